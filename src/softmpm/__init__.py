@@ -1,0 +1,7 @@
+"""softmpm: differentiable simulation of soft robots."""
+
+from softmpm.autograd import simulate
+from softmpm.model import Model, build
+from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm.state import GridField, Params, State
+from softmpm.watch import UnstableError

@@ -1,0 +1,99 @@
+"""The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
+
+import torch
+from torch import Tensor
+
+from softmpm import checks
+from softmpm.kernels.types import Wanted
+from softmpm.model import Model
+from softmpm.rollout import Horizon, rollout, rollout_adj
+from softmpm.state import Low, Params, State
+from softmpm.step import Motion, Solid, lame
+
+
+@torch.compiler.disable
+def simulate(model: Model, start: State, activation: Tensor | None, params: Params, *, substeps: int) -> State:
+    """Advance a soft robot, differentiably.
+
+    Each row of ``activation`` drives ``substeps`` MLS-MPM substeps (Hu et al. 2018, Eq. 29). Second derivatives raise.
+
+    Args:
+        model: What does not change in time; from :func:`softmpm.build`.
+        start: State at the first substep. Differentiable, never modified.
+        activation: Muscle activation [-], shape (control_step, world, muscle); None is one control step without
+            activation. Differentiable.
+        params: Material of each particle: ``young`` [Pa], ``poisson`` [-], ``density`` [kg/m³], shapes that broadcast
+            to (world, particle). Differentiable.
+        substeps: Substeps of ``model.scene.dt`` [s] for each row of ``activation``.
+
+    Returns:
+        State after ``control_step * substeps * dt`` seconds, in new tensors.
+
+    Raises:
+        ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
+        UnstableError: A particle became non-finite, inverted or left the grid; names world, particle, substep and limit.
+    """
+    checks.check_simulate(model, start, activation, params, substeps)
+    lead = (model.worlds, model.particle_count)
+    mu, lam = (term.expand(lead).contiguous() for term in lame(Params(*(p.expand(lead) for p in params))))
+    mass = (params.density * model.volume).expand(lead).contiguous()
+    pull, control_steps = None, 1
+    if activation is not None:
+        control_steps = activation.shape[0]
+        if model.muscle_count:
+            pull = (activation.to(model.dtype) * model.strength).contiguous()
+    elif model.muscle_count:
+        pull = torch.zeros(1, model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
+    low = start.low or (None, None)
+    inputs = (pull, mu, lam, mass, *start)
+    keep = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs)
+    end = _Simulate.apply(model, Horizon(control_steps, substeps), keep, *inputs, *low)
+    state = State(*end[:4])
+    return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
+
+
+class _Simulate(torch.autograd.Function):
+    @staticmethod
+    def forward(model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F):
+        start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
+        end, kept = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep)
+        return (*end, *(end.low or (None, None)), *(kept.tensors() if kept else ()))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.model, ctx.horizon, _, pull, mu, lam, mass, *_ = inputs
+        ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(pull, mu, lam, mass, *output[6:])
+
+    @staticmethod
+    def backward(ctx, *adj_end):
+        wanted = Wanted(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
+        adj = _SimulateBackward.apply(ctx.model, ctx.horizon, wanted, *ctx.saved_tensors, *adj_end[:4])
+        return None, None, None, *adj, None, None
+
+
+class _SimulateBackward(torch.autograd.Function):
+    """A function of its own, so that a second derivative raises instead of silently losing this term."""
+
+    @staticmethod
+    def forward(model, horizon, wanted, pull, mu, lam, mass, *tensors):
+        kept, adj_end = Motion(*tensors[:5]), tensors[5:]
+        shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
+        shapes += 2 * ((*shapes[0], model.dim),)
+        adj_end = State(
+            *(mass.new_zeros(shape) if adj is None else adj for adj, shape in zip(adj_end, shapes, strict=True))
+        )
+        adj, solid, adj_pull = rollout_adj(model, horizon, kept, pull, Solid(mass, mu, lam, pull), adj_end, wanted)
+        return adj_pull, solid.mu, solid.lam, solid.mass, *adj
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+    @staticmethod
+    def backward(ctx, *adj):
+        raise RuntimeError(
+            "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
+            "call backward without create_graph=True."
+        )

@@ -1,0 +1,102 @@
+"""Contact of one grid node with one wall, and its adjoint. Derivation: docs/math/grid.md.
+
+With the outward normal n, vₙ = v·n, v_t = v − vₙ n and Coulomb's coefficient c:
+
+    stick     v' = 0                                                                                 (C1)
+    slip      v' = v_t                                                                               (C2)
+    separate  v' = v_t max(0, 1 + c vₙ / |v_t|) if vₙ < 0, else v                                    (C3)
+
+The twins differentiate the branch that was taken; a node held by friction passes nothing on.
+Source: Stomakhin et al. 2013, "A material point method for snow simulation", section 8.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.types import Spec, solid_types, types
+
+
+@functools.lru_cache(maxsize=None)
+def contact(spec: Spec) -> SimpleNamespace:
+    t = types(spec.dim, spec.dtype)
+    real, vec, ivec = t.real, t.vec, t.ivec
+    Walls = solid_types(spec).Walls
+    several = len(spec.contacts) > 1
+    stick, slip = (spec.contacts.index(kind) if kind in spec.contacts else -1 for kind in ("stick", "slip"))
+    separate, rough = "separate" in spec.contacts, spec.friction
+
+    @wp.func
+    def inside(walls: Walls, k: int, node: ivec, spacing: wp.float64) -> bool:
+        """Decided in float64, so that both precisions put a node on the surface to the same side."""
+        reach = wp.float64(0.0)
+        for axis in range(spec.dim):
+            reach += walls.normal[k][axis] * (wp.float64(node[axis]) * spacing)
+        return reach <= walls.offset[k]
+
+    @wp.func
+    def kind_of(walls: Walls, k: int) -> int:
+        if wp.static(several):
+            return walls.contact[k]
+        return 0
+
+    @wp.func
+    def slide(walls: Walls, k: int, v_n: real, v_t: vec) -> vec:
+        """Tangential velocity that friction leaves, for v_n < 0."""
+        if wp.static(rough):
+            limit = -walls.friction[k] * v_n
+            if limit > real(0.0):
+                speed = wp.length(v_t)
+                if speed <= limit:
+                    return vec()
+                return v_t * (real(1.0) - limit / speed)
+        return v_t
+
+    @wp.func
+    def slide_adj(walls: Walls, k: int, v_n: real, v_t: vec, adj: vec, n: vec) -> vec:
+        """∂L/∂v through v_t and v_n (C3); ``adj`` lies in the tangent plane."""
+        if wp.static(rough):
+            c = walls.friction[k]
+            limit = -c * v_n
+            if limit > real(0.0):
+                speed = wp.length(v_t)
+                if speed <= limit:
+                    return vec()
+                along = wp.dot(adj, v_t) / speed
+                return adj * (real(1.0) - limit / speed) + (along * limit / (speed * speed)) * v_t + (c * along) * n
+        return adj
+
+    @wp.func
+    def respond(walls: Walls, k: int, v: vec) -> vec:
+        n = vec(walls.normal[k])
+        v_n = wp.dot(v, n)
+        kind = kind_of(walls, k)
+        if wp.static(stick >= 0):
+            if kind == stick:
+                return vec()
+        if wp.static(slip >= 0):
+            if kind == slip:
+                return v - v_n * n
+        if wp.static(separate):
+            if v_n < real(0.0):
+                return slide(walls, k, v_n, v - v_n * n)
+        return v
+
+    @wp.func
+    def respond_adj(walls: Walls, k: int, v: vec, adj: vec) -> vec:
+        n = vec(walls.normal[k])
+        v_n = wp.dot(v, n)
+        kind = kind_of(walls, k)
+        if wp.static(stick >= 0):
+            if kind == stick:
+                return vec()
+        if wp.static(slip >= 0):
+            if kind == slip:
+                return adj - wp.dot(adj, n) * n
+        if wp.static(separate):
+            if v_n < real(0.0):
+                return slide_adj(walls, k, v_n, v - v_n * n, adj - wp.dot(adj, n) * n, n)
+        return adj
+
+    return SimpleNamespace(inside=inside, respond=respond, respond_adj=respond_adj)

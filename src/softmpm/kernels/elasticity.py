@@ -1,0 +1,118 @@
+"""Kirchhoff stress τ of a deformation, one block per law, with its adjoint. Derivation: docs/math/elasticity.md.
+
+Everything is written in H = F − I, so that small strains keep their digits in float32. With j = J − 1, R = I + Q:
+
+    neo-Hookean:      τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                        (E1)
+    fixed corotated:  τ = 2μ (H − Q) Fᵀ + λ j (1 + j) I                                             (E2)
+
+Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012. The twins take τ̄ and return (F̄, μ̄, λ̄):
+
+    (E1): F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
+    (E2): F̄ = 2μ (τ̄ F + τ̄ᵀ (F − R)) + λ (2J − 1) tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ τ̄ F,
+          μ̄ = ⟨τ̄, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.polar import polar
+from softmpm.kernels.types import types
+
+
+@functools.lru_cache(maxsize=None)
+def elasticity(dim: int, dtype: str) -> SimpleNamespace:
+    t = types(dim, dtype)
+    real, vec, mat = t.real, t.vec, t.mat
+    rotation, rotation_adj = polar(dim, dtype).rotation, polar(dim, dtype).rotation_adj
+
+    @wp.struct
+    class ElasticAdj:
+        F: mat
+        mu: real
+        lam: real
+
+    @wp.func
+    def identity() -> mat:
+        return wp.identity(n=dim, dtype=real)
+
+    if dim == 2:
+
+        @wp.func
+        def cofactor(F: mat) -> mat:
+            return mat(F[1, 1], -F[1, 0], -F[0, 1], F[0, 0])
+
+        @wp.func
+        def volume_change(H: mat) -> real:
+            """j = det(I + H) − 1."""
+            return H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+    else:
+
+        @wp.func
+        def cofactor(F: mat) -> mat:
+            a = vec(F[0, 0], F[0, 1], F[0, 2])
+            b = vec(F[1, 0], F[1, 1], F[1, 2])
+            c = vec(F[2, 0], F[2, 1], F[2, 2])
+            bc = wp.cross(b, c)
+            ca = wp.cross(c, a)
+            ab = wp.cross(a, b)
+            return mat(bc[0], bc[1], bc[2], ca[0], ca[1], ca[2], ab[0], ab[1], ab[2])
+
+        @wp.func
+        def volume_change(H: mat) -> real:
+            G = cofactor(H)
+            return wp.trace(H) + wp.trace(G) + (H[0, 0] * G[0, 0] + H[0, 1] * G[0, 1] + H[0, 2] * G[0, 2])
+
+    @wp.func
+    def log1p(j: real) -> real:
+        """log(1 + j) to the last digit also for small j (Kahan)."""
+        u = real(1.0) + j
+        if u == real(1.0):
+            return j
+        return wp.log(u) * (j / (u - real(1.0)))
+
+    @wp.func
+    def neo_hookean(H: mat, mu: real, lam: real) -> mat:
+        return mu * (H + wp.transpose(H) + H * wp.transpose(H)) + lam * log1p(volume_change(H)) * identity()
+
+    @wp.func
+    def neo_hookean_adj(H: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
+        F = identity() + H
+        j = volume_change(H)
+        trace = wp.trace(adj_tau)
+        adj = ElasticAdj()
+        adj.F = mu * (adj_tau + wp.transpose(adj_tau)) * F + (lam * trace / (real(1.0) + j)) * cofactor(F)
+        adj.mu = wp.ddot(adj_tau, H + wp.transpose(H) + H * wp.transpose(H))
+        adj.lam = trace * log1p(j)
+        return adj
+
+    @wp.func
+    def fixed_corotated(H: mat, mu: real, lam: real) -> mat:
+        j = volume_change(H)
+        F = identity() + H
+        return real(2.0) * mu * (H - rotation(H)) * wp.transpose(F) + lam * j * (real(1.0) + j) * identity()
+
+    @wp.func
+    def fixed_corotated_adj(H: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
+        F = identity() + H
+        Q = rotation(H)
+        j = volume_change(H)
+        trace = wp.trace(adj_tau)
+        two_mu = real(2.0) * mu
+        adj = ElasticAdj()
+        adj.F = two_mu * (adj_tau * F + wp.transpose(adj_tau) * (H - Q)) + (
+            lam * (real(1.0) + real(2.0) * j) * trace
+        ) * cofactor(F)
+        adj.F += rotation_adj(H, Q, -two_mu * (adj_tau * F))
+        adj.mu = real(2.0) * wp.ddot(adj_tau, (H - Q) * wp.transpose(F))
+        adj.lam = trace * j * (real(1.0) + j)
+        return adj
+
+    return SimpleNamespace(
+        Adj=ElasticAdj,
+        identity=identity,
+        volume_change=volume_change,
+        stress={"neo_hookean": neo_hookean, "fixed_corotated": fixed_corotated},
+        stress_adj={"neo_hookean": neo_hookean_adj, "fixed_corotated": fixed_corotated_adj},
+    )

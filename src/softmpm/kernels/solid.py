@@ -1,0 +1,100 @@
+"""Total stress of one particle: its law plus its muscles, as the scene has them."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.elasticity import elasticity
+from softmpm.kernels.muscle import muscle
+from softmpm.kernels.types import Spec, Wanted, solid_adj_type, solid_types, types
+
+
+@functools.lru_cache(maxsize=None)
+def solid(spec: Spec) -> SimpleNamespace:
+    t = types(spec.dim, spec.dtype)
+    mat, Solid = t.mat, solid_types(spec).Solid
+    laws = elasticity(spec.dim, spec.dtype)
+    first, last = laws.stress[spec.laws[0]], laws.stress[spec.laws[-1]]
+    muscle_stress = muscle(spec.dim, spec.dtype).muscle_stress
+    mixed, slots = len(spec.laws) > 1, spec.muscle_slots
+
+    @wp.func
+    def stress(body: Solid, world: int, p: int, H: mat) -> mat:
+        """Kirchhoff stress τ [Pa]."""
+        tau = mat()
+        if wp.static(mixed):
+            if body.law[p] == 0:
+                tau = first(H, body.mu[world, p], body.lam[world, p])
+            else:
+                tau = last(H, body.mu[world, p], body.lam[world, p])
+        else:
+            tau = first(H, body.mu[world, p], body.lam[world, p])
+        if wp.static(slots > 0):
+            for slot in range(slots):
+                k = body.muscle[p, slot]
+                if k >= 0:
+                    tau += muscle_stress(H, body.fibre[k], body.pull[world, k])
+        return tau
+
+    return SimpleNamespace(stress=stress)
+
+
+@functools.lru_cache(maxsize=None)
+def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+    t = types(spec.dim, spec.dtype)
+    mat, Solid, SolidAdj = t.mat, solid_types(spec).Solid, solid_adj_type(spec, wanted)
+    laws, fibres = elasticity(spec.dim, spec.dtype), muscle(spec.dim, spec.dtype)
+    first_adj, last_adj = laws.stress_adj[spec.laws[0]], laws.stress_adj[spec.laws[-1]]
+    muscle_stress_adj, ElasticAdj = fibres.muscle_stress_adj, laws.Adj
+    mixed, slots = len(spec.laws) > 1, spec.muscle_slots
+
+    @wp.func
+    def stress_adj(body: Solid, world: int, p: int, H: mat, adj_tau: mat, adj_body: SolidAdj) -> mat:
+        """∂L/∂F; adds what is wanted of the material and of the muscles' pull into ``adj_body``."""
+        adj = ElasticAdj()
+        if wp.static(mixed):
+            if body.law[p] == 0:
+                adj = first_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
+            else:
+                adj = last_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
+        else:
+            adj = first_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
+        adj_F = adj.F
+        if wp.static(wanted.material):
+            adj_body.mu[world, p] = adj_body.mu[world, p] + adj.mu
+            adj_body.lam[world, p] = adj_body.lam[world, p] + adj.lam
+        if wp.static(slots > 0):
+            for slot in range(slots):
+                k = body.muscle[p, slot]
+                if k >= 0:
+                    adj_muscle = muscle_stress_adj(H, body.fibre[k], body.pull[world, k], adj_tau)
+                    adj_F += adj_muscle.F
+                    if wp.static(wanted.activation):
+                        adj_body.pull[world, p, slot] = adj_body.pull[world, p, slot] + adj_muscle.pull
+        return adj_F
+
+    return SimpleNamespace(stress_adj=stress_adj)
+
+
+@functools.lru_cache(maxsize=None)
+def collect_pull(spec: Spec):
+    """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
+    t = types(spec.dim, spec.dtype)
+
+    @wp.kernel(module=spec.module + ".adj", enable_backward=False)
+    def collect(
+        # In:
+        muscle: wp.array2d(dtype=wp.int32),
+        # In, cleared:
+        adj_slot: wp.array3d(dtype=t.real),
+        # Out, added into:
+        adj_pull: wp.array2d(dtype=t.real),
+    ):
+        world, p, slot = wp.tid()
+        k = muscle[p, slot]
+        if k >= 0:
+            wp.atomic_add(adj_pull, world, k, adj_slot[world, p, slot])
+            adj_slot[world, p, slot] = t.real(0.0)
+
+    return collect

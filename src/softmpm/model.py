@@ -1,0 +1,208 @@
+"""A scene made ready to run: fixed arrays on one device, and what was specialised for it."""
+
+import logging
+import math
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm import checks
+from softmpm.kernels.types import Spec, solid_types, types
+from softmpm.memory import memory
+from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
+from softmpm.state import Low, Params, State
+
+LAWS = {NeoHookean: "neo_hookean", FixedCorotated: "fixed_corotated"}
+
+logger = logging.getLogger("softmpm")
+
+
+def build(
+    scene: Scene,
+    device: str | torch.device | None = None,
+    dtype: torch.dtype = torch.float32,
+    worlds: int = 1,
+    memory_budget: int | None = None,
+) -> "Model":
+    """Make a scene ready to run.
+
+    Args:
+        scene: What to simulate.
+        device: Where; None takes CUDA if there is one, and says so in the log.
+        dtype: ``torch.float32`` or ``torch.float64``.
+        worlds: Number of independent copies of the scene that run in one launch.
+        memory_budget: Most bytes that one ``simulate`` call may keep for its backward pass, None for a sensible choice;
+            see docs/memory.md.
+
+    Returns:
+        The model: immutable, shared by any number of simulations.
+
+    Raises:
+        ValueError: The scene breaks a rule; the message says which, what came and what to do.
+    """
+    checks.check_scene(scene)
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
+    if not (isinstance(worlds, int) and worlds >= 1):
+        raise ValueError(f"worlds must be a whole number of at least 1, got {worlds!r}.")
+    if memory_budget is not None and not memory_budget > 0:
+        raise ValueError(f"memory_budget must be a positive number of bytes or None, got {memory_budget}.")
+    checks.warn_unstable(scene)
+    return Model(scene, _device(device), dtype, worlds, memory_budget)
+
+
+def _device(device: str | torch.device | None) -> torch.device:
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        logger.info("softmpm runs on %s.", device)
+    device = torch.device(device)
+    if device.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {str(device)!r}.")
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            raise RuntimeError("device 'cuda' was asked for, but PyTorch sees no GPU here; use device='cpu'.")
+        device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
+    return device
+
+
+class Model:
+    """What does not change in time. From :func:`softmpm.build`; never modified.
+
+    Attributes:
+        scene: The scene it was built from.
+        device, dtype: Where it runs and in which precision.
+        worlds, particle_count, muscle_count, dim: Sizes.
+        positions: Rest positions X [m], shape (particle, dim).
+        volume: Rest volumes V⁰ [m³], shape (particle,).
+        body: Index of each particle's body, shape (particle,).
+        spec: What the kernels are specialised for.
+    """
+
+    def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, memory_budget: int | None):
+        self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
+        self.memory_budget = memory_budget
+        self.dim = scene.grid.dim
+        sizes = [len(body.particles) for body in scene.bodies]
+        self.particle_count = sum(sizes)
+        self.muscle_count = len(scene.muscles)
+        self.node_count = math.prod(scene.grid.shape)
+        self.body = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes)).to(device)
+        self._exact_positions = np.concatenate([body.particles.positions for body in scene.bodies])
+        self.positions = self._tensor(self._exact_positions)
+        self.volume = self._tensor(np.concatenate([body.particles.volume for body in scene.bodies]))
+        slots = _muscle_slots(scene, self.particle_count)
+        self.spec = _spec(scene, dtype, slots.shape[1])
+        self.muscle_slots = torch.from_numpy(slots).to(device)
+        self.fibre = self._tensor([m.direction for m in scene.muscles]).reshape(-1, self.dim)
+        self.strength = self._tensor([m.strength for m in scene.muscles])
+        laws = np.array([self.spec.laws.index(LAWS[type(b.material)]) for b in scene.bodies], dtype=np.int32)
+        self.law = torch.from_numpy(np.repeat(laws, sizes)).to(device)
+        wp.init()
+        self.wp_device = wp.device_from_torch(device)
+        self.scale, self.walls = self._scale(), self._walls()
+
+    def _tensor(self, values) -> Tensor:
+        return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
+
+    def _scale(self):
+        scene, t = self.scene, types(self.spec.dim, self.spec.dtype)
+        scale = t.Scale()
+        scale.shape = t.ivec(*scene.grid.shape)
+        scale.dt = scene.dt
+        scale.spacing = scale.exact_spacing = scene.grid.spacing
+        scale.gravity = t.vec(*scene.gravity)
+        scale.decay = math.exp(-scene.damping * scene.dt)
+        return scale
+
+    def _walls(self):
+        walls, given = solid_types(self.spec).Walls(), self.scene.walls
+        walls.count = len(given)
+        if given:
+            vec = wp.types.vector(self.dim, wp.float64)
+            walls.normal = wp.array([w.normal for w in given], dtype=vec, device=self.wp_device)
+            walls.offset = wp.array([w.offset for w in given], dtype=wp.float64, device=self.wp_device)
+        if len(self.spec.contacts) > 1:
+            kinds = [self.spec.contacts.index(w.contact) for w in given]
+            walls.contact = wp.array(kinds, dtype=wp.int32, device=self.wp_device)
+        if self.spec.friction:
+            real = types(self.spec.dim, self.spec.dtype).real
+            walls.friction = wp.array([w.friction for w in given], dtype=real, device=self.wp_device)
+        return walls
+
+    def rest(self) -> State:
+        """State at rest, in every world: x at the rest positions, v = C = 0, F = I. Fresh tensors."""
+        lead = (self.worlds, self.particle_count)
+        x = self.positions.expand(*lead, self.dim).clone()
+        eye = torch.eye(self.dim, dtype=self.dtype, device=self.device).expand(*lead, self.dim, self.dim).clone()
+        state = State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye)
+        if self.dtype == torch.float64:
+            return state
+        low = torch.from_numpy(self._exact_positions).to(self.device) - self.positions.double()
+        return state.with_low(Low(low.to(self.dtype).expand(*lead, self.dim).clone(), torch.zeros_like(eye)))
+
+    def params(self) -> Params:
+        """Material of each particle as the scene gives it, shape (particle,) each. Fresh tensors."""
+        materials = [body.material for body in self.scene.bodies]
+        return Params(*(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields))
+
+    def state_bytes(self) -> int:
+        """Memory of one stored state of all worlds [B]."""
+        real = self.dtype.itemsize
+        return self.worlds * self.particle_count * (4 * self.dim + real * (2 * self.dim + 2 * self.dim**2))
+
+    def node_bytes(self) -> int:
+        """Memory of momentum, mass and velocity on the grid of all worlds [B]; a backward pass has twice that."""
+        return self.worlds * self.node_count * self.dtype.itemsize * (2 * self.dim + 1)
+
+    def describe(self, substeps: int = 1000) -> str:
+        """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""
+        spec, has = self.spec, lambda flag: "compiled" if flag else "left out"
+        limit = checks.stable_dt(self.scene)
+        mib = {name: f"{size / 2**20:.1f} MiB" for name, size in memory(self, substeps)._asdict().items()}
+        lines = [
+            f"softmpm model: {spec.dim}D, {spec.dtype}, on {self.device}, {self.worlds} world(s) of "
+            f"{self.particle_count} particles on {' x '.join(map(str, self.scene.grid.shape))} nodes",
+            f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
+            f"  muscles    {self.muscle_count}, at most {spec.muscle_slots} on one particle"
+            if spec.muscle_slots
+            else "  muscles    left out",
+            f"  contacts   {', '.join(spec.contacts) or 'left out'}"
+            + ("" if not set(CONTACTS) - set(spec.contacts) or not spec.contacts else "; others left out"),
+            f"  friction   {has(spec.friction)}",
+            f"  gravity    {has(spec.gravity)}",
+            f"  damping    {has(spec.damping)}",
+            "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
+            f"  dt         {self.scene.dt:.3g} s; {limit}",
+            f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, {mib['backward']} at the peak",
+        ]
+        return "\n".join(lines)
+
+
+def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
+    """Muscles of each particle, shape (particle, most that overlap on one), filled up with -1."""
+    members = np.zeros(particle_count, dtype=np.int64)
+    for muscle in scene.muscles:
+        members[muscle.particles] += 1
+    slots = np.full((particle_count, int(members.max(initial=0))), -1, dtype=np.int32)
+    members[:] = 0
+    for k, muscle in enumerate(scene.muscles):
+        slots[muscle.particles, members[muscle.particles]] = k
+        members[muscle.particles] += 1
+    return slots
+
+
+def _spec(scene: Scene, dtype: torch.dtype, slots: int) -> Spec:
+    laws = {LAWS[type(body.material)] for body in scene.bodies}
+    contacts = {wall.contact for wall in scene.walls}
+    return Spec(
+        dim=scene.grid.dim,
+        dtype=str(dtype).removeprefix("torch."),
+        laws=tuple(law for law in LAWS.values() if law in laws),
+        muscle_slots=slots,
+        contacts=tuple(kind for kind in CONTACTS if kind in contacts),
+        friction=any(wall.friction > 0 for wall in scene.walls),
+        gravity=any(g != 0 for g in scene.gravity),
+        damping=scene.damping > 0,
+    )

@@ -1,0 +1,46 @@
+"""Run-time failures: how a kernel reports one, and how it reaches the user.
+
+A kernel that meets a failure lowers one 64-bit word of its world, ``watch[world]``, to (substep, kind, particle); the first
+failure has the smallest word and stays. From then on every kernel leaves that world as it is, so the offending value is still
+there when the word is read, and nothing is written out of bounds. Other worlds go on, unchanged.
+"""
+
+from enum import IntEnum
+
+NEVER = 2**63 - 1
+SUBSTEP_SHIFT, KIND_SHIFT = 36, 32
+MAX_SUBSTEP = 2 ** (63 - SUBSTEP_SHIFT) - 1
+
+
+class Kind(IntEnum):
+    """What failed; the order decides which failure of one particle is reported."""
+
+    START = 0
+    NOT_FINITE = 1
+    LEFT_GRID = 2
+    INVERTED = 3
+    GRADIENT = 4
+
+
+class UnstableError(RuntimeError):
+    """A particle became non-finite, inverted or left the grid, or a gradient overflowed.
+
+    Attributes:
+        kind: One of ``start``, ``not_finite``, ``left_grid``, ``inverted``, ``gradient``.
+        world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite.
+        substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.
+        value: The offending value.
+        limit: What it had to keep to.
+        state: State in which every world stopped: at the failure where it failed, at the end elsewhere; None in a backward pass.
+    """
+
+    def __init__(self, message: str, *, kind: Kind, world: int, particle: int, substep: int, value, limit: str, state=None):
+        super().__init__(message)
+        self.kind = kind.name.lower()
+        self.world, self.particle, self.substep = world, particle, substep
+        self.value, self.limit, self.state = value, limit, state
+
+
+def decode(word: int) -> tuple[int, Kind, int]:
+    """(substep, kind, particle) of a watch word."""
+    return word >> SUBSTEP_SHIFT, Kind((word >> KIND_SHIFT) & 0xF), word & 0xFFFFFFFF
