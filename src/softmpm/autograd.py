@@ -6,9 +6,16 @@ from torch import Tensor
 from softmpm import checks
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
+from softmpm.raster import splat, splat_adj
 from softmpm.rollout import Horizon, rollout, rollout_adj
-from softmpm.state import Low, Params, State
+from softmpm.state import GridField, Low, Params, State
 from softmpm.step import Motion, Solid, lame
+
+
+_SECOND = (
+    "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
+    "call backward without create_graph=True."
+)
 
 
 @torch.compiler.disable
@@ -52,6 +59,28 @@ def simulate(model: Model, start: State, activation: Tensor | None, params: Para
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
 
 
+@torch.compiler.disable
+def rasterize(model: Model, state: State) -> GridField:
+    """Mass and velocity of the particles on the grid, as an observer sees them: P2G without forces (APIC, Jiang et al. 2015).
+
+    Args:
+        model: From :func:`softmpm.build`; its densities weigh the particles.
+        state: What to look at. Differentiable in x, v and C; F does not enter.
+
+    Returns:
+        ``mass`` [kg] of shape (world, *nodes) and ``velocity`` [m/s] of shape (world, *nodes, dim), zero where there is no mass.
+
+    Raises:
+        ValueError, UnstableError: As :func:`simulate`, for the state.
+    """
+    checks.check_state(model, state)
+    node = _Splat.apply(model, state.x, state.v, state.C)
+    node = node.view(model.worlds, *model.scene.grid.shape, model.dim + 1)
+    momentum, mass = node[..., :-1], node[..., -1]
+    present = mass > 0
+    return GridField(mass, momentum * (present / torch.where(present, mass, 1))[..., None])
+
+
 class _Simulate(torch.autograd.Function):
     @staticmethod
     def forward(model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F):
@@ -61,10 +90,10 @@ class _Simulate(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.model, ctx.horizon, _, pull, mu, lam, mass, *_ = inputs
+        ctx.model, ctx.horizon, _, *differentiable = inputs[:11]
         ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(pull, mu, lam, mass, *output[6:])
+        ctx.save_for_backward(*differentiable, *output[6:])
 
     @staticmethod
     def backward(ctx, *adj_end):
@@ -78,7 +107,8 @@ class _SimulateBackward(torch.autograd.Function):
 
     @staticmethod
     def forward(model, horizon, wanted, pull, mu, lam, mass, *tensors):
-        kept, adj_end = Motion(*tensors[:5]), tensors[5:]
+        # The start is not read, its kept copy is; it stands here so that a second derivative finds this function.
+        _start, kept, adj_end = tensors[:4], Motion(*tensors[4:9]), tensors[9:]
         shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
         shapes += 2 * ((*shapes[0], model.dim),)
         adj_end = State(
@@ -93,7 +123,36 @@ class _SimulateBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *adj):
-        raise RuntimeError(
-            "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
-            "call backward without create_graph=True."
-        )
+        raise RuntimeError(_SECOND)
+
+
+class _Splat(torch.autograd.Function):
+    @staticmethod
+    def forward(model, x, v, C):
+        return splat(model, State(x, v, C, None))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.model = inputs[0]
+        ctx.save_for_backward(*inputs[1:])
+
+    @staticmethod
+    def backward(ctx, adj_node):
+        return None, *_SplatBackward.apply(ctx.model, adj_node, *ctx.saved_tensors)
+
+
+class _SplatBackward(torch.autograd.Function):
+    """As :class:`_SimulateBackward`: a second derivative raises."""
+
+    @staticmethod
+    def forward(model, adj_node, x, v, C):
+        adj = splat_adj(model, State(x, v, C, None), adj_node)
+        return adj.x, adj.v, adj.C
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+    @staticmethod
+    def backward(ctx, *adj):
+        raise RuntimeError(_SECOND)

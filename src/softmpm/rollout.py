@@ -132,7 +132,7 @@ def raise_failure(model: Model, watch: Tensor, end: State | None) -> None:
     value, limit, advice = _explain(model, kind, world, particle, end)
     where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
     time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
-    others = f"; {len(failed) - 1} more world(s) failed too" if len(failed) > 1 else ""
+    others = f" ({len(failed) - 1} more world(s) failed too.)" if len(failed) > 1 else ""
     when = "in the start state" if kind is Kind.START else f"at {time}"
     raise UnstableError(
         f"{where} {value} {when}; {limit}. {advice}{others}",
@@ -145,7 +145,7 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State | N
     dx = model.scene.grid.spacing
     low = 0.5 * dx
     high = tuple((n - 1.5) * dx for n in model.scene.grid.shape)
-    box = f"every coordinate must stay in [{low:.4g}, {', '.join(f'{h:.4g}' for h in high)}) m"
+    box = "a particle must stay in " + " x ".join(f"[{low:.4g}, {h:.4g})" for h in high) + " m"
     smaller = "Use a smaller dt (softmpm.stable_dt gives a safe one), a weaker activation, or a softer material."
     if kind is Kind.GRADIENT:
         return "has an adjoint that is not finite", "gradients must be finite", "Shorten the horizon or scale the loss."

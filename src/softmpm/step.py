@@ -169,6 +169,8 @@ class Substep:
         self._node_tensor, self.node = self._grid(t.node)
         _, self.velocity = self._grid(t.vec)
         if adjoint:
+            if spec.muscle_slots:
+                collect_pull(spec)  # defined before its module is first loaded, which would be compiled twice otherwise
             _, self.adj_node = self._grid(t.node)
             self._adj_velocity_tensor, self.adj_velocity = self._grid(t.vec)
 

@@ -22,24 +22,10 @@ def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, node_vec, ivec, Scale = t.real, t.vec, t.node, t.ivec, t.Scale
     Walls = solid_types(spec).Walls
-    node_coordinates = spline(spec.dim, spec.dtype).node_coordinates
+    nodes = spline(spec.dim, spec.dtype)
+    node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
     inside, respond, respond_adj = (getattr(contact(spec), name) for name in ("inside", "respond", "respond_adj"))
     dim, walled, gravity, damping = spec.dim, bool(spec.contacts), spec.gravity, spec.damping
-
-    @wp.func
-    def momentum(node: node_vec) -> vec:
-        p = vec()
-        for axis in range(dim):
-            p[axis] = node[axis]
-        return p
-
-    @wp.func
-    def pack(p: vec, m: real) -> node_vec:
-        node = node_vec()
-        for axis in range(dim):
-            node[axis] = p[axis]
-        node[dim] = m
-        return node
 
     @wp.func
     def free_velocity(scale: Scale, u: vec) -> vec:
@@ -111,6 +97,4 @@ def grid(spec: Spec) -> SimpleNamespace:
             adj = pack(adj_p, -wp.dot(adj_p, u))
         adj_node[world, n] = adj
 
-    return SimpleNamespace(
-        momentum=momentum, pack=pack, grid_velocity=grid_velocity, grid_velocity_adj=grid_velocity_adj
-    )
+    return SimpleNamespace(grid_velocity=grid_velocity, grid_velocity_adj=grid_velocity_adj)

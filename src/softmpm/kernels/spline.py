@@ -1,4 +1,4 @@
-"""Quadratic B-spline weights of the 3^dim nodes around a particle. Derivation: docs/math/transfer.md.
+"""Quadratic B-spline weights of the 3^dim nodes around a particle, and the packed node. Derivation: docs/math/transfer.md.
 
 With f the distance from the base node in cells, 0.5 ≤ f < 1.5, along each axis:
 
@@ -19,7 +19,7 @@ from softmpm.kernels.types import types
 @functools.lru_cache(maxsize=None)
 def spline(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
-    real, vec, ivec = t.real, t.vec, t.ivec
+    real, vec, ivec, node_vec = t.real, t.vec, t.ivec, t.node
     table = wp.types.matrix((3, dim), real)  # [offset, axis]
 
     @wp.func
@@ -99,7 +99,24 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
         def node_coordinates(n: int, shape: ivec) -> ivec:
             return ivec(n / (shape[1] * shape[2]), (n / shape[2]) % shape[1], n % shape[2])
 
+    @wp.func
+    def momentum(node: node_vec) -> vec:
+        p = vec()
+        for axis in range(dim):
+            p[axis] = node[axis]
+        return p
+
+    @wp.func
+    def pack(p: vec, m: real) -> node_vec:
+        node = node_vec()
+        for axis in range(dim):
+            node[axis] = p[axis]
+        node[dim] = m
+        return node
+
     return SimpleNamespace(
+        momentum=momentum,
+        pack=pack,
         count=3**dim,
         weights=weights,
         slopes=slopes,

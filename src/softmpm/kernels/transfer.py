@@ -23,7 +23,6 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.elasticity import elasticity
-from softmpm.kernels.grid import grid
 from softmpm.kernels.solid import solid, solid_adj
 from softmpm.kernels.spline import spline
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
@@ -53,7 +52,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     Solid, stress = solid_types(spec).Solid, solid(spec).stress
     s, dim = spline(spec.dim, spec.dtype), spec.dim
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
-    pack, laws = grid(spec).pack, elasticity(spec.dim, spec.dtype)
+    pack, laws = s.pack, elasticity(spec.dim, spec.dtype)
     identity, volume_change = laws.identity, laws.volume_change
     running, report = failure(spec.dim, spec.dtype).running, failure(spec.dim, spec.dtype).report
     mixed = len(spec.laws) > 1
@@ -179,7 +178,7 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     s, dim = spline(spec.dim, spec.dtype), spec.dim
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
-    momentum, identity = grid(spec).momentum, elasticity(spec.dim, spec.dtype).identity
+    momentum, identity = s.momentum, elasticity(spec.dim, spec.dtype).identity
     affine_momentum, report = transfer(spec).affine_momentum, failure(spec.dim, spec.dtype).report
     bad_gradient = int(Kind.GRADIENT)
 
