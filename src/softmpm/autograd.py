@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from softmpm import checks
+from softmpm.checks import check_activation, check_params, check_state, check_substeps, check_values
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
 from softmpm.raster import splat, splat_adj
@@ -40,7 +40,12 @@ def simulate(model: Model, start: State, activation: Tensor | None, params: Para
         ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
         UnstableError: A particle became non-finite, inverted or left the grid; names world, particle, substep and limit.
     """
-    checks.check_simulate(model, start, activation, params, substeps)
+    start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
+    check_state(model, start)
+    check_activation(model, activation)
+    check_params(model, params)
+    check_substeps(substeps)
+    check_values(start, activation, params)
     lead = (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead).contiguous() for term in lame(Params(*(p.expand(lead) for p in params))))
     mass = (params.density * model.volume).expand(lead).contiguous()
@@ -48,7 +53,7 @@ def simulate(model: Model, start: State, activation: Tensor | None, params: Para
     if activation is not None:
         control_steps = activation.shape[0]
         if model.muscle_count:
-            pull = (activation.to(model.dtype) * model.strength).contiguous()
+            pull = (activation * model.strength).contiguous()
     elif model.muscle_count:
         pull = torch.zeros(1, model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
     low = start.low or (None, None)
@@ -73,12 +78,23 @@ def rasterize(model: Model, state: State) -> GridField:
     Raises:
         ValueError, UnstableError: As :func:`simulate`, for the state.
     """
-    checks.check_state(model, state)
+    state = _cast(model, state)
+    check_state(model, state)
     node = _Splat.apply(model, state.x, state.v, state.C)
     node = node.view(model.worlds, *model.scene.grid.shape, model.dim + 1)
     momentum, mass = node[..., :-1], node[..., -1]
     present = mass > 0
     return GridField(mass, momentum * (present / torch.where(present, mass, 1))[..., None])
+
+
+def _cast(model: Model, value):
+    """Under autocast, tensors in the model's precision: a policy then gives half precision without being asked."""
+    if value is None or not torch.is_autocast_enabled(model.device.type):
+        return value
+    if isinstance(value, Tensor):
+        return value.to(model.dtype) if value.is_floating_point() else value
+    cast = type(value)(*(_cast(model, tensor) for tensor in value))
+    return cast.with_low(value.low) if isinstance(value, State) else cast
 
 
 class _Simulate(torch.autograd.Function):
@@ -108,7 +124,7 @@ class _SimulateBackward(torch.autograd.Function):
     @staticmethod
     def forward(model, horizon, wanted, pull, mu, lam, mass, *tensors):
         # The start is not read, its kept copy is; it stands here so that a second derivative finds this function.
-        _start, kept, adj_end = tensors[:4], Motion(*tensors[4:9]), tensors[9:]
+        kept, adj_end = Motion(*tensors[4:-4]), tensors[-4:]
         shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
         shapes += 2 * ((*shapes[0], model.dim),)
         adj_end = State(

@@ -8,10 +8,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm import checks
 from softmpm.kernels.types import Spec, solid_types, types
+from softmpm.checks import check_scene
 from softmpm.memory import memory
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
+from softmpm.stability import stable_dt, warn_unstable
 from softmpm.state import Low, Params, State
 
 LAWS = {NeoHookean: "neo_hookean", FixedCorotated: "fixed_corotated"}
@@ -42,14 +43,14 @@ def build(
     Raises:
         ValueError: The scene breaks a rule; the message says which, what came and what to do.
     """
-    checks.check_scene(scene)
+    check_scene(scene)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
     if not (isinstance(worlds, int) and worlds >= 1):
         raise ValueError(f"worlds must be a whole number of at least 1, got {worlds!r}.")
     if memory_budget is not None and not memory_budget > 0:
         raise ValueError(f"memory_budget must be a positive number of bytes or None, got {memory_budget}.")
-    checks.warn_unstable(scene)
+    warn_unstable(scene)
     return Model(scene, _device(device), dtype, worlds, memory_budget)
 
 
@@ -150,7 +151,8 @@ class Model:
     def state_bytes(self) -> int:
         """Memory of one stored state of all worlds [B]."""
         real = self.dtype.itemsize
-        return self.worlds * self.particle_count * (4 * self.dim + real * (2 * self.dim + 2 * self.dim**2))
+        low = self.dim if self.dtype == torch.float32 else 0
+        return self.worlds * self.particle_count * (4 * self.dim + real * (low + 2 * self.dim + 2 * self.dim**2))
 
     def node_bytes(self) -> int:
         """Memory of momentum, mass and velocity on the grid of all worlds [B]; a backward pass has twice that."""
@@ -159,7 +161,7 @@ class Model:
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""
         spec, has = self.spec, lambda flag: "compiled" if flag else "left out"
-        limit = checks.stable_dt(self.scene)
+        limit = stable_dt(self.scene)
         mib = {name: f"{size / 2**20:.1f} MiB" for name, size in memory(self, substeps)._asdict().items()}
         lines = [
             f"softmpm model: {spec.dim}D, {spec.dtype}, on {self.device}, {self.worlds} world(s) of "
@@ -174,7 +176,7 @@ class Model:
             f"  gravity    {has(spec.gravity)}",
             f"  damping    {has(spec.damping)}",
             "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
-            f"  dt         {self.scene.dt:.3g} s; {limit}",
+            f"  dt         {self.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
             f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, {mib['backward']} at the peak",
         ]
         return "\n".join(lines)

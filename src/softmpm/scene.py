@@ -1,11 +1,11 @@
-"""What a person designs: a grid, bodies with a material, muscles and walls. Plain SI numbers, checked when written down.
+"""What a person designs: grid, bodies with a material, muscles, walls. Plain SI numbers, checked when written.
 
 A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
 Rules that need the whole scene (particles inside the grid, muscle indices) live in ``checks.py``.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,13 +15,41 @@ Contact = Literal["stick", "slip", "separate"]
 CONTACTS: tuple[Contact, ...] = ("stick", "slip", "separate")
 
 
-def _need(condition: bool, message: str) -> None:
+def need(condition: bool, message: str) -> None:
+    """Every rule of a scene: what must hold, what came instead, what to do."""
     if not condition:
         raise ValueError(message)
 
 
-def _finite(*numbers: float) -> bool:
-    return all(math.isfinite(number) for number in numbers)
+def _numbers(name: str, values: Iterable[float]) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be made of plain numbers, got {values!r}.") from error
+    need(all(math.isfinite(number) for number in numbers), f"{name} must be finite, got {values!r}.")
+    return numbers
+
+
+def _store_numbers(owner: object, what: str, *names: str) -> None:
+    """Turn fields into plain floats, so that NumPy scalars compare, hash and print like them."""
+    for name in names:
+        value = getattr(owner, name)
+        if np.ndim(value) != 0 or isinstance(value, (str, bytes, bool)) or value is None:
+            raise TypeError(f"{what} {name} must be one number, got {value!r}.")
+        object.__setattr__(owner, name, _numbers(f"{what} {name}", [value])[0])
+
+
+def _unit(name: str, vector: Sequence[float]) -> tuple[tuple[float, ...], float]:
+    """A vector divided by its length, and that length."""
+    numbers = _numbers(name, vector)
+    length = math.hypot(*numbers)
+    need(length > 0, f"{name} must not be zero, got {tuple(numbers)}.")
+    return tuple(number / length for number in numbers), length
+
+
+def _need_kind(name: str, value: object, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be a {kind.__name__}, got {type(value).__name__}.")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,12 +62,15 @@ class Grid:
     """Distance of neighbouring nodes, dx [m]."""
 
     def __post_init__(self):
-        _need(len(self.shape) in (2, 3), f"grid.shape must have 2 or 3 axes, got {self.shape}.")
-        _need(
-            all(int(n) == n and n >= 4 for n in self.shape),
-            f"grid.shape needs whole numbers of at least 4 nodes along each axis, got {self.shape}.",
+        need(np.shape(self.shape) in ((2,), (3,)), f"grid shape must have 2 or 3 axes, got {self.shape!r}.")
+        shape = _numbers("grid shape", self.shape)
+        need(
+            all(n.is_integer() and n >= 4 for n in shape),
+            f"grid shape needs whole numbers of at least 4 nodes along each axis, got {self.shape}.",
         )
-        _need(_finite(self.spacing) and self.spacing > 0, f"grid.spacing must be > 0 m, got {self.spacing}.")
+        object.__setattr__(self, "shape", tuple(int(n) for n in shape))
+        _store_numbers(self, "grid", "spacing")
+        need(self.spacing > 0, f"grid spacing must be > 0 m, got {self.spacing}.")
 
     @property
     def dim(self) -> int:
@@ -57,20 +88,21 @@ class Particles:
 
     def __post_init__(self):
         positions = np.array(self.positions, dtype=np.float64, ndmin=2)
-        _need(
+        need(
             positions.ndim == 2 and positions.shape[1] in (2, 3),
             f"positions must have shape (particle, 2) or (particle, 3), got {positions.shape}.",
         )
-        _need(len(positions) > 0, "a shape has no particles: make it larger or its spacing smaller.")
+        need(len(positions) > 0, "a shape has no particles: make it larger or its spacing smaller.")
         volume = np.asarray(self.volume, dtype=np.float64)
-        _need(
+        need(
             volume.shape in ((), (len(positions),)),
             f"volume must be one number or have shape ({len(positions)},), got {volume.shape}.",
         )
         for name, array in (("positions", positions), ("volume", volume)):
-            bad = np.argwhere(~np.isfinite(np.atleast_1d(array)))
-            _need(bad.size == 0, f"{name} must be finite; particle {bad[0][0] if bad.size else ''} is not.")
-        _need(bool((volume > 0).all()), f"volume must be > 0, got {volume.min()}.")
+            if not np.isfinite(array).all():
+                particle = np.argwhere(~np.isfinite(np.atleast_1d(array)))[0][0]
+                raise ValueError(f"{name} must be finite; particle {particle} is not.")
+        need(bool((volume > 0).all()), f"volume must be > 0, got {volume.min()}.")
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "volume", np.broadcast_to(volume, (len(positions),)).copy())
 
@@ -90,17 +122,19 @@ class Material:
     """Poisson's ratio ν [-], in (-1, 0.5). Differentiable."""
 
     def __post_init__(self):
-        _need(type(self) is not Material, "a material needs a law: use NeoHookean or FixedCorotated.")
-        _need(_finite(self.density) and self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
-        _need(_finite(self.young) and self.young > 0, f"young must be > 0 Pa, got {self.young}.")
-        _need(
-            -1.0 < self.poisson < 0.5, f"poisson must lie in (-1, 0.5), got {self.poisson}; rubber has 0.45 to 0.49."
+        need(type(self) is not Material, "a material needs a law: use NeoHookean or FixedCorotated.")
+        _store_numbers(self, "material", "density", "young", "poisson")
+        need(self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
+        need(self.young > 0, f"young must be > 0 Pa, got {self.young}.")
+        need(
+            -1.0 < self.poisson < 0.5,
+            f"poisson must lie in (-1, 0.5), got {self.poisson}; rubber has 0.45 to 0.49.",
         )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class NeoHookean(Material):
-    """Neo-Hookean solid, τ = μ(FFᵀ − I) + λ log(J) I. Good for large stretch; an inverted particle is an error.
+    """Neo-Hookean solid, τ = μ(FFᵀ − I) + λ log(J) I. For large stretch; an inverted particle is an error.
 
     Source: Hu et al. 2019, "ChainQueen", section III. Good values: E 10 to 1e6 Pa, ν 0.2 to 0.45.
     """
@@ -108,9 +142,9 @@ class NeoHookean(Material):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FixedCorotated(Material):
-    """Fixed corotated solid, τ = 2μ(F − R)Fᵀ + λ(J − 1)J I. Survives inversion; softens when crushed below J = 0.5.
+    """Fixed corotated solid, τ = 2μ(F − R)Fᵀ + λ(J − 1)J I. Survives inversion; softens below J = 0.5.
 
-    Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity". Good values: as NeoHookean.
+    Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity". Good values as NeoHookean.
     """
 
 
@@ -120,6 +154,10 @@ class Body:
 
     particles: Particles
     material: Material
+
+    def __post_init__(self):
+        _need_kind("body particles", self.particles, Particles)
+        _need_kind("body material", self.material, Material)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -138,29 +176,27 @@ class Muscle:
 
     def __post_init__(self):
         index = np.asarray(self.particles)
-        _need(index.ndim == 1 and index.size > 0, "a muscle needs a list of particle indices that is not empty.")
-        _need(
+        need(index.ndim == 1 and index.size > 0, "a muscle needs a list of particle indices, not empty.")
+        need(
             np.issubdtype(index.dtype, np.integer),
-            f"muscle particles must be whole numbers, got {index.dtype}; turn a mask into indices with np.flatnonzero.",
+            f"muscle particles must be whole numbers, got {index.dtype}; make indices of a mask by np.flatnonzero.",
         )
-        _need(len(np.unique(index)) == index.size, "a muscle names a particle twice; give each index once.")
-        length = math.sqrt(sum(float(c) ** 2 for c in self.direction))
-        _need(_finite(length) and length > 0, f"muscle direction must not be zero, got {tuple(self.direction)}.")
-        _need(_finite(self.strength), f"muscle strength must be finite, got {self.strength}.")
+        need(len(np.unique(index)) == index.size, "a muscle names a particle twice; give each index once.")
         object.__setattr__(self, "particles", index.astype(np.int64))
-        object.__setattr__(self, "direction", tuple(float(c) / length for c in self.direction))
+        object.__setattr__(self, "direction", _unit("muscle direction", self.direction)[0])
+        _store_numbers(self, "muscle", "strength")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Wall:
     """Half space n·x ≤ offset that a body cannot enter; acts on the nodes inside it.
 
-    ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the wall and
-    applies Coulomb friction to the rest.
+    ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the wall
+    and applies Coulomb friction to the rest.
     """
 
     normal: Sequence[float]
-    """Outward normal n, pointing out of the wall into the free space; normalised here together with the offset."""
+    """Normal n, pointing out of the wall into the free space; normalised here together with the offset."""
     offset: float
     """The wall's surface is n·x = offset [m]."""
     contact: Contact = "separate"
@@ -168,18 +204,20 @@ class Wall:
     """Coulomb coefficient [-], for ``separate`` only."""
 
     def __post_init__(self):
-        _need(self.contact in CONTACTS, f"wall contact must be one of {', '.join(CONTACTS)}, got {self.contact!r}.")
-        _need(_finite(self.offset), f"wall offset must be finite, got {self.offset}.")
-        _need(_finite(self.friction) and self.friction >= 0, f"wall friction must be ≥ 0, got {self.friction}.")
-        _need(
+        need(
+            self.contact in CONTACTS,
+            f"wall contact must be one of {', '.join(CONTACTS)}, got {self.contact!r}.",
+        )
+        _store_numbers(self, "wall", "offset", "friction")
+        need(self.friction >= 0, f"wall friction must be ≥ 0, got {self.friction}.")
+        need(
             self.friction == 0.0 or self.contact == "separate",
             f"a {self.contact} wall has no friction, got {self.friction}; use contact='separate'.",
         )
-        length = math.sqrt(sum(float(c) ** 2 for c in self.normal))
-        _need(_finite(length) and length > 0, f"wall normal must not be zero, got {tuple(self.normal)}.")
-        if abs(length - 1.0) > 1e-15:
+        normal, length = _unit("wall normal", self.normal)
+        if abs(length - 1.0) > 1e-15:  # a unit normal leaves the offset as it was written
             object.__setattr__(self, "offset", self.offset / length)
-        object.__setattr__(self, "normal", tuple(float(c) / length for c in self.normal))
+        object.__setattr__(self, "normal", normal)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -198,12 +236,22 @@ class Scene:
     """Length of one substep, Δt [s]; see :func:`softmpm.stable_dt`."""
 
     def __post_init__(self):
+        _need_kind("scene grid", self.grid, Grid)
+        for name, kind in (("bodies", Body), ("muscles", Muscle), ("walls", Wall)):
+            parts = getattr(self, name)
+            if isinstance(parts, kind) or not isinstance(parts, Iterable):
+                raise TypeError(
+                    f"scene {name} must be a list of {kind.__name__}, got {type(parts).__name__}."
+                )
+            parts = tuple(parts)
+            for k, part in enumerate(parts):
+                _need_kind(f"scene {name}[{k}]", part, kind)
+            object.__setattr__(self, name, parts)
+        need(len(self.bodies) > 0, "a scene needs at least one body.")
         dim = self.grid.dim
-        gravity = (0.0,) * dim if self.gravity is None else tuple(float(g) for g in self.gravity)
-        _need(_finite(*gravity) and len(gravity) == dim, f"gravity needs {dim} finite numbers, got {self.gravity}.")
-        _need(_finite(self.damping) and self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
-        _need(_finite(self.dt) and self.dt > 0, f"dt must be > 0 s, got {self.dt}.")
-        _need(len(self.bodies) > 0, "a scene needs at least one body.")
+        gravity = (0.0,) * dim if self.gravity is None else _numbers("gravity", self.gravity)
+        need(len(gravity) == dim, f"gravity needs {dim} numbers, one per axis, got {self.gravity}.")
         object.__setattr__(self, "gravity", gravity)
-        for name in ("bodies", "muscles", "walls"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        _store_numbers(self, "scene", "damping", "dt")
+        need(self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
+        need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")

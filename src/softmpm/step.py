@@ -45,6 +45,7 @@ class Motion:
     v: Tensor
     C: Tensor
     H: Tensor
+    fx_low: Tensor | None = None
 
     @staticmethod
     def empty(model: Model, *lead: int) -> "Motion":
@@ -52,10 +53,12 @@ class Motion:
             return torch.empty(*lead, model.worlds, model.particle_count, *tail, dtype=dtype, device=model.device)
 
         d = model.dim
-        return Motion(tensor(d, dtype=torch.int32), tensor(d), tensor(d), tensor(d, d), tensor(d, d))
+        low = tensor(d) if model.dtype == torch.float32 else None
+        return Motion(tensor(d, dtype=torch.int32), tensor(d), tensor(d), tensor(d, d), tensor(d, d), low)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        return tuple(getattr(self, field.name) for field in fields(self))
+        found = (getattr(self, field.name) for field in fields(self))
+        return tuple(tensor for tensor in found if tensor is not None)
 
     def __getitem__(self, slot) -> "Motion":
         return Motion(*(tensor[slot] for tensor in self.tensors()))
@@ -68,7 +71,8 @@ class Motion:
         t = types(model.spec.dim, model.spec.dtype)
         struct = t.Motion()
         struct.base = view(self.base, t.ivec)
-        for name, dtype in (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat)):
+        names = (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat), ("fx_low", t.vec))
+        for name, dtype in names[: len(self.tensors()) - 1]:
             setattr(struct, name, view(getattr(self, name), dtype))
         return struct
 

@@ -24,7 +24,7 @@ from softmpm.step import Motion, Solid, SolidAdj, Substep, lame, stream_of, view
 class WarpState:
     """State of all particles in Warp arrays of shape (world, particle); all but ``base`` can carry a gradient.
 
-    Small quantities are not stored on top of large ones: position is x = (base + fx) dx, deformation F = I + H.
+    Small quantities are not stored on top of large ones: position is x = (base + fx + fx_low) dx, deformation F = I + H.
     """
 
     base: wp.array
@@ -37,6 +37,8 @@ class WarpState:
     """Affine velocity [1/s]."""
     H: wp.array
     """F − I [-]; its gradient is ∂L/∂F."""
+    fx_low: wp.array | None
+    """What rounding took off ``fx`` (float32 only)."""
 
     def differentiable(self) -> list[wp.array]:
         return [self.fx, self.v, self.C, self.H]
@@ -44,7 +46,8 @@ class WarpState:
     def struct(self, model: Model):
         struct = types(model.spec.dim, model.spec.dtype).Motion()
         for field in fields(self):
-            setattr(struct, field.name, getattr(self, field.name))
+            if getattr(self, field.name) is not None:
+                setattr(struct, field.name, getattr(self, field.name))
         return struct
 
     def adj_struct(self, model: Model):
@@ -94,7 +97,8 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     work.enter(state, motion.struct(model))
     raise_failure(model, work.watch, state)
     arrays = (_owned(getattr(motion, n), d, requires_grad) for n, d in zip("fx v C H".split(), (t.vec, t.vec, t.mat, t.mat)))
-    return WarpState(_owned(motion.base, t.ivec, False), *arrays)
+    low = None if motion.fx_low is None else _owned(motion.fx_low, t.vec, False)
+    return WarpState(_owned(motion.base, t.ivec, False), *arrays, low)
 
 
 def torch_state(model: Model, state: WarpState) -> State:

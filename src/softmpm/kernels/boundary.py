@@ -39,6 +39,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         world, p = wp.tid()
         base = ivec()
         fx = vec()
+        fx_low = vec()
         H = F[world, p]
         size = wp.ddot(H, H) + wp.dot(v[world, p], v[world, p]) + wp.ddot(C[world, p], C[world, p])
         sound = wp.isfinite(size)
@@ -54,6 +55,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
             else:
                 sound = False
             fx[axis] = real(cell - wp.float64(base[axis]))
+            fx_low[axis] = real(cell - wp.float64(base[axis]) - wp.float64(fx[axis]))
             for other in range(dim):
                 change = wp.float64(F[world, p][axis, other]) - wp.float64(wp.where(axis == other, 1.0, 0.0))
                 if wp.static(rounds):
@@ -64,6 +66,8 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         start.v[world, p] = v[world, p]
         start.C[world, p] = C[world, p]
         start.H[world, p] = H
+        if wp.static(rounds):
+            start.fx_low[world, p] = fx_low
         if not sound:
             report(watch, world, 0, bad_start, p)
 
@@ -87,7 +91,10 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         high_F = mat()
         rest_F = mat()
         for axis in range(dim):
-            exact = (wp.float64(end.base[world, p][axis]) + wp.float64(end.fx[world, p][axis])) * scale.exact_spacing
+            cell = wp.float64(end.base[world, p][axis]) + wp.float64(end.fx[world, p][axis])
+            if wp.static(rounds):
+                cell += wp.float64(end.fx_low[world, p][axis])
+            exact = cell * scale.exact_spacing
             high_x[axis] = real(exact)
             rest_x[axis] = real(exact - wp.float64(real(exact)))
             for other in range(dim):

@@ -13,7 +13,8 @@ Adjoints, ∇w being the derivative with respect to x_p:
     v̄' += Δt x̄',  C̄' += Δt H̄' (I + H)ᵀ,  H̄ += H̄' + Δt C'ᵀ H̄',  x̄ += x̄'                              (T3.adj)
     v̄_i += w (v̄' + C̄' r / D),  x̄ += Σ ∇w (v_i·(v̄' + C̄' r / D)) − w C̄'ᵀ v_i / D                     (T2.adj)
 
-Positions are held as base node and fraction, fx = x / dx − base, hence ∂L/∂fx = dx ∂L/∂x.
+Positions are held as base node and fraction, fx = x / dx − base, hence ∂L/∂fx = dx ∂L/∂x. In float32 fx is a compensated
+sum: what adding Δt v' / dx loses is kept and added in the next step.
 Sources: Hu et al. 2018 ("MLS-MPM", Eq. 29), Jiang et al. 2015 ("APIC"); the adjoint as in Hu et al. 2019, rederived.
 """
 
@@ -55,7 +56,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     pack, laws = s.pack, elasticity(spec.dim, spec.dtype)
     identity, volume_change = laws.identity, laws.volume_change
     running, report = failure(spec.dim, spec.dtype).running, failure(spec.dim, spec.dtype).report
-    mixed = len(spec.laws) > 1
+    mixed, rounds = len(spec.laws) > 1, spec.dtype == "float32"
     hookean = spec.laws.index("neo_hookean") if "neo_hookean" in spec.laws else -1
     not_finite, left_grid, inverted = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.INVERTED)
 
@@ -144,6 +145,8 @@ def transfer(spec: Spec) -> SimpleNamespace:
             then.v[world, p] = now.v[world, p]
             then.C[world, p] = now.C[world, p]
             then.H[world, p] = H
+            if wp.static(rounds):
+                then.fx_low[world, p] = now.fx_low[world, p]
             return
         v = vec()
         B = mat()
@@ -155,7 +158,11 @@ def transfer(spec: Spec) -> SimpleNamespace:
             B += wp.outer(share, position(o) - fx)
         C = (real(4.0) / scale.spacing) * B
         H = H + scale.dt * (C + C * H)
-        fx = fx + (scale.dt / scale.spacing) * v
+        step = (scale.dt / scale.spacing) * v
+        if wp.static(rounds):
+            step += now.fx_low[world, p]
+            then.fx_low[world, p] = step - ((fx + step) - fx)
+        fx = fx + step
         if check(body, scale.shape, watch, world, p, substep, base, fx, H):
             for axis in range(dim):
                 cells = wp.floor(fx[axis] - real(0.5))

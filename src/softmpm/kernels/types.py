@@ -57,13 +57,16 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         decay: real  # exp(-damping Δt) [-]
 
     class Motion:
-        """State of particles as the kernels hold it: nothing small is stored on top of something large."""
+        """State of particles as the kernels hold it: nothing small is added to something large and lost."""
 
         base: wp.array2d(dtype=ivec)  # first node of the 3^dim stencil
         fx: wp.array2d(dtype=vec)  # position from the base node, in cells: x = (base + fx) dx, 0.5 ≤ fx < 1.5
         v: wp.array2d(dtype=vec)
         C: wp.array2d(dtype=mat)
         H: wp.array2d(dtype=mat)  # F - I
+
+    if dtype == "float32":
+        Motion.__annotations__["fx_low"] = wp.array2d(dtype=vec)  # what rounding took off fx (compensated sum)
 
     class MotionAdj:
         fx: wp.array2d(dtype=vec)  # ∂L/∂fx = dx ∂L/∂x

@@ -1,0 +1,215 @@
+"""Every rule that needs more than one object: a whole scene, or the tensors that meet a model.
+
+Each message says what must hold, what came instead and what to do. Rules of a single object stand in ``scene.py``.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softmpm.scene import Grid, Scene, need
+
+SAME_PLACE = 1e-6
+"""Two particles nearer than this share of a cell are one particle twice."""
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise ValueError with the first rule that the scene breaks."""
+    _check_bodies(scene)
+    _check_distinct(scene)
+    _check_muscles(scene)
+    _check_walls(scene)
+
+
+def _check_bodies(scene: Scene) -> None:
+    grid = scene.grid
+    for b, body in enumerate(scene.bodies):
+        positions = body.particles.positions
+        need(
+            positions.shape[1] == grid.dim,
+            f"body {b} has {positions.shape[1]}D particles, but the grid {grid.shape} has {grid.dim} axes; "
+            "make both 2D or both 3D.",
+        )
+        base = np.floor(positions / grid.spacing - 0.5)  # first of the three nodes that a particle reaches
+        outside = ((base < 0) | (base > np.array(grid.shape) - 3)).any(axis=1)
+        if outside.any():
+            particle = int(np.argmax(outside))
+            raise ValueError(
+                f"body {b} leaves the grid: particle {particle} at {_tuple(positions[particle])} m, and "
+                f"{outside.sum() - 1} more of {len(positions)}; particles must lie in {_room(grid)} m, so that all "
+                "nodes around them exist. Move the body or enlarge the grid."
+            )
+
+
+def _room(grid: Grid) -> str:
+    return " × ".join(f"[{0.5 * grid.spacing:.5g}, {(n - 1.5) * grid.spacing:.5g})" for n in grid.shape)
+
+
+def _check_distinct(scene: Scene) -> None:
+    positions = np.concatenate([body.particles.positions for body in scene.bodies])
+    # An offset that no lattice has keeps two copies, equal up to rounding, on the same side of a bin's edge.
+    bins = np.floor(positions / (SAME_PLACE * scene.grid.spacing) + 0.381966).astype(np.int64)
+    order = np.lexsort(bins.T)
+    twice = (np.diff(bins[order], axis=0) == 0).all(axis=1)
+    if twice.any():
+        first = int(np.argmax(twice))
+        i, j = sorted(order[first : first + 2].tolist())
+        bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
+        raise ValueError(
+            f"particles {i} (body {bodies[i]}) and {j} (body {bodies[j]}) are at the same place, "
+            f"{_tuple(positions[i])} m, and {twice.sum() - 1} more such pairs: bodies must not overlap. "
+            "Move one, or keep only the particles that the other has not."
+        )
+
+
+def _check_muscles(scene: Scene) -> None:
+    count = sum(len(body.particles) for body in scene.bodies)
+    for m, muscle in enumerate(scene.muscles):
+        low, high = muscle.particles.min(), muscle.particles.max()
+        need(
+            low >= 0 and high < count,
+            f"muscle {m} names particle {low if low < 0 else high}, but the scene's {count} particles are "
+            f"0 to {count - 1}, counted through the bodies in their order.",
+        )
+        _check_axes(f"muscle {m} direction", muscle.direction, scene.grid)
+
+
+def _check_walls(scene: Scene) -> None:
+    grid = scene.grid
+    for w, wall in enumerate(scene.walls):
+        _check_axes(f"wall {w} normal", wall.normal, grid)
+        reach = (
+            np.array(wall.normal) * (np.array(grid.shape) - 1) * grid.spacing
+        )  # n·x along the grid's edges
+        low, high = np.minimum(reach, 0.0).sum(), np.maximum(reach, 0.0).sum()
+        need(
+            low <= wall.offset,
+            f"wall {w} covers no node: n·x ≤ {wall.offset:.5g} m, but n·x is {low:.5g} to {high:.5g} m on the grid, "
+            "so it would do nothing. Move it into the grid or leave it out.",
+        )
+        need(
+            wall.offset < high,
+            f"wall {w} covers every node: n·x ≤ {wall.offset:.5g} m, and n·x is {low:.5g} to {high:.5g} m on the grid. "
+            "Its normal must point out of the wall, into the free space.",
+        )
+
+
+def _check_axes(name: str, vector: tuple[float, ...], grid: Grid) -> None:
+    need(
+        len(vector) == grid.dim,
+        f"{name} needs {grid.dim} numbers, one per axis of the grid, got {_tuple(vector)}.",
+    )
+
+
+def _tuple(values: "np.ndarray | tuple[float, ...]") -> str:
+    return "(" + ", ".join(f"{value:.5g}" for value in values) + ")"
+
+
+class Sizes(Protocol):
+    """What a model says about the tensors that it takes."""
+
+    @property
+    def dim(self) -> int: ...
+    @property
+    def worlds(self) -> int: ...
+    @property
+    def particle_count(self) -> int: ...
+    @property
+    def muscle_count(self) -> int: ...
+    @property
+    def dtype(self) -> torch.dtype: ...
+    @property
+    def device(self) -> torch.device: ...
+
+
+def check_state(model: Sizes, state: NamedTuple) -> None:
+    """Shape, dtype and device of x, v, C and F."""
+    particles, dim = (model.worlds, model.particle_count), model.dim
+    shapes = {"x": (dim,), "v": (dim,), "C": (dim, dim), "F": (dim, dim)}
+    for name, value in _fields("state", state, tuple(shapes)):
+        _check_tensor(model, f"state.{name}", value)
+        need(
+            tuple(value.shape) == particles + shapes[name],
+            f"state.{name} must have shape {particles + shapes[name]} (world, particle, axes), "
+            f"got {tuple(value.shape)}; start from model.rest().",
+        )
+
+
+def check_activation(model: Sizes, activation: Tensor | None) -> None:
+    """Shape (control_step, world, muscle), dtype and device; None is no activation."""
+    if activation is None:
+        return
+    _check_tensor(model, "activation", activation)
+    want = (model.worlds, model.muscle_count)
+    need(
+        activation.ndim == 3 and tuple(activation.shape[1:]) == want,
+        f"activation must have shape (control_step, world, muscle) = (any, {want[0]}, {want[1]}), "
+        f"got {tuple(activation.shape)}; one control step is activation[None].",
+    )
+    need(
+        len(activation) > 0, "activation needs at least one control step, got none; pass None to move freely."
+    )
+
+
+def check_params(model: Sizes, params: NamedTuple) -> None:
+    """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
+    want = (model.worlds, model.particle_count)
+    for name, value in _fields("params", params, ("young", "poisson", "density")):
+        _check_tensor(model, f"params.{name}", value)
+        shape = tuple(value.shape)
+        fits = all(n in (1, full) for n, full in zip(reversed(shape), reversed(want), strict=False))
+        need(
+            fits and len(shape) <= 2,
+            f"params.{name} must broadcast to (world, particle) = {want}, got shape {shape}; "
+            "one value for each world needs shape (world, 1).",
+        )
+
+
+def check_substeps(substeps: int) -> None:
+    whole = isinstance(substeps, (int, np.integer)) and not isinstance(substeps, bool)
+    need(whole and substeps >= 1, f"substeps must be a whole number of at least 1, got {substeps!r}.")
+
+
+def check_values(state: NamedTuple, activation: Tensor | None, params: NamedTuple) -> None:
+    """What only the numbers can tell: all finite, materials possible. Reads them back, so a GPU has to wait."""
+    named = [(f"state.{name}", value) for name, value in _fields("state", state, ("x", "v", "C", "F"))]
+    named += [] if activation is None else [("activation", activation)]
+    for name, value in named:
+        _check_each(name, value, torch.isfinite(value), "finite")
+    for name, value in _fields("params", params, ("young", "poisson", "density")):
+        if name == "poisson":
+            _check_each("params.poisson", value, (value > -1.0) & (value < 0.5), "in (-1, 0.5)")
+        else:
+            _check_each(f"params.{name}", value, torch.isfinite(value) & (value > 0), "finite and > 0")
+
+
+def _check_each(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
+    if not bool(holds.all()):
+        index = tuple(torch.nonzero(~holds)[0].tolist())
+        raise ValueError(
+            f"{name} must be {rule}, but {name}[{', '.join(map(str, index))}] is {value[index].item():g}."
+        )
+
+
+def _fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
+    for name in names:
+        if not hasattr(record, name):
+            raise TypeError(f"{what} must be a softmpm.{what.capitalize()}, got {type(record).__name__}.")
+        yield name, getattr(record, name)
+
+
+def _check_tensor(model: Sizes, name: str, value: Tensor) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
+    need(
+        value.dtype == model.dtype,
+        f"{name} must be {model.dtype} like the model, got {value.dtype}; use .to({model.dtype}), "
+        "or build the model with another dtype.",
+    )
+    need(
+        value.device == model.device,
+        f"{name} must be on {model.device} like the model, got {value.device}; use .to({str(model.device)!r}).",
+    )

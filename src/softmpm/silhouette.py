@@ -1,0 +1,85 @@
+"""What is inside a picture: its silhouette as booleans, and how much of each lattice cell that covers."""
+
+import os
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from softmpm.scene import need
+
+if TYPE_CHECKING:
+    import PIL.Image
+
+Inside = Literal["dark", "light", "opaque"]
+
+
+def silhouette(source: Any, inside: Inside, threshold: float) -> np.ndarray:
+    """Read a path, Pillow image or array; booleans (row, column), the top row first."""
+    need(inside in get_args(Inside), f"inside must be one of {', '.join(get_args(Inside))}, got {inside!r}.")
+    need(0 < threshold < 1, f"threshold must lie between 0 and 1, got {threshold}.")
+    if isinstance(source, (str, os.PathLike)):
+        with _pillow().open(source) as picture:
+            values = _grey(picture, inside)
+    elif hasattr(source, "convert"):
+        values = _grey(source, inside)
+    else:
+        values = np.asarray(source)
+        need(
+            inside != "opaque", "an array has no transparency: use inside='dark', 'light' or a boolean array."
+        )
+    need(
+        values.ndim == 2 and values.size > 0,
+        f"a picture as an array has shape (row, column), got {values.shape}; pass colours as a Pillow image.",
+    )
+    if values.dtype == bool:
+        return values
+    values = _unit(values)
+    return values < threshold if inside == "dark" else values > threshold
+
+
+def coverage(mask: np.ndarray, count: np.ndarray, width: float) -> np.ndarray:
+    """Share of each cell that the mask covers, shape (x, y) with y up; a cell is ``width`` pixels wide."""
+    across = _overlap(count[0], mask.shape[1], width)
+    up = _overlap(count[1], mask.shape[0], width)
+    return across @ mask[::-1].T @ up.T
+
+
+def _overlap(cells: int, pixels: int, width: float) -> np.ndarray:
+    """Share of each cell that each pixel covers along one axis, shape (cell, pixel)."""
+    left = np.arange(cells)[:, None] * width
+    edge = np.arange(pixels)[None, :]
+    return np.clip(np.minimum(left + width, edge + 1) - np.maximum(left, edge), 0.0, None) / width
+
+
+def _grey(picture: "PIL.Image.Image", inside: Inside) -> np.ndarray:
+    if (
+        picture.mode.startswith("I") or picture.mode == "F"
+    ):  # 16 bits or floats: neither colour nor transparency
+        need(inside != "opaque", "the picture has no transparency: use inside='dark' or 'light'.")
+        return np.asarray(picture).astype(np.float64 if picture.mode == "F" else np.uint16)
+    rgba = picture.convert("RGBA")
+    if inside == "opaque":
+        need(picture.has_transparency_data, "the picture has no transparency: use inside='dark' or 'light'.")
+        return np.asarray(rgba.getchannel("A"))
+    pillow = _pillow()
+    paper = pillow.new("RGBA", rgba.size, "white" if inside == "dark" else "black")
+    return np.asarray(pillow.alpha_composite(paper, rgba).convert("L"))
+
+
+def _pillow() -> Any:
+    try:
+        import PIL.Image
+    except ImportError as error:
+        raise ImportError("reading a picture needs Pillow: pip install pillow, or pass an array.") from error
+    return PIL.Image
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    if values.dtype in (np.uint8, np.uint16):
+        return values / np.iinfo(values.dtype).max
+    need(
+        np.issubdtype(values.dtype, np.floating) and bool(((values >= 0) & (values <= 1)).all()),
+        "grey values must be uint8, uint16 or floats from 0, black, to 1, white, "
+        f"got {values.dtype} from {values.min()} to {values.max()}.",
+    )
+    return values

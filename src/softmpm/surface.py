@@ -1,0 +1,76 @@
+"""What is inside a closed triangle mesh: where its winding number is above one half, so parts may overlap.
+
+Source: Jacobson et al. 2013, "Robust inside-outside segmentation using generalized winding numbers". Warp
+answers it on the CPU; trimesh's own test would need rtree.
+"""
+
+import os
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softmpm.scene import need
+
+wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
+
+
+def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (vertex, 3) and outward faces (face, 3) of a mesh file or trimesh object that has an inside."""
+    if isinstance(source, (str, os.PathLike)):
+        source = _load(source)
+    need(
+        hasattr(source, "is_watertight") and len(getattr(source, "faces", ())) > 0,
+        f"mesh needs a path or a trimesh.Trimesh with faces, got {type(source).__name__}.",
+    )
+    if not source.is_watertight:
+        _, faces = np.unique(np.asarray(source.edges_sorted), axis=0, return_counts=True)
+        raise ValueError(
+            f"the mesh is not closed: {(faces != 2).sum()} of its {len(faces)} edges do not join two faces; "
+            "try merge_vertices(), then trimesh.repair.fill_holes, or close it where it was drawn."
+        )
+    need(
+        bool(source.is_winding_consistent) and source.volume != 0,
+        "the mesh's faces do not all turn the same way, so it has no inside: try trimesh.repair.fix_normals.",
+    )
+    vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)
+    return vertices, faces if source.volume > 0 else faces[:, ::-1]  # all faces may turn inwards
+
+
+def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which points (point, 3) lie inside, as booleans."""
+    low = vertices.min(axis=0)
+    unit = float(np.ptp(vertices, axis=0).max())  # the query is in float32: keep its numbers near one
+    surface = wp.Mesh(
+        wp.array((vertices - low) / unit, dtype=wp.vec3, device="cpu"),
+        wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu"),
+        support_winding_number=True,
+    )
+    queries = wp.array((points - low) / unit, dtype=wp.vec3, device="cpu")
+    inside = wp.zeros(len(points), dtype=wp.int32, device="cpu")
+    wp.launch(_inside, dim=len(points), inputs=[surface.id, queries], outputs=[inside], device="cpu")
+    return inside.numpy().astype(bool)
+
+
+@wp.kernel
+def _inside(
+    # In:
+    surface: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    # Out:
+    inside: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(surface, points[i], 10.0)  # the mesh spans one
+    if query.result and query.sign < 0.0:
+        inside[i] = 1
+
+
+def _load(path: "str | os.PathLike[str]") -> Any:
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"there is no mesh file {os.fspath(path)!r}.")
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError("reading a mesh needs trimesh: pip install softmpm[mesh].") from error
+    return trimesh.load_mesh(path)

@@ -1,0 +1,105 @@
+"""Drawing robots by code: smooth outlines and tapered limbs, filled with particles, and split where a muscle should sit.
+
+All lengths are in metres unless a robot says otherwise; points are (x, y), y up.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softmpm import Particles
+
+
+def smooth(points: Sequence, steps: int = 12) -> np.ndarray:
+    """Closed Catmull-Rom curve through ``points``, shape (point · steps, 2)."""
+    b = np.asarray(points, dtype=float)
+    a, c, d = np.roll(b, 1, axis=0), np.roll(b, -1, axis=0), np.roll(b, -2, axis=0)
+    t = np.linspace(0.0, 1.0, steps, endpoint=False)[:, None, None]
+    return _catmull_rom(a, b, c, d, t).transpose(1, 0, 2).reshape(-1, b.shape[1])
+
+
+def smooth_line(points: Sequence, steps: int = 12) -> np.ndarray:
+    """Open Catmull-Rom curve through ``points``; further columns (a width) are blended along."""
+    p = np.asarray(points, dtype=float)
+    p = np.concatenate([2 * p[:1] - p[1:2], p, 2 * p[-1:] - p[-2:-1]])
+    t = np.linspace(0.0, 1.0, steps, endpoint=False)[:, None, None]
+    curve = _catmull_rom(p[:-3], p[1:-2], p[2:-1], p[3:], t).transpose(1, 0, 2).reshape(-1, p.shape[1])
+    return np.concatenate([curve, p[-2:-1]])
+
+
+def _catmull_rom(a, b, c, d, t):
+    return 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
+
+
+@dataclass(frozen=True, eq=False)
+class Limb:
+    """A stroke of changing width along a line: a leg, a trunk, an arm."""
+
+    line: np.ndarray
+    """Points from the root to the tip, shape (point, 2)."""
+    width: np.ndarray
+    """Full width at each point, shape (point,)."""
+    round_tip: bool = False
+
+    @property
+    def _frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit tangent and left-hand normal at each point."""
+        tangent = np.gradient(self.line, axis=0)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        return tangent, np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+
+    def outline(self) -> np.ndarray:
+        """Closed polygon around the limb, shape (point, 2)."""
+        tangent, normal = self._frame
+        half = self.width[:, None] / 2
+        angle = np.linspace(0.0, np.pi, 13)[1:-1, None] if self.round_tip else np.empty((0, 1))
+        tip = self.line[-1] + half[-1] * (np.cos(angle) * normal[-1] + np.sin(angle) * tangent[-1])
+        return np.concatenate([self.line + half * normal, tip, (self.line - half * normal)[::-1]])
+
+    def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points lie: how far along, 0 at the root and 1 at the tip, and how far to the left of the line [m]."""
+        start, step = self.line[:-1], np.diff(self.line, axis=0)
+        length = np.linalg.norm(step, axis=1)
+        share = ((points[:, None] - start) * step).sum(-1) / length**2
+        offset = points[:, None] - start - np.clip(share, 0.0, 1.0)[..., None] * step
+        nearest = np.linalg.norm(offset, axis=-1).argmin(axis=1)
+        row = np.arange(len(points))
+        along = (np.cumsum(length) - length)[nearest] + np.clip(share[row, nearest], 0.0, 1.0) * length[nearest]
+        left = step[nearest, 0] * offset[row, nearest, 1] - step[nearest, 1] * offset[row, nearest, 0]
+        return along / length.sum(), left / length[nearest]
+
+    def direction(self, start: float, end: float) -> np.ndarray:
+        """Unit vector from one place along the limb to another, both in [0, 1]."""
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.line, axis=0), axis=1))])
+        along /= along[-1]
+        first, last = (np.array([np.interp(t, along, axis) for axis in self.line.T]) for t in (start, end))
+        return (last - first) / np.linalg.norm(last - first)
+
+    def part(self, points: np.ndarray, start: float, end: float, side: int = 0) -> np.ndarray:
+        """Indices of the points inside the limb between ``start`` and ``end``; ``side`` 1 keeps its left half, -1 its right."""
+        along, left = self.locate(points)
+        chosen = inside(points, self.outline()) & (along >= start) & (along < end)
+        return np.flatnonzero(chosen if side == 0 else chosen & (np.sign(left) == side))
+
+
+def inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
+    """Whether each point lies in a closed polygon (even-odd rule), shape (point,)."""
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    x, y = points[:, 0, None], points[:, 1, None]
+    crosses = (a[:, 1] > y) != (b[:, 1] > y)
+    rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])  # a level edge never crosses
+    at = a[:, 0] + (y - a[:, 1]) * (b[:, 0] - a[:, 0]) / rise
+    return ((crosses & (x < at)).sum(axis=1) % 2) == 1
+
+
+def fill(polygons: Sequence[np.ndarray], spacing: float) -> Particles:
+    """Particles on a square lattice in the union of some polygons; each stands for ``spacing²`` of area [m²].
+
+    The lattice hangs on the origin, half a spacing off, so that the same outline gives the same particles everywhere.
+    """
+    low = np.floor(np.min([p.min(axis=0) for p in polygons], axis=0) / spacing).astype(int)
+    high = np.ceil(np.max([p.max(axis=0) for p in polygons], axis=0) / spacing).astype(int)
+    axes = [(np.arange(a, b) + 0.5) * spacing for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Particles(points[np.any([inside(points, p) for p in polygons], axis=0)], spacing**2)

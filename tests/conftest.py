@@ -1,0 +1,28 @@
+"""What every test shares: quiet Warp, one thread, and a ``device`` that is the CPU and, where there is one, a GPU."""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import matplotlib
+import pytest
+import torch
+import warp as wp
+
+matplotlib.use("Agg")
+wp.config.log_level = wp.LOG_WARNING
+torch.set_num_threads(1)
+
+NO_GPU = "needs a CUDA GPU; PyTorch sees none here"
+
+
+def pytest_collection_modifyitems(items):
+    if not torch.cuda.is_available():
+        for item in items:
+            if "gpu" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason=NO_GPU))
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request) -> str:
+    return request.param

@@ -1,0 +1,93 @@
+"""Scenes and comparisons that several tests share."""
+
+import numpy as np
+import torch
+
+import softmpm
+
+LAWS = {"neo_hookean": softmpm.NeoHookean, "fixed_corotated": softmpm.FixedCorotated}
+INPUTS = ("x", "v", "C", "F", "activation", "young", "poisson", "density")
+
+
+def busy_scene(dim: int, laws=("neo_hookean", "fixed_corotated"), *, per_law=12, dt=1e-3, seed=0, **changes) -> softmpm.Scene:
+    """Small and full: every law given, two overlapping muscles, a rough floor, a tilted wall, gravity and damping."""
+    rng = np.random.default_rng(seed)
+    bodies = []
+    for law in laws:
+        positions = rng.uniform(0.3, 0.62, (per_law, dim))
+        particles = softmpm.Particles(positions, rng.uniform(0.5, 1.5, per_law) * 0.05**dim)
+        bodies.append(softmpm.Body(particles, LAWS[law](density=1.2, young=80.0, poisson=0.3)))
+    count = per_law * len(laws)
+    up = (0.0, 1.0) + (0.0,) * (dim - 2)
+    settings = dict(
+        grid=softmpm.Grid(shape=(12, 11, 10)[:dim], spacing=0.1),
+        bodies=bodies,
+        muscles=[
+            softmpm.Muscle(particles=np.arange(count * 2 // 3), direction=up, strength=10.0),
+            softmpm.Muscle(particles=np.arange(count // 3, count), direction=(1.0, 0.5, 0.2)[:dim], strength=8.0),
+        ],
+        walls=[
+            softmpm.Wall(normal=up, offset=0.41, contact="separate", friction=0.4),
+            softmpm.Wall(normal=(-1.0, 0.3, 0.1)[:dim], offset=-0.45, contact="slip"),
+        ],
+        gravity=(0.3, -9.8, 0.2)[:dim],
+        damping=0.7,
+        dt=dt,
+    )
+    return softmpm.Scene(**(settings | changes))
+
+
+def busy_inputs(model: softmpm.Model, control_steps=2, seed=1) -> dict[str, torch.Tensor]:
+    """A random start, activation and material for :func:`busy_scene`, as leaves that require gradients."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(shape, scale):
+        return (scale * torch.randn(shape, generator=generator, dtype=torch.float64)).to(model.device, model.dtype)
+
+    rest, params = model.rest(), model.params()
+    lead = (model.worlds, model.particle_count)
+    inputs = dict(
+        x=rest.x + noise(rest.x.shape, 0.01),
+        v=noise(rest.v.shape, 0.5),
+        C=noise(rest.C.shape, 2.0),
+        F=rest.F + noise(rest.F.shape, 0.1),
+        activation=noise((control_steps, model.worlds, model.muscle_count), 0.5),
+        young=params.young * (1 + 0.3 * torch.rand(lead, generator=generator).to(params.young)),
+        poisson=params.poisson - 0.2 * torch.rand(lead, generator=generator).to(params.young),
+        density=params.density * (1 + 0.3 * torch.rand(lead, generator=generator).to(params.young)),
+    )
+    return {name: tensor.detach().requires_grad_() for name, tensor in inputs.items()}
+
+
+def run(simulate, model_or_scene, inputs: dict[str, torch.Tensor], substeps: int) -> softmpm.State:
+    """``simulate`` (softmpm's or the reference's) on inputs given by name."""
+    start = softmpm.State(*(inputs[name] for name in "xvCF"))
+    params = softmpm.Params(*(inputs[name] for name in softmpm.Params._fields))
+    return simulate(model_or_scene, start, inputs.get("activation"), params, substeps=substeps)
+
+
+def cotangent(state: softmpm.State, seed=2) -> softmpm.State:
+    """Random weights of a linear loss: unlike a square, it sees every direction, a wrong rotation among them."""
+    generator = torch.Generator().manual_seed(seed)
+    return softmpm.State(*(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state))
+
+
+def dot(a, b) -> torch.Tensor:
+    return sum((x * y).sum() for x, y in zip(a, b, strict=True))
+
+
+def gradients(simulate, model_or_scene, inputs, substeps, weights=None) -> dict[str, torch.Tensor]:
+    """Gradient of ⟨weights, end⟩ with respect to each input."""
+    end = run(simulate, model_or_scene, inputs, substeps)
+    loss = dot(cotangent(end) if weights is None else weights, end)
+    return dict(zip(inputs, torch.autograd.grad(loss, list(inputs.values())), strict=True))
+
+
+def relative(got: torch.Tensor, want: torch.Tensor) -> float:
+    """Largest difference over the largest wanted value."""
+    return ((got - want).abs().max() / want.abs().max().clamp_min(1e-300)).item()
+
+
+def assert_relative(got, want, limit: float, what: str = "") -> None:
+    error = relative(torch.as_tensor(got), torch.as_tensor(want))
+    assert error <= limit, f"{what} differs by {error:.2e} relative, limit {limit:.0e}"
