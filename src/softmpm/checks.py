@@ -1,6 +1,6 @@
 """Every rule that needs more than one object: a whole scene, or the tensors that meet a model.
 
-Each message says what must hold, what came instead and what to do. Rules of a single object stand in ``scene.py``.
+Each message says what must hold, what came instead and what to do. Rules of one object stand in ``scene.py``.
 """
 
 from collections.abc import Iterator
@@ -39,8 +39,8 @@ def _check_bodies(scene: Scene) -> None:
             particle = int(np.argmax(outside))
             raise ValueError(
                 f"body {b} leaves the grid: particle {particle} at {_tuple(positions[particle])} m, and "
-                f"{outside.sum() - 1} more of {len(positions)}; particles must lie in {_room(grid)} m, so that all "
-                "nodes around them exist. Move the body or enlarge the grid."
+                f"{outside.sum() - 1} more of its {len(positions)}; all must lie in {_room(grid)} m, "
+                "so that the nodes around them exist. Move the body or enlarge the grid."
             )
 
 
@@ -87,13 +87,13 @@ def _check_walls(scene: Scene) -> None:
         low, high = np.minimum(reach, 0.0).sum(), np.maximum(reach, 0.0).sum()
         need(
             low <= wall.offset,
-            f"wall {w} covers no node: n·x ≤ {wall.offset:.5g} m, but n·x is {low:.5g} to {high:.5g} m on the grid, "
-            "so it would do nothing. Move it into the grid or leave it out.",
+            f"wall {w} covers no node: n·x ≤ {wall.offset:.5g} m, but n·x is {low:.5g} to {high:.5g} m "
+            "on the grid, so it would do nothing. Move it into the grid or leave it out.",
         )
         need(
             wall.offset < high,
-            f"wall {w} covers every node: n·x ≤ {wall.offset:.5g} m, and n·x is {low:.5g} to {high:.5g} m on the grid. "
-            "Its normal must point out of the wall, into the free space.",
+            f"wall {w} covers every node: n·x ≤ {wall.offset:.5g} m, and n·x is {low:.5g} to {high:.5g} m "
+            "on the grid. Its normal must point out of the wall, into the free space.",
         )
 
 
@@ -173,25 +173,23 @@ def check_substeps(substeps: int) -> None:
     need(whole and substeps >= 1, f"substeps must be a whole number of at least 1, got {substeps!r}.")
 
 
+@torch.no_grad()
 def check_values(state: NamedTuple, activation: Tensor | None, params: NamedTuple) -> None:
-    """What only the numbers can tell: all finite, materials possible. Reads them back, so a GPU has to wait."""
+    """What only the numbers can tell: all finite, materials possible. Reads back once: a GPU has to wait."""
     named = [(f"state.{name}", value) for name, value in _fields("state", state, ("x", "v", "C", "F"))]
     named += [] if activation is None else [("activation", activation)]
-    for name, value in named:
-        _check_each(name, value, torch.isfinite(value), "finite")
+    rules = [(name, value, torch.isfinite(value), "finite") for name, value in named]
     for name, value in _fields("params", params, ("young", "poisson", "density")):
         if name == "poisson":
-            _check_each("params.poisson", value, (value > -1.0) & (value < 0.5), "in (-1, 0.5)")
+            rules.append((f"params.{name}", value, (value > -1.0) & (value < 0.5), "in (-1, 0.5)"))
         else:
-            _check_each(f"params.{name}", value, torch.isfinite(value) & (value > 0), "finite and > 0")
-
-
-def _check_each(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
-    if not bool(holds.all()):
-        index = tuple(torch.nonzero(~holds)[0].tolist())
-        raise ValueError(
-            f"{name} must be {rule}, but {name}[{', '.join(map(str, index))}] is {value[index].item():g}."
-        )
+            rules.append((f"params.{name}", value, torch.isfinite(value) & (value > 0), "finite and > 0"))
+    kept = torch.stack([holds.all() for _, _, holds, _ in rules]).tolist()
+    for (name, value, holds, rule), good in zip(rules, kept, strict=True):
+        if not good:
+            index = torch.nonzero(~holds)[0].tolist()
+            place = f"[{', '.join(map(str, index))}]" if index else ""
+            raise ValueError(f"{name} must be {rule}, but {name}{place} is {value[tuple(index)].item():g}.")
 
 
 def _fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
@@ -211,5 +209,5 @@ def _check_tensor(model: Sizes, name: str, value: Tensor) -> None:
     )
     need(
         value.device == model.device,
-        f"{name} must be on {model.device} like the model, got {value.device}; use .to({str(model.device)!r}).",
+        f"{name} must be on {model.device} like the model, got {value.device}; use .to('{model.device}').",
     )

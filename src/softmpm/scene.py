@@ -1,4 +1,4 @@
-"""What a person designs: grid, bodies with a material, muscles, walls. Plain SI numbers, checked when written.
+"""What a person designs: grid, bodies with a material, muscles, walls. Plain SI numbers, checked at once.
 
 A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
 Rules that need the whole scene (particles inside the grid, muscle indices) live in ``checks.py``.
@@ -144,7 +144,7 @@ class NeoHookean(Material):
 class FixedCorotated(Material):
     """Fixed corotated solid, τ = 2μ(F − R)Fᵀ + λ(J − 1)J I. Survives inversion; softens below J = 0.5.
 
-    Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity". Good values as NeoHookean.
+    Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity". Values: as NeoHookean.
     """
 
 
@@ -179,7 +179,7 @@ class Muscle:
         need(index.ndim == 1 and index.size > 0, "a muscle needs a list of particle indices, not empty.")
         need(
             np.issubdtype(index.dtype, np.integer),
-            f"muscle particles must be whole numbers, got {index.dtype}; make indices of a mask by np.flatnonzero.",
+            f"muscle particles must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",
         )
         need(len(np.unique(index)) == index.size, "a muscle names a particle twice; give each index once.")
         object.__setattr__(self, "particles", index.astype(np.int64))
@@ -191,8 +191,8 @@ class Muscle:
 class Wall:
     """Half space n·x ≤ offset that a body cannot enter; acts on the nodes inside it.
 
-    ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the wall
-    and applies Coulomb friction to the rest.
+    ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the
+    wall and applies Coulomb friction to the rest.
     """
 
     normal: Sequence[float]

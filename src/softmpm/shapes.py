@@ -1,8 +1,8 @@
 """Shapes to particles: a box, a ball, a picture's silhouette or a closed mesh, on a regular lattice.
 
-Every particle sits in the middle of its lattice cell, the last axis running fastest, and has the cell's volume.
-A box is filled exactly: its mass is its density times its own volume. The other shapes keep the cells that lie
-in them, so their mass is exact to the lattice: density · particle count · spacingᵈ.
+Every particle sits in the middle of its lattice cell and has the cell's volume; the last axis runs fastest.
+A box is filled exactly: its mass is its density times its own volume. The other shapes keep the cells whose
+middle lies in them: their mass is exact to the lattice, density · particle count · spacingᵈ.
 """
 
 import math

@@ -1,14 +1,15 @@
 """The largest stable step, and the warning of a scene that is above it.
 
-A particle alone on the grid obeys Ḟ = C, Ċ = −4τ/(ρ dx²) in MLS-MPM, whatever its place among the nodes. Symplectic Euler
-is stable for an oscillation ω as long as ω dt ≤ 2, and ω² = 4K/(ρ dx²) for a strain ε with τ(ε) = K ε:
+A particle alone on the grid obeys Ḟ = C, Ċ = −4τ/(ρ dx²) in MLS-MPM, wherever it lies between the nodes.
+Symplectic Euler is stable for an oscillation ω while ω dt ≤ 2; ω² = 4K/(ρ dx²) for a strain ε with τ(ε) = K ε:
 
-    dt ≤ dx · √(ρ / K)                                                 (S1)
-    τ(ε) = λ tr(ε) I + 2μ ε + Σ |s| (ε ddᵀ + ddᵀ ε)                    (S2)   both laws at F = I, muscles at |a| = 1
+    dt ≤ dx · √(ρ / K)                                  (S1)
+    τ(ε) = λ tr(ε) I + 2μ ε + Σ |s| (ε ddᵀ + ddᵀ ε)     (S2)  both laws at F = I, muscles at |a| = 1
 
-with K the largest eigenvalue of (S2); without muscles K = 2μ + dim·λ, or 2μ where λ < 0. Particles that share nodes do
-not go below the smallest limit among them: the grid's ω² is a mass-weighted mean of theirs. The limit holds at rest
-and shrinks with stretch: half of it leaves room for a stretch of 1.7 (fixed corotated) or 2.5 (neo-Hookean).
+K is the largest eigenvalue of (S2); without muscles 2μ + dim·λ, or 2μ where λ < 0. Particles that share
+nodes oscillate no faster than the fastest of them would alone: the grid's kinetic energy is at least
+Σ m dx²/8 |C|², the particles' elastic energy at most Σ V K/2 |ε|². The limit holds at rest and shrinks with
+stretch; half of it leaves room for a stretch of 1.7 (fixed corotated) or 2.5 (neo-Hookean).
 """
 
 import math
@@ -60,7 +61,7 @@ def warn_unstable(scene: Scene, *, stacklevel: int = 3) -> None:
     limit = stable_dt(scene)
     if scene.dt > limit:
         warnings.warn(
-            f"dt = {scene.dt:.4g} s is above the largest stable step of {limit.dt:.4g} s, set by {limit.limit}. "
+            f"dt = {scene.dt:.4g} s is above the largest stable one, {limit.dt:.4g} s, set by {limit.limit}. "
             f"Use a dt of about {0.5 * limit:.2g} s, which leaves room for stretch, or a coarser grid.",
             StabilityWarning,
             stacklevel=stacklevel,

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})  # a shape is not differentiat
 
 
 def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (vertex, 3) and outward faces (face, 3) of a mesh file or trimesh object that has an inside."""
+    """Vertices (vertex, 3) and outward faces (face, 3) of a mesh file or trimesh object with an inside."""
     if isinstance(source, (str, os.PathLike)):
         source = _load(source)
     need(

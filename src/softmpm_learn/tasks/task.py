@@ -1,0 +1,104 @@
+"""What every task has: its settings, the robot's scene, the regions worth watching and the goal of an episode."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+import softmpm
+from softmpm_learn.objective import Objective
+
+
+class Resolution(Enum):
+    """Cells of the background grid per metre; two particles per cell along each axis."""
+
+    draft = 80
+    standard = 128
+    fine = 192
+
+
+@dataclass(kw_only=True)
+class TaskConf:
+    """Settings that every task has. SI units; each task's own values are our choice."""
+
+    name: str
+    resolution: Resolution = Resolution.draft
+    """Cells per metre: draft 80, standard 128, fine 192."""
+    seconds: float = 1.0
+    """Length of an episode [s]."""
+    control_period: float = 0.0125
+    """Time between two decisions of the policy [s]."""
+    young: float = 2e4
+    """Young's modulus E [Pa]; where co-design starts."""
+    poisson: float = 0.3
+    """Poisson's ratio ν [-]; where co-design starts."""
+    density: float = 1000.0
+    """Rest density ρ₀ [kg/m³]; where co-design starts."""
+    strength: float = 8e3
+    """Stress of a muscle at full activation [Pa]."""
+    gravity: float = 9.81
+    """Downward acceleration [m/s²]; 0 is weightless."""
+    damping: float = 0.0
+    """Rate at which velocity decays [1/s]."""
+    safety: float = 0.4
+    """Substep over the largest stable one of the undeformed robot; room for stretch and for co-design to stiffen it."""
+    effort: float = 0.0
+    """Weight of the mean squared activation in the loss."""
+
+    def __post_init__(self):
+        positive = ("seconds", "control_period", "young", "density", "strength", "safety")
+        for name in positive:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"task.{name} must be > 0, got {value}.")
+        for name in ("gravity", "damping", "effort"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
+        if self.control_period > self.seconds:
+            raise ValueError(
+                f"task.control_period must not be longer than task.seconds, got {self.control_period} and {self.seconds}."
+            )
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring grid nodes [m]."""
+        return 1.0 / self.resolution.value
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Task:
+    """A robot, its world and what it should do."""
+
+    name: str
+    scene: softmpm.Scene
+    control_steps: int
+    """Decisions of the policy in an episode."""
+    substeps: int
+    """Simulated substeps for each decision."""
+    regions: dict[str, np.ndarray]
+    """Hand-picked clusters of particles by name; they do not overlap. Indices into the model's particles."""
+    objective: Objective
+    body_length: float
+    """Extent of the robot at rest along x, or its reach [m]."""
+    goal: np.ndarray | None = None
+    """Where to go [m], shape (dim,), if the task has a place to go to."""
+
+    @property
+    def seconds(self) -> float:
+        """Length of an episode [s]."""
+        return self.control_steps * self.substeps * self.scene.dt
+
+    @property
+    def control_period(self) -> float:
+        """Time between two decisions [s]."""
+        return self.substeps * self.scene.dt
+
+
+def clock(conf: TaskConf, scene: softmpm.Scene) -> tuple[softmpm.Scene, int, int]:
+    """Choose the substep: the scene with its ``dt``, control steps, substeps in each."""
+    substeps = math.ceil(conf.control_period / (conf.safety * softmpm.stable_dt(scene)))
+    scene = dataclasses.replace(scene, dt=conf.control_period / substeps)
+    return scene, max(1, round(conf.seconds / conf.control_period)), substeps

@@ -1,0 +1,143 @@
+"""The PyTorch boundary: what users of torch expect of a differentiable function."""
+
+import warnings
+
+import pytest
+import torch
+from torch.utils.checkpoint import checkpoint
+
+import softmpm
+from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
+
+
+@pytest.fixture(scope="module")
+def model():
+    return softmpm.build(busy_scene(2, per_law=6), device="cpu", dtype=torch.float64)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gradcheck_of_every_input(dim, device):
+    """torch.autograd.gradcheck in float64, all inputs at once, contact and friction active."""
+    model = softmpm.build(busy_scene(dim, per_law=5), device=device, dtype=torch.float64)
+    inputs = busy_inputs(model)
+
+    def function(*tensors):
+        return tuple(run(softmpm.simulate, model, dict(zip(INPUTS, tensors, strict=True)), substeps=3))
+
+    ordered = tuple(inputs[name] for name in INPUTS)
+    repeatable = 0.0 if device == "cpu" else 1e-10  # atomics add in any order on a GPU
+    assert torch.autograd.gradcheck(function, ordered, fast_mode=True, nondet_tol=repeatable)
+
+
+def test_rasterize_gradcheck(model, device):
+    """Mass and velocity with respect to x, v and C."""
+    model = softmpm.build(busy_scene(3, per_law=4), device=device, dtype=torch.float64, worlds=2)
+    inputs = busy_inputs(model)
+
+    def function(x, v, C):
+        return tuple(softmpm.rasterize(model, softmpm.State(x, v, C, inputs["F"])))
+
+    repeatable = 0.0 if device == "cpu" else 1e-10
+    assert torch.autograd.gradcheck(function, tuple(inputs[n] for n in "xvC"), fast_mode=True, nondet_tol=repeatable)
+
+
+def test_rasterize_keeps_mass_and_momentum(model):
+    """Sums over nodes equal sums over particles; a uniform velocity is seen as such wherever there is mass."""
+    rest = model.rest()
+    field = softmpm.rasterize(model, rest._replace(v=rest.v + torch.tensor([0.3, -0.2], dtype=torch.float64)))
+    mass = model.params().density * model.volume
+    torch.testing.assert_close(field.mass.sum(), mass.sum(), rtol=1e-13, atol=0)
+    present = field.mass > 0
+    assert 0 < present.sum() < present.numel()
+    want = torch.tensor([0.3, -0.2], dtype=torch.float64).expand_as(field.velocity[present])
+    torch.testing.assert_close(field.velocity[present], want, rtol=1e-12, atol=0)
+    assert (field.velocity[~present] == 0).all()
+
+
+def test_second_derivatives_raise(model):
+    """Also for a loss that is linear in the end, where PyTorch alone would return silently without this term."""
+    inputs = busy_inputs(model)
+    for name in INPUTS:
+        end = run(softmpm.simulate, model, inputs, 2)
+        (first,) = torch.autograd.grad(end.x.sum(), inputs[name], create_graph=True)
+        with pytest.raises(RuntimeError, match="second derivatives"):
+            torch.autograd.grad(first.sum() + inputs["v"].sum(), inputs["v"])
+    field = softmpm.rasterize(model, softmpm.State(*(inputs[n] for n in "xvCF")))
+    (first,) = torch.autograd.grad(field.mass.sum(), inputs["x"], create_graph=True)
+    with pytest.raises(RuntimeError, match="second derivatives"):
+        torch.autograd.grad(first.sum() + inputs["x"].sum(), inputs["x"])
+
+
+def test_arguments_are_never_changed_and_results_are_fresh(model):
+    """Forward and backward leave inputs as they were; a second call does not overwrite the first result."""
+    inputs = busy_inputs(model)
+    before = {name: tensor.detach().clone() for name, tensor in inputs.items()}
+    first = run(softmpm.simulate, model, inputs, 3)
+    copy = [tensor.detach().clone() for tensor in first]
+    second = run(softmpm.simulate, model, inputs, 4)
+    dot(cotangent(second), second).backward()
+    assert all(torch.equal(inputs[name], tensor) for name, tensor in before.items())
+    assert all(torch.equal(tensor, kept) for tensor, kept in zip(first, copy, strict=True))
+
+
+def test_an_input_changed_in_place_before_backward_raises(model):
+    """PyTorch's own guard sees it, because the inputs are saved with save_for_backward."""
+    inputs = busy_inputs(model)
+    end = run(softmpm.simulate, model, inputs, 2)
+    with torch.no_grad():
+        inputs["v"] += 1
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        end.x.sum().backward()
+
+
+def test_only_what_is_asked_for_is_computed(model):
+    """The gradient of one input alone is the same as among all; the others get none."""
+    inputs = busy_inputs(model)
+    every = gradients(softmpm.simulate, model, inputs, 3)
+    for name in INPUTS:
+        alone = {k: (t if k == name else t.detach()) for k, t in inputs.items()}
+        end = run(softmpm.simulate, model, alone, 3)
+        (got,) = torch.autograd.grad(dot(cotangent(end), end), alone[name])
+        assert torch.equal(got, every[name]), name
+
+
+def test_broadcast_parameters_get_gradients_of_their_own_shape(model):
+    """One Young's modulus for all particles gets the sum of the particles' gradients."""
+    inputs = busy_inputs(model)
+    per_particle = gradients(softmpm.simulate, model, inputs | {"young": torch.full_like(inputs["young"], 80.0).requires_grad_()}, 3)
+    one = torch.tensor(80.0, dtype=torch.float64, requires_grad=True)
+    shared = gradients(softmpm.simulate, model, inputs | {"young": one}, 3)
+    assert shared["young"].shape == ()
+    assert_relative(shared["young"], per_particle["young"].sum(), 1e-12)
+
+
+def test_it_works_under_func_grad_checkpoint_autocast_and_compile(model):
+    """Each gives the gradient that plain autograd gives."""
+    inputs = {name: tensor.detach() for name, tensor in busy_inputs(model).items()}
+
+    def loss(activation):
+        end = run(softmpm.simulate, model, inputs | {"activation": activation}, 3)
+        return dot(cotangent(end), end)
+
+    leaf = inputs["activation"].clone().requires_grad_()
+    (want,) = torch.autograd.grad(loss(leaf), leaf)
+    torch.testing.assert_close(torch.func.grad(loss)(inputs["activation"]), want, rtol=0, atol=0)
+    (again,) = torch.autograd.grad(checkpoint(loss, leaf, use_reentrant=False), leaf)
+    torch.testing.assert_close(again, want, rtol=0, atol=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch.compile itself warns about its back end
+        compiled = torch.compile(loss, backend="eager")
+        (again,) = torch.autograd.grad(compiled(leaf), leaf)
+    torch.testing.assert_close(again, want, rtol=0, atol=0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = leaf.detach().bfloat16().requires_grad_()
+        (again,) = torch.autograd.grad(loss(half), half)
+    assert again.dtype == torch.bfloat16
+    assert_relative(again.double(), want, 0.05)
+
+
+def test_no_grad_keeps_nothing(model):
+    """Under no_grad the end has no history."""
+    with torch.no_grad():
+        end = run(softmpm.simulate, model, busy_inputs(model), 2)
+    assert not any(tensor.requires_grad for tensor in end)

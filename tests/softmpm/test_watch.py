@@ -1,0 +1,108 @@
+"""A failing simulation says where, when and why, on every device, and loses nothing."""
+
+import numpy as np
+import pytest
+import torch
+
+import softmpm
+from helpers import LAWS, busy_inputs, busy_scene, run
+
+
+def single(law="neo_hookean", device="cpu", worlds=1, dtype=torch.float32, **scene):
+    particles = softmpm.Particles(np.array([[0.5, 0.5], [0.7, 0.55], [0.52, 0.73]]), 0.01)
+    body = softmpm.Body(particles, LAWS[law](density=1.0, young=10.0, poisson=0.3))
+    settings = dict(grid=softmpm.Grid(shape=(12, 12), spacing=0.1), bodies=[body], dt=1e-3)
+    return softmpm.build(softmpm.Scene(**(settings | scene)), device=device, dtype=dtype, worlds=worlds)
+
+
+def fails(model, start, **kwargs) -> softmpm.UnstableError:
+    with pytest.raises(softmpm.UnstableError) as caught:
+        softmpm.simulate(model, start, None, model.params(), **({"substeps": 10} | kwargs))
+    return caught.value
+
+
+def test_leaving_the_grid_names_particle_world_and_substep(device):
+    """Particle 1 of world 2 flies out after 3 substeps; the others are where they would be without it."""
+    model = single(device=device, worlds=3)
+    start = model.rest()
+    start.v[2, 1, 0] = 100.0  # 0.1 m a substep, from 0.7 m; the grid ends at 1.05 m
+    error = fails(model, start)
+    assert (error.kind, error.world, error.particle, error.substep) == ("left_grid", 2, 1, 3)
+    assert "particle 1 (body 0) of world 2" in str(error) and "off the grid" in str(error) and "1.05" in str(error)
+    calm = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
+    for name in "xvCF":
+        assert torch.equal(getattr(error.state, name)[:2], getattr(calm, name)[:2]), name
+
+
+def test_inversion_is_an_error_where_the_law_forbids_it(device):
+    """A neo-Hookean particle must keep det F > 0; a fixed corotated one may pass through."""
+    for law in LAWS:
+        model = single(law, device)
+        start = model.rest()
+        start.C[0, 2] = torch.tensor([[-1500.0, 0.0], [0.0, 0.0]])
+        start.v[0, :, 0] = -1500.0 * (start.x[0, :, 0] - start.x[0, 2, 0])
+        start.v[0, :2] = 0
+        if law == "fixed_corotated":
+            softmpm.simulate(model, start, None, model.params(), substeps=1)
+            continue
+        error = fails(model, start, substeps=1)
+        assert (error.kind, error.particle, error.substep) == ("inverted", 2, 0)
+        assert "det F = -" in str(error)
+
+
+def test_a_value_that_is_not_finite_is_reported_where_it_arises(device):
+    """Stress overflows in float32: the particle is named, with what is not finite."""
+    model = single(device=device)
+    start = model.rest()
+    start.F[0, 0] *= 1e18
+    error = fails(model, start)
+    assert (error.kind, error.particle, error.substep) == ("not_finite", 0, 0)
+    assert "not finite" in str(error)
+
+
+def test_a_start_off_the_grid_is_refused_before_anything_is_written(device):
+    """No stencil node may lie outside: the first kernel refuses, names the particle and gives the limits."""
+    model = single(device=device)
+    for corner in ((0.04, 0.5), (0.5, 1.06), (-3.0, 0.5), (1e9, 0.5)):
+        start = model.rest()
+        start.x[0, 1] = torch.tensor(corner)
+        error = fails(model, start)
+        assert (error.kind, error.particle) == ("start", 1) and "in the start state" in str(error)
+
+
+def test_a_gradient_that_is_not_finite_is_an_error(device):
+    """An infinite cotangent of one particle raises in the backward pass and names substep and particle."""
+    model = single(device=device)
+    start = model.rest()
+    start.v.requires_grad_()
+    end = softmpm.simulate(model, start, None, model.params(), substeps=4)
+    weight = torch.zeros_like(end.x)
+    weight[0, 1] = 3e38
+    with pytest.raises(softmpm.UnstableError) as caught:
+        (end.x * weight * 10).sum().backward()
+    assert caught.value.kind == "gradient" and caught.value.world == 0
+
+
+def test_bad_numbers_are_refused_before_any_launch():
+    """NaN and infinity in every input, with its name and index."""
+    model = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64)
+    for name in ("x", "v", "C", "F", "activation", "young", "poisson", "density"):
+        for bad in (float("nan"), float("inf")):
+            inputs = {k: t.detach().clone() for k, t in busy_inputs(model).items()}
+            inputs[name].view(-1)[3] = bad
+            with pytest.raises(ValueError, match=rf"{name}\b.*finite|{name} must be in"):
+                run(softmpm.simulate, model, inputs, 1)
+
+
+def test_a_world_that_fails_leaves_the_others_bitwise_alone():
+    """Eight worlds, the third one poisoned: the other seven end as they do without it."""
+    model = single(worlds=8)
+    start = model.rest()
+    start.v.add_(torch.linspace(-0.5, 0.5, 8)[:, None, None])
+    calm = softmpm.simulate(model, start, None, model.params(), substeps=30)
+    start.v[3, 0] = torch.tensor([500.0, 0.0])
+    error = fails(model, start, substeps=30)
+    others = [0, 1, 2, 4, 5, 6, 7]
+    assert error.world == 3
+    for name in "xvCF":
+        assert torch.equal(getattr(error.state, name)[others], getattr(calm, name)[others]), name
