@@ -1,0 +1,207 @@
+"""The whole method again in plain PyTorch: slow, readable, the truth in tests. Shares no code with the kernels.
+
+Every function takes tensors with any leading axes and is differentiated by torch.autograd; meant for float64.
+Derivations and labels: docs/math/.
+"""
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from softmpm.scene import FixedCorotated, Scene, Wall
+from softmpm.state import GridField, Params, State
+
+
+def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
+    """μ and λ [Pa] of Young's modulus [Pa] and Poisson's ratio [-]."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+class _Polar(torch.autograd.Function):
+    """Rotation nearest to F by SVD; its derivative from the Sylvester equation Ω S + S Ω = RᵀdF − dFᵀR.
+
+    The equation is solved as one linear system in the entries of the skew matrix Ω, so that repeated singular values,
+    where the derivative of an SVD does not exist, are nothing special.
+    """
+
+    @staticmethod
+    def forward(ctx, F):
+        U, _, Vh = torch.linalg.svd(F)
+        sign = torch.ones(F.shape[:-1], dtype=F.dtype)
+        sign[..., -1] = torch.sign(torch.linalg.det(U @ Vh))
+        R = (U * sign[..., None, :]) @ Vh
+        ctx.save_for_backward(F, R)
+        return R
+
+    @staticmethod
+    def backward(ctx, adj_R):
+        F, R = ctx.saved_tensors
+        dim = F.shape[-1]
+        basis = []
+        for i, j in itertools.combinations(range(dim), 2):
+            skew = torch.zeros(dim, dim, dtype=F.dtype)
+            skew[i, j], skew[j, i] = 1.0, -1.0
+            basis.append(skew)
+        E = torch.stack(basis)  # (k, dim, dim)
+        S = (R.mT @ F)[..., None, :, :]
+        # RᵀdF − dFᵀR = Ω S + S Ω; rows: the equation tested with each E, columns: Ω along each E
+        system = torch.einsum("kij,...lij->...kl", E, E @ S + S @ E)
+        # L = ⟨RᵀR̄, Ω⟩ = y · (system Ω) with systemᵀ y = ⟨RᵀR̄, E⟩, and F̄ = R (Σ y_k 2 E_k)
+        y = torch.linalg.solve(system.mT, torch.einsum("kij,...ij->...k", E, R.mT @ adj_R))
+        return R @ (2 * torch.einsum("...k,kij->...ij", y, E))
+
+
+def polar(F: Tensor) -> Tensor:
+    """Proper rotation R that maximises tr(RᵀF), shape (..., dim, dim); also for det F < 0."""
+    return _Polar.apply(F)
+
+
+def neo_hookean(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Kirchhoff stress τ = μ(FFᵀ − I) + λ log(J) I [Pa] (E1)."""
+    eye = torch.eye(F.shape[-1], dtype=F.dtype)
+    return mu[..., None, None] * (F @ F.mT - eye) + (lam * torch.log(torch.linalg.det(F)))[..., None, None] * eye
+
+
+def fixed_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Kirchhoff stress τ = 2μ(F − R)Fᵀ + λ(J − 1)J I [Pa] (E2)."""
+    eye, J = torch.eye(F.shape[-1], dtype=F.dtype), _det(F)
+    return 2 * mu[..., None, None] * (F - polar(F)) @ F.mT + (lam * (J - 1) * J)[..., None, None] * eye
+
+
+def _det(F: Tensor) -> Tensor:
+    """det F by its polynomial, whose derivative also exists at det F = 0."""
+    if F.shape[-1] == 2:
+        return F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
+    return (F[..., 0, :] * torch.linalg.cross(F[..., 1, :], F[..., 2, :])).sum(-1)
+
+
+def muscle_stress(F: Tensor, direction: Tensor, pull: Tensor) -> Tensor:
+    """τ = p (Fd)(Fd)ᵀ [Pa] (M1)."""
+    f = (F @ direction[..., None])[..., 0]
+    return pull[..., None, None] * f[..., :, None] * f[..., None, :]
+
+
+def stress(scene: Scene, F: Tensor, mu: Tensor, lam: Tensor, activation: Tensor | None) -> Tensor:
+    """Total τ [Pa] of each particle, (world, particle, dim, dim); ``activation`` (world, muscle) or None."""
+    parts, start = [], 0
+    for body in scene.bodies:
+        part = slice(start, start + len(body.particles))
+        law = fixed_corotated if isinstance(body.material, FixedCorotated) else neo_hookean
+        parts.append(law(F[:, part], mu[:, part], lam[:, part]))
+        start = part.stop
+    tau = torch.cat(parts, 1)
+    if activation is not None:
+        for k, muscle in enumerate(scene.muscles):
+            index, d = torch.from_numpy(muscle.particles), torch.tensor(muscle.direction, dtype=F.dtype)
+            pull = (activation[:, k, None] * muscle.strength).expand(-1, len(index))
+            tau = tau.index_add(1, index, muscle_stress(F[:, index], d.expand(len(index), -1), pull))
+    return tau
+
+
+def stencil(scene: Scene, x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """For each of the 3^dim nodes near every particle: flat node index, weight and r = x_i − x_p (S1)."""
+    dx, shape = scene.grid.spacing, scene.grid.shape
+    base = torch.floor(x.detach() / dx - 0.5)
+    nodes = []
+    for offset in itertools.product(range(3), repeat=len(shape)):
+        node = base + torch.tensor(offset, dtype=x.dtype)
+        r = node * dx - x
+        weight = _spline(r / dx).prod(-1)
+        flat = torch.zeros(x.shape[:-1], dtype=torch.int64)
+        for axis, count in enumerate(shape):
+            flat = flat * count + node[..., axis].long()
+        nodes.append((flat, weight, r))
+    return nodes
+
+
+def _spline(distance: Tensor) -> Tensor:
+    """Quadratic B-spline of a distance in cells; |distance| ≤ 3/2 by the choice of the stencil."""
+    d = distance.abs()
+    return torch.where(d < 0.5, 0.75 - d**2, 0.5 * (1.5 - d) ** 2)
+
+
+def p2g(scene: Scene, x: Tensor, mass: Tensor, momentum: Tensor, affine: Tensor) -> tuple[Tensor, Tensor]:
+    """m_i = Σ w m_p and (mv)_i = Σ w (p + A r) (T1), shapes (world, node) and (world, node, dim)."""
+    count = math.prod(scene.grid.shape)
+    node_mass = x.new_zeros(len(x), count)
+    node_momentum = x.new_zeros(len(x), count, x.shape[-1])
+    for node, weight, r in stencil(scene, x):
+        node_mass = node_mass.scatter_add(1, node, weight * mass)
+        share = weight[..., None] * (momentum + (affine @ r[..., None])[..., 0])
+        node_momentum = node_momentum.scatter_add(1, node[..., None].expand_as(share), share)
+    return node_mass, node_momentum
+
+
+def grid_velocity(scene: Scene, mass: Tensor, momentum: Tensor) -> Tensor:
+    """Velocity of the nodes after gravity, damping and walls (G2), zero where there is no mass."""
+    present = (mass > 0)[..., None]
+    v = momentum / torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
+    v = (v + scene.dt * torch.tensor(scene.gravity, dtype=v.dtype)) * math.exp(-scene.damping * scene.dt)
+    axes = [torch.arange(n, dtype=torch.float64) * scene.grid.spacing for n in scene.grid.shape]
+    positions = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
+    for wall in scene.walls:
+        inside = positions @ torch.tensor(wall.normal, dtype=torch.float64) <= wall.offset
+        v = torch.where((inside & present[..., 0])[..., None], respond(wall, v), v)
+    return torch.where(present, v, torch.zeros_like(v))
+
+
+def respond(wall: Wall, v: Tensor) -> Tensor:
+    """Velocity of a node inside a wall (C1 to C3)."""
+    n = torch.tensor(wall.normal, dtype=v.dtype)
+    if wall.contact == "stick":
+        return torch.zeros_like(v)
+    v_n = (v * n).sum(-1, keepdim=True)
+    v_t = v - v_n * n
+    if wall.contact == "slip":
+        return v_t
+    if wall.friction > 0:
+        squared = (v_t**2).sum(-1, keepdim=True)
+        moving = squared > (wall.friction * v_n) ** 2  # not stuck
+        speed = torch.sqrt(torch.where(moving, squared, torch.ones_like(squared)))
+        v_t = torch.where(moving, v_t * (1 + wall.friction * v_n / speed), torch.zeros_like(v_t))
+    return torch.where(v_n < 0, v_t, v)
+
+
+def g2p(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    """v = Σ w v_i and C = Σ w v_i rᵀ / D (T2)."""
+    v, C, D = torch.zeros_like(x), x.new_zeros(*x.shape, x.shape[-1]), scene.grid.spacing**2 / 4
+    for node, weight, r in stencil(scene, x):
+        share = weight[..., None] * velocity.gather(1, node[..., None].expand_as(x))
+        v = v + share
+        C = C + share[..., :, None] * r[..., None, :] / D
+    return v, C
+
+
+def step(scene: Scene, state: State, activation: Tensor | None, mu: Tensor, lam: Tensor, mass: Tensor) -> State:
+    """One substep: P2G, grid, G2P, as design.md states it. ``activation`` (world, muscle); material (world, particle)."""
+    volume = torch.cat([torch.as_tensor(body.particles.volume, dtype=mass.dtype) for body in scene.bodies])
+    tau, D = stress(scene, state.F, mu, lam, activation), scene.grid.spacing**2 / 4
+    affine = mass[..., None, None] * state.C - (scene.dt * volume / D)[:, None, None] * tau
+    node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
+    v, C = g2p(scene, state.x, grid_velocity(scene, node_mass, momentum))
+    return State(state.x + scene.dt * v, v, C, state.F + scene.dt * C @ state.F)
+
+
+def simulate(scene: Scene, start: State, activation: Tensor | None, params: Params, *, substeps: int) -> State:
+    """The contract of :func:`softmpm.simulate`, on a scene instead of a model."""
+    lead = start.x.shape[:2]
+    young, poisson, density = (value.expand(lead) for value in params)
+    mu, lam = lame(young, poisson)
+    volume = torch.cat([torch.as_tensor(body.particles.volume, dtype=density.dtype) for body in scene.bodies])
+    state = start
+    for row in [None] if activation is None else activation:
+        for _ in range(substeps):
+            state = step(scene, state, row, mu, lam, density * volume)
+    return state
+
+
+def rasterize(scene: Scene, state: State, density: Tensor) -> GridField:
+    """Mass and velocity on the nodes without forces (O1); ``density`` broadcasts to (world, particle)."""
+    volume = torch.cat([torch.as_tensor(body.particles.volume, dtype=density.dtype) for body in scene.bodies])
+    mass = (density * volume).expand(state.x.shape[:2])
+    node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, mass[..., None, None] * state.C)
+    velocity = momentum / torch.where(node_mass > 0, node_mass, torch.ones_like(node_mass))[..., None]
+    shape = scene.grid.shape
+    return GridField(node_mass.view(-1, *shape), velocity.view(-1, *shape, len(shape)))
