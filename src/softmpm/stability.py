@@ -1,7 +1,7 @@
 """The largest stable step, and the warning of a scene that is above it.
 
 A particle alone on the grid obeys Ḟ = C, Ċ = −4τ/(ρ dx²) in MLS-MPM, wherever it lies between the nodes.
-Symplectic Euler is stable for an oscillation ω while ω dt ≤ 2; ω² = 4K/(ρ dx²) for a strain ε with τ(ε) = K ε:
+Symplectic Euler is stable for an oscillation ω while ω dt ≤ 2; ω² = 4K/(ρ dx²) for strains with τ(ε) = K ε:
 
     dt ≤ dx · √(ρ / K)                                  (S1)
     τ(ε) = λ tr(ε) I + 2μ ε + Σ |s| (ε ddᵀ + ddᵀ ε)     (S2)  both laws at F = I, muscles at |a| = 1

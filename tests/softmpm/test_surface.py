@@ -1,0 +1,125 @@
+"""Closed meshes to particles, against boxes, balls and solid angles."""
+
+import builtins
+
+import numpy as np
+import pytest
+
+from softmpm.shapes import box, mesh
+from softmpm.surface import closed_surface, winding_inside
+
+trimesh = pytest.importorskip("trimesh")
+
+
+def test_box_mesh_is_a_box():
+    """The mesh of a box whose sides are multiples of the spacing gives the box's own particles."""
+    got = mesh(trimesh.creation.box(bounds=[(1.0, 2.0, 3.0), (1.5, 2.25, 4.0)]), 0.0625)
+    want = box((1.0, 2.0, 3.0), (1.5, 2.25, 4.0), 0.0625)
+    np.testing.assert_allclose(got.positions, want.positions, atol=1e-14)
+    np.testing.assert_allclose(got.volume, want.volume, rtol=1e-14)
+
+
+@pytest.mark.parametrize("spacing, tolerance", [(0.2, 0.05), (0.07, 0.005)])
+def test_volume_converges(spacing, tolerance):
+    """The lattice's volume tends to the mesh's own."""
+    solid = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    assert mesh(solid, spacing).volume.sum() == pytest.approx(solid.volume, rel=tolerance)
+
+
+def test_inside_is_the_winding_number():
+    """A ring and a capsule: each point is inside where the faces' solid angles add up to 4π."""
+    rng = np.random.default_rng(0)
+    for solid in (trimesh.creation.torus(1.0, 0.4), trimesh.creation.capsule(height=1.0, radius=0.3)):
+        points = rng.uniform(*solid.bounds, (400, 3))
+        corner = solid.triangles[None] - points[:, None, None]  # (point, face, corner, axis)
+        a, b, c = np.moveaxis(corner, 2, 0)
+        la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+        over = np.einsum("pfi,pfi->pf", a, np.cross(b, c))
+        dots = [np.einsum("pfi,pfi->pf", u, w) for u, w in ((a, b), (b, c), (c, a))]
+        angle = 2 * np.arctan2(over, la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb)
+        winding = angle.sum(axis=1) / (4 * np.pi)
+        got = winding_inside(*closed_surface(solid), points)
+        np.testing.assert_array_equal(got, winding > 0.5)
+        assert 0.1 < got.mean() < 0.9
+
+
+def test_place_and_size_do_not_matter():
+    """A thousandth of the size, far from the origin, the same particles are inside: the query is scaled to one."""
+    solid = trimesh.creation.icosphere(subdivisions=2)
+    small = solid.copy().apply_scale(1e-3).apply_translation((10.0, 20.0, 30.0))
+    want = mesh(solid, 0.25).positions
+    got = (mesh(small, 0.25e-3).positions - (10.0, 20.0, 30.0)) * 1e3
+    np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_inside_out_and_overlap():
+    """A mesh whose faces all turn inwards holds the same particles; parts that overlap count once."""
+    solid = trimesh.creation.box(extents=(1, 1, 1))
+    inside_out = trimesh.Trimesh(solid.vertices, solid.faces[:, ::-1], process=False)
+    np.testing.assert_array_equal(mesh(inside_out, 0.25).positions, mesh(solid, 0.25).positions)
+    both = trimesh.util.concatenate(solid, solid.copy().apply_translation((0.5, 0, 0)))
+    assert mesh(both, 0.25).volume.sum() == pytest.approx(1.5, rel=1e-12)
+
+
+def test_file(tmp_path):
+    """An STL file on disk gives what the mesh in memory gives."""
+    solid = trimesh.creation.box(extents=(0.5, 0.25, 1.0))
+    solid.export(tmp_path / "robot.stl")
+    for path in (tmp_path / "robot.stl", str(tmp_path / "robot.stl")):
+        np.testing.assert_array_equal(mesh(path, 0.125).positions, mesh(solid, 0.125).positions)
+
+
+def broken(kind: str):
+    solid = trimesh.creation.box()
+    if kind == "open":
+        return trimesh.Trimesh(solid.vertices, solid.faces[2:], process=False)
+    if kind == "turned":
+        faces = solid.faces.copy()
+        faces[0] = faces[0, ::-1]
+        return trimesh.Trimesh(solid.vertices, faces, process=False)
+    return {"cloud": trimesh.PointCloud(solid.vertices), "empty": trimesh.Trimesh(), "array": solid.vertices}[kind]
+
+
+@pytest.mark.parametrize(
+    "kind, message",
+    [
+        ("open", r"not closed: 4 of its 17 edges do not join two faces.*merge_vertices"),
+        ("turned", "do not all turn the same way.*fix_normals"),
+        ("cloud", "path or a trimesh.Trimesh with faces, got PointCloud"),
+        ("empty", "path or a trimesh.Trimesh with faces, got Trimesh"),
+        ("array", "path or a trimesh.Trimesh with faces, got"),
+    ],
+)
+def test_refuses(kind, message):
+    """A mesh that has no inside is refused, with what to try."""
+    with pytest.raises(ValueError, match=message):
+        mesh(broken(kind), 0.1)
+
+
+def test_refuses_size():
+    """Millimetres read as metres are caught before memory is taken; a mesh between the particles is named."""
+    with pytest.raises(ValueError, match="lattice cells.*metres"):
+        mesh(trimesh.creation.box(extents=(100, 100, 100)), 0.01)
+    with pytest.raises(ValueError, match="spacing must be > 0"):
+        mesh(trimesh.creation.box(), -1.0)
+    corner = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+    with pytest.raises(ValueError, match="lies between its particles"):
+        mesh(corner, 1.0)
+
+
+def test_missing_file_and_library(monkeypatch, tmp_path):
+    """A path without a file says so; a file without trimesh says what to install."""
+    with pytest.raises(FileNotFoundError, match="nothing.stl"):
+        mesh(tmp_path / "nothing.stl", 0.1)
+    found = builtins.__import__
+
+    def without(name, *rest, **named):
+        if name == "trimesh":
+            raise ImportError(name)
+        return found(name, *rest, **named)
+
+    path = tmp_path / "robot.stl"
+    path.write_bytes(b"")
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"pip install softmpm\[mesh\]"):
+        mesh(path, 0.1)
