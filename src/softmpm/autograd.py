@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor
 
+from softmpm.buffers import Motion, Solid, lame
 from softmpm.checks import check_activation, check_params, check_state, check_substeps, check_values
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
 from softmpm.raster import splat, splat_adj
 from softmpm.rollout import Horizon, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
-from softmpm.step import Motion, Solid, lame
 
 
 _SECOND = (

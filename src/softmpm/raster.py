@@ -3,12 +3,13 @@
 import torch
 from torch import Tensor
 
+from softmpm.buffers import Motion, MotionAdj, view
 from softmpm.kernels.raster import raster
 from softmpm.kernels.types import types
 from softmpm.model import Model
 from softmpm.rollout import raise_failure
 from softmpm.state import State
-from softmpm.step import Motion, MotionAdj, Substep, view
+from softmpm.step import Substep
 
 
 def _enter(model: Model, state: State):
@@ -18,7 +19,7 @@ def _enter(model: Model, state: State):
     step, motion = Substep(model, None), Motion.empty(model)
     struct = motion.struct(model)
     step.enter(state, struct)
-    raise_failure(model, step.watch, state)
+    raise_failure(model, step.watch_words, state)
     return step, motion, struct
 
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj
 from softmpm.kernels.types import Wanted
 from softmpm.memory import plan
 from softmpm.model import Model
 from softmpm.state import State
-from softmpm.step import Motion, MotionAdj, Solid, SolidAdj, Substep
+from softmpm.step import Substep
 from softmpm.watch import NEVER, Kind, UnstableError, decode
 
 
@@ -55,7 +56,7 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
             kept[s // schedule.segment].copy_(buffers[now])
         step.advance(slots[now], slots[then], s)
     end = step.leave(slots[horizon.total if keep_all else horizon.total % 2])
-    raise_failure(model, step.watch, end)
+    raise_failure(model, step.watch_words, end)
     return end, kept
 
 
@@ -70,7 +71,7 @@ def rollout_adj(model: Model, horizon: Horizon, kept: Motion, pull: Tensor | Non
     """
     schedule = plan(horizon.total, model.state_bytes(), model.memory_budget)
     row = None if pull is None else torch.empty_like(pull[0])
-    step = Substep(model, Solid(solid.mass, solid.mu, solid.lam, row).struct(model), adjoint=True)
+    step = Substep(model, Solid(solid.mass, solid.mu, solid.lam, row).struct(model))
     adj_solid = SolidAdj.zeros(model, wanted)
     adj_pull = torch.zeros_like(pull) if wanted.activation else None
     adjoints = MotionAdj.zeros(model), MotionAdj.zeros(model)
@@ -91,7 +92,7 @@ def rollout_adj(model: Model, horizon: Horizon, kept: Motion, pull: Tensor | Non
         step.adjoint(wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, s)
         if wanted.activation and s % horizon.substeps == 0:
             step.collect_pull(adj_solid, adj_pull[s // horizon.substeps])
-    raise_failure(model, step.watch, None)
+    raise_failure(model, step.watch_words, None)
     start = adjoints[0]
     return State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H), adj_solid, adj_pull
 

@@ -4,31 +4,21 @@ Nothing here decides how many substeps there are or what is kept: that is ``roll
 stream and are never recorded on a ``wp.Tape`` by themselves: :func:`softmpm.step` records the explicit adjoint.
 """
 
-from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from softmpm.buffers import SolidAdj, view
 from softmpm.kernels.boundary import boundary
 from softmpm.kernels.grid import grid
 from softmpm.kernels.solid import collect_pull
 from softmpm.kernels.transfer import transfer, transfer_adj
-from softmpm.kernels.types import Wanted, solid_adj_type, solid_types, types
+from softmpm.kernels.types import Wanted, types
 from softmpm.model import Model
-from softmpm.state import Low, Params, State
+from softmpm.state import Low, State
 from softmpm.watch import NEVER
-
-
-def lame(params: Params) -> tuple[Tensor, Tensor]:
-    """Lamé's μ = E / 2(1 + ν) and λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
-    young, poisson = params.young, params.poisson
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-
-
-def view(tensor: Tensor, dtype) -> wp.array:
-    """Warp array on a tensor's memory; vectors and matrices take up its last axes."""
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
 def stream_of(device: torch.device) -> wp.Stream | None:
@@ -36,151 +26,48 @@ def stream_of(device: torch.device) -> wp.Stream | None:
     return wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
 
 
-@dataclass
-class Motion:
-    """State of all particles as the kernels hold it (kernels/types.py); shapes (..., world, particle, dim[, dim])."""
-
-    base: Tensor
-    fx: Tensor
-    v: Tensor
-    C: Tensor
-    H: Tensor
-    fx_low: Tensor | None = None
-
-    @staticmethod
-    def empty(model: Model, *lead: int) -> "Motion":
-        def tensor(*tail, dtype=model.dtype):
-            return torch.empty(*lead, model.worlds, model.particle_count, *tail, dtype=dtype, device=model.device)
-
-        d = model.dim
-        low = tensor(d) if model.dtype == torch.float32 else None
-        return Motion(tensor(d, dtype=torch.int32), tensor(d), tensor(d), tensor(d, d), tensor(d, d), low)
-
-    def tensors(self) -> tuple[Tensor, ...]:
-        found = (getattr(self, field.name) for field in fields(self))
-        return tuple(tensor for tensor in found if tensor is not None)
-
-    def __getitem__(self, slot) -> "Motion":
-        return Motion(*(tensor[slot] for tensor in self.tensors()))
-
-    def copy_(self, other: "Motion") -> None:
-        for mine, theirs in zip(self.tensors(), other.tensors(), strict=True):
-            mine.copy_(theirs)
-
-    def struct(self, model: Model):
-        t = types(model.spec.dim, model.spec.dtype)
-        struct = t.Motion()
-        struct.base = view(self.base, t.ivec)
-        names = (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat), ("fx_low", t.vec))
-        for name, dtype in names[: len(self.tensors()) - 1]:
-            setattr(struct, name, view(getattr(self, name), dtype))
-        return struct
-
-
-@dataclass
-class MotionAdj:
-    """Adjoint of a :class:`Motion`, one flat tensor so that it is cleared at once."""
-
-    flat: Tensor
-    fx: Tensor
-    v: Tensor
-    C: Tensor
-    H: Tensor
-
-    @staticmethod
-    def zeros(model: Model) -> "MotionAdj":
-        lead, d = (model.worlds, model.particle_count), model.dim
-        shapes = [(*lead, d), (*lead, d), (*lead, d, d), (*lead, d, d)]
-        sizes = [lead[0] * lead[1] * n for n in (d, d, d * d, d * d)]
-        flat = torch.zeros(sum(sizes), dtype=model.dtype, device=model.device)
-        parts = (part.view(shape) for part, shape in zip(flat.split(sizes), shapes, strict=True))
-        return MotionAdj(flat, *parts)
-
-    def struct(self, model: Model):
-        t = types(model.spec.dim, model.spec.dtype)
-        struct = t.MotionAdj()
-        for name, dtype in (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat)):
-            setattr(struct, name, view(getattr(self, name), dtype))
-        return struct
-
-
-@dataclass
-class Solid:
-    """Material of all particles: tensors (world, particle), and the pull of the muscles (world, muscle) [Pa]."""
-
-    mass: Tensor
-    mu: Tensor
-    lam: Tensor
-    pull: Tensor | None
-
-    def struct(self, model: Model):
-        t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
-        for name in ("mass", "mu", "lam"):
-            setattr(solid, name, view(getattr(self, name), t.real))
-        solid.volume = view(model.volume, t.real)
-        if len(model.spec.laws) > 1:
-            solid.law = view(model.law, wp.int32)
-        if model.spec.muscle_slots:
-            solid.muscle = view(model.muscle_slots, wp.int32)
-            solid.fibre = view(model.fibre, t.vec)
-            solid.pull = view(self.pull, t.real)
-        return solid
-
-
-@dataclass
-class SolidAdj:
-    """Adjoint of a :class:`Solid`; what is not wanted is None. ``slot`` is the pull's, of each particle and slot."""
-
-    wanted: Wanted
-    mass: Tensor | None = None
-    mu: Tensor | None = None
-    lam: Tensor | None = None
-    slot: Tensor | None = None
-
-    @staticmethod
-    def zeros(model: Model, wanted: Wanted) -> "SolidAdj":
-        def tensor(*tail):
-            return torch.zeros(model.worlds, model.particle_count, *tail, dtype=model.dtype, device=model.device)
-
-        adj = SolidAdj(wanted)
-        if wanted.material:
-            adj.mass, adj.mu, adj.lam = tensor(), tensor(), tensor()
-        if wanted.activation:
-            adj.slot = tensor(model.spec.muscle_slots)
-        return adj
-
-    def struct(self, model: Model):
-        t, struct = types(model.spec.dim, model.spec.dtype), solid_adj_type(model.spec, self.wanted)()
-        if self.wanted.material:
-            for name in ("mass", "mu", "lam"):
-                setattr(struct, name, view(getattr(self, name), t.real))
-        if self.wanted.activation:
-            struct.pull = view(self.slot, t.real)
-        return struct
-
-
 class Substep:
-    """The launches of one substep on one set of grid buffers."""
+    """The launches of one substep, on grid buffers of its own that are made when first used.
 
-    def __init__(self, model: Model, solid, adjoint: bool = False):
+    Args:
+        solid: Struct of a :class:`Solid`; None if only :meth:`enter` and :meth:`leave` are wanted.
+    """
+
+    def __init__(self, model: Model, solid):
         self.model, self.solid, self.stream = model, solid, stream_of(model.device)
-        t, spec = types(model.spec.dim, model.spec.dtype), model.spec
-        self.types, self.forward_kernels, self.grid_kernels = t, transfer(spec), grid(spec)
+        self.types = types(model.spec.dim, model.spec.dtype)
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
-        self.watch = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
-        self._watch = view(self.watch, wp.int64)
-        self._node_tensor, self.node = self._grid(t.node)
-        _, self.velocity = self._grid(t.vec)
-        if adjoint:
-            if spec.muscle_slots:
-                collect_pull(spec)  # defined before its module is first loaded, which would be compiled twice otherwise
-            _, self.adj_node = self._grid(t.node)
-            self._adj_velocity_tensor, self.adj_velocity = self._grid(t.vec)
+        self.watch_words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+        self.watch = view(self.watch_words, wp.int64)
+        self._arrays = {}
 
-    def _grid(self, dtype) -> tuple[Tensor, wp.array]:
-        tensor = torch.empty(*self.nodes, dtype._length_, dtype=self.model.dtype, device=self.model.device)
-        return tensor, view(tensor, dtype)
+    def _grid(self, dtype) -> Tensor:
+        return torch.empty(*self.nodes, dtype._length_, dtype=self.model.dtype, device=self.model.device)
+
+    def _array(self, name: str) -> wp.array:
+        """Warp's view of one of the grid buffers below, made once."""
+        if name not in self._arrays:
+            self._arrays[name] = view(getattr(self, name), self.types.node if name.endswith("node") else self.types.vec)
+        return self._arrays[name]
+
+    @cached_property
+    def node(self) -> Tensor:
+        """Momentum and mass, (world, node, dim + 1)."""
+        return self._grid(self.types.node)
+
+    @cached_property
+    def velocity(self) -> Tensor:
+        """(world, node, dim)."""
+        return self._grid(self.types.vec)
+
+    @cached_property
+    def adj_node(self) -> Tensor:
+        return self._grid(self.types.node)
+
+    @cached_property
+    def adj_velocity(self) -> Tensor:
+        return self._grid(self.types.vec)
 
     def launch(self, kernel, dim, *inputs) -> None:
         wp.launch(
@@ -189,42 +76,40 @@ class Substep:
 
     def to_grid(self, now) -> None:
         """P2G and the grid stage: velocity of the nodes."""
-        scale = self.model.scale
-        self._node_tensor.zero_()
-        self.launch(self.forward_kernels.p2g, self.particles, scale, self.solid, self._watch, now, self.node)
-        self.launch(
-            self.grid_kernels.grid_velocity, self.nodes, scale, self.model.walls, self.node, self.velocity
-        )
+        scale, spec = self.model.scale, self.model.spec
+        node, velocity = self._array("node"), self._array("velocity")
+        self.node.zero_()
+        self.launch(transfer(spec).p2g, self.particles, scale, self.solid, self.watch, now, node)
+        self.launch(grid(spec).grid_velocity, self.nodes, scale, self.model.walls, node, velocity)
 
     def advance(self, now, then, substep: int) -> None:
         """One whole substep."""
         self.to_grid(now)
-        self.launch(
-            self.forward_kernels.g2p,
-            self.particles,
-            *(self.model.scale, self.solid, substep, self.velocity, now, self._watch, then),
-        )
+        arguments = (self.model.scale, self.solid, substep, self._array("velocity"), now, self.watch, then)
+        self.launch(transfer(self.model.spec).g2p, self.particles, *arguments)
 
     def adjoint(self, wanted: Wanted, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:
         """Adjoint of :meth:`advance`: adds into ``adj_now`` and ``adj_solid``. The grid is computed again."""
-        scale, kernels = self.model.scale, transfer_adj(self.model.spec, wanted)
         self.to_grid(now)
-        self._adj_velocity_tensor.zero_()
-        self.launch(
-            kernels.g2p_adj,
-            self.particles,
-            *(scale, self.velocity, now, then, adj_then, self.adj_velocity, adj_now),
-        )
-        self.launch(
-            self.grid_kernels.grid_velocity_adj,
-            self.nodes,
-            *(scale, self.model.walls, self.node, self.adj_velocity, self.adj_node),
-        )
-        self.launch(
-            kernels.p2g_adj,
-            self.particles,
-            *(scale, self.solid, substep, now, self.adj_node, self._watch, adj_solid, adj_now),
-        )
+        self.adj_velocity.zero_()
+        self.g2p_adj(wanted, now, then, adj_then, adj_now)
+        self.grid_adj()
+        self.p2g_adj(wanted, now, adj_now, adj_solid, substep)
+
+    def g2p_adj(self, wanted: Wanted, now, then, adj_then, adj_now) -> None:
+        velocity, adj_velocity = self._array("velocity"), self._array("adj_velocity")
+        arguments = (self.model.scale, velocity, now, then, adj_then, adj_velocity, adj_now)
+        self.launch(transfer_adj(self.model.spec, wanted).g2p_adj, self.particles, *arguments)
+
+    def grid_adj(self) -> None:
+        model, arrays = self.model, (self._array(name) for name in ("node", "adj_velocity", "adj_node"))
+        arguments = (model.scale, model.walls, *arrays)
+        self.launch(grid(model.spec).grid_velocity_adj, self.nodes, *arguments)
+
+    def p2g_adj(self, wanted: Wanted, now, adj_now, adj_solid, substep: int) -> None:
+        adj_node = self._array("adj_node")
+        arguments = (self.model.scale, self.solid, substep, now, adj_node, self.watch, adj_solid, adj_now)
+        self.launch(transfer_adj(self.model.spec, wanted).p2g_adj, self.particles, *arguments)
 
     def collect_pull(self, adj_solid: SolidAdj, adj_pull: Tensor) -> None:
         """Add what the particles found for the muscles' pull into ``adj_pull`` (world, muscle) and start afresh."""
@@ -243,7 +128,7 @@ class Substep:
             low = Low(torch.zeros_like(state.x), torch.zeros_like(state.F))
         arrays = [view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*state, *low)]
         kernel = boundary(self.model.dim, self.model.spec.dtype).enter
-        self.launch(kernel, self.particles, self.model.scale, *arrays, self._watch, motion)
+        self.launch(kernel, self.particles, self.model.scale, *arrays, self.watch, motion)
 
     def leave(self, motion) -> State:
         """The way back, into fresh tensors."""

@@ -13,11 +13,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from softmpm.buffers import Motion, Solid, SolidAdj, lame, view
 from softmpm.kernels.types import Wanted, solid_adj_type, types
 from softmpm.model import Model
 from softmpm.rollout import raise_failure
 from softmpm.state import Params, State
-from softmpm.step import Motion, Solid, SolidAdj, Substep, lame, stream_of, view
+from softmpm.step import Substep, stream_of
 
 
 @dataclass(eq=False)
@@ -76,7 +77,7 @@ class WarpSolid:
 
     def raise_failure(self, model: Model, state: WarpState) -> None:
         """Raise :class:`softmpm.UnstableError` if a step so far failed; waits for the device."""
-        raise_failure(model, self.work.watch, self.work.leave(state.struct(model)))
+        raise_failure(model, self.work.watch_words, self.work.leave(state.struct(model)))
 
 
 def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
@@ -95,7 +96,7 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     t, state = types(model.spec.dim, model.spec.dtype), model.rest() if state is None else state
     motion, work = Motion.empty(model), Substep(model, None)
     work.enter(state, motion.struct(model))
-    raise_failure(model, work.watch, state)
+    raise_failure(model, work.watch_words, state)
     arrays = (_owned(getattr(motion, n), d, requires_grad) for n, d in zip("fx v C H".split(), (t.vec, t.vec, t.mat, t.mat)))
     low = None if motion.fx_low is None else _owned(motion.fx_low, t.vec, False)
     return WarpState(_owned(motion.base, t.ivec, False), *arrays, low)
@@ -130,7 +131,7 @@ def warp_solid(
     struct = solid.struct(model)
     for name in ("mass", "mu", "lam", *(("pull",) if pull is not None else ())):
         setattr(struct, name, getattr(owned, name))
-    owned.work = Substep(model, struct, adjoint=requires_grad)
+    owned.work = Substep(model, struct)
     return owned
 
 

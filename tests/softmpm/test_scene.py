@@ -45,7 +45,10 @@ def scene(**changes) -> Scene:
         (lambda: Muscle(particles=[0], direction=(0, 0), strength=1), "direction must not be zero"),
         (lambda: Muscle(particles=[0], direction=(np.nan, 0), strength=1), "direction must be finite"),
         (lambda: Muscle(particles=[0], direction=(1, 0), strength=np.inf), "strength must be finite"),
-        (lambda: Wall(normal=(0, 1), offset=0, contact="sticky"), "one of stick, slip, separate, got 'sticky'"),
+        (
+            lambda: Wall(normal=(0, 1), offset=0, contact="sticky"),
+            "one of stick, slip, separate, got 'sticky'",
+        ),
         (lambda: Wall(normal=(0, 1), offset=np.nan), "wall offset must be finite"),
         (lambda: Wall(normal=(0, 0), offset=0), "wall normal must not be zero"),
         (lambda: Wall(normal=(0, 1), offset=0, friction=-0.1), "friction must be ≥ 0"),
@@ -72,7 +75,10 @@ def test_refuses_values(make, message):
         (lambda: NeoHookean(density=None, young=1.0), "material density must be one number, got None"),
         (lambda: Body(np.zeros((3, 2)), NeoHookean(**SOFT)), "particles must be a Particles, got ndarray"),
         (lambda: Body(Particles(np.zeros((3, 2)), 1.0), 5.0), "material must be a Material, got float"),
-        (lambda: Muscle(particles=[0], direction=("x", 0), strength=1), "direction must be made of plain numbers"),
+        (
+            lambda: Muscle(particles=[0], direction=("x", 0), strength=1),
+            "direction must be made of plain numbers",
+        ),
         (lambda: scene(grid=(8, 8)), "grid must be a Grid, got tuple"),
         (lambda: scene(bodies=scene().bodies[0]), "bodies must be a list of Body, got Body"),
         (lambda: scene(muscles=[None]), r"muscles\[0\] must be a Muscle, got NoneType"),
@@ -87,7 +93,9 @@ def test_refuses_kinds(make, message):
 
 def test_directions_are_normalised():
     """A direction keeps its way, not its length; a wall's plane stays where it was written."""
-    assert Muscle(particles=[0], direction=(3, 4), strength=1).direction == pytest.approx((0.6, 0.8), abs=1e-15)
+    assert Muscle(particles=[0], direction=(3, 4), strength=1).direction == pytest.approx(
+        (0.6, 0.8), abs=1e-15
+    )
     wall = Wall(normal=(0, 2), offset=1.0)  # 2 y ≤ 1
     assert wall.normal == (0.0, 1.0) and wall.offset == 0.5
     assert Wall(normal=(0.6, 0.8), offset=0.3).offset == 0.3

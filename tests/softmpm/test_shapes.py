@@ -32,7 +32,9 @@ def test_box_lattice():
 def test_box_fits_its_spacing():
     """Sides of 2.6 and 1.2 spacings get three and one particles, each at the middle of its share."""
     particles = box((0.0, 0.0), (2.6, 1.2), 1.0)
-    np.testing.assert_allclose(particles.positions, [(2.6 / 6, 0.6), (1.3, 0.6), (2.6 * 5 / 6, 0.6)], atol=1e-15)
+    np.testing.assert_allclose(
+        particles.positions, [(2.6 / 6, 0.6), (1.3, 0.6), (2.6 * 5 / 6, 0.6)], atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("dim, unit", [(2, math.pi), (3, 4 / 3 * math.pi)])

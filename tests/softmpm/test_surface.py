@@ -19,7 +19,7 @@ def test_box_mesh_is_a_box():
     np.testing.assert_allclose(got.volume, want.volume, rtol=1e-14)
 
 
-@pytest.mark.parametrize("spacing, tolerance", [(0.2, 0.05), (0.07, 0.005)])
+@pytest.mark.parametrize("spacing, tolerance", [(0.2, 0.08), (0.07, 0.005)])
 def test_volume_converges(spacing, tolerance):
     """The lattice's volume tends to the mesh's own."""
     solid = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
@@ -77,7 +77,9 @@ def broken(kind: str):
         faces = solid.faces.copy()
         faces[0] = faces[0, ::-1]
         return trimesh.Trimesh(solid.vertices, faces, process=False)
-    return {"cloud": trimesh.PointCloud(solid.vertices), "empty": trimesh.Trimesh(), "array": solid.vertices}[kind]
+    return {"cloud": trimesh.PointCloud(solid.vertices), "empty": trimesh.Trimesh(), "array": solid.vertices}[
+        kind
+    ]
 
 
 @pytest.mark.parametrize(
@@ -102,7 +104,9 @@ def test_refuses_size():
         mesh(trimesh.creation.box(extents=(100, 100, 100)), 0.01)
     with pytest.raises(ValueError, match="spacing must be > 0"):
         mesh(trimesh.creation.box(), -1.0)
-    corner = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+    corner = trimesh.Trimesh(
+        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    )
     with pytest.raises(ValueError, match="lies between its particles"):
         mesh(corner, 1.0)
 

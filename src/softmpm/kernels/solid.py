@@ -82,7 +82,7 @@ def collect_pull(spec: Spec):
     """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
     t = types(spec.dim, spec.dtype)
 
-    @wp.kernel(module=spec.module + ".adj", enable_backward=False)
+    @wp.kernel(module=spec.module + ".pull", enable_backward=False)
     def collect(
         # In:
         muscle: wp.array2d(dtype=wp.int32),

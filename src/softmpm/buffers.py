@@ -1,0 +1,145 @@
+"""What the kernels work on, as tensors that PyTorch owns and the Warp structs that see them."""
+
+from dataclasses import dataclass, fields
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.kernels.types import Wanted, solid_adj_type, solid_types, types
+from softmpm.model import Model
+from softmpm.state import Params
+
+
+def view(tensor: Tensor, dtype) -> wp.array:
+    """Warp array on a tensor's memory; vectors and matrices take up its last axes."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def lame(params: Params) -> tuple[Tensor, Tensor]:
+    """Lamé's μ = E / 2(1 + ν) and λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
+    young, poisson = params.young, params.poisson
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+@dataclass
+class Motion:
+    """State of all particles as the kernels hold it (kernels/types.py); shapes (..., world, particle, dim[, dim])."""
+
+    base: Tensor
+    fx: Tensor
+    v: Tensor
+    C: Tensor
+    H: Tensor
+    fx_low: Tensor | None = None
+
+    @staticmethod
+    def empty(model: Model, *lead: int) -> "Motion":
+        def tensor(*tail, dtype=model.dtype):
+            return torch.empty(*lead, model.worlds, model.particle_count, *tail, dtype=dtype, device=model.device)
+
+        d = model.dim
+        low = tensor(d) if model.dtype == torch.float32 else None
+        return Motion(tensor(d, dtype=torch.int32), tensor(d), tensor(d), tensor(d, d), tensor(d, d), low)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        found = (getattr(self, field.name) for field in fields(self))
+        return tuple(tensor for tensor in found if tensor is not None)
+
+    def __getitem__(self, slot) -> "Motion":
+        return Motion(*(tensor[slot] for tensor in self.tensors()))
+
+    def copy_(self, other: "Motion") -> None:
+        for mine, theirs in zip(self.tensors(), other.tensors(), strict=True):
+            mine.copy_(theirs)
+
+    def struct(self, model: Model):
+        t = types(model.spec.dim, model.spec.dtype)
+        struct = t.Motion()
+        struct.base = view(self.base, t.ivec)
+        names = (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat), ("fx_low", t.vec))
+        for name, dtype in names[: len(self.tensors()) - 1]:
+            setattr(struct, name, view(getattr(self, name), dtype))
+        return struct
+
+
+@dataclass
+class MotionAdj:
+    """Adjoint of a :class:`Motion`, one flat tensor so that it is cleared at once."""
+
+    flat: Tensor
+    fx: Tensor
+    v: Tensor
+    C: Tensor
+    H: Tensor
+
+    @staticmethod
+    def zeros(model: Model) -> "MotionAdj":
+        lead, d = (model.worlds, model.particle_count), model.dim
+        shapes = [(*lead, d), (*lead, d), (*lead, d, d), (*lead, d, d)]
+        sizes = [lead[0] * lead[1] * n for n in (d, d, d * d, d * d)]
+        flat = torch.zeros(sum(sizes), dtype=model.dtype, device=model.device)
+        parts = (part.view(shape) for part, shape in zip(flat.split(sizes), shapes, strict=True))
+        return MotionAdj(flat, *parts)
+
+    def struct(self, model: Model):
+        t = types(model.spec.dim, model.spec.dtype)
+        struct = t.MotionAdj()
+        for name, dtype in (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat)):
+            setattr(struct, name, view(getattr(self, name), dtype))
+        return struct
+
+
+@dataclass
+class Solid:
+    """Material of all particles: tensors (world, particle), and the pull of the muscles (world, muscle) [Pa]."""
+
+    mass: Tensor
+    mu: Tensor
+    lam: Tensor
+    pull: Tensor | None
+
+    def struct(self, model: Model):
+        t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
+        for name in ("mass", "mu", "lam"):
+            setattr(solid, name, view(getattr(self, name), t.real))
+        solid.volume = view(model.volume, t.real)
+        if len(model.spec.laws) > 1:
+            solid.law = view(model.law, wp.int32)
+        if model.spec.muscle_slots:
+            solid.muscle = view(model.muscle_slots, wp.int32)
+            solid.fibre = view(model.fibre, t.vec)
+            solid.pull = view(self.pull, t.real)
+        return solid
+
+
+@dataclass
+class SolidAdj:
+    """Adjoint of a :class:`Solid`; what is not wanted is None. ``slot`` is the pull's, of each particle and slot."""
+
+    wanted: Wanted
+    mass: Tensor | None = None
+    mu: Tensor | None = None
+    lam: Tensor | None = None
+    slot: Tensor | None = None
+
+    @staticmethod
+    def zeros(model: Model, wanted: Wanted) -> "SolidAdj":
+        def tensor(*tail):
+            return torch.zeros(model.worlds, model.particle_count, *tail, dtype=model.dtype, device=model.device)
+
+        adj = SolidAdj(wanted)
+        if wanted.material:
+            adj.mass, adj.mu, adj.lam = tensor(), tensor(), tensor()
+        if wanted.activation:
+            adj.slot = tensor(model.spec.muscle_slots)
+        return adj
+
+    def struct(self, model: Model):
+        t, struct = types(model.spec.dim, model.spec.dtype), solid_adj_type(model.spec, self.wanted)()
+        if self.wanted.material:
+            for name in ("mass", "mu", "lam"):
+                setattr(struct, name, view(getattr(self, name), t.real))
+        if self.wanted.activation:
+            struct.pull = view(self.slot, t.real)
+        return struct

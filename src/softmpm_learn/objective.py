@@ -1,0 +1,82 @@
+"""What the robot should do: a loss of how a simulation ends, and running terms along the way. Smaller is better."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from softmpm import State
+
+
+class Running(ABC):
+    """A term that is averaged over the control steps of an episode."""
+
+    @abstractmethod
+    def __call__(self, state: State, activation: Tensor) -> Tensor:
+        """Cost of one control step, shape (world,), from the state after it and the activation (world, muscle) during it."""
+
+
+@dataclass(frozen=True)
+class Effort(Running):
+    """Mean squared activation (Spielberg et al. 2021 use weights of about 1e-6)."""
+
+    weight: float
+
+    def __call__(self, state: State, activation: Tensor) -> Tensor:
+        return self.weight * activation.square().mean(dim=-1)
+
+
+@dataclass(frozen=True)
+class Height(Running):
+    """Keep the particles' mean height above ``lowest`` [m]: weight · max(0, lowest − height)², as a walker that should not fall."""
+
+    weight: float
+    lowest: float
+    axis: int = 1
+    """Which axis is up."""
+
+    def __call__(self, state: State, activation: Tensor) -> Tensor:
+        return self.weight * (self.lowest - state.x[..., self.axis].mean(dim=-1)).clamp(min=0.0).square()
+
+
+class Objective(ABC):
+    """A final loss and running terms."""
+
+    terms: tuple[Running, ...] = ()
+
+    @abstractmethod
+    def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
+        """Loss of each world, shape (world,). ``goal`` [m] has shape (world, dim) where the task has one."""
+
+    def running(self, state: State, activation: Tensor) -> Tensor:
+        """Cost of one control step, shape (world,)."""
+        return sum((term(state, activation) for term in self.terms), activation.new_zeros(activation.shape[0]))
+
+
+@dataclass(frozen=True)
+class Progress(Objective):
+    """Go far: minus the distance [m] that the mean position travels along an axis."""
+
+    axis: int = 0
+    particles: np.ndarray | None = None
+    """Indices of the particles that count, None for all."""
+    terms: tuple[Running, ...] = ()
+
+    def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
+        moved = end.x[..., self.axis] - start.x[..., self.axis]
+        return -(moved if self.particles is None else moved[:, self.particles]).mean(dim=-1)
+
+
+@dataclass(frozen=True)
+class Reach(Objective):
+    """Bring a part to the goal: squared distance [m²] between the mean position of the particles and the goal."""
+
+    particles: np.ndarray
+    """Indices of the particles that should get there."""
+    terms: tuple[Running, ...] = ()
+
+    def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
+        if goal is None:
+            raise ValueError("Reach needs a goal: give the task one.")
+        return (end.x[:, self.particles].mean(dim=1) - goal).square().sum(dim=-1)

@@ -1,0 +1,224 @@
+"""Every setting of the learning loop, one small dataclass for each part of it.
+
+Numbers that the 2019 paper "Learning-in-the-loop optimization" does not state are ours, and it states few; those taken from
+elsewhere name their source. A wrong value fails where the settings are made, in a sentence.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+OBSERVERS = ("latent", "centroids", "kmeans")
+POLICIES = ("linear", "mlp", "sinusoids", "knots")
+OPTIMIZERS = ("adam", "sgd")
+DESIGNS = ("particle", "region", "uniform")
+
+
+def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}; got {value!r}.")
+
+
+def _positive(group: str, settings, *names: str) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{group}.{name} must be > 0, got {value}.")
+
+
+def _share(group: str, settings, *names: str) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        if not 0.0 < value <= 1.0:
+            raise ValueError(f"{group}.{name} must lie in (0, 1], got {value}.")
+
+
+@dataclass(kw_only=True)
+class ObserverConf:
+    """What the policy sees of the robot."""
+
+    name: str = "latent"
+    """latent (learned from grid velocity), centroids (hand-picked regions of the task) or kmeans (clusters found at rest)."""
+    clusters: int = 8
+    """kmeans: number of clusters."""
+    latent_size: int = 8
+    """latent: numbers that describe the motion. 8 is what later work of the authors uses."""
+    channels: list[int] = field(default_factory=lambda: [8, 16, 32])
+    """latent: channels of the encoder's convolutions, each halving the picture; the decoder mirrors them."""
+    nodes: int | None = None
+    """latent: most nodes along the longest axis of the picture, coarser than the grid by averaging; None is 64 in 2D, 32 in 3D."""
+    follow: bool = True
+    """latent: the picture is centred on the robot, so that a step looks alike anywhere; False shows the grid as it stands."""
+
+    def __post_init__(self):
+        _one_of("observer.name", self.name, OBSERVERS)
+        _positive("observer", self, "clusters", "latent_size")
+        if not self.channels or min(self.channels) < 1:
+            raise ValueError(f"observer.channels needs at least one positive number, got {list(self.channels)}.")
+        if self.nodes is not None and self.nodes < 4:
+            raise ValueError(f"observer.nodes must be at least 4 or null, got {self.nodes}.")
+
+
+@dataclass(kw_only=True)
+class PolicyConf:
+    """What turns an observation into the activation of each muscle, in (-1, 1)."""
+
+    name: str = "mlp"
+    """linear, tanh(Wz + b); mlp; sinusoids or knots, which are open loop and see nothing but the time."""
+    hidden: list[int] = field(default_factory=lambda: [64, 64])
+    """mlp: width of each hidden layer; two of 64 as in Spielberg et al. 2021 (Robotica)."""
+    clock: bool = True
+    """Show linear and mlp the time as sines and cosines. Our choice: a rhythm to start from; False is the paper's pure feedback."""
+    period: float = 0.25
+    """Longest period of the clock and of sinusoids [s]."""
+    harmonics: int = 2
+    """Number of periods: period, period/2, period/3, …"""
+    knots: int = 16
+    """knots: values of each muscle along the episode, joined by straight lines."""
+    gain: float = 1.0
+    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest."""
+
+    def __post_init__(self):
+        _one_of("policy.name", self.name, POLICIES)
+        _positive("policy", self, "period", "harmonics")
+        if self.name == "mlp" and (not self.hidden or min(self.hidden) < 1):
+            raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
+        if self.knots < 2:
+            raise ValueError(f"policy.knots must be at least 2, got {self.knots}.")
+        if not (math.isfinite(self.gain) and self.gain >= 0):
+            raise ValueError(f"policy.gain must be ≥ 0, got {self.gain}.")
+
+
+@dataclass(kw_only=True)
+class DesignConf:
+    """Which materials are optimised together with the policy, and between which bounds (as Spielberg et al. 2021)."""
+
+    enabled: bool = True
+    """False keeps the scene's materials: control only."""
+    per: str = "particle"
+    """What has a value of its own: particle, region (of the task) or uniform (one for the robot)."""
+    young: bool = True
+    """Optimise Young's modulus."""
+    poisson: bool = True
+    """Optimise Poisson's ratio."""
+    density: bool = True
+    """Optimise the density."""
+    young_factor: list[float] = field(default_factory=lambda: [0.7, 2.0])
+    """Lowest and highest Young's modulus, in units of the scene's."""
+    poisson_range: list[float] = field(default_factory=lambda: [0.2, 0.4])
+    """Lowest and highest Poisson's ratio [-]; the scene's must lie between."""
+    density_factor: list[float] = field(default_factory=lambda: [0.7, 2.0])
+    """Lowest and highest density, in units of the scene's."""
+
+    def __post_init__(self):
+        _one_of("design.per", self.per, DESIGNS)
+        for name in ("young_factor", "density_factor"):
+            bounds = list(getattr(self, name))
+            if len(bounds) != 2 or not 0.0 < bounds[0] < 1.0 < bounds[1] < math.inf:
+                raise ValueError(f"design.{name} must be [low, high] with 0 < low < 1 < high, got {bounds}.")
+        bounds = list(self.poisson_range)
+        if len(bounds) != 2 or not -1.0 < bounds[0] < bounds[1] < 0.5:
+            raise ValueError(f"design.poisson_range must be [low, high] with -1 < low < high < 0.5, got {bounds}.")
+
+
+@dataclass(kw_only=True)
+class OptimizerConf:
+    """How the gradient of a simulation changes policy and design."""
+
+    name: str = "adam"
+    """adam or sgd (plain gradient descent)."""
+    policy_rate: float = 1e-2
+    """Learning rate of the policy."""
+    design_rate: float = 3e-2
+    """Learning rate of the design, in the unbounded space before the sigmoid."""
+    max_norm: float | None = None
+    """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
+
+    def __post_init__(self):
+        _one_of("optimizer.name", self.name, OPTIMIZERS)
+        _positive("optimizer", self, "policy_rate", "design_rate")
+        if self.max_norm is not None:
+            _positive("optimizer", self, "max_norm")
+
+
+@dataclass(kw_only=True)
+class LearningConf:
+    """The learning phase: how the autoencoder follows the motions that the robot comes up with."""
+
+    every: int = 5
+    """Optimisation steps between two learning phases."""
+    epochs: int = 20
+    """Most epochs in a learning phase."""
+    batches: int = 16
+    """Minibatches in an epoch."""
+    batch: int = 64
+    """Pictures in a minibatch."""
+    rate: float = 1e-3
+    """Learning rate of the autoencoder (Adam)."""
+    variational: bool = True
+    """False trains a plain autoencoder."""
+    kl: float = 1e-4
+    """Weight of the Kullback-Leibler term of the variational autoencoder; the value of later work of the authors."""
+    early_stopping: bool = True
+    """Refinement 1: stop when the loss on simulations held out stops falling, and keep the best weights."""
+    patience: int = 5
+    """Epochs without a better validation loss before stopping."""
+    validation: float = 0.2
+    """Share of the simulations that are held out for validation."""
+    replay: bool = True
+    """Refinement 2: learn from many past simulations; False learns from those since the last learning phase."""
+    simulations: int = 50
+    """Most simulations in the replay buffer; the oldest go first."""
+    megabytes: float = 256.0
+    """Most memory of the replay buffer [MB]; the oldest simulations go first."""
+    frame_every: int = 2
+    """Control steps between two recorded pictures."""
+    target_network: bool = True
+    """Refinement 3: the policy sees through a copy that follows slowly; False, through the network in training."""
+    target_rate: float = 0.3
+    """How much of the way to the trained network the copy goes after each learning phase; 1 copies it."""
+
+    def __post_init__(self):
+        _positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")
+        _positive("learning", self, "simulations", "megabytes", "frame_every")
+        _share("learning", self, "target_rate")
+        if not 0.0 < self.validation <= 0.5:
+            raise ValueError(f"learning.validation must lie in (0, 0.5], got {self.validation}.")
+        if not (math.isfinite(self.kl) and self.kl >= 0):
+            raise ValueError(f"learning.kl must be ≥ 0, got {self.kl}.")
+
+
+@dataclass(kw_only=True)
+class TrainConf:
+    """The run as a whole."""
+
+    iterations: int = 100
+    """Gradient steps, each after one simulation; the paper's experiments take 100."""
+    seed: int = 0
+    """Everything random follows from it: on a CPU, the same seed gives the same run to the last bit."""
+    worlds: int = 1
+    """Simulations side by side in each step; more than one pays where goals are random."""
+    goal_spread: list[float] = field(default_factory=list)
+    """Half width along each axis [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
+    record_every: int = 10
+    """Record the first, every such, the last and the best episode to run.h5; 0 records nothing."""
+    frame_every: int = 1
+    """Control steps between two recorded frames."""
+
+    def __post_init__(self):
+        _positive("train", self, "iterations", "worlds", "frame_every")
+        if self.record_every < 0:
+            raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
+        if any(not (math.isfinite(s) and s >= 0) for s in self.goal_spread):
+            raise ValueError(f"train.goal_spread must be lengths ≥ 0, got {list(self.goal_spread)}.")
+
+
+@dataclass(kw_only=True)
+class Settings:
+    """All of them together."""
+
+    observer: ObserverConf = field(default_factory=ObserverConf)
+    policy: PolicyConf = field(default_factory=PolicyConf)
+    design: DesignConf = field(default_factory=DesignConf)
+    optimizer: OptimizerConf = field(default_factory=OptimizerConf)
+    learning: LearningConf = field(default_factory=LearningConf)
+    train: TrainConf = field(default_factory=TrainConf)

@@ -1,0 +1,86 @@
+"""A tapered arm in 2D, clamped at its foot, that reaches a place with its tip. Sizes and materials are our own choice.
+
+Three segments, each with a muscle on its left and on its right. It lies on a table: no gravity by default.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm_learn.objective import Reach
+from softmpm_learn.tasks.outline import Limb, fill
+from softmpm_learn.tasks.task import Task, TaskConf, clock
+
+BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
+LENGTH = 0.36  # clamp to tip [m]
+WIDTH = (0.075, 0.050)  # at the clamp and at the tip [m]
+SEGMENTS = {"lower": (0.0, 0.34), "middle": (0.34, 0.67), "upper": (0.67, 1.0)}
+TIP = 0.92  # the tip's particles start this far along the arm
+
+
+@dataclass(kw_only=True)
+class ArmConf(TaskConf):
+    """An arm that reaches a place."""
+
+    name: str = "arm"
+    gravity: float = 0.0
+    """Downward acceleration [m/s²]; 0: the arm lies on a table."""
+    damping: float = 2.0
+    """Rate at which velocity decays [1/s]."""
+    goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
+    """Where the tip should be when the episode ends: x and y [m]; at rest it is at (0.45, 0.41)."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if len(self.goal) != 2 or not all(math.isfinite(c) for c in self.goal):
+            raise ValueError(f"task.goal must be two numbers, x and y, such as task.goal=[0.6,0.35], got {self.goal}.")
+        away = math.dist(self.goal, BASE)
+        if away > LENGTH or self.goal[1] < BASE[1]:
+            raise ValueError(
+                f"task.goal must be above the clamp and within the arm's {LENGTH} m of {BASE}, got {self.goal}: {away:.2f} m."
+            )
+
+
+def arm(conf: ArmConf) -> Task:
+    """Build the arm: about 740 particles as a draft, 1,900 at the standard resolution."""
+    root = 3 * conf.spacing  # this much of the arm is inside the clamp
+    way = np.array([-root / LENGTH, 0.0, 1.0])
+    line = np.array(BASE) + way[:, None] * np.array([0.0, LENGTH])
+    limb = Limb(line[1:], np.array(WIDTH), round_tip=True)
+    clamped = Limb(line[:2], np.array([WIDTH[0], WIDTH[0]]))
+    rest = fill([limb.outline(), clamped.outline()], conf.spacing / 2).positions
+    regions = {name: limb.part(rest, start, end if end < 1 else 1.01) for name, (start, end) in SEGMENTS.items()}
+    muscles = [
+        Muscle(particles=limb.part(rest, start, end if end < 1 else 1.01, side), direction=(0.0, 1.0), strength=conf.strength)
+        for start, end in SEGMENTS.values()
+        for side in (1, -1)
+    ]
+    nodes = conf.resolution.value
+    scene = Scene(
+        grid=Grid(shape=(round(0.9 * nodes), round(0.6 * nodes)), spacing=conf.spacing),
+        bodies=[
+            Body(
+                Particles(rest, (conf.spacing / 2) ** 2),
+                NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson),
+            )
+        ],
+        muscles=muscles,
+        walls=[Wall(normal=(0.0, 1.0), offset=BASE[1], contact="stick")],
+        gravity=(0.0, -conf.gravity),
+        damping=conf.damping,
+        dt=conf.control_period,
+    )
+    scene, control_steps, substeps = clock(conf, scene)
+    goal = np.array(conf.goal, dtype=float)
+    return Task(
+        name="arm",
+        scene=scene,
+        control_steps=control_steps,
+        substeps=substeps,
+        regions=regions,
+        objective=Reach(particles=limb.part(rest, TIP, 1.01), target=goal),
+        body_length=LENGTH,
+        goal=goal,
+    )

@@ -1,0 +1,72 @@
+"""A two-legged walker in 2D: a rounded body on a hind and a front leg. Sizes and materials are our own choice."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm_learn.objective import Progress
+from softmpm_learn.tasks.outline import Limb, fill, smooth
+from softmpm_learn.tasks.task import Task, TaskConf, clock
+
+TORSO = (
+    *((0.000, 0.215), (0.018, 0.165), (0.075, 0.145), (0.150, 0.140), (0.225, 0.145), (0.282, 0.165)),
+    *((0.300, 0.215), (0.275, 0.255), (0.210, 0.270), (0.150, 0.273), (0.090, 0.270), (0.025, 0.255)),
+)  # x, y [m], feet at y = 0
+LEGS = {"hind": ((0.065, 0.19), (0.050, 0.0)), "front": ((0.235, 0.19), (0.250, 0.0))}  # hip and sole [m]
+LEG_WIDTH = ((0.0, 0.085), (0.4, 0.068), (0.85, 0.062), (1.0, 0.070), (1.1, 0.070))  # way down, width [m]
+LEG_MUSCLE = (0.12, 1.01)
+
+
+@dataclass(kw_only=True)
+class BipedConf(TaskConf):
+    """A two-legged walker that walks to the right."""
+
+    name: str = "biped"
+    friction: float = 0.8
+    """Coulomb friction of the floor [-]."""
+
+
+def biped(conf: BipedConf) -> Task:
+    """Build the walker: about 1,400 particles as a draft, 3,600 at the standard resolution."""
+    floor = 0.0625
+    way, width = np.array(LEG_WIDTH).T
+    limbs = {n: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width) for n, (hip, sole) in LEGS.items()}
+    soles = [np.maximum(limb.outline(), (-np.inf, 0.0)) for limb in limbs.values()]
+    rest = fill([smooth(TORSO), *soles], conf.spacing / 2).positions
+    regions = {name: limb.part(rest, *LEG_MUSCLE) for name, limb in limbs.items()}
+    muscles = [
+        Muscle(particles=limb.part(rest, *LEG_MUSCLE, side), direction=limb.direction(*LEG_MUSCLE), strength=conf.strength)
+        for limb in limbs.values()
+        for side in (1, -1)
+    ]
+    regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
+    nodes = conf.resolution.value
+    scene = Scene(
+        grid=Grid(shape=(round(1.5 * nodes), round(0.5 * nodes)), spacing=conf.spacing),
+        bodies=[
+            Body(
+                Particles(rest + np.array([0.2, floor + 0.5 * conf.spacing]), (conf.spacing / 2) ** 2),
+                NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson),
+            )
+        ],
+        muscles=muscles,
+        walls=[
+            Wall(normal=(0.0, 1.0), offset=floor, contact="separate", friction=conf.friction),
+            Wall(normal=(1.0, 0.0), offset=0.05),
+            Wall(normal=(-1.0, 0.0), offset=-1.45),
+        ],
+        gravity=(0.0, -conf.gravity),
+        damping=conf.damping,
+        dt=conf.control_period,
+    )
+    scene, control_steps, substeps = clock(conf, scene)
+    return Task(
+        name="biped",
+        scene=scene,
+        control_steps=control_steps,
+        substeps=substeps,
+        regions=regions,
+        objective=Progress(),
+        body_length=float(np.ptp(rest[:, 0])),
+    )

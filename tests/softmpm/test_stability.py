@@ -1,0 +1,187 @@
+"""The largest stable step is the largest: just below it a particle rests, just above it flies apart."""
+
+import copy
+import dataclasses
+import math
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene
+from softmpm.stability import StabilityWarning, stable_dt, warn_unstable
+
+DX, RHO = 0.1, 2.0
+
+
+def scene(material, dim=2, muscles=(), count=4, dt=1e-3, seed=0) -> Scene:
+    positions = np.random.default_rng(seed).uniform(0.25, 0.45, (count, dim))
+    grid = Grid(shape=(9,) * dim, spacing=DX)
+    return Scene(grid=grid, bodies=[Body(Particles(positions, 1e-4), material)], muscles=muscles, dt=dt)
+
+
+def muscle(direction, strength, particles=(0,)) -> Muscle:
+    return Muscle(particles=list(particles), direction=direction, strength=strength)
+
+
+def stencil(x):
+    """Weights, places and numbers of the 3ᵈ nodes around x, by the definition of the quadratic B-spline."""
+    nodes = np.stack(
+        np.meshgrid(*[np.floor(x[a] / DX - 0.5) + np.arange(3) for a in range(len(x))], indexing="ij"), -1
+    )
+    nodes = nodes.reshape(-1, len(x))
+    s = np.abs(x / DX - nodes)
+    return (
+        np.where(s < 0.5, 0.75 - s**2, 0.5 * (1.5 - s) ** 2).prod(axis=1),
+        nodes * DX - x,
+        nodes.astype(int),
+    )
+
+
+def tau(F, material, muscles):
+    """Kirchhoff stress of a nearly resting F, written out once more, in NumPy."""
+    E, nu, eye = material.young, material.poisson, np.eye(len(F))
+    mu, lam, J = E / (2 + 2 * nu), E * nu / ((1 + nu) * (1 - 2 * nu)), np.linalg.det(F)
+    if isinstance(material, NeoHookean):
+        stress = mu * (F @ F.T - eye) + lam * math.log(J) * eye
+    else:
+        U, _, Vt = np.linalg.svd(F)
+        stress = 2 * mu * (F - U @ Vt) @ F.T + lam * (J - 1) * J * eye
+    return stress + sum(abs(m.strength) * np.outer(F @ m.direction, F @ m.direction) for m in muscles)
+
+
+def growth(material, muscles, dim, dt, steps, rng):
+    """How far the strain of one particle, alone on the grid, grows from 1e-9: the whole step in NumPy."""
+    x, v, C, F = rng.uniform(0.3, 0.4, dim), np.zeros(dim), np.zeros((dim, dim)), np.eye(dim)
+    noise = rng.normal(size=(dim, dim))
+    F, held, largest = F + 1e-9 * (noise + noise.T), tau(F, material, muscles), 0.0
+    for _ in range(steps):
+        w, r, _ = stencil(x)
+        force = (
+            (tau(F, material, muscles) - held) * 4 / (material.density * DX**2)
+        )  # about the activated state
+        node_v = v + r @ (C - dt * force).T  # the node's mass is w m: both weights cancel
+        v, C = w @ node_v, 4 / DX**2 * np.einsum("n,ni,nj->ij", w, node_v, r)
+        x, F = x + dt * v, (np.eye(dim) + dt * C) @ F
+        largest = max(largest, np.abs(F - np.eye(dim)).max() / 1e-9)
+    return largest
+
+
+@pytest.mark.parametrize("law", [NeoHookean, FixedCorotated])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("poisson", [-0.5, 0.0, 0.3, 0.49])
+@pytest.mark.parametrize("actuation", [(), (40.0,), (150.0, -60.0)])
+def test_limit_of_a_particle_alone(law, dim, poisson, actuation):
+    """At 0.99 of the limit a small strain stays small for 300 steps, at 1.01 it grows a thousandfold within 60."""
+    material = law(density=RHO, young=100.0, poisson=poisson)
+    directions = [(0.6, 0.8, 0.0)[:dim], (0.2, 1.0, -0.7)[:dim]]
+    muscles = [muscle(d, s) for d, s in zip(directions, actuation, strict=False)]
+    limit = stable_dt(scene(material, dim, muscles))
+    rng = np.random.default_rng(1)
+    assert growth(material, muscles, dim, 0.99 * limit, 300, rng) < 100
+    assert growth(material, muscles, dim, 1.01 * limit, 60, rng) > 1000
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.49])
+def test_closed_form(dim, poisson):
+    """Without muscles the limit is dx · √(ρ / (dim·λ + 2μ)); half the spacing or four times the stiffness halve it."""
+    material = NeoHookean(density=RHO, young=100.0, poisson=poisson)
+    mu, lam = 50.0 / (1 + poisson), 100.0 * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    limit = stable_dt(scene(material, dim))
+    assert limit == pytest.approx(DX * math.sqrt(RHO / (dim * lam + 2 * mu)), rel=1e-13)
+    stiff = stable_dt(scene(dataclasses.replace(material, young=400.0), dim))
+    assert stiff == pytest.approx(limit / 2, rel=1e-13)
+
+
+def test_shared_nodes_are_no_faster():
+    """Clouds of unlike particles that share nodes: the grid's fastest oscillation is within the limit's ω ≤ 2 / dt."""
+    rng = np.random.default_rng(2)
+    fastest = 0.0
+    for _ in range(20):
+        materials = [
+            NeoHookean(density=rng.uniform(0.1, 9), young=rng.uniform(1, 99), poisson=p) for p in (0.1, 0.4)
+        ]
+        parts = [rng.uniform(0.3, rng.uniform(0.32, 0.6), (6, 2)) for _ in materials]
+        bodies = [
+            Body(Particles(x, rng.uniform(0.2, 1.0, 6)), m) for x, m in zip(parts, materials, strict=True)
+        ]
+        limit = stable_dt(Scene(grid=Grid(shape=(9, 9), spacing=DX), bodies=bodies, dt=1e-3))
+        mass, stiffness = np.zeros(81), np.zeros((162, 162))
+        for body in bodies:
+            m = body.material
+            mu, lam = (
+                m.young / (2 + 2 * m.poisson),
+                m.young * m.poisson / ((1 + m.poisson) * (1 - 2 * m.poisson)),
+            )
+            for x, volume in zip(body.particles.positions, body.particles.volume, strict=True):
+                w, r, node = stencil(x)
+                number = node[:, 0] * 9 + node[:, 1]
+                mass[number] += w * m.density * volume
+                strain = np.zeros((2, 2, 162))  # of the nodes' displacements
+                for a in range(2):
+                    for b in range(2):
+                        np.add.at(strain[a, b], 2 * number + a, 2 / DX**2 * w * r[:, b])
+                        np.add.at(strain[b, a], 2 * number + a, 2 / DX**2 * w * r[:, b])
+                trace = strain[0, 0] + strain[1, 1]
+                stiffness += volume * (
+                    2 * mu * np.einsum("abi,abj->ij", strain, strain) + lam * np.outer(trace, trace)
+                )
+        used = np.repeat(mass > 0, 2)
+        root = 1 / np.sqrt(np.repeat(mass, 2)[used])
+        omega = math.sqrt(np.linalg.eigvalsh(root[:, None] * stiffness[np.ix_(used, used)] * root)[-1])
+        fastest = max(fastest, omega * limit / 2)
+        assert omega * limit <= 2 * (1 + 1e-9)
+    assert fastest > 0.7  # near enough to see an error
+
+
+def test_names_what_limits():
+    """The text names the body, its material, the muscles at the limiting particle, and that particle."""
+    soft, stiff = NeoHookean(density=1.0, young=10.0), FixedCorotated(density=1.0, young=25.0, poisson=0.2)
+    points = np.random.default_rng(0).uniform(0.25, 0.45, (6, 2))
+    bodies = [Body(Particles(points[:4], 1e-4), soft), Body(Particles(points[4:], 1e-4), stiff)]
+    made = Scene(grid=Grid(shape=(9, 9), spacing=DX), bodies=bodies, dt=1e-3)
+    plain = stable_dt(made)
+    assert "body 1 (FixedCorotated, young 25 Pa, poisson 0.2, density 1 kg/m³)" in plain.limit
+    assert "muscle" not in plain.limit
+    pulls = [muscle((0, 1), 6.0, (0, 1, 2)), muscle((1, 0), 1.0, (4,)), muscle((0, 1), -7.0, (2, 3))]
+    pulled = stable_dt(dataclasses.replace(made, muscles=pulls))
+    assert "body 0 (NeoHookean, young 10 Pa" in pulled.limit and pulled < plain
+    assert "under muscle 0 (6 Pa) + muscle 2 (-7 Pa) at full activation, as at particle 2" in pulled.limit
+
+
+def test_each_particle_has_its_own_muscles():
+    """The limit is the smallest over particles, each with the muscles that it is in: overlap counts, spread does not."""
+    material, at = (
+        NeoHookean(density=RHO, young=100.0),
+        lambda *muscles: stable_dt(scene(material, muscles=muscles)),
+    )
+    one, twice = at(muscle((1, 0), 50.0)), at(muscle((1, 0), 100.0))
+    assert at(muscle((1, 0), 50.0, (0,)), muscle((1, 0), 50.0, (1, 3))) == one
+    assert at(muscle((1, 0), 50.0, (0, 1)), muscle((1, 0), 50.0, (1, 3))) == pytest.approx(twice, rel=1e-13)
+    assert twice < one < at()
+
+
+def test_warns_only_above():
+    """A scene at its limit builds silently; above it the warning says what limits and which step to take."""
+    made = scene(NeoHookean(density=RHO, young=100.0))
+    limit = stable_dt(made)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_unstable(dataclasses.replace(made, dt=limit.dt))
+    with pytest.warns(
+        StabilityWarning, match=r"dt = .* above the largest stable one, .* set by body 0 .*Use a dt of about"
+    ):
+        warn_unstable(dataclasses.replace(made, dt=1.0001 * limit.dt))
+
+
+def test_is_a_number():
+    """The limit computes like a float, becomes a scene's dt, and keeps its text through copies."""
+    made = scene(NeoHookean(density=RHO, young=100.0))
+    limit = stable_dt(made)
+    assert type(limit.dt) is float and limit.dt == limit and 0.5 * limit == limit.dt / 2
+    assert dataclasses.replace(made, dt=limit).dt == limit
+    assert stable_dt(dataclasses.replace(made, dt=1.0)) == limit
+    for other in (copy.deepcopy(limit), pickle.loads(pickle.dumps(limit))):
+        assert other == limit and other.limit == limit.limit
