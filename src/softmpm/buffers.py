@@ -16,6 +16,14 @@ def view(tensor: Tensor, dtype) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+def clear(tensor: Tensor) -> None:
+    """Set to zero; on the CPU through Warp, since PyTorch would wake its thread pool for each of many small buffers."""
+    if tensor.device.type == "cpu":
+        wp.from_torch(tensor, requires_grad=False).zero_()
+    else:
+        tensor.zero_()
+
+
 def lame(params: Params) -> tuple[Tensor, Tensor]:
     """Lamé's μ = E / 2(1 + ν) and λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
     young, poisson = params.young, params.poisson

@@ -3,7 +3,7 @@
 Each message says what must hold, what came instead and what to do. Rules of one object stand in ``scene.py``.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -97,14 +97,14 @@ def _check_walls(scene: Scene) -> None:
         )
 
 
-def _check_axes(name: str, vector: tuple[float, ...], grid: Grid) -> None:
+def _check_axes(name: str, vector: Sequence[float], grid: Grid) -> None:
     need(
         len(vector) == grid.dim,
         f"{name} needs {grid.dim} numbers, one per axis of the grid, got {_tuple(vector)}.",
     )
 
 
-def _tuple(values: "np.ndarray | tuple[float, ...]") -> str:
+def _tuple(values: np.ndarray | Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.5g}" for value in values) + ")"
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj
+from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj, clear
 from softmpm.kernels.types import Wanted
 from softmpm.memory import plan
 from softmpm.model import Model
@@ -88,7 +88,7 @@ def rollout_adj(model: Model, horizon: Horizon, kept: Motion, pull: Tensor | Non
         now_slot, then_slot = segments.states(s)
         if row is not None:
             row.copy_(pull[s // horizon.substeps])
-        adjoints[s % 2].flat.zero_()
+        clear(adjoints[s % 2].flat)
         step.adjoint(wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, s)
         if wanted.activation and s % horizon.substeps == 0:
             step.collect_pull(adj_solid, adj_pull[s // horizon.substeps])

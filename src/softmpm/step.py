@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import SolidAdj, view
+from softmpm.buffers import SolidAdj, clear, view
 from softmpm.kernels.boundary import boundary
 from softmpm.kernels.grid import grid
 from softmpm.kernels.solid import collect_pull
@@ -36,6 +36,7 @@ class Substep:
     def __init__(self, model: Model, solid):
         self.model, self.solid, self.stream = model, solid, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
+        transfer(model.spec), grid(model.spec)  # all of a module is defined before it is first loaded, and so compiled once
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
         self.watch_words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
@@ -78,7 +79,7 @@ class Substep:
         """P2G and the grid stage: velocity of the nodes."""
         scale, spec = self.model.scale, self.model.spec
         node, velocity = self._array("node"), self._array("velocity")
-        self.node.zero_()
+        clear(self.node)
         self.launch(transfer(spec).p2g, self.particles, scale, self.solid, self.watch, now, node)
         self.launch(grid(spec).grid_velocity, self.nodes, scale, self.model.walls, node, velocity)
 
@@ -91,7 +92,7 @@ class Substep:
     def adjoint(self, wanted: Wanted, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:
         """Adjoint of :meth:`advance`: adds into ``adj_now`` and ``adj_solid``. The grid is computed again."""
         self.to_grid(now)
-        self.adj_velocity.zero_()
+        clear(self.adj_velocity)
         self.g2p_adj(wanted, now, then, adj_then, adj_now)
         self.grid_adj()
         self.p2g_adj(wanted, now, adj_now, adj_solid, substep)

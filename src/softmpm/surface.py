@@ -56,13 +56,13 @@ def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
 def _inside(
     # In:
     surface: wp.uint64,
-    points: wp.array(dtype=wp.vec3),
+    points: wp.array(dtype=wp.vec3),  # pyright: ignore
     # Out:
-    inside: wp.array(dtype=wp.int32),
+    inside: wp.array(dtype=wp.int32),  # pyright: ignore
 ):
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(surface, points[i], 10.0)  # the mesh spans one
-    if query.result and query.sign < 0.0:
+    if query.result and query.sign < 0.0:  # pyright: ignore
         inside[i] = 1
 
 

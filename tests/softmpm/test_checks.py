@@ -34,6 +34,7 @@ def scene(*bodies, **changes) -> Scene:
 
 
 def refused(made: Scene, *words: str):
+    """check_scene refuses, with these words in this order."""
     with pytest.raises(ValueError, match=".*".join(re.escape(word) for word in words)):
         check_scene(made)
 
@@ -83,21 +84,29 @@ def test_muscles_name_particles_of_the_scene():
 
 @pytest.mark.parametrize("grid_spacing", [0.1, 1 / 7, 1 / 64])
 def test_no_particle_twice(grid_spacing):
-    """Two bodies may touch, not overlap: a particle twice is found whatever rounding its place went through."""
+    """Two bodies may touch, not overlap: every particle that is there twice is found."""
     step = grid_spacing / 2
     room = Grid(shape=(64, 64), spacing=grid_spacing)
     left = box((4 * step, 4 * step), (10 * step, 10 * step), step)
     for shift in (3, 5):  # moved by whole spacings, written in another way
         corner, far = (4 + shift) * step, (10 + shift) * step
         right = box((corner, 4 * step), (far, 10 * step), step)
-        both = scene(Body(left, SOFT), Body(right, SOFT), grid=room)
-        refused(both, "particles ", " (body 0) and ", " (body 1) are at the same place", "must not overlap")
+        both, more = scene(Body(left, SOFT), Body(right, SOFT), grid=room), 6 * (6 - shift) - 1
+        refused(both, "(body 0) and", "(body 1) are at the same place", f"{more} more", "must not overlap")
     touching = box((10 * step, 4 * step), (16 * step, 10 * step), step)
     check_scene(scene(Body(left, SOFT), Body(touching, SOFT), grid=room))
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_rounding_hides_no_copy(sign):
+    """A copy that differs in its last digits is a copy, also at a multiple of the tolerance."""
+    copy = np.array((0.25, 0.5)) * (1 + sign * 1e-15)
+    refused(scene(body((0.25, 0.5)), body(copy)), "at the same place")
+    check_scene(scene(body((0.25, 0.5)), body(copy + 1e-5 * DX)))
+
+
 def test_message_of_a_particle_twice():
-    """The message names both particles by the model's index, their place, and how many more pairs there are."""
+    """The message names both particles by the model's index, their place, and how many more pairs."""
     overlap = scene(body((0.5, 0.5), (0.25, 0.5)), body((0.75, 0.5), (0.25, 0.5), (0.5, 0.5)))
     refused(overlap, "particles 1 (body 0) and 3 (body 1)", "(0.25, 0.5) m, and 1 more such pairs")
     refused(scene(body((0.5, 0.5), (0.5, 0.5))), "particles 0 (body 0) and 1 (body 0)", "0 more")
@@ -184,7 +193,7 @@ def test_activation_shape():
 
 @pytest.mark.parametrize("shape", [(2,), (3, 2), (3, 1), (1, 2, 3), (4,), (0,)])
 def test_params_shape(shape):
-    """A material that does not broadcast to (world, particle) is refused, with the way to one value a world."""
+    """A material that does not broadcast to (world, particle) is refused; it says how to give one a world."""
     with pytest.raises(ValueError, match=r"params.poisson must broadcast to .* \(2, 3\).*\(world, 1\)"):
         check_params(MODEL, params(poisson=torch.ones(shape)))
 
@@ -246,7 +255,7 @@ def test_not_finite(name, bad):
     "name, bad", [("young", 0.0), ("density", -1.0), ("poisson", 0.5), ("poisson", -1.0)]
 )
 def test_impossible_materials(name, bad):
-    """A material outside its bounds is refused before it is simulated, also while a graph is being recorded."""
+    """A material outside its bounds is refused, also where it requires gradients."""
     tensors = params(**{name: torch.tensor([0.3, 0.3, bad], requires_grad=True)})
     with pytest.raises(ValueError, match=rf"params.{name} must be .*{name}\[2\] is {bad:g}"):
         check_values(state(), None, tensors)

@@ -102,7 +102,7 @@ def test_directions_are_normalised():
 
 
 def test_plain_numbers_inside():
-    """NumPy scalars and lists become plain numbers and tuples, so that equal settings are equal and hash alike."""
+    """NumPy scalars and lists become plain numbers and tuples, so equal settings hash alike."""
     grid = Grid(shape=np.array([8, 9]), spacing=np.float32(0.5))
     assert grid == Grid(shape=[8, 9.0], spacing=0.5) and hash(grid) == hash(Grid(shape=(8, 9), spacing=0.5))
     assert all(type(n) is int for n in grid.shape) and type(grid.spacing) is float

@@ -11,7 +11,7 @@ from softmpm.shapes import ball, box
 
 @pytest.mark.parametrize("lower, upper", [((0.3, 0.1), (0.5, 0.3)), ((0.0, 0.0, -1.0), (0.33, 0.1, 0.27))])
 def test_box_mass_is_exact(lower, upper):
-    """Whatever the spacing, the particles' volumes add up to the box's own, and their centre is its centre."""
+    """Whatever the spacing, the particles' volumes add up to the box's own, and they share its centre."""
     volume, center = np.prod(np.subtract(upper, lower)), np.add(upper, lower) / 2
     for spacing in (0.1, 0.05, 1 / 30, 0.0123):
         particles = box(lower, upper, spacing)
@@ -21,7 +21,7 @@ def test_box_mass_is_exact(lower, upper):
 
 
 def test_box_lattice():
-    """Particles start half a spacing off the lower corner, the last axis runs fastest, twice the same is the same."""
+    """Particles start half a spacing off the lower corner; the last axis runs fastest; no call differs."""
     particles = box((1.0, 2.0), (1.75, 2.5), 0.25)
     want = [(1.125 + 0.25 * i, 2.125 + 0.25 * j) for i in range(3) for j in range(2)]
     np.testing.assert_allclose(particles.positions, want, atol=1e-15)

@@ -12,7 +12,7 @@ L_SHAPE = np.array([[1, 0, 0], [1, 0, 0], [1, 1, 1]], dtype=bool)  # the top row
 
 
 def test_one_particle_for_each_pixel():
-    """With spacing = height / rows every pixel inside gives one particle at its middle, y up: mass is pixel area."""
+    """With spacing = height / rows every pixel inside gives one particle at its middle, y up."""
     particles = image(L_SHAPE, (1.0, 2.0), height=3.0, spacing=1.0)
     want = [(1.5, 2.5), (1.5, 3.5), (1.5, 4.5), (2.5, 2.5), (3.5, 2.5)]
     np.testing.assert_allclose(particles.positions, want, atol=1e-14)
@@ -21,7 +21,7 @@ def test_one_particle_for_each_pixel():
 
 @pytest.mark.parametrize("fine", [2, 3, 5])
 def test_finer_lattice_keeps_the_area(fine):
-    """A lattice that divides the pixels keeps the silhouette's area exactly, whatever the height's rounding."""
+    """A lattice that divides the pixels keeps the silhouette's area exactly, whatever the rounding."""
     rng = np.random.default_rng(0)
     mask = rng.random((17, 23)) < 0.4
     particles = image(mask, (0.1, 0.2), height=0.7, spacing=0.7 / 17 / fine)
@@ -34,6 +34,17 @@ def test_coarser_lattice_converges():
     particles = image(x**2 + y**2 < 0.8**2, (-1.0, -1.0), height=2.0, spacing=0.043)
     assert particles.volume.sum() == pytest.approx(np.pi * 0.64, rel=0.02)
     assert particles.positions.mean(axis=0) == pytest.approx((0.0, 0.0), abs=0.01)
+
+
+@pytest.mark.parametrize("height", [0.6, 0.7, 1.3])
+def test_half_covered_cells_count(height):
+    """Cells of two by two pixels: two pixels inside make a particle, one does not, whatever the rounding."""
+    mask = np.kron(np.ones((3, 3), dtype=bool), [[True, False, True, False], [True, False, False, False]])
+    particles = image(mask > 0, (0.0, 0.0), height=height, spacing=height / 3)
+    assert (
+        len(particles) == 9
+        and (np.round(particles.positions[:, 0] * 3 / height - 0.5).astype(int) % 2 == 0).all()
+    )
 
 
 def test_full_picture_is_a_box():

@@ -73,7 +73,7 @@ def growth(material, muscles, dim, dt, steps, rng):
 @pytest.mark.parametrize("poisson", [-0.5, 0.0, 0.3, 0.49])
 @pytest.mark.parametrize("actuation", [(), (40.0,), (150.0, -60.0)])
 def test_limit_of_a_particle_alone(law, dim, poisson, actuation):
-    """At 0.99 of the limit a small strain stays small for 300 steps, at 1.01 it grows a thousandfold within 60."""
+    """At 0.99 of the limit a small strain stays small for 300 steps, at 1.01 it grows 1000-fold within 60."""
     material = law(density=RHO, young=100.0, poisson=poisson)
     directions = [(0.6, 0.8, 0.0)[:dim], (0.2, 1.0, -0.7)[:dim]]
     muscles = [muscle(d, s) for d, s in zip(directions, actuation, strict=False)]
@@ -86,7 +86,7 @@ def test_limit_of_a_particle_alone(law, dim, poisson, actuation):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.49])
 def test_closed_form(dim, poisson):
-    """Without muscles the limit is dx · √(ρ / (dim·λ + 2μ)); half the spacing or four times the stiffness halve it."""
+    """Without muscles the limit is dx · √(ρ / (dim·λ + 2μ)); four times the stiffness halve it."""
     material = NeoHookean(density=RHO, young=100.0, poisson=poisson)
     mu, lam = 50.0 / (1 + poisson), 100.0 * poisson / ((1 + poisson) * (1 - 2 * poisson))
     limit = stable_dt(scene(material, dim))
@@ -96,7 +96,7 @@ def test_closed_form(dim, poisson):
 
 
 def test_shared_nodes_are_no_faster():
-    """Clouds of unlike particles that share nodes: the grid's fastest oscillation is within the limit's ω ≤ 2 / dt."""
+    """Unlike particles that share nodes: the grid's fastest oscillation keeps to ω ≤ 2 / dt."""
     rng = np.random.default_rng(2)
     fastest = 0.0
     for _ in range(20):
@@ -152,7 +152,7 @@ def test_names_what_limits():
 
 
 def test_each_particle_has_its_own_muscles():
-    """The limit is the smallest over particles, each with the muscles that it is in: overlap counts, spread does not."""
+    """The limit is the smallest over particles, each with the muscles that it is in: overlap counts."""
     material, at = (
         NeoHookean(density=RHO, young=100.0),
         lambda *muscles: stable_dt(scene(material, muscles=muscles)),

@@ -44,7 +44,7 @@ def test_inside_is_the_winding_number():
 
 
 def test_place_and_size_do_not_matter():
-    """A thousandth of the size, far from the origin, the same particles are inside: the query is scaled to one."""
+    """A thousandth of the size, far from the origin, the same are inside: the query is scaled to one."""
     solid = trimesh.creation.icosphere(subdivisions=2)
     small = solid.copy().apply_scale(1e-3).apply_translation((10.0, 20.0, 30.0))
     want = mesh(solid, 0.25).positions
@@ -59,6 +59,16 @@ def test_inside_out_and_overlap():
     np.testing.assert_array_equal(mesh(inside_out, 0.25).positions, mesh(solid, 0.25).positions)
     both = trimesh.util.concatenate(solid, solid.copy().apply_translation((0.5, 0, 0)))
     assert mesh(both, 0.25).volume.sum() == pytest.approx(1.5, rel=1e-12)
+
+
+def test_parts_within_a_part():
+    """Small boxes that hide the way out along x, y and z from a point leave it inside: no ray is asked."""
+    parts = [trimesh.creation.box(extents=(4, 4, 4))]
+    for way in np.concatenate([np.eye(3), -np.eye(3)]):
+        parts.append(trimesh.creation.box(extents=(0.5, 0.5, 0.5)).apply_translation(way))
+    surface = closed_surface(trimesh.util.concatenate(parts))
+    got = winding_inside(*surface, np.array([(0, 0, 0), (1, 0, 0), (1.5, 0, 0), (2.5, 0, 0)], dtype=float))
+    assert got.tolist() == [True, True, True, False]
 
 
 def test_file(tmp_path):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
-from softmpm_learn.objective import Reach
+from softmpm_learn.objective import Effort, Reach
 from softmpm_learn.tasks.outline import Limb, fill
 from softmpm_learn.tasks.task import Task, TaskConf, clock
 
@@ -80,7 +80,7 @@ def arm(conf: ArmConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Reach(particles=limb.part(rest, TIP, 1.01), target=goal),
+        objective=Reach(limb.part(rest, TIP, 1.01), terms=(Effort(conf.effort),)),
         body_length=LENGTH,
         goal=goal,
     )

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
-from softmpm_learn.objective import Progress
+from softmpm_learn.objective import Effort, Height, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth
 from softmpm_learn.tasks.task import Task, TaskConf, clock
 
 TORSO = (
-    *((0.000, 0.215), (0.018, 0.165), (0.075, 0.145), (0.150, 0.140), (0.225, 0.145), (0.282, 0.165)),
-    *((0.300, 0.215), (0.275, 0.255), (0.210, 0.270), (0.150, 0.273), (0.090, 0.270), (0.025, 0.255)),
+    *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
+    *((0.300, 0.165), (0.275, 0.200), (0.210, 0.213), (0.150, 0.215), (0.090, 0.213), (0.025, 0.200)),
 )  # x, y [m], feet at y = 0
-LEGS = {"hind": ((0.065, 0.19), (0.050, 0.0)), "front": ((0.235, 0.19), (0.250, 0.0))}  # hip and sole [m]
-LEG_WIDTH = ((0.0, 0.085), (0.4, 0.068), (0.85, 0.062), (1.0, 0.070), (1.1, 0.070))  # way down, width [m]
+LEGS = {"hind": ((0.065, 0.15), (0.050, 0.0)), "front": ((0.235, 0.15), (0.250, 0.0))}  # hip and sole [m]
+LEG_WIDTH = ((0.0, 0.090), (0.4, 0.075), (0.85, 0.070), (1.0, 0.078), (1.1, 0.078))  # way down, width [m]
 LEG_MUSCLE = (0.12, 1.01)
 
 
@@ -25,6 +25,8 @@ class BipedConf(TaskConf):
     name: str = "biped"
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
+    upright: float = 50.0
+    """Weight of the squared distance [m²] by which its mean height is below three quarters of that at rest."""
 
 
 def biped(conf: BipedConf) -> Task:
@@ -67,6 +69,6 @@ def biped(conf: BipedConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(),
+        objective=Progress(terms=(Effort(conf.effort), Height(conf.upright, lowest=floor + 0.75 * float(rest[:, 1].mean())))),
         body_length=float(np.ptp(rest[:, 0])),
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
-from softmpm_learn.objective import Progress
+from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth, smooth_line
 from softmpm_learn.tasks.task import Task, TaskConf, clock
 
@@ -85,7 +85,7 @@ def elephant(conf: ElephantConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(),
+        objective=Progress(terms=(Effort(conf.effort),)),
         body_length=float(np.ptp(rest[:, 0])),
     )
 

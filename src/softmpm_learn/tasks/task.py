@@ -30,13 +30,13 @@ class TaskConf:
     """Length of an episode [s]."""
     control_period: float = 0.0125
     """Time between two decisions of the policy [s]."""
-    young: float = 2e4
+    young: float = 5e4
     """Young's modulus E [Pa]; where co-design starts."""
     poisson: float = 0.3
     """Poisson's ratio ν [-]; where co-design starts."""
     density: float = 1000.0
     """Rest density ρ₀ [kg/m³]; where co-design starts."""
-    strength: float = 8e3
+    strength: float = 2e4
     """Stress of a muscle at full activation [Pa]."""
     gravity: float = 9.81
     """Downward acceleration [m/s²]; 0 is weightless."""
@@ -44,8 +44,8 @@ class TaskConf:
     """Rate at which velocity decays [1/s]."""
     safety: float = 0.4
     """Substep over the largest stable one of the undeformed robot; room for stretch and for co-design to stiffen it."""
-    effort: float = 0.0
-    """Weight of the mean squared activation in the loss."""
+    effort: float = 1e-3
+    """Weight of the mean squared activation in the loss; it decides between motions that are equally good."""
 
     def __post_init__(self):
         positive = ("seconds", "control_period", "young", "density", "strength", "safety")
