@@ -1,8 +1,50 @@
-"""softmpm: differentiable simulation of soft robots."""
+"""softmpm: differentiable simulation of soft robots.
+
+A scene (what a person designs) is built into a model (what is fixed on a device); ``simulate`` advances states of it and is
+differentiable in the start, the activation and the material:
+
+    model = softmpm.build(scene)
+    end = softmpm.simulate(model, model.rest(), activation, model.params(), substeps=20)
+"""
 
 from softmpm.autograd import rasterize, simulate
 from softmpm.model import Model, build
 from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene, Wall
-from softmpm.state import GridField, Params, State
+from softmpm.shapes import ball, box, image, mesh
+from softmpm.stability import StabilityWarning, StableDt, stable_dt
+from softmpm.state import GridField, Low, Params, State
 from softmpm.tape import WarpSolid, WarpState, step, torch_state, warp_solid, warp_state
 from softmpm.watch import UnstableError
+
+__all__ = [
+    "Body",
+    "FixedCorotated",
+    "Grid",
+    "GridField",
+    "Low",
+    "Model",
+    "Muscle",
+    "NeoHookean",
+    "Params",
+    "Particles",
+    "Scene",
+    "StabilityWarning",
+    "StableDt",
+    "State",
+    "UnstableError",
+    "Wall",
+    "WarpSolid",
+    "WarpState",
+    "ball",
+    "box",
+    "build",
+    "image",
+    "mesh",
+    "rasterize",
+    "simulate",
+    "stable_dt",
+    "step",
+    "torch_state",
+    "warp_solid",
+    "warp_state",
+]

@@ -38,13 +38,12 @@ def test_coarser_lattice_converges():
 
 @pytest.mark.parametrize("height", [0.6, 0.7, 1.3])
 def test_half_covered_cells_count(height):
-    """Cells of two by two pixels: two pixels inside make a particle, one does not, whatever the rounding."""
-    mask = np.kron(np.ones((3, 3), dtype=bool), [[True, False, True, False], [True, False, False, False]])
-    particles = image(mask > 0, (0.0, 0.0), height=height, spacing=height / 3)
-    assert (
-        len(particles) == 9
-        and (np.round(particles.positions[:, 0] * 3 / height - 0.5).astype(int) % 2 == 0).all()
-    )
+    """Of cells six pixels wide, those with three rows inside make a particle, those with two none."""
+    half, third = (np.repeat([[True], [False]], [n, 6 - n], axis=0) & np.ones((6, 6), bool) for n in (3, 2))
+    mask = np.tile(np.hstack([half, third]), (3, 3))
+    particles = image(mask, (0.0, 0.0), height=height, spacing=height / 3)
+    columns = np.round(particles.positions[:, 0] * 3 / height - 0.5).astype(int)
+    assert len(particles) == 9 and (columns % 2 == 0).all()
 
 
 def test_full_picture_is_a_box():

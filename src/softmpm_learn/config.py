@@ -1,0 +1,142 @@
+"""The settings of a run as Hydra sees them: one typed schema, and the check that nothing else slipped in.
+
+A file in ``conf/`` holds data only. The task's name picks its settings from the table of tasks; nothing that a file names
+is ever imported or called.
+"""
+
+import dataclasses
+import difflib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from softmpm_learn.settings import (
+    DesignConf,
+    LearningConf,
+    ObserverConf,
+    OptimizerConf,
+    PolicyConf,
+    Settings,
+    TrainConf,
+)
+from softmpm_learn.tasks import TASKS, TaskConf
+
+DEVICES = ("auto", "cpu", "cuda")
+DTYPES = ("float32", "float64")
+
+
+@dataclass(kw_only=True)
+class DeviceConf:
+    """Where a run happens and how precisely."""
+
+    name: str = "auto"
+    """auto takes a CUDA GPU if there is one; cpu; cuda."""
+    dtype: str = "float32"
+    """Precision of the simulation: float32 or float64."""
+    threads: int = 1
+    """CPU threads of PyTorch; the same number gives the same run to the last bit."""
+    memory: float | None = None
+    """Most memory that one simulation may keep for its gradient [MB]; null for a sensible choice."""
+
+    def __post_init__(self):
+        for name, value, known in (("name", self.name, DEVICES), ("dtype", self.dtype, DTYPES)):
+            if value not in known:
+                raise ValueError(f"device.{name} must be one of {', '.join(known)}; got {value!r}.")
+        if self.threads < 1:
+            raise ValueError(f"device.threads must be at least 1, got {self.threads}.")
+        if self.memory is not None and not self.memory > 0:
+            raise ValueError(f"device.memory must be > 0 MB or null, got {self.memory}.")
+
+
+@dataclass(kw_only=True)
+class RunConf:
+    """Everything that a run depends on."""
+
+    task: TaskConf = MISSING
+    observer: ObserverConf = field(default_factory=ObserverConf)
+    policy: PolicyConf = field(default_factory=PolicyConf)
+    design: DesignConf = field(default_factory=DesignConf)
+    optimizer: OptimizerConf = field(default_factory=OptimizerConf)
+    learning: LearningConf = field(default_factory=LearningConf)
+    train: TrainConf = field(default_factory=TrainConf)
+    device: DeviceConf = field(default_factory=DeviceConf)
+    resume: str | None = None
+    """Folder of an earlier run to continue; its configuration is used again."""
+
+    @property
+    def settings(self) -> Settings:
+        """What the learning loop needs."""
+        return Settings(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Settings)})
+
+
+def conf_dir() -> str:
+    """Folder of the YAML files: inside the installed package, or at the top of a checkout."""
+    here = Path(__file__).resolve().parent
+    places = (here / "conf", here.parents[1] / "conf")
+    for place in places:
+        if (place / "config.yaml").is_file():
+            return str(place)
+    raise FileNotFoundError(f"config.yaml is missing in {' and in '.join(map(str, places))}; install softmpm again.")
+
+
+def register() -> None:
+    """Give Hydra the schema; groups that start with an underscore are not offered to users."""
+    store = ConfigStore.instance()
+    store.store(group="_schema", name="run", node=RunConf)
+    for name, (conf, _) in TASKS.items():
+        store.store(group="_schema/task", name=name, node=conf)
+
+
+def to_run(config: DictConfig) -> RunConf:
+    """Plain settings from what Hydra composed; raises ValueError for what no schema knows."""
+    if OmegaConf.is_missing(config, "task"):
+        raise ValueError(f"choose a task: task={', task='.join(TASKS)}.")
+    check_keys(config)
+    run = OmegaConf.to_object(config)
+    if not isinstance(run, RunConf):
+        raise ValueError("config.yaml lacks its schema; its defaults must start with /_schema/run@_here_.")
+    return run
+
+
+def check_keys(config: DictConfig, path: str = "") -> None:
+    """Raise ValueError for keys that the schema does not have: Hydra lets ``+key=value`` pass."""
+    kind = OmegaConf.get_type(config)
+    if not dataclasses.is_dataclass(kind):
+        return
+    known = [f.name for f in dataclasses.fields(kind)]
+    for key in config:
+        if key not in known:
+            raise ValueError(unknown_key(f"{path}{key}", kind))
+        if not OmegaConf.is_missing(config, key) and isinstance(child := config[key], DictConfig):
+            check_keys(child, f"{path}{key}.")
+
+
+def unknown_key(key: str, kind: type) -> str:
+    """The sentence for a key that does not exist, with the nearest one that does."""
+    group, _, name = key.rpartition(".")
+    known = [f.name for f in dataclasses.fields(kind)]
+    near = difflib.get_close_matches(name, known, n=1)
+    start = f"{group}." if group else ""
+    hint = f"did you mean {start}{near[0]}?" if near else f"known are {', '.join(start + k for k in known)}."
+    return f"there is no setting {key}; {hint}"
+
+
+def load(path: Path) -> RunConf:
+    """Read the ``config.yaml`` that a run left in its folder."""
+    try:
+        saved: Any = OmegaConf.load(path)
+    except FileNotFoundError:
+        raise ValueError(f"{path.parent} holds no run to resume: there is no {path.name} in it.") from None
+    name = OmegaConf.select(saved, "task.name")
+    if name not in TASKS:
+        raise ValueError(f"{path} names the task {name!r}; known are {', '.join(TASKS)}.")
+    schema = OmegaConf.structured(RunConf(task=TASKS[name][0]()))
+    return to_run(OmegaConf.merge(schema, saved))
+
+
+def save(run: RunConf, path: Path) -> None:
+    """Write the resolved configuration, for people and for ``load``."""
+    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(run)), encoding="utf-8")

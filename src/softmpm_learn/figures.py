@@ -1,0 +1,156 @@
+"""The pictures of a run: the loss, the latent space and the robot. Plain arrays in, PNG files out.
+
+matplotlib is imported where it is used and without pyplot, so that nothing global changes.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from softmpm import Scene
+
+VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""What each latent feature is set to in ``latent_figure``, the others being 0."""
+SIGNED = "RdBu"
+"""Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
+
+
+def _figure(width: float, height: float):
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def loss_figure(path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, best: str = "loss") -> None:
+    """Draw curves over the iterations, one panel each; the panel ``best`` also shows the best value so far.
+
+    Args:
+        curves: For each name the iterations and the values, of the same length; values that are not finite leave gaps.
+    """
+    names = [name for name, (_, values) in curves.items() if np.isfinite(np.asarray(values, dtype=float)).any()]
+    figure = _figure(7.0, 1.2 + 2.0 * max(1, len(names)))
+    for place, name in enumerate(names):
+        iteration, value = (np.asarray(array, dtype=float) for array in curves[name])
+        axes = figure.add_subplot(len(names), 1, place + 1)
+        axes.plot(iteration, value, color="#1f5fa8", marker="o" if len(value) < 3 else None, markersize=4)
+        if name == best:
+            axes.plot(iteration, np.fmin.accumulate(value), color="0.6", linestyle="--", label="best so far")
+            axes.legend(frameon=False)
+        axes.set_ylabel(name)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.margins(x=0.01)
+        if place == len(names) - 1:
+            axes.set_xlabel("iteration")
+    figure.savefig(path, dpi=120)
+
+
+def latent_figure(path: Path, fields: np.ndarray) -> None:
+    """Draw what each latent feature means: one row each, decoded from −1 to 1; x velocity left, y velocity right.
+
+    Args:
+        fields: Decoded velocity of the feature set to each of ``VALUES``, shape (feature, value, *nodes, dim), in any
+            unit. Of a 3D field the middle slice along its last axis is drawn.
+    """
+    if fields.ndim == 6:
+        fields = fields[:, :, :, :, fields.shape[4] // 2]
+    features, steps, nx, ny, _ = fields.shape
+    figure = _figure(1.15 * 2 * steps * max(1.0, nx / ny) ** 0.5, 0.6 + 1.25 * features * max(1.0, ny / nx) ** 0.5)
+    axes = figure.subplots(features, 2 * steps, squeeze=False)
+    for feature in range(features):
+        limit = max(float(np.abs(fields[feature, ..., :2]).max()), 1e-12)  # each row has a scale of its own
+        for column in range(2 * steps):
+            component, step = divmod(column, steps)
+            panel = axes[feature, column]
+            picture = fields[feature, step, ..., component].T
+            panel.imshow(picture, origin="lower", cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
+            panel.set(xticks=[], yticks=[])
+            if feature == 0:
+                panel.set_title(f"{'xy'[component]} velocity, {_value(step, steps):+.1f}", fontsize=7)
+            if column == 0:
+                panel.set_ylabel(f"feature {feature + 1}", fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+def _value(step: int, steps: int) -> float:
+    return VALUES[step] if steps == len(VALUES) else -1.0 + 2.0 * step / max(1, steps - 1)
+
+
+def robot_figure(
+    path: Path,
+    scene: Scene,
+    frames: Sequence[tuple[str, np.ndarray, np.ndarray | None]],
+    design: Mapping[str, tuple[np.ndarray, str]],
+    *,
+    goal: np.ndarray | None = None,
+) -> None:
+    """Draw the robot along an episode, and what co-design made of its materials.
+
+    Args:
+        frames: Title, positions (particle, dim) and activation (muscle,) or None of each picture, drawn one below another.
+        design: For each material its value on each particle (particle,) and its unit; drawn on the shape at rest.
+        goal: Where the robot should go, drawn as a cross.
+    """
+    rest = np.concatenate([body.particles.positions for body in scene.bodies])
+    row = _row_height(scene, frames)
+    figure = _figure(8.0, row * len(frames) + (2.6 if design else 0.0) + 0.3)
+    parts = figure.subfigures(2, 1, height_ratios=[row * len(frames), 2.6]) if design else [figure]
+    panels = parts[0].subplots(len(frames), 1, squeeze=False)[:, 0]
+    for panel, (title, positions, activation) in zip(panels, frames, strict=True):
+        _draw_robot(panel, scene, positions, activation)
+        if goal is not None:
+            panel.plot(goal[0], goal[1], marker="x", color="#c0392b", markersize=8, markeredgewidth=2)
+        panel.set_title(title, fontsize=8, loc="left")
+    if design:
+        for panel, (name, (value, unit)) in zip(
+            parts[1].subplots(1, len(design), squeeze=False)[0], design.items(), strict=True
+        ):
+            dots = panel.scatter(rest[:, 0], rest[:, 1], c=value, s=_dot(scene, rest, 2.4), cmap="viridis", linewidths=0)
+            panel.set(xticks=[], yticks=[], aspect="equal")
+            panel.set_title(f"{name} [{unit}]" if unit else name, fontsize=8)
+            parts[1].colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax.tick_params(labelsize=6)
+    figure.savefig(path, dpi=130)
+
+
+def _row_height(scene: Scene, frames) -> float:
+    low, high = _window(scene)
+    return 7.4 * (high[1] - low[1]) / (high[0] - low[0]) + 0.25
+
+
+def _window(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(2), (np.array(scene.grid.shape[:2]) - 1) * scene.grid.spacing
+
+
+def _dot(scene: Scene, positions: np.ndarray, inches: float) -> float:
+    """Size of a dot [points²] that about fills the distance of two particles."""
+    extent = max(float(np.ptp(positions[:, 0])), float(np.ptp(positions[:, 1])), scene.grid.spacing)
+    return (72.0 * inches * 0.5 * scene.grid.spacing / extent) ** 2
+
+
+def _draw_robot(panel, scene: Scene, positions: np.ndarray, activation: np.ndarray | None) -> None:
+    """Particles in grey, muscles red where they pull and blue where they push, walls hatched."""
+    low, high = _window(scene)
+    value = np.zeros(len(positions))
+    if activation is not None:
+        for muscle, a in zip(scene.muscles, activation, strict=True):
+            value[muscle.particles] += a
+    size = _dot(scene, np.stack([low, high]), 7.4)
+    muscular = np.zeros(len(positions), dtype=bool)
+    for muscle in scene.muscles:
+        muscular[muscle.particles] = True
+    x, y = positions[:, 0], positions[:, 1]
+    panel.scatter(x[~muscular], y[~muscular], s=size, color="#8d99a6", linewidths=0)
+    panel.scatter(
+        x[muscular], y[muscular], s=size, c=value[muscular], cmap="coolwarm", vmin=-1.0, vmax=1.0, linewidths=0
+    )
+    for wall in scene.walls:
+        _draw_wall(panel, wall, low, high)
+    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    panel.tick_params(labelsize=6)
+
+
+def _draw_wall(panel, wall, low: np.ndarray, high: np.ndarray) -> None:
+    """Shade what of the picture lies inside a half space n·x ≤ offset."""
+    x, y = np.meshgrid(np.linspace(low[0], high[0], 200), np.linspace(low[1], high[1], 200))
+    depth = wall.offset - (wall.normal[0] * x + wall.normal[1] * y)
+    panel.contourf(x, y, depth, levels=[0.0, max(float(depth.max()), 1e-9)], colors=["#e3e0da"], zorder=0)

@@ -1,0 +1,219 @@
+"""A model compiles, stores and passes what its scene requires, and says so."""
+
+import logging
+import threading
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import softmpm
+from helpers import assert_relative, busy_inputs, busy_scene, gradients
+from softmpm.buffers import SolidAdj
+from softmpm.kernels.types import Wanted, adj_module, solid_types
+from softmpm.step import Substep
+
+
+def plain_scene(**changes):
+    """One law in empty space, nothing else."""
+    return busy_scene(2, ("neo_hookean",), **({"muscles": (), "walls": (), "gravity": None, "damping": 0.0} | changes))
+
+
+def fields(struct) -> set[str]:
+    return set(struct.vars)
+
+
+def test_what_a_scene_lacks_is_not_passed():
+    """No argument for muscles, laws, walls or friction that are not there."""
+    plain = solid_types(softmpm.build(plain_scene(), device="cpu").spec)
+    assert fields(plain.Solid) == {"mass", "mu", "lam", "volume"}
+    assert fields(plain.Walls) == {"count"}
+    busy = solid_types(softmpm.build(busy_scene(2), device="cpu").spec)
+    assert fields(busy.Solid) - fields(plain.Solid) == {"law", "muscle", "fibre", "pull"}
+    assert fields(busy.Walls) - fields(plain.Walls) == {"normal", "offset", "contact", "friction"}
+    one = softmpm.build(plain_scene(walls=[softmpm.Wall(normal=(0, 1), offset=0.3)]), device="cpu").spec
+    assert fields(solid_types(one).Walls) == {"count", "normal", "offset"}
+
+
+def test_what_a_scene_lacks_is_not_compiled(tmp_path):
+    """The source of the kernels holds the words of a feature only if the scene has it."""
+    words = {"log": "neo_hookean", "rotation": "fixed_corotated", "muscle_stress": "muscles", "slide": "walls"}
+    scenes = {
+        "neo_hookean": plain_scene(),
+        "fixed_corotated": busy_scene(2, ("fixed_corotated",), muscles=(), walls=(), gravity=None, damping=0.0),
+        "muscles": plain_scene(muscles=[softmpm.Muscle(particles=np.arange(5), direction=(0, 1), strength=1.0)]),
+        "walls": plain_scene(walls=[softmpm.Wall(normal=(0, 1), offset=0.3, friction=0.1)]),
+    }
+    for name, scene in scenes.items():
+        source = _source(softmpm.build(scene, device="cpu"), tmp_path / name)
+        for word, feature in words.items():
+            wanted = feature == name or (feature == "neo_hookean" and name in ("muscles", "walls"))
+            assert (word in source) == wanted, (name, word)
+
+
+def _source(model, folder) -> str:
+    """C++ that Warp generates for the kernels of a forward substep."""
+    Substep(model, None)  # defines them
+    wp.compile_aot_module(model.spec.module, device="cpu", module_dir=folder)
+    return "".join(path.read_text() for path in folder.rglob("*.cpp"))
+
+
+def test_what_a_scene_lacks_is_not_stored():
+    """Bytes of the adjoint follow what is asked for; a passive scene has no pull, a model without laws mixed no index."""
+    model = softmpm.build(busy_scene(2), device="cpu")
+    nothing, everything = (SolidAdj.zeros(model, Wanted(material=w, activation=w)) for w in (False, True))
+    assert all(getattr(nothing, name) is None for name in ("mass", "mu", "lam", "slot"))
+    assert everything.slot.shape == (1, model.particle_count, 2)
+    passive = softmpm.build(plain_scene(), device="cpu")
+    assert passive.muscle_slots.numel() == 0 and passive.state_bytes() == 12 * (4 * 2 + 4 * (2 + 4 + 8))
+
+
+def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):
+    """P2G, grid, G2P; the adjoint computes the grid again and adds G2P, grid and P2G twins."""
+    counted = []
+    launch = Substep.launch
+    monkeypatch.setattr(Substep, "launch", lambda self, kernel, *args: (counted.append(kernel.key), launch(self, kernel, *args)))
+    model = softmpm.build(plain_scene(), device="cpu")
+    start = model.rest()
+    start.v.requires_grad_()
+    end = softmpm.simulate(model, start, None, model.params(), substeps=7)
+    assert len(counted) == 3 * 7 + 2  # and one to enter, one to leave
+    counted.clear()
+    end.x.sum().backward()
+    assert len(counted) == 5 * 7
+
+
+def test_modules_are_shared_by_scenes_alike_and_compiled_once():
+    """Two scenes that differ in numbers only have the same kernels."""
+    a = softmpm.build(busy_scene(2, seed=0), device="cpu").spec
+    b = softmpm.build(busy_scene(2, seed=5, dt=2e-3), device="cpu").spec
+    assert a == b and a.module == b.module
+    wanted = Wanted(material=True, activation=False)
+    assert adj_module(a, wanted) != adj_module(a, Wanted(material=False, activation=False))
+
+
+def test_describe_says_what_was_compiled_and_left_out():
+    """Dimension, laws, muscles, contacts, gradients, dt and memory, in words."""
+    text = softmpm.build(plain_scene(), device="cpu").describe()
+    for phrase in ("2D, float32", "neo_hookean; others left out", "muscles    left out", "contacts   left out", "stable up to"):
+        assert phrase in text, phrase
+    busy = softmpm.build(busy_scene(3), device="cpu", dtype=torch.float64, worlds=4).describe(substeps=500)
+    for phrase in ("3D, float64", "4 world(s)", "at most 2 on one particle", "friction   compiled", "500 substeps"):
+        assert phrase in busy, phrase
+
+
+def test_build_refuses_what_cannot_work():
+    """Device, precision, worlds and budget are checked, with what came."""
+    for wrong, message in (
+        (dict(device="tpu"), "device must be|tpu"),
+        (dict(dtype=torch.float16), "float16"),
+        (dict(worlds=0), "worlds must be .* got 0"),
+        (dict(memory_budget=-1), "memory_budget"),
+    ):
+        with pytest.raises((ValueError, RuntimeError), match=message):
+            softmpm.build(plain_scene(), **({"device": "cpu"} | wrong))
+    if not torch.cuda.is_available():
+        with pytest.raises(RuntimeError, match="sees no GPU here; use device='cpu'"):
+            softmpm.build(plain_scene(), device="cuda")
+
+
+def test_the_chosen_device_is_said_in_the_log(caplog):
+    """device=None takes CUDA if there is one, never silently."""
+    with caplog.at_level(logging.INFO, "softmpm"):
+        model = softmpm.build(plain_scene())
+    assert f"runs on {model.device.type}" in caplog.text
+
+
+def test_building_and_running_changes_no_global_state():
+    """Default dtype, seeds, threads and Warp's settings stay as they were."""
+    def settings():
+        config = {name: getattr(wp.config, name) for name in ("mode", "verify_fp", "enable_backward", "log_level")}
+        return torch.get_default_dtype(), torch.initial_seed(), torch.get_num_threads(), torch.get_rng_state().sum(), config
+
+    before = settings()
+    model = softmpm.build(busy_scene(2), device="cpu")
+    gradients(softmpm.simulate, model, busy_inputs(model), 2)
+    assert str(settings()) == str(before)
+
+
+def test_two_models_in_two_threads_give_what_they_give_alone(device):
+    """Forward and backward of different scenes at the same time; on a GPU each thread on a stream of its own."""
+    models = [softmpm.build(busy_scene(dim), device=device, dtype=torch.float64) for dim in (2, 3)]
+    inputs = [busy_inputs(model) for model in models]
+    alone = [gradients(softmpm.simulate, model, given, 10) for model, given in zip(models, inputs, strict=True)]
+    together = [[], []]
+
+    def work(k):
+        for _ in range(5):
+            if device == "cuda":
+                with torch.cuda.stream(torch.cuda.Stream()):
+                    torch.cuda.current_stream().wait_stream(torch.cuda.default_stream())
+                    found = gradients(softmpm.simulate, models[k], inputs[k], 10)
+                    torch.cuda.current_stream().synchronize()
+            else:
+                found = gradients(softmpm.simulate, models[k], inputs[k], 10)
+            together[k].append(found)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for k in (0, 1):
+        assert len(together[k]) == 5
+        for found in together[k]:
+            for name, gradient in found.items():
+                if device == "cpu":
+                    assert torch.equal(gradient, alone[k][name]), name
+                else:
+                    assert_relative(gradient, alone[k][name], 1e-10, name)
+
+
+@pytest.mark.gpu
+def test_work_runs_on_the_current_stream():
+    """A result is ready once PyTorch's current stream is, without a device-wide wait: a long copy before it is seen."""
+    model = softmpm.build(plain_scene(), device="cuda", dtype=torch.float64)
+    want = softmpm.simulate(model, model.rest(), None, model.params(), substeps=5)
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        start = model.rest()
+        torch.cuda._sleep(200_000_000)  # keeps the stream busy; work on another stream would read v too early
+        start.v.add_(0.25)
+        end = softmpm.simulate(model, start, None, model.params(), substeps=5)
+    stream.synchronize()
+    torch.testing.assert_close(end.v, want.v + 0.25, rtol=0, atol=1e-12)
+
+
+@pytest.mark.gpu
+def test_memory_follows_the_formula():
+    """Peak of a call with gradient against Model.describe's formula, for 1, 10, 100 and 1,000 substeps: within 20 %."""
+    from softmpm.memory import memory
+
+    side = np.arange(100) / 256 + 0.25
+    positions = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+    body = softmpm.Body(softmpm.Particles(positions, 1 / 256**2), softmpm.NeoHookean(density=1.0, young=10.0))
+    scene = softmpm.Scene(grid=softmpm.Grid(shape=(128, 128), spacing=1 / 128), bodies=[body], dt=1e-4)
+    model = softmpm.build(scene, device="cuda")
+    params = softmpm.Params(*(p.requires_grad_() for p in model.params()))
+    for substeps in (1, 10, 100, 1000):
+        start = model.rest()
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        end = softmpm.simulate(model, start, None, params, substeps=substeps)
+        end.x.sum().backward()
+        got, want = torch.cuda.max_memory_allocated() - before, memory(model, substeps).backward
+        print(f"substeps {substeps}: measured {got / 2**20:.2f} MiB, formula {want / 2**20:.2f} MiB, {got / want - 1:+.1%}")
+        assert abs(got / want - 1) < 0.2, substeps
+
+
+def test_shapes_of_what_a_model_gives():
+    """rest() and params() are fresh tensors of the promised shapes; the bodies' particles stand in their order."""
+    model = softmpm.build(busy_scene(3), device="cpu", worlds=3)
+    rest, params = model.rest(), model.params()
+    assert rest.x.shape == rest.v.shape == (3, 24, 3) and rest.C.shape == rest.F.shape == (3, 24, 3, 3)
+    assert all(p.shape == (24,) for p in params)
+    rest.x.zero_()
+    assert model.rest().x.abs().sum() > 0
+    assert model.body.tolist() == [0] * 12 + [1] * 12
