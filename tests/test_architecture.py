@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 SRC = Path(__file__).parents[1] / "src"
-ORDER = """scene state watch shapes silhouette surface checks stability memory
+ORDER = """scene state watch silhouette surface shapes checks stability memory
     kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact kernels.grid
-    kernels.transfer kernels.boundary kernels.raster
+    kernels.failure kernels.transfer kernels.boundary kernels.raster
     model buffers step rollout raster autograd tape reference playback recording rerun_file""".split()
 OUTSIDE = {"rerun": {"rerun_file"}, "h5py": {"recording", "playback"}, "hydra": set(), "matplotlib": set()}
 

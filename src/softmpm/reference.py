@@ -1,4 +1,4 @@
-"""The whole method again in plain PyTorch: slow, readable, the truth in tests. Shares no code with the kernels.
+"""The whole method again in plain PyTorch: slow, readable, the truth in tests; no code shared with kernels.
 
 Every function takes tensors with any leading axes and is differentiated by torch.autograd; meant for float64.
 Derivations and labels: docs/math/.
@@ -22,16 +22,19 @@ def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
 class _Polar(torch.autograd.Function):
     """Rotation nearest to F by SVD; its derivative from the Sylvester equation Ω S + S Ω = RᵀdF − dFᵀR.
 
-    The equation is solved as one linear system in the entries of the skew matrix Ω, so that repeated singular values,
-    where the derivative of an SVD does not exist, are nothing special.
+    The equation is solved as one linear system in the entries of the skew matrix Ω, so that repeated
+    singular values, where the derivative of an SVD does not exist, are nothing special. Where R itself is
+    not unique (two signed singular values add up to zero) it is one of the maximisers and its derivative
+    NaN; a non-finite F gives NaN throughout.
     """
 
     @staticmethod
     def forward(ctx, F):
-        U, _, Vh = torch.linalg.svd(F)
+        finite = torch.isfinite(F).all(-1).all(-1)[..., None, None]
+        U, _, Vh = torch.linalg.svd(torch.where(finite, F, torch.zeros_like(F)))
         sign = torch.ones(F.shape[:-1], dtype=F.dtype)
-        sign[..., -1] = torch.sign(torch.linalg.det(U @ Vh))
-        R = (U * sign[..., None, :]) @ Vh
+        sign[..., -1] = torch.sign(torch.linalg.det(U @ Vh))  # of the smallest singular value
+        R = torch.where(finite, (U * sign[..., None, :]) @ Vh, torch.nan)
         ctx.save_for_backward(F, R)
         return R
 
@@ -49,7 +52,8 @@ class _Polar(torch.autograd.Function):
         # RᵀdF − dFᵀR = Ω S + S Ω; rows: the equation tested with each E, columns: Ω along each E
         system = torch.einsum("kij,...lij->...kl", E, E @ S + S @ E)
         # L = ⟨RᵀR̄, Ω⟩ = y · (system Ω) with systemᵀ y = ⟨RᵀR̄, E⟩, and F̄ = R (Σ y_k 2 E_k)
-        y = torch.linalg.solve(system.mT, torch.einsum("kij,...ij->...k", E, R.mT @ adj_R))
+        y, failed = torch.linalg.solve_ex(system.mT, torch.einsum("kij,...ij->...k", E, R.mT @ adj_R))
+        y = torch.where((failed == 0)[..., None], y, torch.nan)
         return R @ (2 * torch.einsum("...k,kij->...ij", y, E))
 
 
@@ -60,8 +64,8 @@ def polar(F: Tensor) -> Tensor:
 
 def neo_hookean(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     """Kirchhoff stress τ = μ(FFᵀ − I) + λ log(J) I [Pa] (E1)."""
-    eye = torch.eye(F.shape[-1], dtype=F.dtype)
-    return mu[..., None, None] * (F @ F.mT - eye) + (lam * torch.log(torch.linalg.det(F)))[..., None, None] * eye
+    eye, J = torch.eye(F.shape[-1], dtype=F.dtype), _det(F)
+    return mu[..., None, None] * (F @ F.mT - eye) + (lam * torch.log(J))[..., None, None] * eye
 
 
 def fixed_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
@@ -104,6 +108,13 @@ def stencil(scene: Scene, x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """For each of the 3^dim nodes near every particle: flat node index, weight and r = x_i − x_p (S1)."""
     dx, shape = scene.grid.spacing, scene.grid.shape
     base = torch.floor(x.detach() / dx - 0.5)
+    outside = ~((base >= 0) & (base <= torch.tensor(shape) - 3)).all(-1)  # also where x is not a number
+    if outside.any():
+        first = tuple(outside.nonzero()[0].tolist())
+        raise ValueError(
+            f"particle {first[-1]} of world {first[0]} must stay half a cell inside the grid, got "
+            f"x = {x[first].tolist()} m; make the grid larger or dt smaller."
+        )
     nodes = []
     for offset in itertools.product(range(3), repeat=len(shape)):
         node = base + torch.tensor(offset, dtype=x.dtype)
@@ -139,12 +150,17 @@ def grid_velocity(scene: Scene, mass: Tensor, momentum: Tensor) -> Tensor:
     present = (mass > 0)[..., None]
     v = momentum / torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
     v = (v + scene.dt * torch.tensor(scene.gravity, dtype=v.dtype)) * math.exp(-scene.damping * scene.dt)
-    axes = [torch.arange(n, dtype=torch.float64) * scene.grid.spacing for n in scene.grid.shape]
-    positions = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
     for wall in scene.walls:
-        inside = positions @ torch.tensor(wall.normal, dtype=torch.float64) <= wall.offset
-        v = torch.where((inside & present[..., 0])[..., None], respond(wall, v), v)
+        v = torch.where(inside(scene, wall)[:, None] & present, respond(wall, v), v)
     return torch.where(present, v, torch.zeros_like(v))
+
+
+def inside(scene: Scene, wall: Wall) -> Tensor:
+    """Nodes that a wall acts on: n·(i dx) ≤ offset, summed axis by axis in float64; shape (node,)."""
+    reach = torch.zeros((), dtype=torch.float64)
+    for n, count in zip(wall.normal, scene.grid.shape, strict=True):
+        reach = reach[..., None] + n * (torch.arange(count, dtype=torch.float64) * scene.grid.spacing)
+    return (reach <= wall.offset).flatten()
 
 
 def respond(wall: Wall, v: Tensor) -> Tensor:
@@ -174,34 +190,42 @@ def g2p(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
     return v, C
 
 
-def step(scene: Scene, state: State, activation: Tensor | None, mu: Tensor, lam: Tensor, mass: Tensor) -> State:
-    """One substep: P2G, grid, G2P, as design.md states it. ``activation`` (world, muscle); material (world, particle)."""
-    volume = torch.cat([torch.as_tensor(body.particles.volume, dtype=mass.dtype) for body in scene.bodies])
+def _volume(scene: Scene, dtype: torch.dtype) -> Tensor:
+    """Rest volumes V⁰ [m³], in 2D [m²], shape (particle,)."""
+    return torch.cat([torch.as_tensor(body.particles.volume, dtype=dtype) for body in scene.bodies])
+
+
+def step(
+    scene: Scene, state: State, activation: Tensor | None, mu: Tensor, lam: Tensor, mass: Tensor
+) -> State:
+    """One substep: P2G, grid, G2P. ``activation`` (world, muscle) or None; material (world, particle)."""
     tau, D = stress(scene, state.F, mu, lam, activation), scene.grid.spacing**2 / 4
-    affine = mass[..., None, None] * state.C - (scene.dt * volume / D)[:, None, None] * tau
+    load = scene.dt * _volume(scene, mass.dtype) / D
+    affine = mass[..., None, None] * state.C - load[:, None, None] * tau
     node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
     v, C = g2p(scene, state.x, grid_velocity(scene, node_mass, momentum))
     return State(state.x + scene.dt * v, v, C, state.F + scene.dt * C @ state.F)
 
 
-def simulate(scene: Scene, start: State, activation: Tensor | None, params: Params, *, substeps: int) -> State:
+def simulate(
+    scene: Scene, start: State, activation: Tensor | None, params: Params, *, substeps: int
+) -> State:
     """The contract of :func:`softmpm.simulate`, on a scene instead of a model."""
     lead = start.x.shape[:2]
     young, poisson, density = (value.expand(lead) for value in params)
     mu, lam = lame(young, poisson)
-    volume = torch.cat([torch.as_tensor(body.particles.volume, dtype=density.dtype) for body in scene.bodies])
-    state = start
+    mass, state = density * _volume(scene, density.dtype), start
     for row in [None] if activation is None else activation:
         for _ in range(substeps):
-            state = step(scene, state, row, mu, lam, density * volume)
+            state = step(scene, state, row, mu, lam, mass)
     return state
 
 
 def rasterize(scene: Scene, state: State, density: Tensor) -> GridField:
     """Mass and velocity on the nodes without forces (O1); ``density`` broadcasts to (world, particle)."""
-    volume = torch.cat([torch.as_tensor(body.particles.volume, dtype=density.dtype) for body in scene.bodies])
-    mass = (density * volume).expand(state.x.shape[:2])
-    node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, mass[..., None, None] * state.C)
+    mass = (density * _volume(scene, density.dtype)).expand(state.x.shape[:2])
+    affine = mass[..., None, None] * state.C
+    node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
     velocity = momentum / torch.where(node_mass > 0, node_mass, torch.ones_like(node_mass))[..., None]
     shape = scene.grid.shape
     return GridField(node_mass.view(-1, *shape), velocity.view(-1, *shape, len(shape)))

@@ -80,7 +80,7 @@ class Substep:
         scale, spec = self.model.scale, self.model.spec
         node, velocity = self._array("node"), self._array("velocity")
         clear(self.node)
-        self.launch(transfer(spec).p2g, self.particles, scale, self.solid, self.watch, now, node)
+        self.launch(transfer(spec).p2g, self.particles, scale, self.solid, now, node)
         self.launch(grid(spec).grid_velocity, self.nodes, scale, self.model.walls, node, velocity)
 
     def advance(self, now, then, substep: int) -> None:

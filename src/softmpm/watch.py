@@ -1,8 +1,8 @@
 """Run-time failures: how a kernel reports one, and how it reaches the user.
 
 A kernel that meets a failure lowers one 64-bit word of its world, ``watch[world]``, to (substep, kind, particle); the first
-failure has the smallest word and stays. From then on every kernel leaves that world as it is, so the offending value is still
-there when the word is read, and nothing is written out of bounds. Other worlds go on, unchanged.
+failure has the smallest word and stays. From then on that world is left as it is, so the offending value is still there when the
+word is read, and nothing is written out of bounds. Other worlds go on, unchanged.
 """
 
 from enum import IntEnum

@@ -1,7 +1,7 @@
-"""The settings of a run as Hydra sees them: one typed schema, and the check that nothing else slipped in.
+"""The settings of a run: one typed schema, and the check that nothing else slipped in.
 
-A file in ``conf/`` holds data only. The task's name picks its settings from the table of tasks; nothing that a file names
-is ever imported or called.
+A file in ``conf/`` holds data only. The task's name picks its settings from the table of tasks; nothing that
+a file names is ever imported or called.
 """
 
 import dataclasses
@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from softmpm_learn.settings import (
@@ -79,15 +78,9 @@ def conf_dir() -> str:
     for place in places:
         if (place / "config.yaml").is_file():
             return str(place)
-    raise FileNotFoundError(f"config.yaml is missing in {' and in '.join(map(str, places))}; install softmpm again.")
-
-
-def register() -> None:
-    """Give Hydra the schema; groups that start with an underscore are not offered to users."""
-    store = ConfigStore.instance()
-    store.store(group="_schema", name="run", node=RunConf)
-    for name, (conf, _) in TASKS.items():
-        store.store(group="_schema/task", name=name, node=conf)
+    raise FileNotFoundError(
+        f"config.yaml is missing in {' and in '.join(map(str, places))}; install softmpm again."
+    )
 
 
 def to_run(config: DictConfig) -> RunConf:

@@ -22,13 +22,17 @@ def _figure(width: float, height: float):
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def loss_figure(path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, best: str = "loss") -> None:
+def loss_figure(
+    path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, best: str = "loss"
+) -> None:
     """Draw curves over the iterations, one panel each; the panel ``best`` also shows the best value so far.
 
     Args:
         curves: For each name the iterations and the values, of the same length; values that are not finite leave gaps.
     """
-    names = [name for name, (_, values) in curves.items() if np.isfinite(np.asarray(values, dtype=float)).any()]
+    names = [
+        name for name, (_, values) in curves.items() if np.isfinite(np.asarray(values, dtype=float)).any()
+    ]
     figure = _figure(7.0, 1.2 + 2.0 * max(1, len(names)))
     for place, name in enumerate(names):
         iteration, value = (np.asarray(array, dtype=float) for array in curves[name])
@@ -55,7 +59,8 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
     if fields.ndim == 6:
         fields = fields[:, :, :, :, fields.shape[4] // 2]
     features, steps, nx, ny, _ = fields.shape
-    figure = _figure(1.15 * 2 * steps * max(1.0, nx / ny) ** 0.5, 0.6 + 1.25 * features * max(1.0, ny / nx) ** 0.5)
+    width = 1.1 * (nx / ny) ** 0.5
+    figure = _figure(2 * steps * width + 0.4, features * (width * ny / nx + 0.08) + 0.4)
     axes = figure.subplots(features, 2 * steps, squeeze=False)
     for feature in range(features):
         limit = max(float(np.abs(fields[feature, ..., :2]).max()), 1e-12)  # each row has a scale of its own
@@ -63,7 +68,9 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
             component, step = divmod(column, steps)
             panel = axes[feature, column]
             picture = fields[feature, step, ..., component].T
-            panel.imshow(picture, origin="lower", cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
+            panel.imshow(
+                picture, origin="lower", cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest"
+            )
             panel.set(xticks=[], yticks=[])
             if feature == 0:
                 panel.set_title(f"{'xy'[component]} velocity, {_value(step, steps):+.1f}", fontsize=7)
@@ -105,7 +112,9 @@ def robot_figure(
         for panel, (name, (value, unit)) in zip(
             parts[1].subplots(1, len(design), squeeze=False)[0], design.items(), strict=True
         ):
-            dots = panel.scatter(rest[:, 0], rest[:, 1], c=value, s=_dot(scene, rest, 2.4), cmap="viridis", linewidths=0)
+            dots = panel.scatter(
+                rest[:, 0], rest[:, 1], c=value, s=_dot(scene, rest, 2.4), cmap="viridis", linewidths=0
+            )
             panel.set(xticks=[], yticks=[], aspect="equal")
             panel.set_title(f"{name} [{unit}]" if unit else name, fontsize=8)
             parts[1].colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax.tick_params(labelsize=6)
@@ -124,7 +133,7 @@ def _window(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def _dot(scene: Scene, positions: np.ndarray, inches: float) -> float:
     """Size of a dot [points²] that about fills the distance of two particles."""
     extent = max(float(np.ptp(positions[:, 0])), float(np.ptp(positions[:, 1])), scene.grid.spacing)
-    return (72.0 * inches * 0.5 * scene.grid.spacing / extent) ** 2
+    return (72.0 * inches * 0.62 * scene.grid.spacing / extent) ** 2
 
 
 def _draw_robot(panel, scene: Scene, positions: np.ndarray, activation: np.ndarray | None) -> None:
@@ -141,7 +150,14 @@ def _draw_robot(panel, scene: Scene, positions: np.ndarray, activation: np.ndarr
     x, y = positions[:, 0], positions[:, 1]
     panel.scatter(x[~muscular], y[~muscular], s=size, color="#8d99a6", linewidths=0)
     panel.scatter(
-        x[muscular], y[muscular], s=size, c=value[muscular], cmap="coolwarm", vmin=-1.0, vmax=1.0, linewidths=0
+        x[muscular],
+        y[muscular],
+        s=size,
+        c=value[muscular],
+        cmap="coolwarm",
+        vmin=-1.0,
+        vmax=1.0,
+        linewidths=0,
     )
     for wall in scene.walls:
         _draw_wall(panel, wall, low, high)

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from softmpm import State
@@ -47,7 +48,7 @@ class Objective(ABC):
 
     @abstractmethod
     def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
-        """Loss of each world, shape (world,). ``goal`` [m] has shape (world, dim) where the task has one."""
+        """Loss of each world, shape (world,). ``goal`` [m] of shape (world, dim) if the episode has one of its own."""
 
     def running(self, state: State, activation: Tensor) -> Tensor:
         """Cost of one control step, shape (world,)."""
@@ -70,13 +71,14 @@ class Progress(Objective):
 
 @dataclass(frozen=True)
 class Reach(Objective):
-    """Bring a part to the goal: squared distance [m²] between the mean position of the particles and the goal."""
+    """Bring a part to a place: squared distance [m²] between the mean position of the particles and the place."""
 
     particles: np.ndarray
     """Indices of the particles that should get there."""
+    target: np.ndarray
+    """Where to [m], shape (dim,); an episode with a goal of its own goes there instead."""
     terms: tuple[Running, ...] = ()
 
     def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
-        if goal is None:
-            raise ValueError("Reach needs a goal: give the task one.")
-        return (end.x[:, self.particles].mean(dim=1) - goal).square().sum(dim=-1)
+        place = torch.as_tensor(self.target).to(end.x) if goal is None else goal
+        return (end.x[:, self.particles].mean(dim=1) - place).square().sum(dim=-1)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.transfer import failure
+from softmpm.kernels import failure
 from softmpm.kernels.types import types
 from softmpm.watch import Kind
 
@@ -17,7 +17,7 @@ from softmpm.watch import Kind
 def boundary(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, Scale, Motion = t.real, t.vec, t.mat, t.ivec, t.Scale, t.Motion
-    report = failure(dim, dtype).report
+    report = failure.report(dim, dtype).report
     bad_start, rounds = int(Kind.START), dtype == "float32"
     module = f"softmpm.boundary.d{dim}.{dtype}"
 

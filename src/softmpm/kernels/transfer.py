@@ -23,27 +23,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.kernels import failure
 from softmpm.kernels.elasticity import elasticity
 from softmpm.kernels.solid import solid, solid_adj
 from softmpm.kernels.spline import spline
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
-from softmpm.watch import KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
-
-
-@functools.lru_cache(maxsize=None)
-def failure(dim: int, dtype: str) -> SimpleNamespace:
-    """Functions with which a kernel reports a failure; see softmpm/watch.py."""
-
-    @wp.func
-    def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
-        return watch[world] == wp.int64(NEVER)
-
-    @wp.func
-    def report(watch: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
-        word = (wp.int64(substep) << wp.int64(SUBSTEP_SHIFT)) | (wp.int64(kind) << wp.int64(KIND_SHIFT)) | wp.int64(particle)
-        wp.atomic_min(watch, world, word)
-
-    return SimpleNamespace(running=running, report=report)
+from softmpm.watch import Kind
 
 
 @functools.lru_cache(maxsize=None)
@@ -53,12 +38,10 @@ def transfer(spec: Spec) -> SimpleNamespace:
     Solid, stress = solid_types(spec).Solid, solid(spec).stress
     s, dim = spline(spec.dim, spec.dtype), spec.dim
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
-    pack, laws = s.pack, elasticity(spec.dim, spec.dtype)
-    identity, volume_change = laws.identity, laws.volume_change
-    running, report = failure(spec.dim, spec.dtype).running, failure(spec.dim, spec.dtype).report
-    mixed, rounds = len(spec.laws) > 1, spec.dtype == "float32"
-    hookean = spec.laws.index("neo_hookean") if "neo_hookean" in spec.laws else -1
-    not_finite, left_grid, inverted = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.INVERTED)
+    pack = s.pack
+    identity = elasticity(spec.dim, spec.dtype).identity
+    running, rounds = failure.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
+    sound, complain = failure.check(spec).sound, failure.check(spec).complain
 
     @wp.func
     def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat) -> mat:
@@ -72,15 +55,12 @@ def transfer(spec: Spec) -> SimpleNamespace:
         scale: Scale,
         body: Solid,
         # In:
-        watch: wp.array(dtype=wp.int64),
         now: Motion,
         # Out, added into:
         node: wp.array2d(dtype=node_vec),
     ):
         world, p = wp.tid()
-        if not running(watch, world):
-            return
-        base = now.base[world, p]
+        base = now.base[world, p]  # valid also in a world that failed: it was not moved
         fx = now.fx[world, p]
         m = body.mass[world, p]
         mv = m * now.v[world, p]
@@ -90,37 +70,6 @@ def transfer(spec: Spec) -> SimpleNamespace:
             o = offset(n)
             share = weight(w, o)
             wp.atomic_add(node, world, node_index(base, o, scale.shape), share * pack(mv + A * (position(o) - fx), m))
-
-    @wp.func
-    def check(
-        body: Solid,
-        shape: t.ivec,
-        watch: wp.array(dtype=wp.int64),
-        world: int,
-        p: int,
-        substep: int,
-        base: t.ivec,
-        fx: vec,
-        H: mat,
-    ) -> bool:
-        """True if the new state is sound; otherwise reports what is wrong with it."""
-        size = wp.ddot(H, H) + wp.dot(fx, fx)
-        if not wp.isfinite(size):
-            report(watch, world, substep, not_finite, p)
-            return False
-        for axis in range(dim):
-            cell = base[axis] + int(wp.floor(fx[axis] - real(0.5)))
-            if wp.abs(fx[axis]) > real(1.0e6) or cell < 0 or cell > shape[axis] - 3:
-                report(watch, world, substep, left_grid, p)
-                return False
-        if wp.static(hookean >= 0):
-            forbidden = volume_change(H) <= real(-1.0)
-            if wp.static(mixed):
-                forbidden = forbidden and body.law[p] == hookean
-            if forbidden:
-                report(watch, world, substep, inverted, p)
-                return False
-        return True
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def g2p(
@@ -163,11 +112,16 @@ def transfer(spec: Spec) -> SimpleNamespace:
             step += now.fx_low[world, p]
             then.fx_low[world, p] = step - ((fx + step) - fx)
         fx = fx + step
-        if check(body, scale.shape, watch, world, p, substep, base, fx, H):
-            for axis in range(dim):
-                cells = wp.floor(fx[axis] - real(0.5))
-                base[axis] = base[axis] + int(cells)
-                fx[axis] = fx[axis] - cells
+        cells = vec()
+        new_base = base
+        for axis in range(dim):
+            cells[axis] = wp.floor(fx[axis] - real(0.5))
+            new_base[axis] = base[axis] + int(cells[axis])
+        if sound(body, scale.shape, p, fx, new_base, H):
+            base = new_base
+            fx = fx - cells
+        else:
+            complain(watch, world, p, substep, fx, H)
         then.base[world, p] = base
         then.fx[world, p] = fx
         then.v[world, p] = v
@@ -186,7 +140,7 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
     momentum, identity = s.momentum, elasticity(spec.dim, spec.dtype).identity
-    affine_momentum, report = transfer(spec).affine_momentum, failure(spec.dim, spec.dtype).report
+    affine_momentum, report = transfer(spec).affine_momentum, failure.report(spec.dim, spec.dtype).report
     bad_gradient = int(Kind.GRADIENT)
 
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)

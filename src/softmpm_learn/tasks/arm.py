@@ -35,7 +35,9 @@ class ArmConf(TaskConf):
     def __post_init__(self):
         super().__post_init__()
         if len(self.goal) != 2 or not all(math.isfinite(c) for c in self.goal):
-            raise ValueError(f"task.goal must be two numbers, x and y, such as task.goal=[0.6,0.35], got {self.goal}.")
+            raise ValueError(
+                f"task.goal must be two numbers, x and y, such as task.goal=[0.6,0.35], got {self.goal}."
+            )
         away = math.dist(self.goal, BASE)
         if away > LENGTH or self.goal[1] < BASE[1]:
             raise ValueError(
@@ -51,9 +53,15 @@ def arm(conf: ArmConf) -> Task:
     limb = Limb(line[1:], np.array(WIDTH), round_tip=True)
     clamped = Limb(line[:2], np.array([WIDTH[0], WIDTH[0]]))
     rest = fill([limb.outline(), clamped.outline()], conf.spacing / 2).positions
-    regions = {name: limb.part(rest, start, end if end < 1 else 1.01) for name, (start, end) in SEGMENTS.items()}
+    regions = {
+        name: limb.part(rest, start, end if end < 1 else 1.01) for name, (start, end) in SEGMENTS.items()
+    }
     muscles = [
-        Muscle(particles=limb.part(rest, start, end if end < 1 else 1.01, side), direction=(0.0, 1.0), strength=conf.strength)
+        Muscle(
+            particles=limb.part(rest, start, end if end < 1 else 1.01, side),
+            direction=(0.0, 1.0),
+            strength=conf.strength,
+        )
         for start, end in SEGMENTS.values()
         for side in (1, -1)
     ]

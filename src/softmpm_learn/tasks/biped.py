@@ -33,12 +33,19 @@ def biped(conf: BipedConf) -> Task:
     """Build the walker: about 1,400 particles as a draft, 3,600 at the standard resolution."""
     floor = 0.0625
     way, width = np.array(LEG_WIDTH).T
-    limbs = {n: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width) for n, (hip, sole) in LEGS.items()}
+    limbs = {
+        n: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
+        for n, (hip, sole) in LEGS.items()
+    }
     soles = [np.maximum(limb.outline(), (-np.inf, 0.0)) for limb in limbs.values()]
     rest = fill([smooth(TORSO), *soles], conf.spacing / 2).positions
     regions = {name: limb.part(rest, *LEG_MUSCLE) for name, limb in limbs.items()}
     muscles = [
-        Muscle(particles=limb.part(rest, *LEG_MUSCLE, side), direction=limb.direction(*LEG_MUSCLE), strength=conf.strength)
+        Muscle(
+            particles=limb.part(rest, *LEG_MUSCLE, side),
+            direction=limb.direction(*LEG_MUSCLE),
+            strength=conf.strength,
+        )
         for limb in limbs.values()
         for side in (1, -1)
     ]
@@ -69,6 +76,8 @@ def biped(conf: BipedConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(terms=(Effort(conf.effort), Height(conf.upright, lowest=floor + 0.75 * float(rest[:, 1].mean())))),
+        objective=Progress(
+            terms=(Effort(conf.effort), Height(conf.upright, lowest=floor + 0.75 * float(rest[:, 1].mean())))
+        ),
         body_length=float(np.ptp(rest[:, 0])),
     )

@@ -15,9 +15,33 @@ from softmpm_learn.tasks.task import Task, TaskConf, clock
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
-    *((0.050, 0.320), (0.030, 0.420), (0.048, 0.515), (0.110, 0.590), (0.210, 0.630), (0.330, 0.637), (0.440, 0.615)),
-    *((0.510, 0.590), (0.560, 0.600), (0.620, 0.640), (0.690, 0.652), (0.755, 0.622), (0.800, 0.555), (0.815, 0.480)),
-    *((0.790, 0.410), (0.740, 0.385), (0.690, 0.360), (0.655, 0.310), (0.590, 0.270), (0.480, 0.255), (0.330, 0.245)),
+    *(
+        (0.050, 0.320),
+        (0.030, 0.420),
+        (0.048, 0.515),
+        (0.110, 0.590),
+        (0.210, 0.630),
+        (0.330, 0.637),
+        (0.440, 0.615),
+    ),
+    *(
+        (0.510, 0.590),
+        (0.560, 0.600),
+        (0.620, 0.640),
+        (0.690, 0.652),
+        (0.755, 0.622),
+        (0.800, 0.555),
+        (0.815, 0.480),
+    ),
+    *(
+        (0.790, 0.410),
+        (0.740, 0.385),
+        (0.690, 0.360),
+        (0.655, 0.310),
+        (0.590, 0.270),
+        (0.480, 0.255),
+        (0.330, 0.245),
+    ),
     *((0.200, 0.255), (0.100, 0.270)),
 )  # rump, back, neck, forehead, chin, chest, belly: x, y
 TRUNK = (
@@ -31,7 +55,14 @@ LEGS = {
     "leg3": ((0.520, 0.36), (0.462, 0.0)),
     "leg4": ((0.595, 0.36), (0.640, 0.0)),
 }  # hip and sole, from the back
-LEG_WIDTH = ((0.0, 0.130), (0.5, 0.100), (0.8, 0.095), (0.94, 0.103), (1.0, 0.106), (1.1, 0.106))  # way down, width
+LEG_WIDTH = (
+    (0.0, 0.130),
+    (0.5, 0.100),
+    (0.8, 0.095),
+    (0.94, 0.103),
+    (1.0, 0.106),
+    (1.1, 0.106),
+)  # way down, width
 LEG_MUSCLE = (0.10, 1.0)  # from just below the hip to the sole
 TRUNK_MUSCLES = ((0.25, 0.60), (0.60, 1.0))  # way along the trunk
 
@@ -49,7 +80,9 @@ def elephant(conf: ElephantConf) -> Task:
     """Build the elephant: about 2,100 particles as a draft, 5,400 at the standard resolution."""
     floor = 0.0625
     limbs, outlines = limbs_and_outlines()
-    shift = np.array([0.22, floor + 0.5 * conf.spacing])  # the feet's particles half a cell over the floor's nodes
+    shift = np.array(
+        [0.22, floor + 0.5 * conf.spacing]
+    )  # the feet's particles half a cell over the floor's nodes
     rest = fill([LENGTH * outline for outline in outlines], conf.spacing / 2).positions
     regions, muscles = {}, []
     for name, limb in limbs.items():
@@ -66,7 +99,10 @@ def elephant(conf: ElephantConf) -> Task:
         NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson),
     )
     scene = Scene(
-        grid=Grid(shape=(round(1.5 * conf.resolution.value), round(0.5 * conf.resolution.value)), spacing=conf.spacing),
+        grid=Grid(
+            shape=(round(1.5 * conf.resolution.value), round(0.5 * conf.resolution.value)),
+            spacing=conf.spacing,
+        ),
         bodies=[body],
         muscles=muscles,
         walls=[
@@ -105,4 +141,6 @@ def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:
         if name != "trunk":
             outline[:, 1] = np.maximum(outline[:, 1], 0.0)  # flat soles
         outlines.append(outline)
-    return {name: Limb(LENGTH * limb.line, LENGTH * limb.width, limb.round_tip) for name, limb in limbs.items()}, outlines
+    return {
+        name: Limb(LENGTH * limb.line, LENGTH * limb.width, limb.round_tip) for name, limb in limbs.items()
+    }, outlines

@@ -65,7 +65,9 @@ class Limb:
         offset = points[:, None] - start - np.clip(share, 0.0, 1.0)[..., None] * step
         nearest = np.linalg.norm(offset, axis=-1).argmin(axis=1)
         row = np.arange(len(points))
-        along = (np.cumsum(length) - length)[nearest] + np.clip(share[row, nearest], 0.0, 1.0) * length[nearest]
+        along = (np.cumsum(length) - length)[nearest] + np.clip(share[row, nearest], 0.0, 1.0) * length[
+            nearest
+        ]
         left = step[nearest, 0] * offset[row, nearest, 1] - step[nearest, 1] * offset[row, nearest, 0]
         return along / length.sum(), left / length[nearest]
 

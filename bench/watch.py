@@ -1,0 +1,78 @@
+"""What does watching for failures cost? `python bench/watch.py [--device cuda]`
+
+The same substeps with the checks of kernels/failure.py and with kernels compiled without them, in turn, in one run: ratio of
+medians. The second kind of kernel exists only here.
+"""
+
+import dataclasses
+import statistics
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from common import arguments, cube, median_seconds, report
+from step import CASES
+
+import softmpm
+from softmpm.kernels import failure
+from softmpm.kernels.transfer import transfer
+from softmpm.kernels.types import solid_types, types
+
+
+def unchecked(model: softmpm.Model):
+    """Replace the checks by functions that say yes, for a specification that differs in its name only."""
+    spec = model.spec
+    t, Solid = types(spec.dim, spec.dtype), solid_types(spec).Solid
+    ivec, vec, mat = t.ivec, t.vec, t.mat
+
+    @wp.func
+    def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
+        return True
+
+    @wp.func
+    def sound(body: Solid, shape: ivec, p: int, fx: vec, base: ivec, H: mat) -> bool:
+        return True
+
+    @wp.func
+    def complain(watch: wp.array(dtype=wp.int64), world: int, p: int, substep: int, fx: vec, H: mat):
+        pass
+
+    report_of, check_of = failure.report, failure.check
+    failure.report = lambda *_: SimpleNamespace(running=running, report=report_of(spec.dim, spec.dtype).report)
+    failure.check = lambda *_: SimpleNamespace(sound=sound, complain=complain)
+    transfer(spec)
+    failure.report, failure.check = report_of, check_of
+
+
+def main():
+    args = arguments(__doc__)
+    device, rows = torch.device(args.device), []
+    substeps = 20 if device.type == "cpu" else 200
+    for dim, particles, nodes in CASES[:-1]:
+        if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
+            continue
+        models = [softmpm.build(cube(dim, particles, nodes), device=device) for _ in range(2)]
+
+        class Unchecked(type(models[1].spec)):
+            module = models[1].spec.module + ".unchecked"
+
+        models[1].spec = Unchecked(**dataclasses.asdict(models[1].spec))
+        unchecked(models[1])
+        start, params = models[0].rest(), models[0].params()
+        seconds = [[], []]
+        for _ in range(args.repeats):
+            for k, model in enumerate(models):
+
+                def work(model=model):
+                    with torch.no_grad():
+                        softmpm.simulate(model, start, None, params, substeps=substeps)
+
+                seconds[k].append(median_seconds(work, device, 3))
+        with_watch, without = (statistics.median(s) / substeps * 1e6 for s in seconds)
+        ratio = statistics.median(a / b for a, b in zip(*seconds, strict=True))
+        rows.append({"dim": dim, "particles": particles, "watched us": with_watch, "unwatched us": without, "ratio": ratio})
+    report("Cost of watching for failures, float32", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()

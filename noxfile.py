@@ -1,0 +1,30 @@
+"""``nox -s check`` before every commit; ``nox -s gpu`` and ``nox -s bench`` on a machine with a GPU."""
+
+import nox
+
+nox.options.sessions = ["check"]
+
+
+@nox.session
+def check(session: nox.Session) -> None:
+    """Format, lint, types and the tests on the CPU."""
+    session.install("-e", ".[dev]")
+    session.run("ruff", "format", "--check", ".")
+    session.run("ruff", "check", ".")
+    session.run("pyright")
+    session.run("pytest", "-m", "not gpu", *session.posargs, env={"OMP_NUM_THREADS": "1"})
+
+
+@nox.session
+def gpu(session: nox.Session) -> None:
+    """The tests that need a GPU."""
+    session.install("-e", ".[dev]")
+    session.run("pytest", "-m", "gpu", *session.posargs)
+
+
+@nox.session
+def bench(session: nox.Session) -> None:
+    """Every benchmark in ``bench/``, or those named."""
+    session.install("-e", ".[dev]")
+    for name in session.posargs or ("step", "gradient"):
+        session.run("python", f"bench/{name}.py")

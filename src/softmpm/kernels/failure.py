@@ -1,0 +1,73 @@
+"""Failures found on the device, and how they are reported: one 64-bit word per world, see softmpm/watch.py."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.elasticity import elasticity
+from softmpm.kernels.types import Spec, solid_types, types
+from softmpm.watch import KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
+
+
+@functools.lru_cache(maxsize=None)
+def report(dim: int, dtype: str) -> SimpleNamespace:
+    """How a kernel asks whether its world still runs, and how it says that it failed."""
+
+    @wp.func
+    def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
+        return watch[world] == wp.int64(NEVER)
+
+    @wp.func
+    def write(watch: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
+        word = (wp.int64(substep) << wp.int64(SUBSTEP_SHIFT)) | (wp.int64(kind) << wp.int64(KIND_SHIFT)) | wp.int64(particle)
+        wp.atomic_min(watch, world, word)
+
+    return SimpleNamespace(running=running, report=write)
+
+
+@functools.lru_cache(maxsize=None)
+def check(spec: Spec) -> SimpleNamespace:
+    """What must hold of a new state: finite, on the grid, and not inverted where the law forbids it."""
+    t = types(spec.dim, spec.dtype)
+    real, vec, mat, ivec, Solid = t.real, t.vec, t.mat, t.ivec, solid_types(spec).Solid
+    write, volume_change = report(spec.dim, spec.dtype).report, elasticity(spec.dim, spec.dtype).volume_change
+    dim, mixed = spec.dim, len(spec.laws) > 1
+    hookean = spec.laws.index("neo_hookean") if "neo_hookean" in spec.laws else -1
+    not_finite, left_grid, inverted = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.INVERTED)
+
+    @wp.func
+    def allowed(body: Solid, p: int, H: mat) -> bool:
+        """H is finite, and det F > 0 where the law needs it; a comparison with NaN is false."""
+        if wp.static(not mixed and hookean == 0):
+            return volume_change(H) > real(-1.0)
+        total = real(0.0)
+        for i in range(dim):
+            for j in range(dim):
+                total += H[i, j]
+        if wp.static(mixed):
+            if body.law[p] == hookean:
+                return volume_change(H) > real(-1.0)
+        return wp.isfinite(total)
+
+    @wp.func
+    def sound(body: Solid, shape: ivec, p: int, fx: vec, base: ivec, H: mat) -> bool:
+        """The new state may be kept: ``fx`` as it came, ``base`` as it would be."""
+        if not (allowed(body, p, H) and wp.dot(fx, fx) < real(1.0e12)):
+            return False
+        for axis in range(dim):
+            if wp.uint32(base[axis]) > wp.uint32(shape[axis] - 3):  # also below zero
+                return False
+        return True
+
+    @wp.func
+    def complain(watch: wp.array(dtype=wp.int64), world: int, p: int, substep: int, fx: vec, H: mat):
+        """Say which rule a state that is not sound breaks; NaN before place before inversion."""
+        kind = left_grid
+        if not wp.isfinite(wp.ddot(H, H) + wp.dot(fx, fx)):
+            kind = not_finite
+        elif wp.static(hookean >= 0) and volume_change(H) <= real(-1.0):
+            kind = inverted
+        write(watch, world, substep, kind, p)
+
+    return SimpleNamespace(sound=sound, complain=complain)
