@@ -73,8 +73,7 @@ class Recorder:
                 with Recording(self.path) as old:
                     _copy(old, file, static, resume_before)
         _put_in_place(draft, self.path)
-        self._file = h5py.File(self.path, "r+", **_OPEN)
-        self._file.swmr_mode = True
+        self._file = _open_to_append(self.path)
         self.tables = {name: self._file[name] for name in TABLES}
         self._count = {name: len(table) for name, table in self.tables.items()}
 
@@ -227,6 +226,15 @@ def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before
     for name, (iterations, values) in old.scalars.items():
         kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]
         extend("scalar", np.array(kept, SCALAR))
+
+
+def _open_to_append(path: Path) -> h5py.File:
+    """Open straight into reader-safe mode: with "r+" and ``swmr_mode`` a kill in between leaves a file that nobody opens."""
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_libver_bounds(h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
+    access.set_file_locking(True, True)
+    flags = h5py.h5f.ACC_RDWR | h5py.h5f.ACC_SWMR_WRITE
+    return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
 
 
 def _put_in_place(draft: Path, path: Path) -> None:

@@ -1,5 +1,6 @@
 """The bridge from Hydra to plain objects: command line and ``conf/`` in, a run in its folder out."""
 
+import dataclasses
 import os
 import sys
 import traceback
@@ -9,19 +10,35 @@ from typing import NoReturn
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+)
 
-from softmpm_learn.config import RunConf, conf_dir, load, save, to_run
-from softmpm_learn.errors import EXPECTED, sentence
+from softmpm_learn.config import RunConf, conf_dir, load, save, to_run, unknown_key
 from softmpm_learn.run import run
 from softmpm_learn.tasks import TASKS
 
 CHANGEABLE = ("train.iterations", "train.record_every", "device")
 """What may differ when a run is resumed: how far it goes, what it records and where it runs."""
+EXPECTED = (
+    ValueError,
+    RuntimeError,
+    OSError,
+    ImportError,
+    MemoryError,
+    HydraException,
+    OmegaConfBaseException,
+)
+"""Errors whose message is meant for people; any other is a fault of the program."""
 
 
 def main() -> None:
-    """Entry of ``python -m softmpm_learn``: exit code 0, or 1 after one sentence that says what went wrong."""
+    """Entry of ``python -m softmpm_learn``: exit code 0, or 1 after one sentence on what went wrong."""
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))  # the user asks for tracebacks
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints an error its own way, in several lines
     register()
@@ -83,7 +100,7 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
             saved.device = conf.device
         elif key != "resume":
             raise ValueError(
-                f"a run is resumed with its own configuration; only {', '.join(CHANGEABLE)} may change, not {key}."
+                f"a run is resumed with its own settings; only {', '.join(CHANGEABLE)} may change, not {key}."
             )
     return saved
 
@@ -91,3 +108,31 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
 def _give_up(error: Exception, more: str = "") -> NoReturn:
     print(f"softmpm_learn: {sentence(error)}{more}", file=sys.stderr)
     raise SystemExit(1)
+
+
+def sentence(error: BaseException) -> str:
+    """What went wrong and, where it is known, what to do, in one line."""
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return sentence(error.__cause__)
+    cause = error.__cause__ or error.__context__
+    if isinstance(error, InterpolationResolutionError) and isinstance(cause, ValueError):
+        return sentence(cause)  # from a resolver of ours
+    if isinstance(error, OverrideParseException):
+        return f"cannot read {error.override!r}: write key=value, in quotes if it has spaces or brackets."
+    kind = getattr(error, "object_type", None)
+    if isinstance(error, (ConfigAttributeError, ConfigKeyError)) and dataclasses.is_dataclass(kind):
+        return unknown_key(str(error.full_key), kind)
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
+    text = _line(str(error)) or "no details"
+    return text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
+
+
+def _line(text: str) -> str:
+    """A message on one line, without Hydra's list of search paths."""
+    text = text.partition("Config search path:")[0]
+    text = " ".join(text.split())
+    return text if not text or text.endswith((".", "!", "?", ")")) else f"{text}."

@@ -25,10 +25,10 @@ def _figure(width: float, height: float):
 def loss_figure(
     path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, best: str = "loss"
 ) -> None:
-    """Draw curves over the iterations, one panel each; the panel ``best`` also shows the best value so far.
+    """Draw curves over the iterations, one panel each; ``best`` also shows the best value so far.
 
     Args:
-        curves: For each name the iterations and the values, of the same length; values that are not finite leave gaps.
+        curves: For each name the iterations and the values; values that are not finite leave gaps.
     """
     names = [
         name for name, (_, values) in curves.items() if np.isfinite(np.asarray(values, dtype=float)).any()
@@ -50,11 +50,11 @@ def loss_figure(
 
 
 def latent_figure(path: Path, fields: np.ndarray) -> None:
-    """Draw what each latent feature means: one row each, decoded from −1 to 1; x velocity left, y velocity right.
+    """Draw what each latent feature means, one row each: decoded from −1 to 1; x velocity left, y right.
 
     Args:
-        fields: Decoded velocity of the feature set to each of ``VALUES``, shape (feature, value, *nodes, dim), in any
-            unit. Of a 3D field the middle slice along its last axis is drawn.
+        fields: Decoded velocity with the feature set to each of ``VALUES``, in any unit, shape
+            (feature, value, *nodes, dim). Of a 3D field the middle slice along its last axis is drawn.
     """
     if fields.ndim == 6:
         fields = fields[:, :, :, :, fields.shape[4] // 2]
@@ -94,8 +94,8 @@ def robot_figure(
     """Draw the robot along an episode, and what co-design made of its materials.
 
     Args:
-        frames: Title, positions (particle, dim) and activation (muscle,) or None of each picture, drawn one below another.
-        design: For each material its value on each particle (particle,) and its unit; drawn on the shape at rest.
+        frames: Of each picture the title, positions (particle, dim) and activation (muscle,) or None.
+        design: Of each material its value on each particle (particle,) and its unit; drawn at rest.
         goal: Where the robot should go, drawn as a cross.
     """
     rest = np.concatenate([body.particles.positions for body in scene.bodies])

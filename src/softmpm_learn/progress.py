@@ -14,7 +14,7 @@ class Progress:
     """Call it after each iteration. Use as a context manager."""
 
     def __init__(self, total: int, *, first: int = 0, lines: int = 20):
-        """Count to ``total`` iterations, of which ``first`` were done by an earlier run; without a terminal, ``lines`` lines."""
+        """Count to ``total``, ``first`` of them done before; without a terminal, write ``lines`` lines."""
         self.total, self.first, self.every = total, first, max(1, round(total / lines))
         self.best = float("inf")
         self._began = time.monotonic()

@@ -1,5 +1,171 @@
-"""One run, from its settings to what it leaves in its folder. No Hydra here."""
+"""What a run is made of: observer, policy, design, optimiser and learner, put together from settings, saved and restored as one."""
 
+import dataclasses
+import hashlib
+import json
+import math
 from pathlib import Path
-def run(conf, out: Path, *, resume: bool) -> None:
-    print("run", conf.task.name, out, resume, conf.train.iterations)
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from softmpm import Model, Params
+from softmpm_learn.autoencoder import Autoencoder
+from softmpm_learn.design import Design
+from softmpm_learn.learner import Learner
+from softmpm_learn.observe import Centroids, Latent, Observer, Picture, clusters
+from softmpm_learn.policy import Goal, make_policy
+from softmpm_learn.replay import Replay
+from softmpm_learn.seeding import seeded
+from softmpm_learn.settings import Settings
+
+if TYPE_CHECKING:
+    from softmpm_learn.tasks.task import Task
+
+MAY_CHANGE = ("iterations", "record_every", "frame_every")
+"""Settings of TrainConf that a resumed run may have different."""
+
+
+class Run:
+    """Everything that changes while a run goes on; a checkpoint is its :meth:`state_dict`.
+
+    Attributes:
+        iteration: Iterations done.
+        observer, policy, design, optimizer: What is optimised, and how.
+        learner: The learning phase, None unless the observer is learned.
+        generator: The only source of randomness after the first weights.
+        best: The lowest loss so far and what gave it.
+    """
+
+    def __init__(self, task: "Task", model: Model, settings: Settings, out: Path):
+        if settings.train.worlds != model.worlds:
+            raise ValueError(f"train.worlds is {settings.train.worlds}, but the model was built with {model.worlds}.")
+        self.task, self.model, self.settings = task, model, settings
+        self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
+        self.generator = torch.Generator().manual_seed(settings.train.seed)
+        self.learner: Learner | None = None
+        self.observer = self._make_observer(out)
+        self._goal = self._make_goal()
+        seconds = task.control_steps * task.substeps * model.scene.dt
+        policy = make_policy(
+            settings.policy, self.observer.size, model.muscle_count, seconds, settings.train.seed, self._goal
+        )
+        self.policy: nn.Module = policy.to(model.device, model.dtype)
+        self.design = Design(settings.design, model, task.regions)
+        self.optimizer = self._make_optimizer()
+
+    def _make_observer(self, out: Path) -> Observer:
+        conf, model, task = self.settings.observer, self.model, self.task
+        if conf.name == "centroids":
+            return Centroids(model, list(task.regions.values()), task.body_length)
+        if conf.name == "kmeans":
+            found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
+            return Centroids(model, found, task.body_length)
+        picture = Picture(model, conf.nodes, conf.follow)
+        with seeded(self.settings.train.seed):
+            size, channels = conf.latent_size, list(conf.channels)
+            autoencoder = Autoencoder(model.dim, picture.shape, size, channels, scale=task.body_length)
+        learning = self.settings.learning
+        since_last = learning.every * model.worlds
+        replay = Replay(
+            out / "replay",
+            simulations=learning.simulations if learning.replay else since_last,
+            megabytes=learning.megabytes,
+            validation=learning.validation,
+        )
+        self.learner = Learner(learning, autoencoder.to(model.device, model.dtype), replay)
+        return Latent(picture, self.learner.encoder, size)
+
+    def _make_goal(self) -> Goal | None:
+        spread = self.settings.train.goal_spread
+        if not any(spread):
+            return None
+        if self.task.goal is None or len(spread) != self.model.dim:
+            raise ValueError(
+                f"train.goal_spread needs a task with a goal and {self.model.dim} lengths; "
+                f"task {self.task.name} has goal {self.task.goal}, train.goal_spread is {list(spread)}."
+            )
+        centre, width = (torch.tensor(np.asarray(v), dtype=self.model.dtype) for v in (self.task.goal, spread))
+        return Goal(centre, width).to(self.model.device)
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        conf = self.settings.optimizer
+        groups = [{"params": list(self.policy.parameters()), "lr": conf.policy_rate}]
+        if list(self.design.parameters()):
+            groups.append({"params": list(self.design.parameters()), "lr": conf.design_rate})
+        return {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[conf.name](groups)
+
+    def params(self) -> Params:
+        """Materials of the design as it is."""
+        return self.design()
+
+    def draw_goals(self) -> Tensor | None:
+        """A goal for each world [m], shape (world, dim), or None for the task's own."""
+        if self._goal is None:
+            return None
+        place = 2 * torch.rand(self.model.worlds, self.model.dim, generator=self.generator, dtype=self.model.dtype) - 1
+        spread = torch.tensor(list(self.settings.train.goal_spread)).to(self._goal.centre)
+        return self._goal.centre + spread * place.to(spread.device)
+
+    def actor(self) -> dict:
+        """Copies of what decides how the robot moves: policy, design and what the policy sees through."""
+        parts = {"observer": self.observer, "policy": self.policy, "design": self.design}
+        return {name: {k: t.clone() for k, t in part.state_dict().items()} for name, part in parts.items()}
+
+    def load_actor(self, actor: dict) -> None:
+        for name in ("observer", "policy", "design"):
+            getattr(self, name).load_state_dict(actor[name])
+
+    def state_dict(self) -> dict:
+        return {
+            "iteration": self.iteration,
+            "about": self.about(),
+            "policy": self.policy.state_dict(),
+            "design": self.design.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "learner": None if self.learner is None else self.learner.state_dict(),
+            "best": self.best,
+        }
+
+    def load_state_dict(self, content: dict) -> None:
+        """Go on from a checkpoint of the same task and settings.
+
+        Raises:
+            ValueError: Task or settings are others; names each difference.
+        """
+        theirs, ours = json.loads(content["about"]), json.loads(self.about())
+        other = [f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in ours if theirs.get(name) != ours[name]]
+        if other:
+            raise ValueError("this run cannot go on from its checkpoint, it was made with other settings: " + "; ".join(other))
+        self.policy.load_state_dict(content["policy"])
+        self.design.load_state_dict(content["design"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        self.generator.set_state(content["generator"])
+        if self.learner is not None:
+            self.learner.load_state_dict(content["learner"])
+        self.iteration, self.best = content["iteration"], content["best"]
+
+    def about(self) -> str:
+        """Task and settings as JSON, one flat level: what a resumed run must share."""
+        flat = {}
+        for group, values in dataclasses.asdict(self.settings).items():
+            names = [n for n in values if not (group == "train" and n in MAY_CHANGE)]
+            flat |= {f"{group}.{name}": values[name] for name in names}
+        flat["task"], flat["dtype"] = self.task.name, str(self.model.dtype)
+        flat["steps"] = [self.task.control_steps, self.task.substeps]
+        flat["scene"] = _digest(self.model)
+        return json.dumps(flat, sort_keys=True)
+
+
+def _digest(model: Model) -> str:
+    """A short name of a scene: another one if any of its numbers is."""
+    scene, digest = model.scene, hashlib.sha256()
+    for tensor in (model.positions, model.volume, *model.params()):
+        digest.update(tensor.cpu().numpy().tobytes())
+    for muscle in scene.muscles:
+        digest.update(muscle.particles.tobytes() + repr((muscle.direction, muscle.strength)).encode())
+    digest.update(repr((scene.grid, scene.walls, scene.gravity, scene.damping, scene.dt)).encode())
+    return digest.hexdigest()[:16]

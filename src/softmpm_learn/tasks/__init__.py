@@ -24,6 +24,15 @@ def make_task(conf: TaskConf) -> Task:
 
 
 __all__ = [
-    *("TASKS", "ArmConf", "BipedConf", "ElephantConf", "Resolution", "Task", "TaskConf"),
-    *("arm", "biped", "elephant", "make_task"),
+    "TASKS",
+    "ArmConf",
+    "BipedConf",
+    "ElephantConf",
+    "Resolution",
+    "Task",
+    "TaskConf",
+    "arm",
+    "biped",
+    "elephant",
+    "make_task",
 ]

@@ -1,6 +1,7 @@
-"""A tapered arm in 2D, clamped at its foot, that reaches a place with its tip. Sizes and materials are our own choice.
+"""A tapered arm in 2D, clamped at its foot, that reaches a place with its tip.
 
 Three segments, each with a muscle on its left and on its right. It lies on a table: no gravity by default.
+Sizes and materials are our own choice.
 """
 
 import math
@@ -41,13 +42,14 @@ class ArmConf(TaskConf):
         away = math.dist(self.goal, BASE)
         if away > LENGTH or self.goal[1] < BASE[1]:
             raise ValueError(
-                f"task.goal must be above the clamp and within the arm's {LENGTH} m of {BASE}, got {self.goal}: {away:.2f} m."
+                f"task.goal must be above the clamp and at most the arm's {LENGTH} m from {BASE}, "
+                f"got {self.goal}, which is {away:.2f} m away."
             )
 
 
 def arm(conf: ArmConf) -> Task:
     """Build the arm: about 740 particles as a draft, 1,900 at the standard resolution."""
-    root = 3 * conf.spacing  # this much of the arm is inside the clamp
+    root = 3 * conf.spacing  # so much of the arm is inside the clamp
     way = np.array([-root / LENGTH, 0.0, 1.0])
     line = np.array(BASE) + way[:, None] * np.array([0.0, LENGTH])
     limb = Limb(line[1:], np.array(WIDTH), round_tip=True)

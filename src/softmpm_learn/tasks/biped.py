@@ -1,4 +1,4 @@
-"""A two-legged walker in 2D: a rounded body on a hind and a front leg. Sizes and materials are our own choice."""
+"""A walker in 2D: a rounded body on a hind and a front leg. Sizes and materials are our own choice."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class BipedConf(TaskConf):
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
     upright: float = 50.0
-    """Weight of the squared distance [m²] by which its mean height is below three quarters of that at rest."""
+    """Weight of the squared distance [m²] of its mean height below three quarters of that at rest."""
 
 
 def biped(conf: BipedConf) -> Task:

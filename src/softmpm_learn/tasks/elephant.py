@@ -1,7 +1,7 @@
 """An elephant in 2D that learns to walk to the right. Outline, sizes and materials are our own choice.
 
-As soft as a gel, so that it sinks a little under its own weight. Each leg is split into a front and a back half: when one
-shortens and the other lengthens, the leg swings. Two more pairs of muscles bend the trunk.
+As soft as a gel, so that it sinks a little under its own weight. Each leg is split into a front and a back
+half: when one shortens and the other lengthens, the leg swings. Two more pairs of muscles bend the trunk.
 """
 
 from dataclasses import dataclass
@@ -127,7 +127,7 @@ def elephant(conf: ElephantConf) -> Task:
 
 
 def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:
-    """Legs and trunk [m] for the muscles; closed outlines of everything, in body lengths, for the particles."""
+    """Legs and trunk [m] for the muscles; outlines of everything, in body lengths, for the particles."""
     trunk, tail = smooth_line(TRUNK), smooth_line(TAIL)
     way, width = np.array(LEG_WIDTH).T
     limbs = {

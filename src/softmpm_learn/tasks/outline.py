@@ -1,4 +1,4 @@
-"""Drawing robots by code: smooth outlines and tapered limbs, filled with particles, and split where a muscle should sit.
+"""Drawing robots by code: smooth outlines and tapered limbs, filled with particles, split for muscles.
 
 All lengths are in metres unless a robot says otherwise; points are (x, y), y up.
 """
@@ -58,7 +58,7 @@ class Limb:
         return np.concatenate([self.line + half * normal, tip, (self.line - half * normal)[::-1]])
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points lie: how far along, 0 at the root and 1 at the tip, and how far to the left of the line [m]."""
+        """Where points lie: along the limb, 0 at the root and 1 at the tip, and left of its line [m]."""
         start, step = self.line[:-1], np.diff(self.line, axis=0)
         length = np.linalg.norm(step, axis=1)
         share = ((points[:, None] - start) * step).sum(-1) / length**2
@@ -79,7 +79,7 @@ class Limb:
         return (last - first) / np.linalg.norm(last - first)
 
     def part(self, points: np.ndarray, start: float, end: float, side: int = 0) -> np.ndarray:
-        """Indices of the points inside the limb between ``start`` and ``end``; ``side`` 1 keeps its left half, -1 its right."""
+        """Indices of the points of a piece of the limb; ``side`` 1 keeps its left half, -1 its right."""
         along, left = self.locate(points)
         chosen = inside(points, self.outline()) & (along >= start) & (along < end)
         return np.flatnonzero(chosen if side == 0 else chosen & (np.sign(left) == side))
@@ -96,9 +96,9 @@ def inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
 
 
 def fill(polygons: Sequence[np.ndarray], spacing: float) -> Particles:
-    """Particles on a square lattice in the union of some polygons; each stands for ``spacing²`` of area [m²].
+    """Particles on a square lattice in the union of polygons, each for an area of ``spacing²`` [m²].
 
-    The lattice hangs on the origin, half a spacing off, so that the same outline gives the same particles everywhere.
+    The lattice hangs on the origin, half a spacing off, whatever the polygons.
     """
     low = np.floor(np.min([p.min(axis=0) for p in polygons], axis=0) / spacing).astype(int)
     high = np.ceil(np.max([p.max(axis=0) for p in polygons], axis=0) / spacing).astype(int)

@@ -1,4 +1,4 @@
-"""What every task has: its settings, the robot's scene, the regions worth watching and the goal of an episode."""
+"""What every task has: settings, the robot's scene, the regions worth watching, what to do."""
 
 import dataclasses
 import math
@@ -43,9 +43,9 @@ class TaskConf:
     damping: float = 0.0
     """Rate at which velocity decays [1/s]."""
     safety: float = 0.4
-    """Substep over the largest stable one of the undeformed robot; room for stretch and for co-design to stiffen it."""
+    """Substep over the largest stable one at rest; leaves room for stretch and co-design."""
     effort: float = 1e-3
-    """Weight of the mean squared activation in the loss; it decides between motions that are equally good."""
+    """Weight of the mean squared activation in the loss; decides between motions that are equally good."""
 
     def __post_init__(self):
         positive = ("seconds", "control_period", "young", "density", "strength", "safety")
@@ -59,7 +59,7 @@ class TaskConf:
                 raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
         if self.control_period > self.seconds:
             raise ValueError(
-                f"task.control_period must not be longer than task.seconds, got {self.control_period} and {self.seconds}."
+                f"task.control_period must be at most task.seconds = {self.seconds}, got {self.control_period}."
             )
 
     @property

@@ -1,0 +1,168 @@
+"""Convolutional autoencoder of grid velocity, plain or variational, in 2D and 3D; training with early stopping.
+
+    ℓ = mean (u − û)² + β · mean Σ ½ (m² + s² − 1 − log s²)        (A1)   u: picture / scale; m, s: mean and deviation of z
+
+Kingma & Welling 2014, "Auto-encoding variational Bayes". Layers and channels are our choice: the 2019 paper states none.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from softmpm_learn.settings import LearningConf
+
+VALIDATION_PICTURES = 512
+"""Most pictures that a validation loss looks at, evenly chosen."""
+
+
+def _halvings(shape: tuple[int, ...], times: int) -> list[tuple[int, ...]]:
+    sizes = [tuple(shape)]
+    for _ in range(times):
+        sizes.append(tuple((n + 1) // 2 for n in sizes[-1]))
+    return sizes
+
+
+class Encoder(nn.Module):
+    """Picture → latent. Each convolution halves the picture; smooth activations, because a policy's gradient passes here."""
+
+    def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float):
+        super().__init__()
+        conv = nn.Conv2d if dim == 2 else nn.Conv3d
+        widths = [dim, *channels]
+        self.convs = nn.ModuleList(
+            conv(a, b, kernel_size=3, stride=2, padding=1) for a, b in zip(widths, widths[1:], strict=False)
+        )
+        corner = _halvings(shape, len(channels))[-1]
+        self.head = nn.Linear(channels[-1] * torch.Size(corner).numel(), 2 * latent_size)
+        self.register_buffer("scale", torch.tensor(float(scale)))
+
+    def moments(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log variance of the latent, each (picture, latent_size), of velocities [m/s] (picture, dim, *nodes)."""
+        h = picture / self.scale
+        for conv in self.convs:
+            h = F.silu(conv(h))
+        return self.head(h.flatten(start_dim=1)).chunk(2, dim=-1)
+
+    def forward(self, picture: Tensor) -> Tensor:
+        return self.moments(picture)[0]
+
+
+class Decoder(nn.Module):
+    """Latent → picture in units of the scale: the encoder mirrored."""
+
+    def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int]):
+        super().__init__()
+        conv = nn.Conv2d if dim == 2 else nn.Conv3d
+        *self.sizes, self.corner = _halvings(shape, len(channels))
+        self.tail = nn.Linear(latent_size, channels[-1] * torch.Size(self.corner).numel())
+        widths = [*reversed(channels), dim]
+        self.convs = nn.ModuleList(conv(a, b, kernel_size=3, padding=1) for a, b in zip(widths, widths[1:], strict=False))
+
+    def forward(self, z: Tensor) -> Tensor:
+        h = self.tail(z).unflatten(1, (-1, *self.corner))
+        for conv, size in zip(self.convs, reversed(self.sizes), strict=True):
+            h = conv(F.interpolate(F.silu(h), size=size))
+        return h
+
+
+class Autoencoder(nn.Module):
+    """Encoder and decoder of pictures of grid velocity.
+
+    Args:
+        dim: 2 or 3.
+        shape: Nodes of a picture.
+        latent_size, channels: See :class:`softmpm_learn.settings.ObserverConf`.
+        scale: Typical velocity [m/s], until :meth:`rescale` has seen some.
+    """
+
+    def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float = 1.0):
+        super().__init__()
+        self.encoder = Encoder(dim, shape, latent_size, channels, scale)
+        self.decoder = Decoder(dim, shape, latent_size, channels)
+
+    def decode(self, z: Tensor) -> Tensor:
+        """Velocity [m/s], shape (picture, dim, *nodes), that the latent (picture, latent_size) stands for."""
+        return self.decoder(z) * self.encoder.scale
+
+    def rescale(self, pictures: Tensor) -> None:
+        """Take the root mean square of the velocities that are not zero as the scale."""
+        moving = pictures[pictures != 0]
+        if moving.numel():
+            self.encoder.scale.copy_(moving.square().mean().sqrt())
+
+    def loss(self, pictures: Tensor, kl: float | None, generator: torch.Generator | None = None) -> Tensor:
+        """(A1); ``kl`` is β, or None for a plain autoencoder. Without a generator the latent is its mean."""
+        mean, log_variance = self.encoder.moments(pictures)
+        z = mean
+        if kl is not None and generator is not None:
+            noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype).to(mean.device)
+            z = mean + noise * (0.5 * log_variance).exp()
+        loss = F.mse_loss(self.decoder(z), pictures / self.encoder.scale)
+        if kl is not None:
+            loss = loss + kl * 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1).mean()
+        return loss
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a learning phase reports."""
+
+    epochs: int
+    """Epochs that were run."""
+    training: float
+    """Mean loss of the last epoch."""
+    validation: float
+    """Loss of the weights that were kept on simulations held out; nan if there are none yet."""
+
+
+def train_autoencoder(
+    autoencoder: Autoencoder,
+    optimizer: torch.optim.Optimizer,
+    sample: Callable[[], Tensor],
+    validation: Tensor | None,
+    conf: LearningConf,
+    generator: torch.Generator,
+) -> Learned:
+    """Train on minibatches from ``sample``, watch ``validation``, and with early stopping keep the best weights, also the first.
+
+    Args:
+        sample: Gives a minibatch of velocities [m/s], shape (batch, dim, *nodes).
+        validation: Pictures of other simulations, or None; without them nothing stops early.
+        generator: Source of the variational noise.
+    """
+    kl = conf.kl if conf.variational else None
+    best_loss, best, training, waited, epoch = float("inf"), None, float("nan"), 0, 0
+
+    def judge() -> float:
+        with torch.no_grad():
+            return autoencoder.loss(validation, kl).item()
+
+    if validation is not None:
+        validation = validation[:: -(-len(validation) // VALIDATION_PICTURES)]
+        best_loss, best = judge(), copy.deepcopy(autoencoder.state_dict())
+    for epoch in range(1, conf.epochs + 1):
+        losses = []
+        for _ in range(conf.batches):
+            loss = autoencoder.loss(sample(), kl, generator)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.detach())
+        training = torch.stack(losses).mean().item()
+        if validation is None:
+            continue
+        now = judge()
+        if now < best_loss or not conf.early_stopping:
+            best_loss, best, waited = now, copy.deepcopy(autoencoder.state_dict()), 0
+        else:
+            waited += 1
+            if waited >= conf.patience:
+                break
+    if validation is None:
+        return Learned(epoch, training, float("nan"))
+    autoencoder.load_state_dict(best)
+    return Learned(epoch, training, best_loss)

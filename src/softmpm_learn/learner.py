@@ -1,0 +1,69 @@
+"""The learning phase: replay buffer, autoencoder and target network, put together as the 2019 paper describes.
+
+Its three refinements, early stopping, replay and target network, each have a switch in :class:`LearningConf`.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from softmpm_learn.autoencoder import Autoencoder, train_autoencoder
+from softmpm_learn.replay import Replay
+from softmpm_learn.settings import LearningConf
+from softmpm_learn.target import TargetNetwork
+
+
+class Learner:
+    """Learns pictures of grid velocity; the policy looks through :attr:`encoder`."""
+
+    def __init__(self, conf: LearningConf, autoencoder: Autoencoder, replay: Replay):
+        self.conf, self.autoencoder, self.replay = conf, autoencoder, replay
+        self.optimizer = torch.optim.Adam(autoencoder.parameters(), lr=conf.rate)
+        self.target = TargetNetwork(autoencoder.encoder) if conf.target_network else None
+
+    @property
+    def encoder(self) -> nn.Module:
+        return self.target or self.autoencoder.encoder
+
+    @property
+    def device(self) -> torch.device:
+        return self.autoencoder.encoder.scale.device
+
+    def watch(self, first: int, seen: Tensor) -> None:
+        """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on."""
+        for world, pictures in enumerate(seen.unbind(dim=1)):
+            self.replay.add(first + world, pictures)
+
+    def learn(self, generator: torch.Generator) -> dict[str, float]:
+        """One learning phase; its figures for metrics.csv."""
+        training, validation = self.replay.split("training"), self.replay.split("validation")
+        if not training:
+            return {}
+        self.autoencoder.rescale(torch.cat(training))
+        learned = train_autoencoder(
+            self.autoencoder,
+            self.optimizer,
+            lambda: self.replay.sample(generator, self.conf.batch).to(self.device),
+            torch.cat(validation).to(self.device) if validation else None,
+            self.conf,
+            generator,
+        )
+        if self.target is not None:
+            self.target.follow(self.autoencoder.encoder, self.conf.target_rate)
+        if not self.conf.replay:
+            self.replay.clear()
+        return {"epochs": learned.epochs, "training_loss": learned.training, "validation_loss": learned.validation}
+
+    def state_dict(self) -> dict:
+        return {
+            "autoencoder": self.autoencoder.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "target": None if self.target is None else self.target.state_dict(),
+            "replay": self.replay.ids,
+        }
+
+    def load_state_dict(self, content: dict) -> None:
+        self.autoencoder.load_state_dict(content["autoencoder"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        if self.target is not None:
+            self.target.load_state_dict(content["target"])
+        self.replay.load(content["replay"])

@@ -1,0 +1,134 @@
+"""State → features: centroids of hand-picked regions, of k-means clusters, or a learned latent of the grid velocity.
+
+An observer works in two steps, ``look`` (state → what is seen) and ``encode`` (what is seen → features), because what a learned
+observer sees is also what it learns from. Both are differentiable.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+import softmpm
+from softmpm import Model, State
+
+THIN = 0.01
+"""A node with this share of a full node's mass shows half its velocity. Otherwise what is seen would jump, and the gradient
+miss the jump, whenever a node gains or loses its last particle. Our choice."""
+POSTURE = 0.1
+"""Regions typically move by this much of a body length against each other; makes features of order one."""
+
+
+class Observer(nn.Module, ABC):
+    """What the policy sees of the robot."""
+
+    size: int
+    """Number of features."""
+
+    @abstractmethod
+    def look(self, model: Model, state: State) -> Tensor:
+        """What is seen of each world, shape (world, ...)."""
+
+    @abstractmethod
+    def encode(self, seen: Tensor) -> Tensor:
+        """Features of order one, shape (world, size)."""
+
+    def forward(self, model: Model, state: State) -> Tensor:
+        return self.encode(self.look(model, state))
+
+
+class Centroids(Observer):
+    """Mean position and velocity of each of some regions (the hand-picked features of Hu et al. 2019, "ChainQueen").
+
+    Positions count from the centroid of the robot and from their rest values, in tenths of a body length; velocities in
+    body lengths per second. So the features do not tell where the robot is.
+    """
+
+    def __init__(self, model: Model, regions: Sequence[np.ndarray], body_length: float):
+        super().__init__()
+        mean = torch.zeros(len(regions), model.particle_count, dtype=model.dtype)
+        for row, region in zip(mean, regions, strict=True):
+            row[torch.as_tensor(region)] = 1.0 / len(region)
+        self.register_buffer("mean", mean.to(model.device), persistent=False)
+        self.register_buffer("rest", self._posture(model.positions[None]), persistent=False)
+        self.body_length = body_length
+        self.size = 2 * model.dim * len(regions)
+
+    def _posture(self, x: Tensor) -> Tensor:
+        return self.mean @ x - x.mean(dim=1, keepdim=True)
+
+    def look(self, model: Model, state: State) -> Tensor:
+        """Posture and velocity of each region, shape (world, region, 2 · dim)."""
+        posture = (self._posture(state.x) - self.rest) / (POSTURE * self.body_length)
+        return torch.cat([posture, self.mean @ state.v / self.body_length], dim=-1)
+
+    def encode(self, seen: Tensor) -> Tensor:
+        return seen.flatten(start_dim=1)
+
+
+def clusters(positions: np.ndarray, count: int) -> list[np.ndarray]:
+    """k-means clusters of points (particle, dim), the same in every run: each first centre is the point farthest from the others."""
+    from scipy.cluster.vq import kmeans2
+
+    if count > len(positions):
+        raise ValueError(f"observer.clusters must not be above the {len(positions)} particles, got {count}.")
+    chosen = [int(np.square(positions - positions.mean(axis=0)).sum(axis=1).argmax())]
+    distance = np.full(len(positions), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, np.square(positions - positions[chosen[-1]]).sum(axis=1))
+        chosen.append(int(distance.argmax()))
+    _, label = kmeans2(positions, positions[chosen], minit="matrix", iter=20)
+    return [np.flatnonzero(label == k) for k in np.unique(label)]
+
+
+class Picture:
+    """Grid velocity as a learned observer sees it: averaged over blocks of nodes, components first.
+
+    Args:
+        model: Whose grid.
+        nodes: Most nodes of the picture along the longest axis, None for 64 in 2D and 32 in 3D.
+        follow: Move the robot's centroid to the middle of the picture first.
+    """
+
+    def __init__(self, model: Model, nodes: int | None = None, follow: bool = True):
+        grid = model.scene.grid
+        self.block = math.ceil(max(grid.shape) / (nodes or (64 if model.dim == 2 else 32)))
+        self.shape = tuple(math.ceil(n / self.block) for n in grid.shape)
+        """Nodes of the picture."""
+        self.follow = follow
+        mass = (model.params().density * model.volume).sum() / model.volume.sum() * grid.spacing**model.dim
+        self._thin = THIN * mass.item()
+        last = torch.tensor(grid.shape, dtype=model.dtype, device=model.device) - 1
+        self._low, self._high = torch.full_like(last, grid.spacing), (last - 1) * grid.spacing
+        self._middle = last * grid.spacing / 2
+        spare = [n * self.block - full for n, full in zip(self.shape, grid.shape, strict=True)]
+        self._pad = [side for count in reversed(spare) for side in (0, count)]
+
+    def __call__(self, model: Model, state: State) -> Tensor:
+        """Velocity [m/s], shape (world, dim, *shape)."""
+        if self.follow:
+            x = state.x + (self._middle - state.x.mean(dim=1, keepdim=True))
+            state = state._replace(x=torch.minimum(torch.maximum(x, self._low), self._high))
+        field = softmpm.rasterize(model, state)
+        velocity = field.velocity * (field.mass / (field.mass + self._thin))[..., None]
+        pool = F.avg_pool2d if model.dim == 2 else F.avg_pool3d
+        return pool(F.pad(velocity.movedim(-1, 1), self._pad), self.block)
+
+
+class Latent(Observer):
+    """Features that an encoder finds in the picture of the grid velocity; which encoder is not this class's business."""
+
+    def __init__(self, picture: Picture, encoder: nn.Module, size: int):
+        super().__init__()
+        self.picture, self.encoder, self.size = picture, encoder, size
+
+    def look(self, model: Model, state: State) -> Tensor:
+        """The picture, shape (world, dim, *nodes) [m/s]."""
+        return self.picture(model, state)
+
+    def encode(self, seen: Tensor) -> Tensor:
+        return self.encoder(seen)

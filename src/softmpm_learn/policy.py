@@ -1,0 +1,115 @@
+"""Features → activation. Closed loop: tanh(Wz + b) or a small network, with a clock if wanted. Open loop: sinusoids or knots.
+
+The clock, sines and cosines of the time, is our choice: a pure feedback policy has to find a rhythm before it can improve one.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from softmpm_learn.seeding import seeded
+from softmpm_learn.settings import PolicyConf
+
+
+class Clock(nn.Module):
+    """sin and cos of 2π h t / period for h = 1 … harmonics."""
+
+    def __init__(self, period: float, harmonics: int):
+        super().__init__()
+        self.register_buffer("rate", 2 * math.pi / period * torch.arange(1, harmonics + 1), persistent=False)
+        self.size = 2 * harmonics
+
+    def forward(self, time: float) -> Tensor:
+        """Shape (size,)."""
+        return torch.cat([torch.sin(self.rate * time), torch.cos(self.rate * time)])
+
+
+class Goal(nn.Module):
+    """A goal [m] as its place in the box that goals are drawn from, in [-1, 1] along each axis."""
+
+    def __init__(self, centre: Tensor, spread: Tensor):
+        super().__init__()
+        self.register_buffer("centre", centre, persistent=False)
+        self.register_buffer("inverse", torch.where(spread > 0, 1 / spread, 0.0), persistent=False)
+        self.size = len(centre)
+
+    def forward(self, goal: Tensor) -> Tensor:
+        return (goal - self.centre) * self.inverse
+
+
+class Feedback(nn.Module):
+    """tanh of a network of features, clock and goal (Spielberg et al. 2021); without hidden layers tanh(Wz + b) (Hu et al. 2019)."""
+
+    def __init__(
+        self, size: int, muscles: int, hidden: list[int], gain: float, clock: Clock | None = None, goal: Goal | None = None
+    ):
+        super().__init__()
+        self.clock, self.goal = clock, goal
+        width = size + (clock.size if clock else 0) + (goal.size if goal else 0)
+        layers = []
+        for wider in hidden:
+            layers += [nn.Linear(width, wider), nn.ELU()]
+            width = wider
+        last = nn.Linear(width, muscles)
+        nn.init.normal_(last.weight, std=gain / math.sqrt(width))
+        nn.init.zeros_(last.bias)
+        self.layers = nn.Sequential(*layers, last)
+
+    def forward(self, z: Tensor, time: float, goal: Tensor | None = None) -> Tensor:
+        """Activation (world, muscle) in (-1, 1) from features (world, size), time [s] and goals (world, dim) [m]."""
+        inputs = [z]
+        if self.clock:
+            inputs.append(self.clock(time).expand(len(z), -1))
+        if self.goal:
+            inputs.append(self.goal(goal))
+        return torch.tanh(self.layers(torch.cat(inputs, dim=-1)))
+
+
+class Sinusoids(nn.Module):
+    """Open loop: tanh(W clock(t) + b), one amplitude and phase for each muscle and harmonic."""
+
+    def __init__(self, muscles: int, gain: float, clock: Clock):
+        super().__init__()
+        self.clock, self.wave = clock, nn.Linear(clock.size, muscles)
+        nn.init.normal_(self.wave.weight, std=gain / math.sqrt(clock.size))
+        nn.init.zeros_(self.wave.bias)
+
+    def forward(self, z: Tensor, time: float, goal: Tensor | None = None) -> Tensor:
+        return torch.tanh(self.wave(self.clock(time))).expand(len(z), -1)
+
+
+class Knots(nn.Module):
+    """Open loop: tanh of values at evenly spaced times, joined by straight lines; constant after the last."""
+
+    def __init__(self, muscles: int, gain: float, knots: int, seconds: float):
+        super().__init__()
+        self.seconds, self.values = seconds, nn.Parameter(gain * torch.randn(knots, muscles))
+
+    def forward(self, z: Tensor, time: float, goal: Tensor | None = None) -> Tensor:
+        last = len(self.values) - 1
+        place = min(max(time / self.seconds, 0.0), 1.0) * last
+        left = min(int(place), last - 1)
+        return torch.tanh(torch.lerp(self.values[left], self.values[left + 1], place - left)).expand(len(z), -1)
+
+
+def make_policy(
+    conf: PolicyConf, size: int, muscles: int, seconds: float, seed: int, goal: Goal | None = None
+) -> nn.Module:
+    """The policy that the settings name.
+
+    Args:
+        size: Number of features of the observer.
+        seconds: Length of an episode [s].
+        goal: If goals are drawn at random, how a feedback policy sees them.
+    """
+    if muscles < 1:
+        raise ValueError("a policy needs muscles to drive; the scene has none.")
+    clock = Clock(conf.period, conf.harmonics)
+    with seeded(seed):
+        if conf.name == "sinusoids":
+            return Sinusoids(muscles, conf.gain, clock)
+        if conf.name == "knots":
+            return Knots(muscles, conf.gain, conf.knots, seconds)
+        hidden = list(conf.hidden) if conf.name == "mlp" else []
+        return Feedback(size, muscles, hidden, conf.gain, clock if conf.clock else None, goal)

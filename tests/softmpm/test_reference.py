@@ -1,0 +1,353 @@
+"""The float64 reference against laws of physics and central differences: it leans on no kernel."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from softmpm import reference
+from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm.state import Params, State
+
+DX = 0.1
+DIMS = pytest.mark.parametrize("dim", [2, 3])
+MATERIALS = {"neo_hookean": NeoHookean, "fixed_corotated": FixedCorotated}
+
+
+def f64(values) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def randn(*shape, seed=0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def difference(f, at: torch.Tensor, d: torch.Tensor, h: float) -> torch.Tensor:
+    """Directional derivative by a central difference of sixth order."""
+    terms = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+    return sum(c * (f(at + k * h * d) - f(at - k * h * d)) for k, c in terms) / h
+
+
+def tiny(dim: int, laws=("neo_hookean", "fixed_corotated"), **changes) -> Scene:
+    """Two small bodies that share nodes; nothing else unless asked for."""
+    lattice = np.array(list(itertools.product(*(range(n) for n in (3, 2, 2)[:dim]))), dtype=float)
+    rng, bodies = np.random.default_rng(0), []
+    for corner, law in ((0.37, laws[0]), (0.5, laws[-1])):
+        material = MATERIALS[law](density=1.2, young=80.0, poisson=0.3)
+        positions = corner + 0.05 * lattice + rng.uniform(-0.01, 0.01, lattice.shape)
+        bodies.append(Body(Particles(positions, rng.uniform(0.5, 1.5, len(lattice)) * 0.05**dim), material))
+    settings = dict(grid=Grid(shape=(11, 10, 12)[:dim], spacing=DX), bodies=bodies, dt=1e-3)
+    return Scene(**(settings | changes))
+
+
+def full(dim: int, laws=("neo_hookean", "fixed_corotated")) -> Scene:
+    """:func:`tiny` with everything a scene may have: overlapping muscles, three kinds of wall, damping."""
+    count, up = (12, 24)[dim - 2], (0.0, 1.0, 0.0)[:dim]
+    return tiny(
+        dim,
+        laws,
+        muscles=[
+            Muscle(particles=np.arange(count * 2 // 3), direction=(0.0, 1.0, 0.3)[:dim], strength=10.0),
+            Muscle(particles=np.arange(count // 3, count), direction=(1.0, 0.5, 0.2)[:dim], strength=8.0),
+        ],
+        walls=[
+            Wall(normal=up, offset=0.41, contact="separate", friction=0.4),
+            Wall(normal=(-1.0, 0.3, 0.1)[:dim], offset=-0.45, contact="slip"),
+            Wall(normal=(1.0, 0.0, 0.0)[:dim], offset=0.3, contact="stick"),
+        ],
+        gravity=(0.3, -9.8, 0.2)[:dim],
+        damping=0.7,
+    )
+
+
+def rest(scene: Scene, worlds=1) -> tuple[State, Params]:
+    x = torch.from_numpy(np.concatenate([body.particles.positions for body in scene.bodies]))
+    x = x.expand(worlds, *x.shape)
+    F = torch.eye(x.shape[-1], dtype=torch.float64).expand(*x.shape, x.shape[-1])
+    materials = [body.material for body in scene.bodies for _ in range(len(body.particles))]
+    columns = ([getattr(m, name) for m in materials] for name in Params._fields)
+    return State(x, torch.zeros_like(x), torch.zeros_like(F), F), Params(*(f64(c) for c in columns))
+
+
+def shaken(scene: Scene, worlds=1, noise=1.0) -> tuple[State, Params]:
+    """A random state and material near the scene's."""
+    (x, v, C, F), params = rest(scene, worlds)
+    by = [noise * randn(*t.shape, seed=30 + k) for k, t in enumerate((x, v, C, F))]
+    start = State(x + 0.01 * by[0], 0.5 * by[1], 2.0 * by[2], F + 0.1 * by[3])
+    factor = 1 + 0.1 * randn(3, *x.shape[:2], seed=40)
+    return start, Params(*(value * factor[k] for k, value in enumerate(params)))
+
+
+def masses(scene: Scene, params: Params) -> torch.Tensor:
+    return params.density * torch.from_numpy(np.concatenate([b.particles.volume for b in scene.bodies]))
+
+
+@DIMS
+def test_weights_are_quadratic_b_splines(dim):
+    """Σ w = 1, Σ w r = 0, Σ w r rᵀ = dx²/4 I, and Σ ∇w r'ᵀ = I with r' = x_i: also on a cell edge."""
+    scene = tiny(dim)
+    edge = f64([[0.45, 0.5, 0.55][:dim], [0.4, 0.35, 0.6][:dim]])
+    x = torch.cat([edge, shaken(scene)[0].x[0]])[None].requires_grad_()
+    nodes = reference.stencil(scene, x)
+    w, r = torch.stack([n[1] for n in nodes], -1), torch.stack([n[2] for n in nodes], -2)
+    eye = torch.eye(dim, dtype=torch.float64)
+
+    def close(got, want):
+        torch.testing.assert_close(got, torch.as_tensor(want).double().expand_as(got), rtol=0, atol=1e-14)
+
+    assert (w >= 0).all()
+    assert len(nodes) == 3**dim
+    close(w.sum(-1), 1.0)
+    close((w[..., None] * r).sum(-2), 0.0)
+    close(torch.einsum("wpn,wpni,wpnj->wpij", w, r, r), DX**2 / 4 * eye)
+    for axis in range(dim):
+        (slope,) = torch.autograd.grad(
+            (w * (r + x[..., None, :]).detach()[..., axis]).sum(), x, retain_graph=True
+        )
+        close(slope, eye[axis])
+
+
+@DIMS
+def test_transfer_keeps_mass_momentum_and_spin(dim):
+    """P2G then G2P keeps Σ m, Σ m v and Σ (x ∧ m v + m D C − its transpose), without forces, to rounding."""
+    scene = tiny(dim)
+    state, params = shaken(scene)
+    mass = masses(scene, params)[..., None]
+    node_mass, momentum = reference.p2g(
+        scene, state.x, mass[..., 0], mass * state.v, mass[..., None] * state.C
+    )
+    v, C = reference.g2p(scene, state.x, reference.grid_velocity(scene, node_mass, momentum))
+
+    def spin(v, C):
+        A = (mass[..., None] * (state.x[..., :, None] * v[..., None, :] + DX**2 / 4 * C.mT)).sum(1)
+        return A - A.mT
+
+    torch.testing.assert_close(node_mass.sum(), mass.sum(), rtol=1e-14, atol=0)
+    torch.testing.assert_close((mass * v).sum(1), (mass * state.v).sum(1), rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(spin(v, C), spin(state.v, state.C), rtol=1e-12, atol=1e-15)
+
+
+@DIMS
+def test_an_affine_flow_is_seen_and_kept_exactly(dim):
+    """v(x) = a + Bx of the particles is a + B x_i on every node with mass, and comes back from G2P."""
+    scene, a, B = tiny(dim), randn(dim, seed=50), randn(dim, dim, seed=51)
+    state, params = rest(scene)
+    state = state._replace(v=a + state.x @ B.T, C=B.expand_as(state.F))
+    field = reference.rasterize(scene, state, params.density)
+    nodes = torch.stack(
+        torch.meshgrid(*(DX * torch.arange(n).double() for n in scene.grid.shape), indexing="ij"), -1
+    )
+    want = torch.where(field.mass[..., None] > 0, a + nodes @ B.T, 0.0)
+    assert field.velocity.shape == (1, *scene.grid.shape, dim)
+    assert (field.mass == 0).any()
+    torch.testing.assert_close(field.velocity, want, rtol=0, atol=1e-12)
+    torch.testing.assert_close(field.mass.sum(), masses(scene, params).sum(), rtol=1e-14, atol=0)
+    v, C = reference.g2p(scene, state.x, field.velocity.view(1, -1, dim))
+    torch.testing.assert_close(v, state.v, rtol=0, atol=1e-12)
+    torch.testing.assert_close(C, state.C, rtol=0, atol=1e-12)
+
+
+@DIMS
+def test_free_fall_with_damping(dim):
+    """A body at rest follows v ← e^(−γΔt)(v + Δt g), x ← x + Δt v, whatever its material: ≤ 1e-13."""
+    gravity = (0.4, -9.8, 0.2)[:dim]
+    scene = tiny(dim, gravity=gravity, damping=3.0)
+    start, params = rest(scene)
+    end = reference.simulate(scene, start, None, params, substeps=20)
+    v, fallen, g = torch.zeros(dim).double(), torch.zeros(dim).double(), f64(gravity)
+    for _ in range(20):
+        v = math.exp(-3.0 * scene.dt) * (v + scene.dt * g)
+        fallen = fallen + scene.dt * v
+    torch.testing.assert_close(end.v, v.expand_as(end.v), rtol=0, atol=1e-13)
+    torch.testing.assert_close(end.x - start.x, fallen.expand_as(end.x), rtol=0, atol=1e-13)
+    torch.testing.assert_close(end.F, start.F, rtol=0, atol=1e-13)
+
+
+@DIMS
+def test_free_motion_keeps_momentum_and_spin(dim):
+    """Elastic forces and muscles change neither Σ m v nor the spin: ≤ 1e-13 in 20 substeps."""
+    scene = tiny(dim, muscles=full(dim).muscles)
+    start, params = shaken(scene)
+    mass = masses(scene, params)[..., None]
+    end = reference.simulate(scene, start, randn(2, 1, 2, seed=60), params, substeps=10)
+
+    def spin(s):
+        A = (mass[..., None] * (s.x[..., :, None] * s.v[..., None, :] + DX**2 / 4 * s.C.mT)).sum(1)
+        return A - A.mT
+
+    scale = (mass * start.v.abs()).sum()
+    assert ((mass * (end.v - start.v)).sum(1)).abs().max() <= 1e-13 * scale
+    assert (spin(end) - spin(start)).abs().max() <= 1e-13 * scale
+    assert (end.v - start.v).abs().max() > 0.1, "nothing happened"
+
+
+def test_a_quarter_turn_of_the_scene_turns_the_result():
+    """Axes swapped as (x, y) → (L − y, x): catches mixed axes and nodes."""
+    scene = tiny(2, grid=Grid(shape=(11, 11), spacing=DX))
+    start, params = shaken(scene)
+    Q, L = f64([[0.0, -1.0], [1.0, 0.0]]), f64([10 * DX, 0.0])
+
+    def turn(s):
+        return State(s.x @ Q.T + L, s.v @ Q.T, Q @ s.C @ Q.T, Q @ s.F)
+
+    got = reference.simulate(scene, turn(start), None, params, substeps=10)
+    want = turn(reference.simulate(scene, start, None, params, substeps=10))
+    for a, b in zip(got, want, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+
+
+def test_a_muscle_contracts_along_its_fibre():
+    """Positive activation shortens the body along d and widens it across; negative does the opposite."""
+    muscle = Muscle(particles=np.arange(12), direction=(0.0, 1.0), strength=8.0)
+    scene = tiny(2, muscles=[muscle])
+    start, params = rest(scene)
+    for sign in (1.0, -1.0):
+        end = reference.simulate(scene, start, torch.full((1, 1, 1), sign).double(), params, substeps=15)
+        strain = end.F[0].diagonal(dim1=-2, dim2=-1).mean(0) - 1
+        assert sign * strain[1] < -1e-3
+        assert sign * strain[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("wall", "v", "want"),
+    [
+        ({"contact": "stick"}, (3.0, 1.0), (0.0, 0.0)),
+        ({"contact": "slip"}, (3.0, 1.0), (3.0, 0.0)),
+        ({"contact": "slip"}, (3.0, -1.0), (3.0, 0.0)),
+        ({"contact": "separate"}, (3.0, 1.0), (3.0, 1.0)),
+        ({"contact": "separate"}, (3.0, -1.0), (3.0, 0.0)),
+        ({"contact": "separate", "friction": 0.5}, (3.0, 1.0), (3.0, 1.0)),
+        ({"contact": "separate", "friction": 0.5}, (3.0, -1.0), (2.5, 0.0)),
+        ({"contact": "separate", "friction": 0.5}, (-3.0, -1.0), (-2.5, 0.0)),
+        ({"contact": "separate", "friction": 0.5}, (0.4, -1.0), (0.0, 0.0)),
+        ({"contact": "separate", "friction": 0.5}, (3.0, 0.0), (3.0, 0.0)),
+    ],
+)
+def test_contact_of_a_node(wall, v, want):
+    """What each contact leaves of a velocity above a floor, and on the same floor turned."""
+    v, want = f64(v), f64(want)
+    for Q in (f64([[1.0, 0.0], [0.0, 1.0]]), f64([[0.8, 0.6], [-0.6, 0.8]])):
+        normal = tuple(Q[:, 1].tolist())
+        got = reference.respond(Wall(normal=normal, offset=0.0, **wall), Q @ v)
+        torch.testing.assert_close(got, Q @ want, rtol=0, atol=1e-15)
+
+
+@DIMS
+def test_friction_never_gives_nan(dim):
+    """Pressed straight into a rough wall a node is held, gradient 0; on a smooth one it is free to slide."""
+    n = torch.eye(dim, dtype=torch.float64)[1]
+    for friction, want in ((0.5, torch.zeros(dim, dim)), (0.0, torch.eye(dim) - torch.outer(n, n).float())):
+        wall = Wall(normal=tuple(n.tolist()), offset=0.0, friction=friction)
+        jacobian = torch.autograd.functional.jacobian(lambda v: reference.respond(wall, v), -n)  # noqa: B023
+        torch.testing.assert_close(jacobian, want.double(), rtol=0, atol=0)
+        still = torch.autograd.functional.jacobian(
+            lambda v: reference.respond(wall, v),  # noqa: B023
+            torch.zeros_like(n),
+        )
+        torch.testing.assert_close(still, torch.eye(dim).double(), rtol=0, atol=0)  # v·n < 0 does not hold
+
+
+@DIMS
+def test_contact_derivative(dim):
+    """Each contact is differentiated within its branch: sliding, held and leaving."""
+    normal = (0.3, 1.0, -0.2)[:dim]
+    for contact, friction in (("slip", 0.0), ("separate", 0.0), ("separate", 0.3), ("separate", 5.0)):
+        wall = Wall(normal=normal, offset=0.0, contact=contact, friction=friction)
+        for up in (-1.0, 1.0):
+            v = f64((0.7, up, 0.4)[:dim]).requires_grad_()
+            assert torch.autograd.gradcheck(lambda v: reference.respond(wall, v), v)  # noqa: B023
+
+
+def test_walls_act_on_their_nodes_in_order():
+    """A node on the surface is inside; the last wall has the last word; empty nodes stay at zero."""
+    floor = Wall(normal=(0.0, 1.0), offset=0.25, contact="slip")
+    side = Wall(normal=(-1.0, 1.0), offset=0.0, contact="slip")
+    grid = Grid(shape=(5, 4), spacing=0.125)
+    velocity = f64([1.0, -2.0])
+    mass = torch.full((1, 20), 2.0).double()
+    mass[0, 7] = 0.0
+
+    def go(*walls):
+        scene = tiny(2, grid=grid, walls=walls, dt=1e-3)
+        return reference.grid_velocity(scene, mass, mass[..., None] * velocity).view(5, 4, 2)
+
+    assert (go(floor)[0, :3] == torch.tensor([1.0, 0.0])).all()  # 2 · 0.125 = 0.25 is inside
+    assert (go(floor)[0, 3] == velocity).all()
+    torch.testing.assert_close(go(floor, side)[2, 2], f64([0.5, 0.5]))
+    torch.testing.assert_close(go(side, floor)[2, 2], f64([-0.5, 0.0]))
+    assert (go(floor, side)[1, 3] == 0).all()
+
+
+@pytest.mark.parametrize("laws", [("neo_hookean",), ("fixed_corotated",), ("neo_hookean", "fixed_corotated")])
+@DIMS
+def test_gradient_of_a_rollout(dim, laws):
+    """Along a random direction of each input equals a central difference: 2 control steps, 2 worlds, ≤ 5e-9.
+
+    The body slides with 2 m/s, so that no node changes between held, sliding and leaving in between.
+    """
+    scene = full(dim, laws)
+    start, params = shaken(scene, worlds=2, noise=0.3)
+    start = start._replace(v=start.v + f64((2.0, -0.5, 0.3)[:dim]))
+    inputs = {**start._asdict(), **params._asdict(), "activation": 0.5 * randn(2, 2, 2, seed=70)}
+    weights = [randn(*t.shape, seed=80 + k) for k, t in enumerate(start)]
+
+    def loss(values):
+        s, p = State(*(values[k] for k in "xvCF")), Params(*(values[k] for k in Params._fields))
+        end = reference.simulate(scene, s, values["activation"], p, substeps=4)
+        return sum((w * t).sum() for w, t in zip(weights, end, strict=True))
+
+    leaves = {name: value.clone().requires_grad_() for name, value in inputs.items()}
+    gradient = dict(zip(leaves, torch.autograd.grad(loss(leaves), list(leaves.values())), strict=True))
+    scale = dict(x=0.02, v=0.5, C=2.0, F=0.1, young=40.0, poisson=0.1, density=0.5, activation=0.5)
+    for k, (name, value) in enumerate(inputs.items()):
+        d = scale[name] * randn(*value.shape, seed=90 + k)
+        want = difference(lambda at: loss(inputs | {name: at}), value, d, 1e-4)  # noqa: B023
+        parts = gradient[name] * d
+        assert parts.isfinite().all()
+        assert parts.norm() > 0, f"the test does not exercise {name}"
+        assert abs(parts.sum() - want) <= 5e-9 * max(abs(want), parts.norm()), name
+
+
+def test_worlds_do_not_touch():
+    """Two worlds in one call are two calls of one, and the start is left as it was."""
+    scene = full(2)
+    start, params = shaken(scene, worlds=2)
+    activation, before = randn(2, 2, 2, seed=61), [t.clone() for t in start]
+    both = reference.simulate(scene, start, activation, params, substeps=3)
+    for w in range(2):
+        part = slice(w, w + 1)
+        alone = reference.simulate(
+            scene,
+            State(*(t[part] for t in start)),
+            activation[:, part],
+            Params(*(p[part] for p in params)),
+            substeps=3,
+        )
+        for a, b in zip(both, alone, strict=True):
+            torch.testing.assert_close(a[part], b, rtol=0, atol=1e-14)
+    assert all(torch.equal(a, b) for a, b in zip(start, before, strict=True))
+
+
+def test_each_row_drives_its_substeps():
+    """Rows of activation are control steps in order; no activation is one control step of zeros."""
+    scene, (start, params) = full(2), shaken(full(2))
+    rows = randn(2, 1, 2, seed=62)
+    first = reference.simulate(scene, start, rows[:1], params, substeps=3)
+    second = reference.simulate(scene, first, rows[1:], params, substeps=3)
+    for a, b in zip(reference.simulate(scene, start, rows, params, substeps=3), second, strict=True):
+        assert torch.equal(a, b)
+    idle = reference.simulate(scene, start, torch.zeros_like(rows[:1]), params, substeps=3)
+    for a, b in zip(reference.simulate(scene, start, None, params, substeps=3), idle, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("where", [0.04, 0.96, math.nan])
+def test_a_particle_outside_the_grid_is_an_error(where):
+    """Not a value from the other side of the grid: the message names world and particle."""
+    scene, (start, params) = tiny(2), rest(tiny(2), worlds=2)
+    x = start.x.clone()
+    x[1, 5, 1] = where
+    with pytest.raises(ValueError, match="particle 5 of world 1 must stay half a cell inside the grid"):
+        reference.simulate(scene, start._replace(x=x), None, params, substeps=1)

@@ -1,0 +1,198 @@
+"""The robots: what they are made of, that they stand where they should, and that their muscles move them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import softmpm
+from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
+from softmpm_learn.tasks.outline import Limb, fill, inside, smooth, smooth_line
+from softmpm_learn.tasks.task import Resolution, TaskConf
+
+SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+
+
+@pytest.fixture(scope="module", params=list(TASKS))
+def task(request):
+    """Each task at its own settings."""
+    return make_task(TASKS[request.param][0]())
+
+
+def simulate(task, activation, seconds):
+    model = softmpm.build(task.scene, device="cpu")
+    steps = round(seconds / task.control_period)
+    rows = torch.as_tensor(activation, dtype=torch.float32).expand(steps, 1, model.muscle_count)
+    with torch.no_grad():
+        return model, softmpm.simulate(model, model.rest(), rows, model.params(), substeps=task.substeps)
+
+
+def test_elephant_has_its_particles_at_each_resolution():
+    """At least 5,000 at the standard resolution, about 2,000 as a draft; the outline's area is the same to 3 %."""
+    count, area = {}, {}
+    for resolution in Resolution:
+        task = elephant(ElephantConf(resolution=resolution))
+        particles = task.scene.bodies[0].particles
+        count[resolution.name], area[resolution.name] = len(particles), particles.volume.sum()
+    assert count["standard"] >= 5000 and 1500 <= count["draft"] <= 2500 and count["fine"] > 10000
+    assert max(area.values()) / min(area.values()) < 1.03
+
+
+def test_regions_and_muscles_are_particles_of_the_robot(task):
+    """Regions do not overlap; every muscle has particles at even the coarsest resolution, and nothing is out of range."""
+    count = len(task.scene.bodies[0].particles)
+    every = np.concatenate(list(task.regions.values()))
+    assert len(np.unique(every)) == len(every) and every.min() >= 0 and every.max() < count
+    assert all(len(region) > 20 for region in task.regions.values())
+    assert all(len(muscle.particles) > 20 for muscle in task.scene.muscles)
+    assert len(task.scene.muscles) % 2 == 0
+
+
+def test_a_pair_of_muscles_splits_a_limb(task):
+    """The muscles of a pair share no particle and pull along the same direction, so that they bend it."""
+    muscles = task.scene.muscles
+    for left, right in zip(muscles[::2], muscles[1::2], strict=True):
+        assert not np.intersect1d(left.particles, right.particles).size
+        assert left.direction == pytest.approx(right.direction)
+        assert len(left.particles) == pytest.approx(len(right.particles), rel=0.3)
+
+
+def test_legs_stand_on_the_floor():
+    """The soles of all legs are at the same height, half a cell above the floor's nodes, at every resolution."""
+    for build, conf in ((elephant, ElephantConf), (biped, BipedConf)):
+        for resolution in Resolution:
+            task = build(conf(resolution=resolution))
+            scene, positions = task.scene, task.scene.bodies[0].particles.positions
+            floor = scene.walls[0].offset
+            legs = [region for name, region in task.regions.items() if name not in ("body", "trunk")]
+            for leg in legs:
+                gap = (positions[leg, 1].min() - floor) / scene.grid.spacing
+                assert 0.5 < gap < 1.0
+            assert positions[:, 1].min() == min(positions[leg, 1].min() for leg in legs)
+
+
+def test_the_step_is_stable_with_room_for_co_design(task):
+    """dt is at most 0.4 of the limit, whole substeps fill a control period, and the episode lasts as long as asked."""
+    assert task.scene.dt <= 0.4 * softmpm.stable_dt(task.scene) * (1 + 1e-12)
+    conf = TASKS[task.name][0]()
+    assert task.substeps * task.scene.dt == pytest.approx(conf.control_period)
+    assert task.control_steps * task.control_period == pytest.approx(conf.seconds)
+    assert task.seconds == pytest.approx(conf.seconds)
+
+
+def test_the_walkers_stand_without_activation():
+    """Left alone for 0.3 s they sink by less than a sixth of their height and stay where they are."""
+    for task in (elephant(ElephantConf()), biped(BipedConf())):
+        model, end = simulate(task, 0.0, 0.3)
+        rest = model.rest().x[0]
+        floor = task.scene.walls[0].offset
+        assert end.x[0, :, 1].mean() - floor > (rest[:, 1].mean() - floor) * 5 / 6
+        assert abs(float(end.x[0, :, 0].mean() - rest[:, 0].mean())) < 0.1 * task.body_length
+
+
+def test_the_arm_is_clamped_and_bends_to_the_side_that_pulls():
+    """Pulling with the muscles on the right brings the tip to the right; the clamped foot stays."""
+    task = arm(ArmConf())
+    tip = task.objective.particles
+    for side, sign in ((0, -1), (1, 1)):  # muscles come in pairs, left and right
+        activation = torch.zeros(len(task.scene.muscles))
+        activation[side::2] = 0.5
+        model, end = simulate(task, activation, 0.15)
+        moved = (end.x - model.rest().x)[0]
+        assert sign * float(moved[tip, 0].mean()) > 0.02
+        clamped = model.positions[:, 1] < task.scene.walls[0].offset - task.scene.grid.spacing
+        assert clamped.any() and moved[clamped].abs().max() < 1e-3
+
+
+def test_a_leg_swings_when_its_halves_work_against_each_other():
+    """The elephant's foot goes forward when the front half of the leg shortens and the back half lengthens."""
+    task = elephant(ElephantConf(gravity=0.0))
+    pair = 2 * list(task.regions).index("leg4")
+    activation = torch.zeros(len(task.scene.muscles))
+    muscles = task.scene.muscles
+    positions = task.scene.bodies[0].particles.positions
+    means = [positions[muscles[pair + k].particles, 0].mean() for k in (0, 1)]
+    front = pair + int(np.argmax(means))
+    activation[front], activation[2 * pair + 1 - front] = 0.5, -0.5
+    model, end = simulate(task, activation, 0.1)
+    leg = task.regions["leg4"]
+    foot = leg[positions[leg, 1] < positions[leg, 1].min() + 0.02]
+    assert float((end.x - model.rest().x)[0, foot, 0].mean()) > 0.005
+
+
+def test_settings_reach_the_scene():
+    """Materials, strength, gravity, friction and resolution of the settings are those of the scene."""
+    conf = ElephantConf(
+        young=4e4, poisson=0.25, density=900.0, strength=1e4, gravity=3.0, friction=0.3, damping=0.5
+    )
+    scene = elephant(conf).scene
+    material = scene.bodies[0].material
+    assert (material.young, material.poisson, material.density) == (4e4, 0.25, 900.0)
+    assert {muscle.strength for muscle in scene.muscles} == {1e4}
+    assert scene.gravity == (0.0, -3.0) and scene.walls[0].friction == 0.3 and scene.damping == 0.5
+    assert scene.grid.spacing == pytest.approx(1 / 80)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        (ElephantConf, {"seconds": 0.0}, "task.seconds must be > 0"),
+        (ElephantConf, {"young": float("nan")}, "task.young must be > 0"),
+        (ElephantConf, {"gravity": -1.0}, "task.gravity must be ≥ 0"),
+        (ElephantConf, {"friction": -0.1}, "task.friction must be ≥ 0"),
+        (BipedConf, {"upright": -1.0}, "task.upright must be ≥ 0"),
+        (ElephantConf, {"control_period": 2.0}, "task.control_period must be at most task.seconds"),
+        (ArmConf, {"goal": [0.5]}, "task.goal must be two numbers"),
+        (ArmConf, {"goal": [0.9, 0.9]}, "at most the arm's 0.36 m"),
+        (ArmConf, {"goal": [0.45, 0.01]}, "above the clamp"),
+    ],
+)
+def test_a_wrong_setting_says_what_must_hold(kind, change, message):
+    """Settings are checked where they are made."""
+    with pytest.raises(ValueError, match=message):
+        kind(**change)
+
+
+def test_make_task_knows_its_tasks():
+    """Each name of the table builds a task of that name; other settings are refused."""
+    for name, (conf, _) in TASKS.items():
+        assert conf().name == name and make_task(conf()).name == name
+
+    @dataclasses.dataclass(kw_only=True)
+    class Other(TaskConf):
+        name: str = "other"
+
+    with pytest.raises(ValueError, match="no task has settings of type Other"):
+        make_task(Other())
+
+
+def test_inside_and_fill():
+    """Points inside a square and no others; a filled square has the square's area, overlapping parts count once."""
+    points = np.array([(0.5, 0.5), (1.5, 0.5), (-0.1, 0.2), (0.99, 0.01)])
+    assert inside(points, SQUARE).tolist() == [True, False, False, True]
+    particles = fill([SQUARE, SQUARE + (0.5, 0.0)], 0.05)
+    assert particles.volume.sum() == pytest.approx(1.5)
+    assert len(np.unique(particles.positions.round(6), axis=0)) == len(particles)
+
+
+def test_smooth_curves_pass_through_their_points():
+    """Every step-th point of a curve is one that was given; a closed curve has no double point where it closes."""
+    assert smooth(SQUARE, 4)[::4] == pytest.approx(SQUARE)
+    assert len(smooth(SQUARE, 4)) == 16
+    line = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 2.0), (2.0, 1.0, 1.0)])
+    assert smooth_line(line, 5)[::5] == pytest.approx(line)
+
+
+def test_a_limb_knows_along_and_across():
+    """On a bent limb, places are measured along its line and to its left, and its parts are the halves of its outline."""
+    limb = Limb(np.array([(0.0, 0.0), (0.0, -1.0), (1.0, -1.0)]), np.array([0.2, 0.2, 0.2]))
+    along, left = limb.locate(np.array([(0.05, -0.5), (0.5, -0.95), (0.5, -1.05)]))
+    assert along == pytest.approx([0.25, 0.75, 0.75]) and left == pytest.approx([0.05, 0.05, -0.05])
+    assert limb.direction(0.0, 0.5) == pytest.approx([0.0, -1.0])
+    points = fill([limb.outline()], 0.02).positions
+    halves = [limb.part(points, 0.0, 1.01, side) for side in (1, -1)]
+    assert len(np.intersect1d(*halves)) == 0
+    assert len(limb.part(points, 0.0, 1.01)) == pytest.approx(sum(map(len, halves)), abs=60)
+    round_limb = dataclasses.replace(limb, round_tip=True)
+    assert round_limb.outline()[:, 0].max() == pytest.approx(1.1, abs=1e-3)
