@@ -9,6 +9,9 @@ differentiable in the start, the activation and the material:
 
 from softmpm.autograd import rasterize, simulate
 from softmpm.model import Model, build
+from softmpm.playback import Recording
+from softmpm.recording import Recorder
+from softmpm.rerun_file import to_rerun
 from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene, Wall
 from softmpm.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
@@ -27,6 +30,8 @@ __all__ = [
     "NeoHookean",
     "Params",
     "Particles",
+    "Recorder",
+    "Recording",
     "Scene",
     "StabilityWarning",
     "StableDt",
@@ -44,6 +49,7 @@ __all__ = [
     "simulate",
     "stable_dt",
     "step",
+    "to_rerun",
     "torch_state",
     "warp_solid",
     "warp_state",

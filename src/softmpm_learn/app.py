@@ -20,7 +20,7 @@ from omegaconf.errors import (
 )
 
 from softmpm_learn.config import RunConf, conf_dir, load, save, to_run, unknown_key
-from softmpm_learn.run import run
+from softmpm_learn.experiment import run_experiment
 from softmpm_learn.tasks import TASKS
 
 CHANGEABLE = ("train.iterations", "train.record_every", "device")
@@ -82,7 +82,7 @@ def job(config: DictConfig) -> None:
         _give_up(error)
     save(conf, out / "config.yaml")
     try:
-        run(conf, out, resume=resume)
+        run_experiment(conf, out)
     except Exception as error:
         (out / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
         _give_up(error, "" if isinstance(error, EXPECTED) else f" The traceback is in {out / 'error.txt'}.")

@@ -1,0 +1,184 @@
+"""One experiment, from its settings to everything that it leaves in its folder. Nothing here knows Hydra."""
+
+import csv
+import logging
+import math
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+import softmpm
+from softmpm_learn.config import DeviceConf, RunConf
+from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
+from softmpm_learn.objective import Progress as Travel
+from softmpm_learn.objective import Reach
+from softmpm_learn.progress import Progress
+from softmpm_learn.run import Run
+from softmpm_learn.stop import stop_on_signals
+from softmpm_learn.tasks import Task, make_task
+from softmpm_learn.train import Result, train
+
+PICTURES = 4
+"""Moments of the best episode in robot.png, the first and the last among them."""
+DESIGN = {"young": ("Young's modulus", "Pa"), "poisson": ("Poisson's ratio", ""), "density": ("density", "kg/m³")}
+CURVES = {
+    "loss": "loss",
+    "validation_loss": "validation loss of the autoencoder",
+    "effort": "activation, root mean square",
+    "young_change": "mean change of Young's modulus",
+}
+"""Columns of metrics.csv in loss.png; those without numbers are left out."""
+
+logger = logging.getLogger("softmpm_learn")
+
+
+def run_experiment(conf: RunConf, out: Path) -> None:
+    """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next."""
+    wp.config.log_level = wp.LOG_WARNING
+    torch.set_num_threads(conf.device.threads)
+    task = make_task(conf.task)
+    model = make_model(task, conf.device, conf.train.worlds)
+    logger.info("%s", model.describe(task.control_steps * task.substeps))
+    with Progress(conf.train.iterations) as progress, stop_on_signals() as stop:
+        result = train(
+            task,
+            model,
+            conf.settings,
+            out,
+            progress=lambda iteration, row: progress(iteration, row["loss"]),
+            stop=stop,
+        )
+    draw(result, task, out)
+    logger.info("%s", farewell(result, task, out))
+
+
+def make_model(task: Task, conf: DeviceConf, worlds: int) -> softmpm.Model:
+    """The task's scene on the device of the settings."""
+    return softmpm.build(
+        task.scene,
+        device=None if conf.name == "auto" else conf.name,
+        dtype=getattr(torch, conf.dtype),
+        worlds=worlds,
+        memory_budget=None if conf.memory is None else round(1e6 * conf.memory),
+    )
+
+
+def draw(result: Result, task: Task, out: Path) -> None:
+    """Leave loss.png, latent.png where a latent was learned, and robot.png where something was recorded."""
+    loss_figure(out / "loss.png", curves(out / "metrics.csv"))
+    if result.run.learner is not None:
+        latent_figure(out / "latent.png", decoded(result.run))
+    episode = last_episode(out / "run.h5")
+    if episode is not None:
+        iteration, frames = episode
+        moments = np.linspace(0, len(frames["time"]) - 1, PICTURES).round().astype(int)
+        pictures = [
+            (f"iteration {iteration}, {frames['time'][k]:.2f} s", frames["x"][k], _shown(frames["activation"][k]))
+            for k in moments
+        ]
+        goal = None if any(result.run.settings.train.goal_spread) else task.goal
+        robot_figure(out / "robot.png", task.scene, pictures, design(result.run), goal=goal)
+
+
+def curves(path: Path) -> dict[str, tuple[list[float], list[float]]]:
+    """What loss.png shows of metrics.csv: iterations and values of each curve."""
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = {}
+    for column, title in CURVES.items():
+        points = [(int(row["iteration"]), float(row[column])) for row in rows if row.get(column)]
+        found[title] = ([k for k, _ in points], [value for _, value in points])
+    return found
+
+
+@torch.no_grad()
+def decoded(run: Run) -> np.ndarray:
+    """Velocity [m/s] that each latent feature stands for at ``VALUES``, shape (feature, value, *nodes, dim)."""
+    assert run.learner is not None
+    size, like = run.observer.size, run.learner.autoencoder.encoder.scale
+    features = torch.zeros(size, len(VALUES), size, dtype=like.dtype, device=like.device)
+    for k in range(size):
+        features[k, :, k] = torch.tensor(VALUES)
+    fields = run.learner.autoencoder.decode(features.flatten(end_dim=1))
+    return fields.unflatten(0, (size, len(VALUES))).movedim(2, -1).cpu().numpy()
+
+
+@torch.no_grad()
+def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
+    """Materials of the best robot: value of each particle and unit."""
+    now = run.actor()
+    if run.best["iteration"] >= 0:
+        run.load_actor(run.best)
+    params = run.params()
+    run.load_actor(now)
+    return {title: (getattr(params, name).cpu().numpy(), unit) for name, (title, unit) in DESIGN.items()}
+
+
+def last_episode(path: Path) -> tuple[int, dict[str, np.ndarray]] | None:
+    """Iteration shown and frames of the last recorded simulation: the best, once a run is finished."""
+    if not path.exists():
+        return None
+    with softmpm.Recording(path) as recording:
+        if not recording.episodes:
+            return None
+        row = recording.episodes[-1]
+        frames = recording.frames(row)
+        shown = int(recording.attributes(row).get("of", row))
+    return (shown, frames) if len(frames["time"]) else None
+
+
+def _shown(activation: np.ndarray) -> np.ndarray | None:
+    return None if np.isnan(activation).any() else activation
+
+
+def farewell(result: Result, task: Task, out: Path) -> str:
+    """What came out, and as the last line how to look at it or how to go on."""
+    lines = []
+    if math.isfinite(result.best_loss):
+        lines.append(f"Best loss {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}.")
+    shown = _relative(out)
+    if not result.finished:
+        lines.append(f"Stopped after {result.run.iteration} iterations.")
+    if (out / "run.h5").exists():
+        lines.append(f"Everything is in {shown}. To look at the recording: {convert(out)}")
+    else:
+        lines.append(f"Everything is in {shown}; train.record_every=0, so nothing was recorded.")
+    if not result.finished:
+        lines.append(f"To go on: python -m softmpm_learn resume={shown}")
+    return "\n".join(lines)
+
+
+def outcome(task: Task, out: Path) -> str:
+    """How far the robot of the last recorded simulation got, in words."""
+    episode = last_episode(out / "run.h5")
+    if episode is None:
+        return ""
+    start, end = episode[1]["x"][0], episode[1]["x"][-1]
+    if isinstance(task.objective, Travel):
+        moved = float((end - start)[:, task.objective.axis].mean())
+        return f"; it travelled {moved:.3f} m, {moved / task.body_length:.2f} of its length"
+    if isinstance(task.objective, Reach) and task.goal is not None:
+        away = float(np.linalg.norm(end[task.objective.particles].mean(axis=0) - task.goal))
+        return f"; it ended {1000 * away:.0f} mm from the goal"
+    return ""
+
+
+def convert(out: Path) -> str:
+    """Turn run.h5 into run.rrd; gives the command that opens the recording, or that first converts it elsewhere."""
+    recording, picture = out / "run.h5", out / "run.rrd"
+    viewer = f"rerun {_relative(picture)}"
+    try:
+        softmpm.to_rerun(recording, picture)
+    except ImportError:
+        return f"python -m softmpm.recording {_relative(recording)} {_relative(picture)} (needs rerun-sdk), then {viewer}"
+    return viewer if shutil.which("rerun") else f"python -m {viewer}"
+
+
+def _relative(path: Path) -> str:
+    """As short as it can be typed from here."""
+    here = os.path.relpath(path)
+    return str(path) if here.startswith("..") else here
