@@ -11,10 +11,12 @@ from pathlib import Path
 
 
 def take(rrd: Path, folder: Path, times: list[float], view: str | None, port: int) -> list[Path]:
-    """One PNG for each time [s] of the time line ``time``: of the whole window, or of the first view named ``view*``."""
+    """One PNG for each time [s] on the time line ``time``, of the window or of one view."""
     import rerun as rr
 
-    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # where pip put the viewer
+    os.environ["PATH"] = (
+        f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # where pip put the viewer
+    )
     folder.mkdir(parents=True, exist_ok=True)
     client = rr.experimental.ViewerClient.spawn(
         headless=True, port=port, hide_welcome_screen=True, detach_process=False
@@ -35,10 +37,14 @@ def take(rrd: Path, folder: Path, times: list[float], view: str | None, port: in
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("rrd", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--times", type=float, nargs="+", default=[0.5], help="seconds on the time line 'time'")
+    parser.add_argument(
+        "--times", type=float, nargs="+", default=[0.5], help="seconds on the time line 'time'"
+    )
     parser.add_argument("--view", help="name of one view, or how it begins; the whole window without")
     parser.add_argument("--port", type=int, default=9957)
     given = parser.parse_args()

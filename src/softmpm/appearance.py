@@ -1,7 +1,5 @@
 """How a recorded robot looks: colours, sizes, walls, arrows and what to frame. NumPy only."""
 
-from itertools import product
-
 import numpy as np
 
 BODY = np.array([(205, 208, 214), (216, 206, 190), (194, 210, 196), (210, 198, 214)], float)
@@ -35,37 +33,51 @@ def activation_colours(static: dict[str, np.ndarray], activation: np.ndarray) ->
 
 
 def strain_colours(strain: np.ndarray, top: float) -> np.ndarray:
-    """Dark violet for 0 to yellow for ``top`` and above; strain (frame, particle), as are the packed colours."""
+    """Packed colours of strain (frame, particle): dark violet for 0 to yellow for ``top`` and above."""
     at = np.clip(np.nan_to_num(strain, nan=top) / top, 0, 1) * (len(STRAIN) - 1)
     return pack(np.stack([np.interp(at, np.arange(len(STRAIN)), channel) for channel in STRAIN.T], -1))
 
 
 def radii(volume: np.ndarray, shown: float, dim: int) -> np.ndarray:
-    """Radius [m] of each particle's dot, so that the dots fill the body when a share ``shown`` of it is drawn."""
-    return 0.62 * (volume / shown) ** (1 / dim)
+    """Radius [m] of each particle's dot; a part ``shown`` of all dots then fills the body."""
+    return 0.7 * (volume / shown) ** (1 / dim)
 
 
-def wall_outline(normal: np.ndarray, offset: float, upper: np.ndarray) -> np.ndarray:
-    """Where the surface n·x = offset cuts the box from 0 to ``upper``.
+def wall_outlines(normals: np.ndarray, offsets: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
+    """What can be seen of the surface n·x = offset of each wall.
+
+    Args:
+        normals, offsets: Of the walls, shapes (wall, dim) and (wall,).
+        upper: The grid reaches from 0 to here, shape (dim,) [m].
 
     Returns:
-        Corners (corner, dim) in order: 2 in 2D, 3 to 6 in 3D; none if the wall misses the box.
+        For each wall its corners (corner, dim) in order, two in 2D; none if it is outside or hidden.
     """
-    corners = np.array(list(product(*((0.0, u) for u in upper))))
+    dim, outlines = len(upper), []
+    free = [(axis, 0.0) for axis in np.eye(dim)] + [
+        (-axis, -u) for axis, u in zip(np.eye(dim), upper, strict=True)
+    ]
+    for k, (normal, offset) in enumerate(zip(normals, offsets, strict=True)):
+        across = np.linalg.svd(normal[None])[2][1:]  # unit vectors in the surface
+        corners = np.concatenate([across, -across])  # of a square, or the ends of a line
+        outline = offset * normal + 10 * (np.linalg.norm(upper) + abs(offset)) * corners
+        others = [other for j, other in enumerate(zip(normals, offsets, strict=True)) if j != k]
+        for limit_normal, limit in [*free, *others]:
+            outline = _clip(outline, limit_normal, limit - 1e-6 * upper.max())
+        outlines.append(outline)
+    return outlines
+
+
+def _clip(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
+    """Where a convex polygon, or a line of two points, has n·x ≥ offset (Sutherland and Hodgman 1974)."""
     side = corners @ normal - offset
-    found = [corner for corner, s in zip(corners, side, strict=True) if abs(s) < 1e-9]
-    for i, j in product(range(len(corners)), repeat=2):
-        if i < j and (corners[i] != corners[j]).sum() == 1 and side[i] * side[j] < 0:
-            found.append(corners[i] + (corners[j] - corners[i]) * side[i] / (side[i] - side[j]))
-    found = np.unique(np.round(found, 12), axis=0) if found else np.zeros((0, len(upper)))
-    if len(found) < len(upper):
-        return np.zeros((0, len(upper)))
-    if len(upper) == 2:
-        return found
-    first = found[0] - found.mean(0)
-    first /= np.linalg.norm(first)
-    around = np.arctan2((found - found.mean(0)) @ np.cross(normal, first), (found - found.mean(0)) @ first)
-    return found[np.argsort(around)]
+    kept = []
+    for i, j in zip(range(len(corners)), np.roll(range(len(corners)), -1), strict=True):
+        if side[i] >= 0:
+            kept.append(corners[i])
+        if side[i] * side[j] < 0 and (len(corners) > 2 or i < j):  # a line has no edge back to its start
+            kept.append(corners[i] + (corners[j] - corners[i]) * side[i] / (side[i] - side[j]))
+    return np.array(kept).reshape(-1, corners.shape[1])
 
 
 def hatch(outline: np.ndarray, normal: np.ndarray, gap: float) -> np.ndarray:
@@ -105,10 +117,12 @@ def frame_box(low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> tuple[np.
 
 def eye(low: np.ndarray, high: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where to stand to see a 3D box, a little from above: position and target [m]."""
-    target, size = (low + high) / 2, float(np.linalg.norm(high - low))
     extent = high - low
-    side = np.array([extent[i] if abs(up[i]) < 0.5 else np.inf for i in range(3)])
-    front = np.eye(3)[int(np.argmin(side))]  # look along the robot's thin axis, at its broad side
-    across = np.cross(up, front)
-    direction = front + 0.45 * across + 0.4 * up
-    return target + 1.25 * size * direction / np.linalg.norm(direction), target
+    flat = [extent[i] if abs(up[i]) < 0.5 else np.inf for i in range(3)]
+    front = np.eye(3)[int(np.argmin(flat))]  # look along the thinner horizontal axis, at the broad side
+    right = np.cross(up, front)
+    if right.sum() < 0:  # the other horizontal axis points to the right
+        front, right = -front, -right
+    direction = front + 0.4 * right + 0.45 * up
+    target = (low + high) / 2
+    return target + 1.1 * np.linalg.norm(extent) * direction / np.linalg.norm(direction), target

@@ -7,7 +7,7 @@ from softmpm.buffers import Motion, Solid, lame
 from softmpm.checks import check_activation, check_params, check_state, check_substeps, check_values
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
-from softmpm.raster import splat, splat_adj
+from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Horizon, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
 
@@ -80,11 +80,7 @@ def rasterize(model: Model, state: State) -> GridField:
     """
     state = _cast(model, state)
     check_state(model, state)
-    node = _Splat.apply(model, state.x, state.v, state.C)
-    node = node.view(model.worlds, *model.scene.grid.shape, model.dim + 1)
-    momentum, mass = node[..., :-1], node[..., -1]
-    present = mass > 0
-    return GridField(mass, momentum * (present / torch.where(present, mass, 1))[..., None])
+    return GridField(*_Rasterize.apply(model, state.x, state.v, state.C))
 
 
 def _cast(model: Model, value):
@@ -142,27 +138,27 @@ class _SimulateBackward(torch.autograd.Function):
         raise RuntimeError(_SECOND)
 
 
-class _Splat(torch.autograd.Function):
+class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(model, x, v, C):
-        return splat(model, State(x, v, C, None))
+        return rasterize_nodes(model, State(x, v, C, None))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
         ctx.model = inputs[0]
-        ctx.save_for_backward(*inputs[1:])
+        ctx.save_for_backward(*inputs[1:], *output)
 
     @staticmethod
-    def backward(ctx, adj_node):
-        return None, *_SplatBackward.apply(ctx.model, adj_node, *ctx.saved_tensors)
+    def backward(ctx, adj_mass, adj_velocity):
+        return None, *_RasterizeBackward.apply(ctx.model, adj_mass, adj_velocity, *ctx.saved_tensors)
 
 
-class _SplatBackward(torch.autograd.Function):
+class _RasterizeBackward(torch.autograd.Function):
     """As :class:`_SimulateBackward`: a second derivative raises."""
 
     @staticmethod
-    def forward(model, adj_node, x, v, C):
-        adj = splat_adj(model, State(x, v, C, None), adj_node)
+    def forward(model, adj_mass, adj_velocity, x, v, C, mass, velocity):
+        adj = rasterize_nodes_adj(model, State(x, v, C, None), GridField(mass, velocity), GridField(adj_mass, adj_velocity))
         return adj.x, adj.v, adj.C
 
     @staticmethod

@@ -2,16 +2,19 @@
 
     episode           {iteration, attributes}       one row per recorded simulation
     scalar            {iteration, name, value}      one row per number, such as a loss
-    frame/index       {episode, time, field, latent}  one row per frame: rows of the tables that hold the rest, -1 for none
+    frame/index       {episode, time, field, latent}  one row per frame; its rows of the last two, or -1
     frame/x, frame/v  (frame, particle, dim)        [m], [m/s]
-    frame/strain      (frame, particle)             size of the Green strain [-], see ``strain`` in recording.py
+    frame/strain      (frame, particle)             size of the Green strain [-], see recording.py
     frame/activation  (frame, muscle)               [-], NaN where none was given
     field/velocity    (row, *nodes, dim)            grid velocity [m/s]
     latent/value      (row, size)                   what an observer saw
     static/*                                        rest shape, muscles, walls
 
-A row of a table with names is complete when its first number is not negative; HDF5 shows the fill value -1 until then.
+A row of a table with names is complete when its first number is not negative; HDF5 shows the fill value -1
+until then.
 """
+
+from typing import cast
 
 import h5py
 import numpy as np
@@ -88,10 +91,16 @@ def create(file: h5py.File, model: Model, static: dict[str, np.ndarray]) -> None
     grid = model.scene.grid
     file.attrs["format"], file.attrs["version"] = np.bytes_(FORMAT), VERSION
     file.attrs["dt"], file.attrs["spacing"] = model.scene.dt, grid.spacing
+    file.attrs["share"] = len(static["particle"]) / model.particle_count
     for name, values in static.items():
         checksum = {"fletcher32": True, "chunks": values.shape} if values.size else {}
         file.create_dataset(f"static/{name}", data=values, **checksum)
-    size = {"p": (len(static["particle"]),), "d": (grid.dim,), "m": (len(model.scene.muscles),), "n": tuple(grid.shape)}
+    size = {
+        "p": (len(static["particle"]),),
+        "d": (grid.dim,),
+        "m": (len(model.scene.muscles),),
+        "n": tuple(grid.shape),
+    }
     for name, (dtype, axes) in TABLES.items():
         if axes == "rl":
             _create_table(file, name, dtype, (0,), (_LATENT_MOST,), (_LATENT_CHUNK,))
@@ -106,10 +115,24 @@ def _create_table(file: h5py.File, name: str, dtype: np.dtype, row: tuple, most:
     fill = np.zeros((), dtype)
     if dtype.names:
         fill[dtype.names[0]] = -1
-    squeeze = {} if dtype in (SCALAR, FRAME) else {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    file.create_dataset(
-        name, (0, *row), dtype, maxshape=(None, *most), chunks=(1, *chunk), fillvalue=fill, fletcher32=True, **squeeze
+    squeeze = (
+        {} if dtype in (SCALAR, FRAME) else {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     )
+    file.create_dataset(
+        name,
+        (0, *row),
+        dtype,
+        maxshape=(None, *most),
+        chunks=(1, *chunk),
+        fillvalue=fill,
+        fletcher32=True,
+        **squeeze,
+    )
+
+
+def tables(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """All tables of a file that :func:`create` made."""
+    return {name: cast(h5py.Dataset, file[name]) for name in TABLES}
 
 
 def put(table: h5py.Dataset, start: int, rows: np.ndarray) -> None:
@@ -122,5 +145,6 @@ def put(table: h5py.Dataset, start: int, rows: np.ndarray) -> None:
 
 def complete(rows: np.ndarray) -> np.ndarray:
     """Rows of a table with names, up to the first that a killed run did not finish."""
-    unfinished = np.flatnonzero(rows[rows.dtype.names[0]] < 0)
+    names = rows.dtype.names or ("",)
+    unfinished = np.flatnonzero(rows[names[0]] < 0)
     return rows[: unfinished[0]] if len(unfinished) else rows

@@ -1,8 +1,9 @@
 """Recording: read what a Recorder wrote, while it writes, after it ended or after it was killed.
 
-A recording may come from somebody else, so nothing in it is trusted: only the names in ``layout.py`` are read, each must be
-plain numbers inside this file (no links, no external or virtual data), and none may claim more than the file can hold. That
-keeps a file from reading other files and from filling memory; it cannot mend faults of the HDF5 library itself.
+A recording may come from somebody else, so nothing in it is trusted: only the names in ``layout.py`` are
+read, each must be plain numbers inside this file (no links, no external or virtual data), and none may claim
+more than the file can hold. That keeps a file from reading other files and from filling memory; it cannot
+mend faults of the HDF5 library itself.
 """
 
 import json
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 
 from softmpm.layout import FORMAT, PARTS, PER_FRAME, STATIC, TABLES, VERSION, complete
 
@@ -20,13 +22,15 @@ _BEST_COMPRESSION = 1100  # deflate never exceeds 1032:1
 class Recording:
     """A recorded run.
 
-    Other tools can open the file too: ``h5py.File(path, "r", swmr=True)``; without ``swmr`` HDF5 refuses the file of a run
-    that still writes or was killed.
+    Other tools can open the file too: ``h5py.File(path, "r", swmr=True)``; without ``swmr`` HDF5 refuses the
+    file of a run that still writes or was killed.
 
     Attributes:
-        static: What does not change, by name: ``positions`` (particle, dim) [m], ``volume``, ``body``, ``particle`` (the
-            model's index of each recorded particle), ``muscle`` (muscle, particle) 0 or 1, ``wall_normal``, ``grid_shape``, ...
+        static: What does not change, by name: ``positions`` (particle, dim) [m], ``volume``, ``body``,
+            ``particle`` (the model's index of each recorded particle), ``muscle`` (muscle, particle) 0 or 1,
+            ``wall_normal``, ``grid_shape``, ...
         dt, spacing: Substep [s] and grid spacing [m].
+        share: Part of the model's particles that was recorded, 1 for all.
         episodes: Iterations of the recorded simulations, in the order of the run.
         scalars: Name to (iteration, value), two arrays.
 
@@ -56,10 +60,14 @@ class Recording:
         attributes = self._file.attrs
         if attributes.get("format") != FORMAT.encode():
             raise ValueError(f"{self.path} is an HDF5 file, but no softmpm recording.")
-        if int(attributes["version"]) != VERSION:
-            raise ValueError(f"{self.path} has format version {attributes['version']}; this softmpm reads {VERSION}.")
-        self.dt, self.spacing = float(attributes["dt"]), float(attributes["spacing"])
-        self.static = {name: self._dataset(f"static/{name}", dtype)[()] for name, (dtype, _) in STATIC.items()}
+        version = np.asarray(attributes["version"]).item()
+        if version != VERSION:
+            raise ValueError(f"{self.path} has format version {version}; this softmpm reads {VERSION}.")
+        numbers = (float(np.asarray(attributes[name]).item()) for name in ("dt", "spacing", "share"))
+        self.dt, self.spacing, self.share = numbers
+        self.static = {
+            name: self._dataset(f"static/{name}", dtype)[()] for name, (dtype, _) in STATIC.items()
+        }
         self._tables = {name: self._dataset(name, dtype) for name, (dtype, _) in TABLES.items()}
         self._check_shapes()
         episodes = complete(self._tables["episode"][()])
@@ -73,7 +81,9 @@ class Recording:
         """The named dataset, if it is what a recording holds under that name and lies wholly in this file."""
         node = self._file
         for part in name.split("/"):
-            if not isinstance(node, h5py.Group) or not isinstance(node.get(part, getlink=True), h5py.HardLink):
+            if not isinstance(node, h5py.Group) or not isinstance(
+                node.get(part, getlink=True), h5py.HardLink
+            ):
                 raise ValueError(f"{self.path}: {name} is missing or leads out of the file.")
             node = node[part]
         if not isinstance(node, h5py.Dataset) or node.is_virtual or node.external:
@@ -93,7 +103,11 @@ class Recording:
         static = self.static
         if static["positions"].ndim != 2 or static["positions"].shape[1] not in (2, 3):
             raise ValueError(f"{self.path}: static/positions must have shape (particle, 2 or 3).")
-        size = {"p": (self.particle_count,), "d": (self.dim,), "n": tuple(int(n) for n in static["grid_shape"])}
+        size = {
+            "p": (self.particle_count,),
+            "d": (self.dim,),
+            "n": tuple(int(n) for n in static["grid_shape"]),
+        }
         size |= {"m": static["muscle"].shape[:1], "w": static["wall_offset"].shape[:1]}
         size |= {"l": self._tables["latent/value"].shape[1:]}
         found = {f"static/{name}": (static[name].shape, axes) for name, (_, axes) in STATIC.items()}
@@ -117,26 +131,32 @@ class Recording:
 
     def _row(self, iteration: int) -> int:
         if iteration not in self._newest:
-            raise KeyError(f"{self.path} has no simulation of iteration {iteration}; it has {list(self.episodes)}.")
+            raise KeyError(
+                f"{self.path} has no simulation of iteration {iteration}; it has {list(self.episodes)}."
+            )
         return self._newest[iteration]
 
     def rows(self, iteration: int) -> np.ndarray:
-        """Row numbers of this simulation's frames, for :meth:`read`. If it was recorded twice, of the newer one."""
+        """Rows of this simulation's frames, for :meth:`read`; of the newer one, if it was recorded twice."""
         return np.flatnonzero(self._frame["episode"] == self._row(iteration))
 
-    def read(self, name: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def recorded(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Those of ``rows`` at which this quantity was recorded."""
+        return rows[self._frame[name][rows] >= 0] if name in PARTS else rows
+
+    def read(self, name: str, rows: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """One quantity, ``time x v strain activation field latent``, at some frames.
 
         Returns:
-            Those of ``rows`` at which it was recorded (all but for field and latent), and its values there.
+            Those of ``rows`` at which it was recorded, and its values there, with a first axis of rows.
         """
         rows = np.asarray(rows, dtype=np.int64)
         if name == "time":
             return rows, self._frame["time"][rows]
         if name in PER_FRAME:
             return rows, self._take(f"frame/{name}", rows)
-        parts = self._frame[name][rows]
-        return rows[parts >= 0], self._take(PARTS[name], parts[parts >= 0])
+        rows = self.recorded(name, rows)
+        return rows, self._take(PARTS[name], self._frame[name][rows])
 
     def _take(self, table: str, rows: np.ndarray) -> np.ndarray:
         data = self._tables[table]
@@ -152,9 +172,10 @@ class Recording:
         """All frames of one simulation.
 
         Returns:
-            ``time`` (frame,) [s], ``x`` and ``v`` (frame, particle, dim), ``strain`` (frame, particle), ``activation``
-            (frame, muscle); and where they were recorded ``field`` (row, *nodes, dim) and ``latent`` (row, size), with
-            ``field_frame`` and ``latent_frame`` (row,), the frame that each row belongs to.
+            ``time`` (frame,) [s], ``x`` and ``v`` (frame, particle, dim), ``strain`` (frame, particle),
+            ``activation`` (frame, muscle); and where they were recorded ``field`` (row, *nodes, dim) and
+            ``latent`` (row, size), with ``field_frame`` and ``latent_frame`` (row,), the frame that each row
+            belongs to.
         """
         rows = self.rows(iteration)
         out = {name: self.read(name, rows)[1] for name in ("time", *PER_FRAME)}

@@ -1,8 +1,9 @@
 """Recorder: a run to HDF5 as it happens.
 
-The file can be read at every instant, also after ``kill -9``: everything with a name exists before the first row is written;
-the file is then in HDF5's single-writer-multiple-reader mode, in which the library orders its writes so that the file is
-always consistent; and a frame counts only once its row of ``frame/index`` has followed its data. Layout: ``layout.py``.
+The file can be read at every instant, also after ``kill -9``: everything with a name exists before the first
+row is written; the file is then in HDF5's single-writer-multiple-reader mode, in which the library orders its
+writes so that the file is always consistent; and a frame counts only once its row of ``frame/index`` has
+followed its data. Layout: ``layout.py``.
 """
 
 import json
@@ -14,17 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.layout import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, TABLES, create, put, static_values
+from softmpm.layout import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, create, put, static_values, tables
 from softmpm.model import Model
 from softmpm.playback import Recording
 from softmpm.state import GridField, State
 
 _OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
-_PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # nothing small crosses a page, so a kill cannot tear it
+_PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot tear what does not cross a page
 
 
 class Recorder:
-    """Writes what happens in a run, for people to look at: particles, muscles, grid velocity, latent values, losses.
+    """Writes what happens in a run, for people to look at: particles, muscles, grid velocity, losses.
 
     ::
 
@@ -33,15 +34,16 @@ class Recorder:
                 episode.frame(0.0, state, activation)
             recorder.scalars(0, {"loss": 0.3})
 
-    A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity comes on top.
+    A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity
+    comes on top.
 
     Args:
         path: The file to write. It must not exist, unless ``resume_before`` is given.
         model: What is simulated.
-        resume_before: Keep the simulations and scalars of iterations before this one of an existing file and go on after
-            them; without a file, start one.
+        resume_before: Keep the simulations and scalars of iterations before this one of an existing file and
+            go on after them; without a file, start one.
         every: Record each ``every``-th frame of a simulation only.
-        max_particles: Record this many particles, chosen evenly at random, the same in every run; None for all.
+        max_particles: Record this many particles, chosen evenly at random, the same in every run; None: all.
 
     Raises:
         FileExistsError: The file exists, and ``resume_before`` was not given.
@@ -62,10 +64,12 @@ class Recorder:
                 raise ValueError(f"{name} must be at least 1, got {value}.")
         self.path, self.every = Path(path), every
         if resume_before is None and self.path.exists():
-            raise FileExistsError(f"{self.path} exists; choose another path, or go on with resume_before=<iteration>.")
+            raise FileExistsError(
+                f"{self.path} exists; choose another path, or go on with resume_before=<iteration>."
+            )
         static = static_values(model, max_particles)
-        self.particles = torch.from_numpy(static["particle"])
-        self.shape = (model.particle_count, model.scene.grid.dim)
+        self._particles = torch.from_numpy(static["particle"])
+        self._shape = (model.particle_count, model.scene.grid.dim)
         draft = self.path.with_name(f"{self.path.name}.new")
         with h5py.File(draft, "w", **_OPEN, **_PAGES) as file:
             create(file, model, static)
@@ -74,8 +78,8 @@ class Recorder:
                     _copy(old, file, static, resume_before)
         _put_in_place(draft, self.path)
         self._file = _open_to_append(self.path)
-        self.tables = {name: self._file[name] for name in TABLES}
-        self._count = {name: len(table) for name, table in self.tables.items()}
+        self._tables = tables(self._file)
+        self._count = {name: len(table) for name, table in self._tables.items()}
 
     def episode(self, iteration: int, **attributes) -> "Episode":
         """Begin a simulation, shown under this iteration; ``attributes`` are JSON values to keep with it."""
@@ -93,12 +97,20 @@ class Recorder:
                 raise ValueError(f"the name of a scalar must have 1 to 64 bytes, got {name.decode()!r}.")
         self._write("scalar", np.array(rows, SCALAR))
 
-    def frame(self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> None:
+    def _frame(
+        self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]
+    ) -> None:
         """One row in each table of a frame; it counts when the last one, ``frame/index``, is written."""
         self._need_open()
-        names = {f"frame/{name}": one for name, one in values.items()} | {PARTS[name]: one for name, one in parts.items()}
+        names = {f"frame/{name}": one for name, one in values.items()} | {
+            PARTS[name]: one for name, one in parts.items()
+        }
         for table, one in names.items():
-            put(self.tables[table], self._count["frame/index" if table not in PARTS.values() else table], one[None])
+            put(
+                self._tables[table],
+                self._count["frame/index" if table not in PARTS.values() else table],
+                one[None],
+            )
         self._file.flush()  # the data goes before the row that declares it complete
         field, latent = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
         self._write("frame/index", np.array([(episode, time, field, latent)], FRAME))
@@ -107,7 +119,7 @@ class Recorder:
 
     def _write(self, name: str, rows: np.ndarray) -> None:
         self._need_open()
-        put(self.tables[name], self._count[name], rows)
+        put(self._tables[name], self._count[name], rows)
         self._file.flush()
         self._count[name] += len(rows)
 
@@ -147,19 +159,22 @@ class Episode:
             time: Time since the start of this simulation [s].
             state: State of all worlds.
             activation: Muscle activation [-], shape (world, muscle) or (muscle,).
-            field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize`` returns.
+            field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize``
+                returns.
             latent: What an observer saw, shape (world, size) or (size,).
             world: The world to record.
         """
         recorder, self._calls = self._recorder, self._calls + 1
         if (self._calls - 1) % recorder.every:
             return
-        if tuple(state.x.shape[1:]) != recorder.shape:
-            raise ValueError(f"state.x must have shape (world, *{recorder.shape}), got {tuple(state.x.shape)}.")
-        particles = recorder.particles.to(state.x.device)
+        if tuple(state.x.shape[1:]) != recorder._shape:
+            raise ValueError(
+                f"state.x must have shape (world, *{recorder._shape}), got {tuple(state.x.shape)}."
+            )
+        particles = recorder._particles.to(state.x.device)
         x, v, F = (tensor.detach()[world][particles] for tensor in (state.x, state.v, state.F))
         values = {"x": _numpy(x), "v": _numpy(v), "strain": _numpy(strain(F))}
-        row = {name: table.shape[1:] for name, table in recorder.tables.items()}
+        row = {name: table.shape[1:] for name, table in recorder._tables.items()}
         values["activation"] = np.full(row["frame/activation"], np.nan, np.float32)
         if activation is not None:
             values["activation"] = _one_world("activation", activation, world, row["frame/activation"])
@@ -170,7 +185,7 @@ class Episode:
         if latent is not None:  # the first one decides the size
             size = row["latent/value"] if row["latent/value"] != (0,) else tuple(latent.shape[-1:])
             parts["latent"] = _one_world("latent", latent, world, size)
-        recorder.frame(self._row, float(time), values, parts)
+        recorder._frame(self._row, float(time), values, parts)
 
     def __enter__(self) -> "Episode":
         return self
@@ -180,7 +195,7 @@ class Episode:
 
 
 def strain(F: Tensor) -> Tensor:
-    """Size of the Green strain, ‖(FᵀF − I)/2‖ [-], zero for every rigid motion. F (..., dim, dim) gives (...)."""
+    """Size of the Green strain, ‖(FᵀF − I)/2‖ [-], zero for every rigid motion; F is (..., dim, dim)."""
     eye = torch.eye(F.shape[-1], dtype=F.dtype, device=F.device)
     return torch.linalg.matrix_norm(F.mT @ F - eye) / 2
 
@@ -198,7 +213,9 @@ def _numpy(tensor: Tensor) -> np.ndarray:
 def _one_world(name: str, tensor: Tensor, world: int, shape: tuple[int, ...]) -> np.ndarray:
     one = tensor[world] if tensor.ndim == len(shape) + 1 else tensor
     if tuple(one.shape) != shape:
-        raise ValueError(f"{name} must have shape {shape}, or that after a first axis world, got {tuple(tensor.shape)}.")
+        raise ValueError(
+            f"{name} must have shape {shape}, or that after a first axis world, got {tuple(tensor.shape)}."
+        )
     return _numpy(one)
 
 
@@ -208,8 +225,10 @@ def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before
         if not np.array_equal(values, old.static[name]):
             raise ValueError(f"{old.path} records another scene ({name} differs); record to another path.")
 
+    new = tables(file)
+
     def extend(name: str, rows: np.ndarray) -> None:
-        put(file[name], len(file[name]), rows)
+        put(new[name], len(new[name]), rows)
 
     for iteration in (i for i in old.episodes if i < before):
         extend("episode", np.array([(iteration, json.dumps(old.attributes(iteration)).encode())], EPISODE))
@@ -217,19 +236,21 @@ def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before
             for name in PER_FRAME:
                 extend(f"frame/{name}", old.read(name, [row])[1])
             parts = {name: old.read(name, [row])[1] for name in PARTS}
-            at = {name: len(file[PARTS[name]]) if len(values) else -1 for name, values in parts.items()}
+            at = {name: len(new[PARTS[name]]) if len(values) else -1 for name, values in parts.items()}
             for name, values in parts.items():
                 if len(values):
                     extend(PARTS[name], values)
             time = old.read("time", [row])[1][0]
-            extend("frame/index", np.array([(len(file["episode"]) - 1, time, at["field"], at["latent"])], FRAME))
+            extend(
+                "frame/index", np.array([(len(new["episode"]) - 1, time, at["field"], at["latent"])], FRAME)
+            )
     for name, (iterations, values) in old.scalars.items():
         kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]
         extend("scalar", np.array(kept, SCALAR))
 
 
 def _open_to_append(path: Path) -> h5py.File:
-    """Open straight into reader-safe mode: with "r+" and ``swmr_mode`` a kill in between leaves a file that nobody opens."""
+    """Open straight into reader-safe mode; a kill between "r+" and ``swmr_mode`` locks a file."""
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_libver_bounds(h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
     access.set_file_locking(True, True)

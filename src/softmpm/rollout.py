@@ -89,10 +89,11 @@ def rollout_adj(model: Model, horizon: Horizon, kept: Motion, pull: Tensor | Non
         if row is not None:
             row.copy_(pull[s // horizon.substeps])
         clear(adjoints[s % 2].flat)
-        step.adjoint(wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, s)
+        back = horizon.total - 1 - s  # the first failure on the way back has the smallest word
+        step.adjoint(wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, back)
         if wanted.activation and s % horizon.substeps == 0:
             step.collect_pull(adj_solid, adj_pull[s // horizon.substeps])
-    raise_failure(model, step.watch_words, None)
+    raise_gradient_failure(model, horizon, step.watch_words, adj_end)
     start = adjoints[0]
     return State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H), adj_solid, adj_pull
 
@@ -141,6 +142,25 @@ def raise_failure(model: Model, watch: Tensor, end: State | None) -> None:
     )
 
 
+def raise_gradient_failure(model: Model, horizon: Horizon, watch: Tensor, adj_end: State) -> None:
+    """Raise what the adjoint kernels reported, if anything; they count substeps from the last one."""
+    words = watch.tolist()
+    world = min(range(len(words)), key=lambda w: words[w])
+    if words[world] == NEVER:
+        return
+    back, kind, particle = decode(words[world])
+    substep, limit = horizon.total - 1 - back, "gradients must be finite"
+    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end)
+    cause = "It overflowed on the way back: shorten the horizon or scale the loss" if given else (
+        "The gradient of the loss with respect to the end state came in like that: look at the loss"
+    )
+    raise UnstableError(
+        f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite at substep "
+        f"{substep} of {horizon.total}, counted from the start of the call; {limit}. {cause}.",
+        **dict(kind=kind, world=world, particle=particle, substep=substep, value="not finite", limit=limit),
+    )
+
+
 def _explain(model: Model, kind: Kind, world: int, particle: int, end: State | None) -> tuple[str, str, str]:
     """What came, what must hold, what to do."""
     dx = model.scene.grid.spacing
@@ -148,8 +168,6 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State | N
     high = tuple((n - 1.5) * dx for n in model.scene.grid.shape)
     box = "a particle must stay in " + " x ".join(f"[{low:.4g}, {h:.4g})" for h in high) + " m"
     smaller = "Use a smaller dt (softmpm.stable_dt gives a safe one), a weaker activation, or a softer material."
-    if kind is Kind.GRADIENT:
-        return "has an adjoint that is not finite", "gradients must be finite", "Shorten the horizon or scale the loss."
     x, F = end.x[world, particle].tolist(), end.F[world, particle]
     if kind is Kind.LEFT_GRID or (kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))):
         return f"is at {_numbers(x)} m, off the grid", box, "Make the grid larger, add walls, or start further inside."

@@ -23,7 +23,7 @@ from softmpm_learn.config import RunConf, conf_dir, load, save, to_run, unknown_
 from softmpm_learn.experiment import run_experiment
 from softmpm_learn.tasks import TASKS
 
-CHANGEABLE = ("train.iterations", "train.record_every", "device")
+CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "device")
 """What may differ when a run is resumed: how far it goes, what it records and where it runs."""
 EXPECTED = (
     ValueError,
@@ -73,8 +73,7 @@ def job(config: DictConfig) -> None:
     out = Path(HydraConfig.get().runtime.output_dir)
     try:
         conf = to_run(config)
-        resume = conf.resume is not None
-        if resume:
+        if conf.resume is not None:
             conf = resumed(conf, [text.lstrip("+~") for text in HydraConfig.get().overrides.task])
         elif (out / "config.yaml").exists():
             raise ValueError(f"{out} holds a run already; go on with resume={out}, or choose another folder.")
@@ -92,12 +91,11 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
     """The configuration of the run to go on with, with what the command line may change of it."""
     saved = load(Path(str(conf.resume)) / "config.yaml")
     for key in (text.partition("=")[0] for text in overrides):
-        if key == "train.iterations":
-            saved.train.iterations = conf.train.iterations
-        elif key == "train.record_every":
-            saved.train.record_every = conf.train.record_every
-        elif key.partition(".")[0] == "device":
+        group, _, name = key.partition(".")
+        if group == "device":
             saved.device = conf.device
+        elif key in CHANGEABLE:
+            setattr(saved.train, name, getattr(conf.train, name))
         elif key != "resume":
             raise ValueError(
                 f"a run is resumed with its own settings; only {', '.join(CHANGEABLE)} may change, not {key}."

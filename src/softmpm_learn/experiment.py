@@ -24,7 +24,11 @@ from softmpm_learn.train import Result, train
 
 PICTURES = 4
 """Moments of the best episode in robot.png, the first and the last among them."""
-DESIGN = {"young": ("Young's modulus", "Pa"), "poisson": ("Poisson's ratio", ""), "density": ("density", "kg/m³")}
+DESIGN = {
+    "young": ("Young's modulus", "Pa"),
+    "poisson": ("Poisson's ratio", ""),
+    "density": ("density", "kg/m³"),
+}
 CURVES = {
     "loss": "loss",
     "validation_loss": "validation loss of the autoencoder",
@@ -38,7 +42,7 @@ logger = logging.getLogger("softmpm_learn")
 
 def run_experiment(conf: RunConf, out: Path) -> None:
     """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next."""
-    wp.config.log_level = wp.LOG_WARNING
+    wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(conf.device.threads)
     task = make_task(conf.task)
     model = make_model(task, conf.device, conf.train.worlds)
@@ -76,8 +80,9 @@ def draw(result: Result, task: Task, out: Path) -> None:
     if episode is not None:
         iteration, frames = episode
         moments = np.linspace(0, len(frames["time"]) - 1, PICTURES).round().astype(int)
+        active = frames["activation"][:-1]  # the last frame has none
         pictures = [
-            (f"iteration {iteration}, {frames['time'][k]:.2f} s", frames["x"][k], _shown(frames["activation"][k]))
+            (f"iteration {iteration}, {frames['time'][k]:.2f} s", frames["x"][k], active[min(k, len(active) - 1)])
             for k in moments
         ]
         goal = None if any(result.run.settings.train.goal_spread) else task.goal
@@ -128,18 +133,16 @@ def last_episode(path: Path) -> tuple[int, dict[str, np.ndarray]] | None:
         row = recording.episodes[-1]
         frames = recording.frames(row)
         shown = int(recording.attributes(row).get("of", row))
-    return (shown, frames) if len(frames["time"]) else None
-
-
-def _shown(activation: np.ndarray) -> np.ndarray | None:
-    return None if np.isnan(activation).any() else activation
+    return (shown, frames) if len(frames["time"]) > 1 else None
 
 
 def farewell(result: Result, task: Task, out: Path) -> str:
     """What came out, and as the last line how to look at it or how to go on."""
     lines = []
     if math.isfinite(result.best_loss):
-        lines.append(f"Best loss {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}.")
+        lines.append(
+            f"Best loss {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}."
+        )
     shown = _relative(out)
     if not result.finished:
         lines.append(f"Stopped after {result.run.iteration} iterations.")

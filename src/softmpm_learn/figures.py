@@ -12,6 +12,8 @@ from softmpm import Scene
 
 VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """What each latent feature is set to in ``latent_figure``, the others being 0."""
+STILL = 0.1
+"""Nodes that never move at this share of the highest speed are cut off around a latent picture."""
 SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
@@ -58,6 +60,7 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
     """
     if fields.ndim == 6:
         fields = fields[:, :, :, :, fields.shape[4] // 2]
+    fields = _moving(fields)
     features, steps, nx, ny, _ = fields.shape
     width = 1.1 * (nx / ny) ** 0.5
     figure = _figure(2 * steps * width + 0.4, features * (width * ny / nx + 0.08) + 0.4)
@@ -77,6 +80,17 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
             if column == 0:
                 panel.set_ylabel(f"feature {feature + 1}", fontsize=8)
     figure.savefig(path, dpi=120)
+
+
+def _moving(fields: np.ndarray) -> np.ndarray:
+    """The part of the grid where anything moves, with a margin."""
+    speed = np.abs(fields).max(axis=(0, 1, 4))
+    for axis in (0, 1):
+        moving = np.flatnonzero(speed.max(axis=1 - axis) > STILL * speed.max())
+        if moving.size:
+            part = slice(max(moving[0] - 1, 0), moving[-1] + 2)
+            fields = fields[:, :, part] if axis == 0 else fields[:, :, :, part]
+    return fields
 
 
 def _value(step: int, steps: int) -> float:
@@ -100,8 +114,8 @@ def robot_figure(
     """
     rest = np.concatenate([body.particles.positions for body in scene.bodies])
     row = _row_height(scene, frames)
-    figure = _figure(8.0, row * len(frames) + (2.6 if design else 0.0) + 0.3)
-    parts = figure.subfigures(2, 1, height_ratios=[row * len(frames), 2.6]) if design else [figure]
+    figure = _figure(8.0, row * len(frames) + (2.3 if design else 0.0) + 0.3)
+    parts = figure.subfigures(2, 1, height_ratios=[row * len(frames), 2.3]) if design else [figure]
     panels = parts[0].subplots(len(frames), 1, squeeze=False)[:, 0]
     for panel, (title, positions, activation) in zip(panels, frames, strict=True):
         _draw_robot(panel, scene, positions, activation)

@@ -19,6 +19,7 @@ class Learner:
         self.conf, self.autoencoder, self.replay = conf, autoencoder, replay
         self.optimizer = torch.optim.Adam(autoencoder.parameters(), lr=conf.rate)
         self.target = TargetNetwork(autoencoder.encoder) if conf.target_network else None
+        self.phases = 0
 
     @property
     def encoder(self) -> nn.Module:
@@ -48,7 +49,9 @@ class Learner:
             generator,
         )
         if self.target is not None:
-            self.target.follow(self.autoencoder.encoder, self.conf.target_rate)
+            rate = self.conf.target_rate if self.phases else 1.0  # what it copies at first is only noise
+            self.target.follow(self.autoencoder.encoder, rate)
+        self.phases += 1
         if not self.conf.replay:
             self.replay.clear()
         return {"epochs": learned.epochs, "training_loss": learned.training, "validation_loss": learned.validation}
@@ -59,6 +62,7 @@ class Learner:
             "optimizer": self.optimizer.state_dict(),
             "target": None if self.target is None else self.target.state_dict(),
             "replay": self.replay.ids,
+            "phases": self.phases,
         }
 
     def load_state_dict(self, content: dict) -> None:
@@ -67,3 +71,4 @@ class Learner:
         if self.target is not None:
             self.target.load_state_dict(content["target"])
         self.replay.load(content["replay"])
+        self.phases = content["phases"]

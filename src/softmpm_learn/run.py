@@ -36,6 +36,7 @@ class Run:
         observer, policy, design, optimizer: What is optimised, and how.
         learner: The learning phase, None unless the observer is learned.
         generator: The only source of randomness after the first weights.
+        safe: Values of policy and design in the last simulation that did not fail.
         best: The lowest loss so far and what gave it.
     """
 
@@ -55,6 +56,7 @@ class Run:
         self.policy: nn.Module = policy.to(model.device, model.dtype)
         self.design = Design(settings.design, model, task.regions)
         self.optimizer = self._make_optimizer()
+        self.safe: list[Tensor] = []
 
     def _make_observer(self, out: Path) -> Observer:
         conf, model, task = self.settings.observer, self.model, self.task
@@ -97,6 +99,20 @@ class Run:
             groups.append({"params": list(self.design.parameters()), "lr": conf.design_rate})
         return {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[conf.name](groups)
 
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """What the gradient changes: policy, then design."""
+        return [*self.policy.parameters(), *self.design.parameters()]
+
+    def keep_safe(self) -> None:
+        self.safe = [p.detach().clone() for p in self.parameters]
+
+    @torch.no_grad()
+    def step_back(self) -> None:
+        """Halve the step since :meth:`keep_safe`."""
+        for parameter, safe in zip(self.parameters, self.safe, strict=True):
+            parameter.lerp_(safe, 0.5)
+
     def params(self) -> Params:
         """Materials of the design as it is."""
         return self.design()
@@ -127,6 +143,7 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "learner": None if self.learner is None else self.learner.state_dict(),
+            "safe": self.safe,
             "best": self.best,
         }
 
@@ -146,6 +163,7 @@ class Run:
         self.generator.set_state(content["generator"])
         if self.learner is not None:
             self.learner.load_state_dict(content["learner"])
+        self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, self.best = content["iteration"], content["best"]
 
     def about(self) -> str:

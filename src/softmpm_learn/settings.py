@@ -130,14 +130,18 @@ class OptimizerConf:
     """Learning rate of the policy."""
     design_rate: float = 3e-2
     """Learning rate of the design, in the unbounded space before the sigmoid."""
-    max_norm: float | None = None
+    max_norm: float | None = 1.0
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
+    retries: int = 4
+    """Where a simulation fails, go halfway back to the last that did not, at most so often; 0 ends the run at once."""
 
     def __post_init__(self):
         _one_of("optimizer.name", self.name, OPTIMIZERS)
         _positive("optimizer", self, "policy_rate", "design_rate")
         if self.max_norm is not None:
             _positive("optimizer", self, "max_norm")
+        if self.retries < 0:
+            raise ValueError(f"optimizer.retries must be ≥ 0, got {self.retries}.")
 
 
 @dataclass(kw_only=True)
@@ -148,9 +152,9 @@ class LearningConf:
     """Optimisation steps between two learning phases."""
     epochs: int = 20
     """Most epochs in a learning phase."""
-    batches: int = 16
+    batches: int = 8
     """Minibatches in an epoch."""
-    batch: int = 64
+    batch: int = 32
     """Pictures in a minibatch."""
     rate: float = 1e-3
     """Learning rate of the autoencoder (Adam)."""
@@ -175,7 +179,7 @@ class LearningConf:
     target_network: bool = True
     """Refinement 3: the policy sees through a copy that follows slowly; False, through the network in training."""
     target_rate: float = 0.3
-    """How much of the way to the trained network the copy goes after each learning phase; 1 copies it."""
+    """How much of the way to the trained network the copy goes after a learning phase, all of it after the first; 1 copies."""
 
     def __post_init__(self):
         _positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")

@@ -28,7 +28,7 @@ from softmpm_learn.settings import Settings
 from softmpm_learn.table import Table
 
 METRICS = [
-    *("loss", "final", "running", "best", "effort", "gradient_policy", "gradient_design", "clipped"),
+    *("loss", "final", "running", "best", "effort", "gradient_policy", "gradient_design", "clipped", "retries"),
     *("young_change", "poisson_change", "density_change"),
     *("epochs", "training_loss", "validation_loss", "replay"),
 ]
@@ -124,27 +124,45 @@ def _loop(run: Run, out: Path, progress, stop) -> Result:
 
 def optimise(run: Run, recorder: softmpm.Recorder | None, seconds: dict[str, float]) -> dict[str, float]:
     """One optimisation step: simulate, differentiate, move policy and design. Gives figures for metrics.csv."""
-    k, settings = run.iteration, run.settings
-    every, last = settings.train.record_every, settings.train.iterations - 1
-    recorded = recorder is not None and (k % every == 0 or k == last)
-    keep_every = settings.learning.frame_every if run.learner else 0
-    try:
-        with _clock(seconds, "simulate"), _record(run, recorder if recorded else None, k) as on_frame:
-            episode = run_episode(
-                run.task, run.model, run.observer, run.policy, run.params(),
-                goal=run.draw_goals(), keep_every=keep_every, on_frame=on_frame,
-            )  # fmt: skip
-        with _clock(seconds, "backward"):
-            gradient = differentiate(run, episode)
-    except softmpm.UnstableError as error:
-        raise TrainingError(k, " ".join([str(error), *getattr(error, "__notes__", [])])) from error
-    row = _figures(run, episode) | gradient
+    goal, retries = run.draw_goals(), 0
+    while True:
+        try:
+            episode, lengths = attempt(run, goal, recorder, seconds)
+            break
+        except softmpm.UnstableError as error:
+            if not run.safe or retries == run.settings.optimizer.retries:
+                problem = " ".join([str(error), *getattr(error, "__notes__", [])])
+                raise TrainingError(run.iteration, problem) from error
+            logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
+            run.step_back()
+            retries += 1
+    row = _figures(run, episode) | lengths | {"retries": retries}
     if row["loss"] < run.best["loss"]:
-        run.best = {"loss": row["loss"], "iteration": k, **run.actor()}
+        run.best = {"loss": row["loss"], "iteration": run.iteration, **run.actor()}
+    run.keep_safe()
     run.optimizer.step()
     if run.learner:
-        run.learner.watch(k * run.model.worlds, episode.seen)
-    return row | {"best": run.best["loss"]} | {f"{n}_change": c for n, c in run.design.change().items()}
+        run.learner.watch(run.iteration * run.model.worlds, episode.seen)
+    return row | {"best": run.best["loss"]}
+
+
+def attempt(run: Run, goal, recorder, seconds) -> tuple[Episode, dict[str, float]]:
+    """Simulate and differentiate policy and design as they are."""
+    k, conf = run.iteration, run.settings.train
+    due = recorder is not None and (k % conf.record_every == 0 or k == conf.iterations - 1)
+    with _clock(seconds, "simulate"), _record(run, recorder if due else None, k) as on_frame:
+        episode = run_episode(
+            run.task,
+            run.model,
+            run.observer,
+            run.policy,
+            run.params(),
+            goal=goal,
+            keep_every=run.settings.learning.frame_every if run.learner else 0,
+            on_frame=on_frame,
+        )
+    with _clock(seconds, "backward"):
+        return episode, differentiate(run, episode)
 
 
 def differentiate(run: Run, episode: Episode) -> dict[str, float]:
@@ -194,7 +212,8 @@ def play_best(run: Run, recorder: softmpm.Recorder) -> None:
 
 def _figures(run: Run, episode: Episode) -> dict[str, float]:
     parts = {"loss": episode.loss, "final": episode.final, "running": episode.running}
-    return {name: value.mean().item() for name, value in parts.items()} | {"effort": episode.effort}
+    row = {name: value.mean().item() for name, value in parts.items()} | {"effort": episode.effort}
+    return row | {f"{name}_change": change for name, change in run.design.change().items()}
 
 
 def _save(run: Run, out: Path, named: list[int]) -> list[int]:

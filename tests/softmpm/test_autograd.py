@@ -141,3 +141,17 @@ def test_no_grad_keeps_nothing(model):
     with torch.no_grad():
         end = run(softmpm.simulate, model, busy_inputs(model), 2)
     assert not any(tensor.requires_grad for tensor in end)
+
+
+def test_rasterize_has_finite_gradients_at_vanishing_mass():
+    """A node with a mass of 1e-30 or less: p/m² would overflow in float32, and a gradient of zero turn into NaN."""
+    particles = softmpm.Particles(torch.full((1, 2), 0.5).numpy(), 1e-12)
+    body = softmpm.Body(particles, softmpm.NeoHookean(density=1e-9, young=1.0))
+    model = softmpm.build(softmpm.Scene(grid=softmpm.Grid(shape=(12, 12), spacing=0.1), bodies=[body], dt=1e-9), device="cpu")
+    for off in (1e-3, 1e-6, 1e-8):
+        x = (model.rest().x * 0 + 0.45 + off).requires_grad_()
+        v = torch.ones_like(x).requires_grad_()
+        field = softmpm.rasterize(model, model.rest()._replace(x=x, v=v))
+        seen = field.velocity * (field.mass / (field.mass + 1e-25))[..., None]
+        for gradient in torch.autograd.grad(seen.sum(), (x, v)):
+            assert torch.isfinite(gradient).all(), off

@@ -71,7 +71,7 @@ def test_a_start_off_the_grid_is_refused_before_anything_is_written(device):
 
 
 def test_a_gradient_that_is_not_finite_is_an_error(device):
-    """An infinite cotangent of one particle raises in the backward pass and names substep and particle."""
+    """An infinite cotangent of one particle raises in the backward pass, names the substep and says that it came in."""
     model = single(device=device)
     start = model.rest()
     start.v.requires_grad_()
@@ -80,7 +80,8 @@ def test_a_gradient_that_is_not_finite_is_an_error(device):
     weight[0, 1] = 3e38
     with pytest.raises(softmpm.UnstableError) as caught:
         (end.x * weight * 10).sum().backward()
-    assert caught.value.kind == "gradient" and caught.value.world == 0
+    assert (caught.value.kind, caught.value.world, caught.value.substep) == ("gradient", 0, 3)
+    assert "look at the loss" in str(caught.value)
 
 
 def test_bad_numbers_are_refused_before_any_launch():

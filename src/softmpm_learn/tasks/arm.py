@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm import Body, Grid, Muscle, Particles, Scene, Wall
 from softmpm_learn.objective import Effort, Reach
 from softmpm_learn.tasks.outline import Limb, fill
-from softmpm_learn.tasks.task import Task, TaskConf, clock
+from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean
 
 BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
 WIDTH = (0.075, 0.050)  # at the clamp and at the tip [m]
-SEGMENTS = {"lower": (0.0, 0.34), "middle": (0.34, 0.67), "upper": (0.67, 1.0)}
+SEGMENTS = {"lower": (0.0, 0.34), "middle": (0.34, 0.67), "upper": (0.67, 1.01)}
 TIP = 0.92  # the tip's particles start this far along the arm
 
 
@@ -55,12 +55,10 @@ def arm(conf: ArmConf) -> Task:
     limb = Limb(line[1:], np.array(WIDTH), round_tip=True)
     clamped = Limb(line[:2], np.array([WIDTH[0], WIDTH[0]]))
     rest = fill([limb.outline(), clamped.outline()], conf.spacing / 2).positions
-    regions = {
-        name: limb.part(rest, start, end if end < 1 else 1.01) for name, (start, end) in SEGMENTS.items()
-    }
+    regions = {name: limb.part(rest, start, end) for name, (start, end) in SEGMENTS.items()}
     muscles = [
         Muscle(
-            particles=limb.part(rest, start, end if end < 1 else 1.01, side),
+            particles=limb.part(rest, start, end, side),
             direction=(0.0, 1.0),
             strength=conf.strength,
         )
@@ -70,12 +68,7 @@ def arm(conf: ArmConf) -> Task:
     nodes = conf.resolution.value
     scene = Scene(
         grid=Grid(shape=(round(0.9 * nodes), round(0.6 * nodes)), spacing=conf.spacing),
-        bodies=[
-            Body(
-                Particles(rest, (conf.spacing / 2) ** 2),
-                NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson),
-            )
-        ],
+        bodies=[Body(Particles(rest, (conf.spacing / 2) ** 2), neo_hookean(conf))],
         muscles=muscles,
         walls=[Wall(normal=(0.0, 1.0), offset=BASE[1], contact="stick")],
         gravity=(0.0, -conf.gravity),
@@ -90,7 +83,7 @@ def arm(conf: ArmConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Reach(limb.part(rest, TIP, 1.01), terms=(Effort(conf.effort),)),
+        objective=Reach(limb.part(rest, TIP, 1.01), goal, terms=(Effort(conf.effort),)),
         body_length=LENGTH,
         goal=goal,
     )

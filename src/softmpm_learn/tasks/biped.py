@@ -4,17 +4,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm import Body, Muscle, Particles, Scene
 from softmpm_learn.objective import Effort, Height, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth
-from softmpm_learn.tasks.task import Task, TaskConf, clock
+from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean, track
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
     *((0.300, 0.165), (0.275, 0.200), (0.210, 0.213), (0.150, 0.215), (0.090, 0.213), (0.025, 0.200)),
 )  # x, y [m], feet at y = 0
 LEGS = {"hind": ((0.065, 0.15), (0.050, 0.0)), "front": ((0.235, 0.15), (0.250, 0.0))}  # hip and sole [m]
-LEG_WIDTH = ((0.0, 0.090), (0.4, 0.075), (0.85, 0.070), (1.0, 0.078), (1.1, 0.078))  # way down, width [m]
+LEG_WIDTH = np.array(
+    [(0.0, 0.090), (0.4, 0.075), (0.85, 0.070), (1.0, 0.078), (1.1, 0.078)]
+)  # way down from the hip, width [m]; below the sole it is cut off
 LEG_MUSCLE = (0.12, 1.01)
 
 
@@ -28,14 +30,17 @@ class BipedConf(TaskConf):
     upright: float = 50.0
     """Weight of the squared distance [m²] of its mean height below three quarters of that at rest."""
 
+    def __post_init__(self):
+        super().__post_init__()
+        self.need_not_negative("friction", "upright")
+
 
 def biped(conf: BipedConf) -> Task:
-    """Build the walker: about 1,400 particles as a draft, 3,600 at the standard resolution."""
-    floor = 0.0625
-    way, width = np.array(LEG_WIDTH).T
+    """Build the walker: about 1,200 particles as a draft, 3,000 at the standard resolution."""
+    way, width = LEG_WIDTH.T
     limbs = {
-        n: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
-        for n, (hip, sole) in LEGS.items()
+        name: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
+        for name, (hip, sole) in LEGS.items()
     }
     soles = [np.maximum(limb.outline(), (-np.inf, 0.0)) for limb in limbs.values()]
     rest = fill([smooth(TORSO), *soles], conf.spacing / 2).positions
@@ -50,34 +55,25 @@ def biped(conf: BipedConf) -> Task:
         for side in (1, -1)
     ]
     regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
-    nodes = conf.resolution.value
+    grid, walls = track(conf, conf.friction)
+    feet = np.array([0.2, walls[0].offset + 0.5 * conf.spacing])  # half a cell over the floor's nodes
     scene = Scene(
-        grid=Grid(shape=(round(1.5 * nodes), round(0.5 * nodes)), spacing=conf.spacing),
-        bodies=[
-            Body(
-                Particles(rest + np.array([0.2, floor + 0.5 * conf.spacing]), (conf.spacing / 2) ** 2),
-                NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson),
-            )
-        ],
+        grid=grid,
+        bodies=[Body(Particles(rest + feet, (conf.spacing / 2) ** 2), neo_hookean(conf))],
         muscles=muscles,
-        walls=[
-            Wall(normal=(0.0, 1.0), offset=floor, contact="separate", friction=conf.friction),
-            Wall(normal=(1.0, 0.0), offset=0.05),
-            Wall(normal=(-1.0, 0.0), offset=-1.45),
-        ],
+        walls=walls,
         gravity=(0.0, -conf.gravity),
         damping=conf.damping,
         dt=conf.control_period,
     )
     scene, control_steps, substeps = clock(conf, scene)
+    lowest = walls[0].offset + 0.75 * float(rest[:, 1].mean())
     return Task(
         name="biped",
         scene=scene,
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(
-            terms=(Effort(conf.effort), Height(conf.upright, lowest=floor + 0.75 * float(rest[:, 1].mean())))
-        ),
+        objective=Progress(terms=(Effort(conf.effort), Height(conf.upright, lowest))),
         body_length=float(np.ptp(rest[:, 0])),
     )

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm import Body, Muscle, Particles, Scene
 from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, TaskConf, clock
+from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean, track
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -55,16 +55,11 @@ LEGS = {
     "leg3": ((0.520, 0.36), (0.462, 0.0)),
     "leg4": ((0.595, 0.36), (0.640, 0.0)),
 }  # hip and sole, from the back
-LEG_WIDTH = (
-    (0.0, 0.130),
-    (0.5, 0.100),
-    (0.8, 0.095),
-    (0.94, 0.103),
-    (1.0, 0.106),
-    (1.1, 0.106),
-)  # way down, width
-LEG_MUSCLE = (0.10, 1.0)  # from just below the hip to the sole
-TRUNK_MUSCLES = ((0.25, 0.60), (0.60, 1.0))  # way along the trunk
+LEG_WIDTH = np.array(
+    [(0.0, 0.130), (0.5, 0.100), (0.8, 0.095), (0.94, 0.103), (1.0, 0.106), (1.1, 0.106)]
+)  # way down from the hip, width; below the sole it is cut off
+LEG_MUSCLES = ((0.10, 1.01),)  # way along the leg, from below the hip to the sole
+TRUNK_MUSCLES = ((0.25, 0.60), (0.60, 1.01))  # way along the trunk
 
 
 @dataclass(kw_only=True)
@@ -75,41 +70,23 @@ class ElephantConf(TaskConf):
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
 
+    def __post_init__(self):
+        super().__post_init__()
+        self.need_not_negative("friction")
+
 
 def elephant(conf: ElephantConf) -> Task:
-    """Build the elephant: about 2,100 particles as a draft, 5,400 at the standard resolution."""
-    floor = 0.0625
+    """Build the elephant: about 2,000 particles as a draft, 5,200 at the standard resolution."""
     limbs, outlines = limbs_and_outlines()
-    shift = np.array(
-        [0.22, floor + 0.5 * conf.spacing]
-    )  # the feet's particles half a cell over the floor's nodes
     rest = fill([LENGTH * outline for outline in outlines], conf.spacing / 2).positions
-    regions, muscles = {}, []
-    for name, limb in limbs.items():
-        parts = TRUNK_MUSCLES if name == "trunk" else (LEG_MUSCLE,)
-        regions[name] = limb.part(rest, parts[0][0], parts[-1][1] + 0.01)
-        for start, end in parts:
-            direction = limb.direction(start, end)
-            for side in (1, -1):
-                index = limb.part(rest, start, end + 0.01, side)
-                muscles.append(Muscle(particles=index, direction=direction, strength=conf.strength))
-    regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
-    body = Body(
-        Particles(rest + shift, (conf.spacing / 2) ** 2),
-        NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson),
-    )
+    regions, muscles = actuate(rest, limbs, conf.strength)
+    grid, walls = track(conf, conf.friction)
+    feet = np.array([0.22, walls[0].offset + 0.5 * conf.spacing])  # half a cell over the floor's nodes
     scene = Scene(
-        grid=Grid(
-            shape=(round(1.5 * conf.resolution.value), round(0.5 * conf.resolution.value)),
-            spacing=conf.spacing,
-        ),
-        bodies=[body],
+        grid=grid,
+        bodies=[Body(Particles(rest + feet, (conf.spacing / 2) ** 2), neo_hookean(conf))],
         muscles=muscles,
-        walls=[
-            Wall(normal=(0.0, 1.0), offset=floor, contact="separate", friction=conf.friction),
-            Wall(normal=(1.0, 0.0), offset=0.05),
-            Wall(normal=(-1.0, 0.0), offset=-1.45),
-        ],
+        walls=walls,
         gravity=(0.0, -conf.gravity),
         damping=conf.damping,
         dt=conf.control_period,
@@ -126,12 +103,31 @@ def elephant(conf: ElephantConf) -> Task:
     )
 
 
+def actuate(
+    rest: np.ndarray, limbs: dict[str, Limb], strength: float
+) -> tuple[dict[str, np.ndarray], list[Muscle]]:
+    """A region for each limb and one for the rest of the body; muscles in pairs, left and right of a limb's line."""
+    regions, muscles, free = {}, [], np.ones(len(rest), dtype=bool)
+    for name, limb in limbs.items():
+        for start, end in TRUNK_MUSCLES if name == "trunk" else LEG_MUSCLES:
+            for side in (1, -1):
+                index = limb.part(rest, start, end, side)
+                index = index[free[index]]  # at the hips two legs meet
+                muscles.append(
+                    Muscle(particles=index, direction=limb.direction(start, end), strength=strength)
+                )
+        taken = limb.part(rest, TRUNK_MUSCLES[0][0] if name == "trunk" else LEG_MUSCLES[0][0], 1.01)
+        regions[name] = taken[free[taken]]
+        free[taken] = False
+    return regions | {"body": np.flatnonzero(free)}, muscles
+
+
 def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:
     """Legs and trunk [m] for the muscles; outlines of everything, in body lengths, for the particles."""
     trunk, tail = smooth_line(TRUNK), smooth_line(TAIL)
-    way, width = np.array(LEG_WIDTH).T
+    way, width = LEG_WIDTH.T
     limbs = {
-        name: Limb(np.array(hip) + way[:, None] * (np.array(sole) - np.array(hip)), width)
+        name: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
         for name, (hip, sole) in LEGS.items()
     }
     limbs["trunk"] = Limb(trunk[:, :2], trunk[:, 2], round_tip=True)

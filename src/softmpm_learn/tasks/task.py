@@ -53,14 +53,18 @@ class TaskConf:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"task.{name} must be > 0, got {value}.")
-        for name in ("gravity", "damping", "effort"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
+        self.need_not_negative("gravity", "damping", "effort")
         if self.control_period > self.seconds:
             raise ValueError(
                 f"task.control_period must be at most task.seconds = {self.seconds}, got {self.control_period}."
             )
+
+    def need_not_negative(self, *names: str) -> None:
+        """Raise ValueError for the first of some settings that is negative or not finite."""
+        for name in names:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
 
     @property
     def spacing(self) -> float:
@@ -102,3 +106,21 @@ def clock(conf: TaskConf, scene: softmpm.Scene) -> tuple[softmpm.Scene, int, int
     substeps = math.ceil(conf.control_period / (conf.safety * softmpm.stable_dt(scene)))
     scene = dataclasses.replace(scene, dt=conf.control_period / substeps)
     return scene, max(1, round(conf.seconds / conf.control_period)), substeps
+
+
+def neo_hookean(conf: TaskConf) -> softmpm.NeoHookean:
+    """The material that the settings describe."""
+    return softmpm.NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson)
+
+
+def track(conf: TaskConf, friction: float) -> tuple[softmpm.Grid, list[softmpm.Wall]]:
+    """Grid and walls of a walker: 1.5 m long, 0.5 m high, a floor with friction first, smooth ends."""
+    length, height, floor, margin = 1.5, 0.5, 0.0625, 0.05
+    nodes = conf.resolution.value
+    grid = softmpm.Grid(shape=(round(length * nodes), round(height * nodes)), spacing=conf.spacing)
+    walls = [
+        softmpm.Wall(normal=(0.0, 1.0), offset=floor, friction=friction),
+        softmpm.Wall(normal=(1.0, 0.0), offset=margin),
+        softmpm.Wall(normal=(-1.0, 0.0), offset=margin - length),
+    ]
+    return grid, walls

@@ -1,0 +1,314 @@
+"""The command line: what it accepts, how it refuses, what a run leaves behind, and that it can go on."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+import softmpm
+from softmpm_learn import app, experiment
+from softmpm_learn.config import RunConf, check_keys, conf_dir, load, save, to_run
+from softmpm_learn.tasks import TASKS, ArmConf, Resolution
+
+ROOT = Path(__file__).parents[2]
+TINY = [  # the smallest run that has every phase
+    *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
+    *("learning.epochs=1", "learning.batches=1", "train.iterations=2"),
+]
+LEFT = (
+    *("config.yaml", "metrics.csv", "timing.csv", "run.h5", "run.rrd", "checkpoint.pt"),
+    *("loss.png", "latent.png", "robot.png"),
+)
+
+
+@pytest.fixture(autouse=True)
+def fresh_hydra(monkeypatch):
+    """Hydra keeps what it has composed; main() also sets an environment variable."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    GlobalHydra.instance().clear()
+    yield
+    GlobalHydra.instance().clear()
+
+
+def composed(*overrides):
+    app.register()
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def refusal(monkeypatch, capsys, *overrides) -> str:
+    """What ``python -m softmpm_learn`` says on stderr when it ends with exit code 1."""
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", *overrides])
+    with pytest.raises(SystemExit) as stop:
+        app.main()
+    assert stop.value.code == 1
+    said = capsys.readouterr().err
+    assert said.startswith("softmpm_learn: ") and said.count("\n") == 1, said
+    return said.removeprefix("softmpm_learn: ").strip()
+
+
+def command(*overrides):
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    return [sys.executable, "-m", "softmpm_learn", *overrides], environment
+
+
+def start(folder, *overrides) -> subprocess.Popen:
+    words, environment = command(*overrides)
+    return subprocess.Popen(
+        words, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def run(folder, *overrides) -> str:
+    """Run to the end, without an error; gives what was printed."""
+    process = start(folder, *overrides)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    return out
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with a run of two iterations in ``run``, and what it printed."""
+    folder = tmp_path_factory.mktemp("app")
+    return folder, run(folder, *TINY, "hydra.run.dir=run")
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# What it accepts
+
+
+def test_the_default_is_the_elephant_with_a_learned_latent():
+    """``python -m softmpm_learn`` runs the loop of the workshop paper with all three refinements and co-design."""
+    conf = to_run(composed())
+    assert conf.task.name == "elephant" and conf.observer.name == "latent" and conf.design.enabled
+    assert conf.learning.replay and conf.learning.early_stopping and conf.learning.target_network
+
+
+GROUPS = [
+    (group.name, option.stem)
+    for group in sorted(Path(conf_dir()).iterdir())
+    if group.is_dir()
+    for option in sorted(group.glob("*.yaml"))
+]
+
+
+@pytest.mark.parametrize(("group", "option"), GROUPS)
+def test_every_choice_composes_and_is_in_the_help(group, option):
+    """Each file of ``conf/`` is valid by itself, is named in the help, and sets what its name says."""
+    conf = to_run(composed(f"{group}={option}"))
+    described = (Path(conf_dir()) / "config.yaml").read_text().partition("template:")[2]
+    line = next(line for line in described.splitlines() if line.strip().startswith(group + " "))
+    assert option in line.replace(",", " ").split()
+    if group in ("task", "observer", "policy", "optimizer", "device"):
+        assert getattr(conf, group).name == option
+
+
+def test_every_task_has_its_file():
+    """The table of tasks and ``conf/task/`` have the same names."""
+    assert {path.stem for path in (Path(conf_dir()) / "task").glob("*.yaml")} == set(TASKS)
+
+
+def test_plain_settings_reach_the_run():
+    """A value on the command line is that value in the settings, of its own type."""
+    conf = to_run(composed("task=arm", "task.resolution=fine", "train.seed=7", "task.goal=[0.5,0.3]"))
+    assert isinstance(conf.task, ArmConf) and conf.task.resolution is Resolution.fine
+    assert conf.settings.train.seed == 7 and conf.task.goal == [0.5, 0.3]
+
+
+def test_a_saved_configuration_reads_back(tmp_path):
+    """``config.yaml`` of a run gives the very same settings again."""
+    conf = to_run(composed("task=biped", "task.young=4e4", "policy=linear", "learning=plain", "device=cpu"))
+    save(conf, tmp_path / "config.yaml")
+    assert load(tmp_path / "config.yaml") == conf
+
+
+def test_help_is_worth_reading(monkeypatch, capsys):
+    """It shows how to run, resume and sweep, what can be chosen, and what a run leaves."""
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", "--help"])
+    app.main()
+    text = capsys.readouterr().out
+    for word in ("python -m softmpm_learn task=arm", "resume=", "-m train.seed=0,1,2", *LEFT):
+        assert word in text
+    assert "_schema" not in text and max(map(len, text.splitlines())) <= 110
+
+
+# How it refuses
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("task=elefant", "there is no task called elefant; choose one of arm, biped, elephant."),
+        ("task.sekonds=3", "there is no setting task.sekonds; did you mean task.seconds?"),
+        ("tsk=arm", "there is no setting tsk; did you mean task?"),
+        ("train.iterations=1.5", "train.iterations: Value '1.5' of type 'float' could not be converted"),
+        ("design.young=perhaps", "design.young: Value 'perhaps' is not a valid bool"),
+        ("task.resolution=huge", "task.resolution: Invalid value 'huge', expected one of [draft, standard, fine]."),
+        ("task.goal=[1", "cannot read 'task.goal=[1': write key=value"),
+        ("resume=nowhere", "there is no run to resume in nowhere"),
+        ("experiment=nope", "there is no experiment called nope; choose one of smoke."),
+    ],
+)  # fmt: skip
+def test_a_wrong_word_ends_in_one_sentence(monkeypatch, capsys, tmp_path, override, sentence):
+    """Misspelt keys and choices, wrong types and unreadable words: one line, exit code 1, nothing left behind."""
+    monkeypatch.chdir(tmp_path)
+    assert sentence in refusal(monkeypatch, capsys, override)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("key", ["foo", "task.foo", "train.foo", "policy.foo.bar"])
+def test_a_key_that_is_not_in_the_schema_is_refused(key):
+    """Hydra lets ``+key=value`` pass; the schema does not."""
+    config = composed(f"+{key}=1")
+    with pytest.raises(ValueError, match="there is no setting "):
+        to_run(config)
+    check_keys(composed("train.seed=1"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["task.seconds=-1"], "task.seconds must be > 0"),
+        (["design.young_factor=[3,1]"], "design.young_factor must be"),
+        (["device.threads=0"], "device.threads must be at least 1"),
+        (["device.dtype=float16"], "device.dtype must be one of float32, float64"),
+        (["device.memory=-1"], "device.memory must be > 0 MB or null"),
+        (["device.name=tpu"], "device.name must be one of auto, cpu, cuda"),
+        (["~task"], "choose a task: task=elephant, task=arm, task=biped."),
+    ],
+)
+def test_a_wrong_value_says_what_must_hold(overrides, message):
+    """Ranges are checked when the settings are made."""
+    with pytest.raises(ValueError, match="^" + message.replace(".", r"\.").replace("=", "=")):
+        to_run(composed(*overrides))
+
+
+def test_a_fault_of_the_program_is_called_so():
+    """Errors that are not meant for people give their type; messages of several lines become one."""
+    assert app.sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)"
+    assert app.sentence(RuntimeError("first\n  second")) == "first second."
+    assert app.sentence(RuntimeError()) == "no details."
+
+
+def test_cuda_without_a_gpu_is_refused_in_a_sentence(tmp_path):
+    """``device=cuda`` never falls back silently."""
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    process = start(tmp_path, *TINY, "device=cuda", "hydra.run.dir=run")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert err.startswith("softmpm_learn: device 'cuda' was asked for") and err.count("\n") == 1
+    assert "Traceback" in (tmp_path / "run" / "error.txt").read_text()
+
+
+# What a run leaves, and going on
+
+
+def test_a_run_leaves_everything(finished):
+    """All files are there and not empty; the last line is the command that opens the recording."""
+    folder, printed = finished
+    for name in LEFT:
+        assert (folder / "run" / name).stat().st_size > 0, name
+    assert len(rows(folder / "run" / "metrics.csv")) == 2
+    assert printed.rstrip().splitlines()[-1].endswith(f"rerun {Path('run') / 'run.rrd'}")
+    assert "after 2 of 2 iterations: loss" in printed and "mm from the goal" in printed
+    with softmpm.Recording(folder / "run" / "run.h5") as recording:
+        assert len(recording.episodes) == 3  # both iterations and the best once more
+    assert load(folder / "run" / "config.yaml").train.iterations == 2
+
+
+def test_a_folder_with_a_run_is_not_overwritten(finished):
+    """A second run into the same folder is refused and says how to go on."""
+    folder, _ = finished
+    before = (folder / "run" / "metrics.csv").read_bytes()
+    process = start(folder, *TINY, "hydra.run.dir=run")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 1 and "holds a run already; go on with resume=" in err
+    assert (folder / "run" / "metrics.csv").read_bytes() == before
+
+
+def test_resume_goes_on_with_the_run_s_own_settings(finished):
+    """Two iterations and two more give the metrics of four in one go, to the last bit."""
+    folder, _ = finished
+    run(folder, *TINY, "train.iterations=4", "hydra.run.dir=whole")
+    run(folder, "resume=run", "train.iterations=4")
+    assert rows(folder / "run" / "metrics.csv") == rows(folder / "whole" / "metrics.csv")
+    assert load(folder / "run" / "config.yaml").task.name == "arm"
+
+
+def test_resume_changes_nothing_but_what_may_change(tmp_path):
+    """Iterations, recording and device may differ; another key is refused by name."""
+    old = RunConf(task=ArmConf(young=4e4))
+    save(old, tmp_path / "config.yaml")
+    new = to_run(composed("task=elephant", "train.iterations=7", "device=cpu"))
+    new.resume = str(tmp_path)
+    conf = app.resumed(new, [f"resume={tmp_path}", "train.iterations=7", "device=cpu"])
+    assert conf.task == old.task and conf.train.iterations == 7 and conf.device.name == "cpu"
+    assert conf.resume is None and conf.train.seed == old.train.seed
+    with pytest.raises(ValueError, match="may change, not train.seed"):
+        app.resumed(new, ["train.seed=3"])
+
+
+def test_ctrl_c_ends_cleanly_and_saves(tmp_path):
+    """After SIGINT the iteration is finished, pictures are drawn, the exit code is 0 and the last line says how to go on."""
+    process = start(tmp_path, *TINY, "train.iterations=1000", "hydra.run.dir=run")
+    metrics, end = tmp_path / "run" / "metrics.csv", time.monotonic() + 120
+    while not (metrics.exists() and metrics.read_text().count("\n") > 1):
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    done = len(rows(metrics))
+    assert 1 <= done < 1000
+    assert f"Stopped after {done} iterations." in out
+    assert out.rstrip().splitlines()[-1] == "To go on: python -m softmpm_learn resume=run"
+    assert (tmp_path / "run" / "loss.png").exists()
+    run(tmp_path, "resume=run", f"train.iterations={done + 1}")
+    assert len(rows(metrics)) == done + 1
+
+
+def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_path):
+    """Where rerun is not installed a run still ends well, and says which command converts its recording elsewhere."""
+
+    def missing(*_):
+        raise ImportError("no rerun here")
+
+    monkeypatch.setattr(softmpm, "to_rerun", missing)
+    monkeypatch.chdir(tmp_path)
+    said = experiment.convert(tmp_path / "out")
+    assert said.startswith(f"python -m softmpm.recording {Path('out') / 'run.h5'} {Path('out') / 'run.rrd'}")
+
+
+def test_the_configuration_is_found_in_a_wheel(tmp_path):
+    """A wheel holds ``conf/``, and its command line works away from the checkout."""
+    pytest.importorskip("hatchling")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    unpack = [sys.executable, "-m", "zipfile", "-e", str(wheel), str(tmp_path / "site")]
+    subprocess.run(unpack, check=True, timeout=60)
+    assert (tmp_path / "site" / "softmpm_learn" / "conf" / "task" / "elephant.yaml").is_file()
+    _, environment = command()
+    done = subprocess.run(
+        [sys.executable, "-m", "softmpm_learn", "task=arm", "--cfg", "job"],
+        cwd=tmp_path,
+        env=environment | {"PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0 and "name: arm" in done.stdout, done.stderr

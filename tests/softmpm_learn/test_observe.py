@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+import torch
+from conftest import block_scene
+
+import softmpm
+from softmpm_learn.observe import Centroids, Latent, Picture, clusters
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The block in float64, two worlds."""
+    return softmpm.build(block_scene(), device="cpu", dtype=torch.float64, worlds=2)
+
+
+def moving(model, seed=0) -> softmpm.State:
+    generator = torch.Generator().manual_seed(seed)
+    rest = model.rest()
+    noise = [torch.randn(t.shape, generator=generator, dtype=t.dtype) for t in rest]
+    return softmpm.State(rest.x + 0.01 * noise[0], 0.3 * noise[1], 0.5 * noise[2], rest.F)
+
+
+def test_centroids_at_rest_and_in_translation(exact):
+    """At rest all features are zero; a translation at 0.2 m/s shows as velocity alone, in body lengths per second."""
+    observer = Centroids(exact, [np.arange(12), np.arange(16, 32)], body_length=0.4)
+    rest = exact.rest()
+    torch.testing.assert_close(observer(exact, rest), torch.zeros(2, observer.size, dtype=torch.float64))
+    moved = rest._replace(x=rest.x + 0.1, v=rest.v + torch.tensor([0.2, 0.0], dtype=torch.float64))
+    want = torch.tensor([0.0, 0.0, 0.5, 0.0], dtype=torch.float64).repeat(2, 2)
+    torch.testing.assert_close(observer(exact, moved), want)
+
+
+def test_clusters_split_the_particles_evenly_the_same_way_each_time():
+    """Four groups of points far apart are found; every particle is in exactly one cluster; no randomness."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.normal(c, 0.01, (10, 2)) for c in ((0, 0), (0, 1), (1, 0), (1, 1))])
+    found = clusters(points, 4)
+    assert sorted(set(map(tuple, (c // 10 for c in found)))) == [(k,) * 10 for k in range(4)]
+    assert all((a == b).all() for a, b in zip(found, clusters(points, 4), strict=True))
+    with pytest.raises(ValueError, match="clusters must not be above the 40"):
+        clusters(points, 41)
+
+
+def test_picture_averages_blocks_of_the_grid_velocity(exact):
+    """A uniform motion shows as its velocity in blocks full of particles and as nothing far away; pooling is a plain mean."""
+    state = exact.rest()._replace(v=torch.ones_like(exact.rest().v) * torch.tensor([0.3, -0.2]).double())
+    fine = Picture(exact, nodes=13, follow=False)(exact, state)
+    coarse = Picture(exact, nodes=7, follow=False)(exact, state)
+    assert fine.shape == (2, 2, 13, 9) and coarse.shape == (2, 2, 7, 5)
+    torch.testing.assert_close(fine[:, :, 5, 3], torch.tensor([[0.3, -0.2]] * 2).double(), rtol=0.02, atol=0)
+    assert (fine[:, :, 12] == 0).all()
+    torch.testing.assert_close(coarse[:, :, 2, 1], fine[:, :, 4:6, 2:4].mean(dim=(-2, -1)))
+    torch.testing.assert_close(coarse[:, :, 6, 4], fine[:, :, 12, 8] / 4)  # the border is padded with nothing
+
+
+def test_picture_follows_the_robot(exact):
+    """With follow, a robot elsewhere looks the same; without, it does not. At the rim it is still seen, not an error."""
+    state = moving(exact)
+    away = state._replace(x=state.x + torch.tensor([0.13, 0.07], dtype=torch.float64))
+    follow, fixed = Picture(exact), Picture(exact, follow=False)
+    torch.testing.assert_close(follow(exact, away), follow(exact, state))
+    assert (fixed(exact, away) - fixed(exact, state)).abs().max() > 0.05
+    wide = state._replace(x=state.x + 0.4 * torch.randn(state.x.shape, generator=torch.Generator().manual_seed(1)).double())
+    assert follow(exact, wide).isfinite().all()
+
+
+@pytest.mark.parametrize("kind", ["centroids", "latent"])
+def test_features_are_differentiable(exact, kind):
+    """A central difference of the features along a random direction of x, v and C agrees with autograd."""
+    torch.manual_seed(0)
+    if kind == "centroids":
+        observer = Centroids(exact, [np.arange(12)], body_length=0.4)
+    else:
+        net = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(2 * 13 * 9, 3), torch.nn.Tanh()).double()
+        observer = Latent(Picture(exact), net, size=3)
+    state, direction = moving(exact), [torch.randn_like(t) for t in exact.rest()]
+    leaves = [t.clone().requires_grad_() for t in state]
+    weight = torch.randn(2, observer.size, dtype=torch.float64)
+
+    def value(h):
+        return (weight * observer(exact, softmpm.State(*(t + h * d for t, d in zip(state, direction, strict=True))))).sum()
+
+    gradient = torch.autograd.grad((weight * observer(exact, softmpm.State(*leaves))).sum(), leaves, allow_unused=True)
+    got = sum((g * d).sum() for g, d in zip(gradient, direction, strict=True) if g is not None)
+    torch.testing.assert_close((value(1e-5) - value(-1e-5)) / 2e-5, got, rtol=1e-6, atol=1e-9)

@@ -1,0 +1,38 @@
+import pytest
+
+from softmpm_learn import settings
+
+
+@pytest.mark.parametrize(
+    ("conf", "wrong", "says"),
+    [
+        ("ObserverConf", {"name": "latnt"}, "latent, centroids, kmeans"),
+        ("ObserverConf", {"channels": []}, "channels"),
+        ("ObserverConf", {"nodes": 2}, "nodes"),
+        ("PolicyConf", {"name": "rnn"}, "linear, mlp, sinusoids, knots"),
+        ("PolicyConf", {"hidden": [0]}, "hidden"),
+        ("PolicyConf", {"gain": float("nan")}, "gain"),
+        ("PolicyConf", {"knots": 1}, "knots"),
+        ("DesignConf", {"per": "leg"}, "particle, region, uniform"),
+        ("DesignConf", {"young_factor": [1.1, 2.0]}, "young_factor"),
+        ("DesignConf", {"poisson_range": [0.3, 0.5]}, "poisson_range"),
+        ("OptimizerConf", {"policy_rate": 0.0}, "policy_rate"),
+        ("OptimizerConf", {"max_norm": -1.0}, "max_norm"),
+        ("OptimizerConf", {"retries": -1}, "retries"),
+        ("LearningConf", {"every": 0}, "every"),
+        ("LearningConf", {"validation": 0.6}, "validation"),
+        ("LearningConf", {"target_rate": 0.0}, "target_rate"),
+        ("TrainConf", {"iterations": 0}, "iterations"),
+        ("TrainConf", {"goal_spread": [0.1, -0.1]}, "goal_spread"),
+    ],
+)
+def test_a_wrong_setting_fails_where_it_is_made(conf, wrong, says):
+    """The message names the setting and what came."""
+    with pytest.raises(ValueError, match=says):
+        getattr(settings, conf)(**wrong)
+
+
+def test_settings_do_not_share_lists():
+    """Changing a list of one object leaves the next one's alone."""
+    settings.ObserverConf().channels.append(99)
+    assert 99 not in settings.ObserverConf().channels
