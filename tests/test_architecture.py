@@ -9,8 +9,8 @@ SRC = Path(__file__).parents[1] / "src"
 ORDER = """scene state watch silhouette surface shapes checks stability memory
     kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact kernels.grid
     kernels.failure kernels.transfer kernels.boundary kernels.raster
-    model buffers step rollout raster autograd tape reference playback recording rerun_file""".split()
-OUTSIDE = {"rerun": {"rerun_file"}, "h5py": {"recording", "playback"}, "hydra": set(), "matplotlib": set()}
+    model buffers step rollout raster autograd tape reference layout playback recording appearance rerun_file""".split()
+OUTSIDE = {"rerun": {"rerun_file"}, "h5py": {"layout", "recording", "playback"}, "hydra": set(), "matplotlib": set()}
 
 
 def imports(path: Path) -> set[str]:

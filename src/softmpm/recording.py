@@ -22,6 +22,7 @@ from softmpm.state import GridField, State
 
 _OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
 _PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot tear what does not cross a page
+_CLAIM_EXTRA = 2**20  # for HDF5's own tables
 
 
 class Recorder:
@@ -48,6 +49,7 @@ class Recorder:
     Raises:
         FileExistsError: The file exists, and ``resume_before`` was not given.
         ValueError: The existing file records another scene.
+        OSError: There is no room on the disk; also from the methods. What was recorded before is safe.
     """
 
     def __init__(
@@ -72,6 +74,8 @@ class Recorder:
         self._shape = (model.particle_count, model.scene.grid.dim)
         draft = self.path.with_name(f"{self.path.name}.new")
         with h5py.File(draft, "w", **_OPEN, **_PAGES) as file:
+            old_size = self.path.stat().st_size if self.path.exists() else 0
+            _claim(file, old_size + sum(values.nbytes for values in static.values()))
             create(file, model, static)
             if resume_before is not None and self.path.exists():
                 with Recording(self.path) as old:
@@ -105,6 +109,7 @@ class Recorder:
         names = {f"frame/{name}": one for name, one in values.items()} | {
             PARTS[name]: one for name, one in parts.items()
         }
+        _claim(self._file, sum(one.nbytes for one in names.values()))
         for table, one in names.items():
             put(
                 self._tables[table],
@@ -119,6 +124,7 @@ class Recorder:
 
     def _write(self, name: str, rows: np.ndarray) -> None:
         self._need_open()
+        _claim(self._file, rows.nbytes)
         put(self._tables[name], self._count[name], rows)
         self._file.flush()
         self._count[name] += len(rows)
@@ -247,6 +253,19 @@ def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before
     for name, (iterations, values) in old.scalars.items():
         kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]
         extend("scalar", np.array(kept, SCALAR))
+
+
+def _claim(file: h5py.File, size: int) -> None:
+    """Make sure that ``size`` more bytes fit on the disk: HDF5 itself crashes the process after a failed write."""
+    handle, end = file.id.get_vfd_handle(), file.id.get_filesize()
+    try:
+        if hasattr(os, "posix_fallocate"):  # HDF5 cuts the file to its true size at the next flush
+            os.posix_fallocate(handle, end, size + _CLAIM_EXTRA)
+    except OSError as error:
+        os.ftruncate(handle, end)
+        raise OSError(
+            error.errno, f"no room to record ({error.strerror}); what was recorded is safe", file.filename
+        ) from error
 
 
 def _open_to_append(path: Path) -> h5py.File:

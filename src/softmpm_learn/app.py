@@ -125,12 +125,11 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
-    text = _line(str(error)) or "no details"
-    return text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
+    text = str(error) if str(error).strip() else "no details"
+    return _line(text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)")
 
 
 def _line(text: str) -> str:
     """A message on one line, without Hydra's list of search paths."""
-    text = text.partition("Config search path:")[0]
-    text = " ".join(text.split())
-    return text if not text or text.endswith((".", "!", "?", ")")) else f"{text}."
+    text = " ".join(text.partition("Config search path:")[0].split())
+    return text if text.endswith((".", "!", "?")) else f"{text}."

@@ -27,7 +27,12 @@ def _halvings(shape: tuple[int, ...], times: int) -> list[tuple[int, ...]]:
 
 
 class Encoder(nn.Module):
-    """Picture → latent. Each convolution halves the picture; smooth activations, because a policy's gradient passes here."""
+    """Picture → latent. Each convolution halves the picture; smooth activations, because a policy's gradient passes here.
+
+    Velocities are divided by ``scale``, and the latent that a policy sees is standardised: ``centre`` and ``spread`` bring
+    it to mean 0 and deviation 1 on the pictures learned from. Our choice: with the small weight of the divergence in (A1)
+    the latent of a fresh network and of a trained one differ tenfold, and a policy between them saturates.
+    """
 
     def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float):
         super().__init__()
@@ -39,6 +44,8 @@ class Encoder(nn.Module):
         corner = _halvings(shape, len(channels))[-1]
         self.head = nn.Linear(channels[-1] * torch.Size(corner).numel(), 2 * latent_size)
         self.register_buffer("scale", torch.tensor(float(scale)))
+        self.register_buffer("centre", torch.zeros(latent_size))
+        self.register_buffer("spread", torch.ones(latent_size))
 
     def moments(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log variance of the latent, each (picture, latent_size), of velocities [m/s] (picture, dim, *nodes)."""
@@ -48,7 +55,8 @@ class Encoder(nn.Module):
         return self.head(h.flatten(start_dim=1)).chunk(2, dim=-1)
 
     def forward(self, picture: Tensor) -> Tensor:
-        return self.moments(picture)[0]
+        """Standardised latent, shape (picture, latent_size)."""
+        return (self.moments(picture)[0] - self.centre) / self.spread
 
 
 class Decoder(nn.Module):
@@ -85,14 +93,22 @@ class Autoencoder(nn.Module):
         self.decoder = Decoder(dim, shape, latent_size, channels)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Velocity [m/s], shape (picture, dim, *nodes), that the latent (picture, latent_size) stands for."""
-        return self.decoder(z) * self.encoder.scale
+        """Velocity [m/s], shape (picture, dim, *nodes), that a standardised latent (picture, latent_size) stands for."""
+        encoder = self.encoder
+        return self.decoder(encoder.centre + encoder.spread * z) * encoder.scale
 
     def rescale(self, pictures: Tensor) -> None:
         """Take the root mean square of the velocities that are not zero as the scale."""
         moving = pictures[pictures != 0]
         if moving.numel():
             self.encoder.scale.copy_(moving.square().mean().sqrt())
+
+    @torch.no_grad()
+    def standardise(self, pictures: Tensor) -> None:
+        """Bring the latent of these pictures to mean 0 and deviation 1."""
+        mean = self.encoder.moments(pictures)[0]
+        self.encoder.centre.copy_(mean.mean(dim=0))
+        self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=1e-3))
 
     def loss(self, pictures: Tensor, kl: float | None, generator: torch.Generator | None = None) -> Tensor:
         """(A1); ``kl`` is β, or None for a plain autoencoder. Without a generator the latent is its mean."""

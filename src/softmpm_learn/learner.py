@@ -12,6 +12,10 @@ from softmpm_learn.settings import LearningConf
 from softmpm_learn.target import TargetNetwork
 
 
+STANDARD = 4
+"""Every fourth picture is enough to standardise the latent."""
+
+
 class Learner:
     """Learns pictures of grid velocity; the policy looks through :attr:`encoder`."""
 
@@ -48,6 +52,7 @@ class Learner:
             self.conf,
             generator,
         )
+        self.autoencoder.standardise(torch.cat([pictures[::STANDARD] for pictures in training]).to(self.device))
         if self.target is not None:
             rate = self.conf.target_rate if self.phases else 1.0  # what it copies at first is only noise
             self.target.follow(self.autoencoder.encoder, rate)

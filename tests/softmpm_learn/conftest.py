@@ -28,6 +28,12 @@ def block_scene(**changes) -> softmpm.Scene:
 
 
 @pytest.fixture(scope="session")
+def make_block():
+    """:func:`block_scene`, for tests that need another block."""
+    return block_scene
+
+
+@pytest.fixture(scope="session")
 def task() -> Task:
     return Task(
         name="block",

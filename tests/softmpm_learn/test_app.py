@@ -1,7 +1,9 @@
 """The command line: what it accepts, how it refuses, what a run leaves behind, and that it can go on."""
 
 import csv
+import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +16,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, experiment
+from softmpm_learn import app, checkpoint, experiment
 from softmpm_learn.config import RunConf, check_keys, conf_dir, load, save, to_run
 from softmpm_learn.tasks import TASKS, ArmConf, Resolution
 
@@ -46,40 +48,39 @@ def composed(*overrides):
 
 def refusal(monkeypatch, capsys, *overrides) -> str:
     """What ``python -m softmpm_learn`` says on stderr when it ends with exit code 1."""
-    monkeypatch.setattr(sys, "argv", ["softmpm_learn", *overrides])
     with pytest.raises(SystemExit) as stop:
-        app.main()
+        main(monkeypatch, *overrides)
     assert stop.value.code == 1
     said = capsys.readouterr().err
     assert said.startswith("softmpm_learn: ") and said.count("\n") == 1, said
     return said.removeprefix("softmpm_learn: ").strip()
 
 
-def command(*overrides):
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    return [sys.executable, "-m", "softmpm_learn", *overrides], environment
+def main(monkeypatch, *overrides) -> None:
+    """``python -m softmpm_learn`` in this process; Hydra leaves the logging alone."""
+    quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", *overrides, *quiet])
+    app.main()
 
 
-def start(folder, *overrides) -> subprocess.Popen:
-    words, environment = command(*overrides)
-    return subprocess.Popen(
-        words, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
-def run(folder, *overrides) -> str:
-    """Run to the end, without an error; gives what was printed."""
-    process = start(folder, *overrides)
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 0, err
-    return out
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A folder with a run of two iterations in ``run``, and what it printed."""
-    folder = tmp_path_factory.mktemp("app")
-    return folder, run(folder, *TINY, "hydra.run.dir=run")
+    """A folder with a run of two iterations, and what it said."""
+    folder = tmp_path_factory.mktemp("run")
+    said = []
+    keep = logging.Handler()
+    keep.emit = lambda record: said.append(record.getMessage())
+    experiment.logger.addHandler(keep)
+    experiment.logger.setLevel(logging.INFO)
+    conf = to_run(composed(*TINY))
+    save(conf, folder / "config.yaml")
+    experiment.run_experiment(conf, folder)
+    experiment.logger.removeHandler(keep)
+    return folder, "\n".join(said)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -138,7 +139,9 @@ def test_a_saved_configuration_reads_back(tmp_path):
 def test_help_is_worth_reading(monkeypatch, capsys):
     """It shows how to run, resume and sweep, what can be chosen, and what a run leaves."""
     monkeypatch.setattr(sys, "argv", ["softmpm_learn", "--help"])
-    app.main()
+    with pytest.raises(SystemExit) as stop:
+        app.main()
+    assert stop.value.code == 0
     text = capsys.readouterr().out
     for word in ("python -m softmpm_learn task=arm", "resume=", "-m train.seed=0,1,2", *LEFT):
         assert word in text
@@ -198,19 +201,16 @@ def test_a_wrong_value_says_what_must_hold(overrides, message):
 
 def test_a_fault_of_the_program_is_called_so():
     """Errors that are not meant for people give their type; messages of several lines become one."""
-    assert app.sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)"
+    assert app.sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
     assert app.sentence(RuntimeError("first\n  second")) == "first second."
     assert app.sentence(RuntimeError()) == "no details."
 
 
-def test_cuda_without_a_gpu_is_refused_in_a_sentence(tmp_path):
-    """``device=cuda`` never falls back silently."""
-    if torch.cuda.is_available():
-        pytest.skip("there is a GPU")
-    process = start(tmp_path, *TINY, "device=cuda", "hydra.run.dir=run")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert err.startswith("softmpm_learn: device 'cuda' was asked for") and err.count("\n") == 1
+def test_cuda_without_a_gpu_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):
+    """``device=cuda`` never falls back silently; the traceback of a failed run is in its folder."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    said = refusal(monkeypatch, capsys, *TINY, "device=cuda", f"hydra.run.dir={tmp_path}/run")
+    assert said.startswith("device 'cuda' was asked for")
     assert "Traceback" in (tmp_path / "run" / "error.txt").read_text()
 
 
@@ -219,34 +219,33 @@ def test_cuda_without_a_gpu_is_refused_in_a_sentence(tmp_path):
 
 def test_a_run_leaves_everything(finished):
     """All files are there and not empty; the last line is the command that opens the recording."""
-    folder, printed = finished
+    folder, said = finished
     for name in LEFT:
-        assert (folder / "run" / name).stat().st_size > 0, name
-    assert len(rows(folder / "run" / "metrics.csv")) == 2
-    assert printed.rstrip().splitlines()[-1].endswith(f"rerun {Path('run') / 'run.rrd'}")
-    assert "after 2 of 2 iterations: loss" in printed and "mm from the goal" in printed
-    with softmpm.Recording(folder / "run" / "run.h5") as recording:
+        assert (folder / name).stat().st_size > 0, name
+    assert len(rows(folder / "metrics.csv")) == 2
+    assert said.splitlines()[-1].endswith(f"rerun {folder / 'run.rrd'}")
+    assert "after 2 of 2 iterations: loss" in said and "mm from the goal" in said
+    with softmpm.Recording(folder / "run.h5") as recording:
         assert len(recording.episodes) == 3  # both iterations and the best once more
-    assert load(folder / "run" / "config.yaml").train.iterations == 2
 
 
-def test_a_folder_with_a_run_is_not_overwritten(finished):
+def test_a_folder_with_a_run_is_not_overwritten(monkeypatch, capsys, finished):
     """A second run into the same folder is refused and says how to go on."""
     folder, _ = finished
-    before = (folder / "run" / "metrics.csv").read_bytes()
-    process = start(folder, *TINY, "hydra.run.dir=run")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 1 and "holds a run already; go on with resume=" in err
-    assert (folder / "run" / "metrics.csv").read_bytes() == before
+    before = (folder / "metrics.csv").read_bytes()
+    said = refusal(monkeypatch, capsys, *TINY, f"hydra.run.dir={folder}")
+    assert f"holds a run already; go on with resume={folder}" in said
+    assert (folder / "metrics.csv").read_bytes() == before
 
 
-def test_resume_goes_on_with_the_run_s_own_settings(finished):
-    """Two iterations and two more give the metrics of four in one go, to the last bit."""
-    folder, _ = finished
-    run(folder, *TINY, "train.iterations=4", "hydra.run.dir=whole")
-    run(folder, "resume=run", "train.iterations=4")
-    assert rows(folder / "run" / "metrics.csv") == rows(folder / "whole" / "metrics.csv")
-    assert load(folder / "run" / "config.yaml").task.name == "arm"
+def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finished):
+    """Two iterations and one more give the metrics of three in one go, to the last bit."""
+    shutil.copytree(finished[0], tmp_path / "run")
+    main(monkeypatch, f"resume={tmp_path}/run", "train.iterations=3")
+    main(monkeypatch, *TINY, "train.iterations=3", f"hydra.run.dir={tmp_path}/whole")
+    resumed, whole = (rows(tmp_path / name / "metrics.csv") for name in ("run", "whole"))
+    assert resumed == whole and len(whole) == 3
+    assert load(tmp_path / "run" / "config.yaml").task.name == "arm"
 
 
 def test_resume_changes_nothing_but_what_may_change(tmp_path):
@@ -263,22 +262,28 @@ def test_resume_changes_nothing_but_what_may_change(tmp_path):
 
 
 def test_ctrl_c_ends_cleanly_and_saves(tmp_path):
-    """After SIGINT the iteration is finished, pictures are drawn, the exit code is 0 and the last line says how to go on."""
-    process = start(tmp_path, *TINY, "train.iterations=1000", "hydra.run.dir=run")
+    """After SIGINT the iteration is finished and saved; exit code 0, and the last line says how to go on."""
+    words = [sys.executable, "-m", "softmpm_learn", *TINY, "train.iterations=1000", "hydra.run.dir=run"]
+    process = subprocess.Popen(
+        words,
+        cwd=tmp_path,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     metrics, end = tmp_path / "run" / "metrics.csv", time.monotonic() + 120
     while not (metrics.exists() and metrics.read_text().count("\n") > 1):
         assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.1)
+        time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     done = len(rows(metrics))
-    assert 1 <= done < 1000
+    assert 1 <= done < 1000 and checkpoint.load(tmp_path / "run")["iteration"] == done
     assert f"Stopped after {done} iterations." in out
     assert out.rstrip().splitlines()[-1] == "To go on: python -m softmpm_learn resume=run"
     assert (tmp_path / "run" / "loss.png").exists()
-    run(tmp_path, "resume=run", f"train.iterations={done + 1}")
-    assert len(rows(metrics)) == done + 1
 
 
 def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_path):
@@ -302,11 +307,10 @@ def test_the_configuration_is_found_in_a_wheel(tmp_path):
     unpack = [sys.executable, "-m", "zipfile", "-e", str(wheel), str(tmp_path / "site")]
     subprocess.run(unpack, check=True, timeout=60)
     assert (tmp_path / "site" / "softmpm_learn" / "conf" / "task" / "elephant.yaml").is_file()
-    _, environment = command()
     done = subprocess.run(
         [sys.executable, "-m", "softmpm_learn", "task=arm", "--cfg", "job"],
         cwd=tmp_path,
-        env=environment | {"PYTHONPATH": str(tmp_path / "site")},
+        env=environment() | {"PYTHONPATH": str(tmp_path / "site")},
         capture_output=True,
         text=True,
         timeout=120,

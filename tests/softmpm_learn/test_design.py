@@ -1,6 +1,5 @@
 import pytest
 import torch
-from conftest import block_scene
 
 import softmpm
 from softmpm_learn.design import Design
@@ -53,10 +52,10 @@ def test_gradient_reaches_the_free_variables(model, task):
     torch.testing.assert_close(gradient, torch.tensor([(20 - 14) * (40 - 20) / (40 - 14)]), rtol=1e-5, atol=0)
 
 
-def test_a_start_outside_the_bounds_is_named():
+def test_a_start_outside_the_bounds_is_named(make_block):
     """A scene whose Poisson's ratio is outside the range is told which bound to widen."""
-    scene = block_scene()
+    scene = make_block()
     soft = softmpm.NeoHookean(density=1.0, young=20.0, poisson=0.1)
-    scene = block_scene(bodies=[softmpm.Body(scene.bodies[0].particles, soft)])
+    scene = make_block(bodies=[softmpm.Body(scene.bodies[0].particles, soft)])
     with pytest.raises(ValueError, match=r"poisson must lie between .* 0\.2 and 0\.4"):
         Design(DesignConf(), softmpm.build(scene, device="cpu"), {})

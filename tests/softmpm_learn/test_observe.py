@@ -1,16 +1,15 @@
 import numpy as np
 import pytest
 import torch
-from conftest import block_scene
 
 import softmpm
 from softmpm_learn.observe import Centroids, Latent, Picture, clusters
 
 
 @pytest.fixture(scope="module")
-def exact():
+def exact(make_block):
     """The block in float64, two worlds."""
-    return softmpm.build(block_scene(), device="cpu", dtype=torch.float64, worlds=2)
+    return softmpm.build(make_block(), device="cpu", dtype=torch.float64, worlds=2)
 
 
 def moving(model, seed=0) -> softmpm.State:

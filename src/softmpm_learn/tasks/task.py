@@ -36,7 +36,7 @@ class TaskConf:
     """Poisson's ratio ν [-]; where co-design starts."""
     density: float = 1000.0
     """Rest density ρ₀ [kg/m³]; where co-design starts."""
-    strength: float = 2e4
+    strength: float = 1.2e4
     """Stress of a muscle at full activation [Pa]."""
     gravity: float = 9.81
     """Downward acceleration [m/s²]; 0 is weightless."""

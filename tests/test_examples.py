@@ -1,0 +1,24 @@
+"""What the README shows runs as it stands there."""
+
+import re
+from pathlib import Path
+
+import torch
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_the_code_of_the_readme_runs():
+    """The ten lines give a gradient for every control step."""
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    gradient = names["activation"].grad
+    assert gradient.shape == (10, 1, 1) and bool(torch.isfinite(gradient).all()) and bool((gradient != 0).all())
+
+
+def test_every_file_that_the_readme_names_is_there():
+    """Links and pictures lead somewhere."""
+    for target in re.findall(r"\]\(([^)#]+)\)", README.read_text()):
+        if not target.startswith("http"):
+            assert (README.parent / target).exists(), target
