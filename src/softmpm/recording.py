@@ -73,14 +73,11 @@ class Recorder:
         self._particles = torch.from_numpy(static["particle"])
         self._shape = (model.particle_count, model.scene.grid.dim)
         draft = self.path.with_name(f"{self.path.name}.new")
-        with h5py.File(draft, "w", **_OPEN, **_PAGES) as file:
-            old_size = self.path.stat().st_size if self.path.exists() else 0
-            _claim(file, old_size + sum(values.nbytes for values in static.values()))
-            create(file, model, static)
-            if resume_before is not None and self.path.exists():
-                with Recording(self.path) as old:
-                    _copy(old, file, static, resume_before)
-        _put_in_place(draft, self.path)
+        try:
+            _begin(draft, model, static, self.path, resume_before)
+            _put_in_place(draft, self.path)
+        finally:
+            draft.unlink(missing_ok=True)
         self._file = _open_to_append(self.path)
         self._tables = tables(self._file)
         self._count = {name: len(table) for name, table in self._tables.items()}
@@ -105,7 +102,6 @@ class Recorder:
         self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]
     ) -> None:
         """One row in each table of a frame; it counts when the last one, ``frame/index``, is written."""
-        self._need_open()
         names = {f"frame/{name}": one for name, one in values.items()} | {
             PARTS[name]: one for name, one in parts.items()
         }
@@ -171,6 +167,7 @@ class Episode:
             world: The world to record.
         """
         recorder, self._calls = self._recorder, self._calls + 1
+        recorder._need_open()
         if (self._calls - 1) % recorder.every:
             return
         if tuple(state.x.shape[1:]) != recorder._shape:
@@ -225,6 +222,19 @@ def _one_world(name: str, tensor: Tensor, world: int, shape: tuple[int, ...]) ->
     return _numpy(one)
 
 
+def _begin(
+    draft: Path, model: Model, static: dict[str, np.ndarray], path: Path, resume_before: int | None
+) -> None:
+    """Write a recording with what is kept of the one at ``path``."""
+    kept = path.stat().st_size if path.exists() else 0
+    with h5py.File(draft, "w", **_OPEN, **_PAGES) as file:
+        _claim(file, sum(values.nbytes for values in static.values()) + kept)
+        create(file, model, static)
+        if kept and resume_before is not None:
+            with Recording(path) as old:
+                _copy(old, file, static, resume_before)
+
+
 def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before: int) -> None:
     """Everything of iterations before ``before``."""
     for name, values in static.items():
@@ -256,7 +266,7 @@ def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before
 
 
 def _claim(file: h5py.File, size: int) -> None:
-    """Make sure that ``size`` more bytes fit on the disk: HDF5 itself crashes the process after a failed write."""
+    """Make sure that ``size`` more bytes fit on the disk; a failed write of HDF5 itself crashes the process."""
     handle, end = file.id.get_vfd_handle(), file.id.get_filesize()
     try:
         if hasattr(os, "posix_fallocate"):  # HDF5 cuts the file to its true size at the next flush

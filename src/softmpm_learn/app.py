@@ -5,7 +5,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -117,7 +117,7 @@ def sentence(error: BaseException) -> str:
         return sentence(cause)  # from a resolver of ours
     if isinstance(error, OverrideParseException):
         return f"cannot read {error.override!r}: write key=value, in quotes if it has spaces or brackets."
-    kind = getattr(error, "object_type", None)
+    kind: Any = getattr(error, "object_type", None)
     if isinstance(error, (ConfigAttributeError, ConfigKeyError)) and dataclasses.is_dataclass(kind):
         return unknown_key(str(error.full_key), kind)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
@@ -126,7 +126,9 @@ def sentence(error: BaseException) -> str:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
     text = str(error) if str(error).strip() else "no details"
-    return _line(text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)")
+    return _line(
+        text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
+    )
 
 
 def _line(text: str) -> str:

@@ -126,8 +126,8 @@ def load(path: Path) -> RunConf:
     name = OmegaConf.select(saved, "task.name")
     if name not in TASKS:
         raise ValueError(f"{path} names the task {name!r}; known are {', '.join(TASKS)}.")
-    schema = OmegaConf.structured(RunConf(task=TASKS[name][0]()))
-    return to_run(OmegaConf.merge(schema, saved))
+    task: Any = TASKS[name][0]
+    return to_run(DictConfig(OmegaConf.merge(OmegaConf.structured(RunConf(task=task())), saved)))
 
 
 def save(run: RunConf, path: Path) -> None:

@@ -82,7 +82,11 @@ def draw(result: Result, task: Task, out: Path) -> None:
         moments = np.linspace(0, len(frames["time"]) - 1, PICTURES).round().astype(int)
         active = frames["activation"][:-1]  # the last frame has none
         pictures = [
-            (f"iteration {iteration}, {frames['time'][k]:.2f} s", frames["x"][k], active[min(k, len(active) - 1)])
+            (
+                f"iteration {iteration}, {frames['time'][k]:.2f} s",
+                frames["x"][k],
+                active[min(k, len(active) - 1)],
+            )
             for k in moments
         ]
         goal = None if any(result.run.settings.train.goal_spread) else task.goal
@@ -104,8 +108,8 @@ def curves(path: Path) -> dict[str, tuple[list[float], list[float]]]:
 def decoded(run: Run) -> np.ndarray:
     """Velocity [m/s] that each latent feature stands for at ``VALUES``, shape (feature, value, *nodes, dim)."""
     assert run.learner is not None
-    size, like = run.observer.size, run.learner.autoencoder.encoder.scale
-    features = torch.zeros(size, len(VALUES), size, dtype=like.dtype, device=like.device)
+    size = run.observer.size
+    features = torch.zeros(size, len(VALUES), size, dtype=run.model.dtype, device=run.model.device)
     for k in range(size):
         features[k, :, k] = torch.tensor(VALUES)
     fields = run.learner.autoencoder.decode(features.flatten(end_dim=1))
@@ -171,14 +175,13 @@ def outcome(task: Task, out: Path) -> str:
 
 
 def convert(out: Path) -> str:
-    """Turn run.h5 into run.rrd; gives the command that opens the recording, or that first converts it elsewhere."""
+    """Turn run.h5 into run.rrd; gives the command that opens the recording, or that converts it elsewhere."""
     recording, picture = out / "run.h5", out / "run.rrd"
-    viewer = f"rerun {_relative(picture)}"
     try:
         softmpm.to_rerun(recording, picture)
     except ImportError:
-        return f"python -m softmpm.recording {_relative(recording)} {_relative(picture)} (needs rerun-sdk), then {viewer}"
-    return viewer if shutil.which("rerun") else f"python -m {viewer}"
+        return f"python -m softmpm {_relative(recording)} && rerun {_relative(picture)} (with rerun-sdk)"
+    return f"rerun {_relative(picture)}" if shutil.which("rerun") else f"python -m rerun {_relative(picture)}"
 
 
 def _relative(path: Path) -> str:

@@ -5,6 +5,7 @@ matplotlib is imported where it is used and without pyplot, so that nothing glob
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
 
-def _figure(width: float, height: float):
+def _figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -112,32 +113,36 @@ def robot_figure(
         design: Of each material its value on each particle (particle,) and its unit; drawn at rest.
         goal: Where the robot should go, drawn as a cross.
     """
-    rest = np.concatenate([body.particles.positions for body in scene.bodies])
-    row = _row_height(scene, frames)
-    figure = _figure(8.0, row * len(frames) + (2.3 if design else 0.0) + 0.3)
-    parts = figure.subfigures(2, 1, height_ratios=[row * len(frames), 2.3]) if design else [figure]
-    panels = parts[0].subplots(len(frames), 1, squeeze=False)[:, 0]
-    for panel, (title, positions, activation) in zip(panels, frames, strict=True):
-        _draw_robot(panel, scene, positions, activation)
+    low, high = _window(scene)
+    ratio = (high[1] - low[1]) / (high[0] - low[0])
+    columns = 1 if ratio < 0.45 else 2  # a high world is drawn half as wide
+    rows = -(-len(frames) // columns)
+    above, below = rows * (7.4 / columns * ratio + 0.25), 2.3 if design else 0.0
+    figure = _figure(8.0, above + below + 0.3)
+    parts = figure.subfigures(2, 1, height_ratios=[above, below]) if design else np.array([figure])
+    panels = parts[0].subplots(rows, columns, squeeze=False).ravel()
+    for panel, (title, positions, activation) in zip(panels, frames, strict=False):
+        _draw_robot(panel, scene, positions, activation, inches=7.4 / columns)
         if goal is not None:
             panel.plot(goal[0], goal[1], marker="x", color="#c0392b", markersize=8, markeredgewidth=2)
         panel.set_title(title, fontsize=8, loc="left")
+    for panel in panels[len(frames) :]:
+        panel.set_axis_off()
     if design:
-        for panel, (name, (value, unit)) in zip(
-            parts[1].subplots(1, len(design), squeeze=False)[0], design.items(), strict=True
-        ):
-            dots = panel.scatter(
-                rest[:, 0], rest[:, 1], c=value, s=_dot(scene, rest, 2.4), cmap="viridis", linewidths=0
-            )
-            panel.set(xticks=[], yticks=[], aspect="equal")
-            panel.set_title(f"{name} [{unit}]" if unit else name, fontsize=8)
-            parts[1].colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax.tick_params(labelsize=6)
+        _draw_design(parts[1], scene, design)
     figure.savefig(path, dpi=130)
 
 
-def _row_height(scene: Scene, frames) -> float:
-    low, high = _window(scene)
-    return 7.4 * (high[1] - low[1]) / (high[0] - low[0]) + 0.25
+def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]]) -> None:
+    """Each material on the shape at rest, with a scale of its own."""
+    rest = np.concatenate([body.particles.positions for body in scene.bodies])
+    panels = part.subplots(1, len(design), squeeze=False)[0]
+    for panel, (name, (value, unit)) in zip(panels, design.items(), strict=True):
+        size = _dot(scene, rest, 2.2 if np.ptp(rest[:, 0]) > np.ptp(rest[:, 1]) else 1.6)
+        dots = panel.scatter(rest[:, 0], rest[:, 1], c=value, s=size, cmap="viridis", linewidths=0)
+        panel.set(xticks=[], yticks=[], aspect="equal")
+        panel.set_title(f"{name} [{unit}]" if unit else name, fontsize=8)
+        part.colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax.tick_params(labelsize=6)
 
 
 def _window(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -145,19 +150,21 @@ def _window(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _dot(scene: Scene, positions: np.ndarray, inches: float) -> float:
-    """Size of a dot [points²] that about fills the distance of two particles."""
+    """Size of a dot [points²] that about fills the distance of two particles, in a picture of so many inches."""
     extent = max(float(np.ptp(positions[:, 0])), float(np.ptp(positions[:, 1])), scene.grid.spacing)
     return (72.0 * inches * 0.62 * scene.grid.spacing / extent) ** 2
 
 
-def _draw_robot(panel, scene: Scene, positions: np.ndarray, activation: np.ndarray | None) -> None:
+def _draw_robot(
+    panel, scene: Scene, positions: np.ndarray, activation: np.ndarray | None, *, inches: float
+) -> None:
     """Particles in grey, muscles red where they pull and blue where they push, walls hatched."""
     low, high = _window(scene)
     value = np.zeros(len(positions))
     if activation is not None:
         for muscle, a in zip(scene.muscles, activation, strict=True):
             value[muscle.particles] += a
-    size = _dot(scene, np.stack([low, high]), 7.4)
+    size = _dot(scene, np.stack([low, high]), inches)
     muscular = np.zeros(len(positions), dtype=bool)
     for muscle in scene.muscles:
         muscular[muscle.particles] = True

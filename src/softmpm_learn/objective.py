@@ -41,6 +41,24 @@ class Height(Running):
         return self.weight * (self.lowest - state.x[..., self.axis].mean(dim=-1)).clamp(min=0.0).square()
 
 
+@dataclass(frozen=True)
+class Upright(Running):
+    """Keep level: weight · (slope − slope at rest)², the slope that from the hind part of the robot to its front part."""
+
+    weight: float
+    front: np.ndarray
+    back: np.ndarray
+    """Indices of the particles of either part."""
+    rest: np.ndarray
+    """Rest positions of all particles [m], shape (particle, dim)."""
+
+    def __call__(self, state: State, activation: Tensor) -> Tensor:
+        apart = self.rest[self.front].mean(axis=0) - self.rest[self.back].mean(axis=0)
+        y = state.x[..., 1]
+        rise = y[:, self.front].mean(dim=-1) - y[:, self.back].mean(dim=-1)
+        return self.weight * ((rise - apart[1]) / apart[0]).square()
+
+
 class Objective(ABC):
     """A final loss and running terms."""
 

@@ -68,7 +68,7 @@ class PolicyConf:
     """mlp: width of each hidden layer; two of 64 as in Spielberg et al. 2021 (Robotica)."""
     clock: bool = True
     """Show linear and mlp the time as sines and cosines. Our choice: a rhythm to start from; False is the paper's pure feedback."""
-    period: float = 0.25
+    period: float = 0.4
     """Longest period of the clock and of sinusoids [s]."""
     harmonics: int = 2
     """Number of periods: period, period/2, period/3, …"""
@@ -126,7 +126,7 @@ class OptimizerConf:
 
     name: str = "adam"
     """adam or sgd (plain gradient descent)."""
-    policy_rate: float = 1e-2
+    policy_rate: float = 5e-3
     """Learning rate of the policy."""
     design_rate: float = 3e-2
     """Learning rate of the design, in the unbounded space before the sigmoid."""

@@ -194,7 +194,7 @@ def learn(run: Run, seconds: dict[str, float]) -> dict[str, float]:
     if run.learner is None:
         return {}
     row = {"replay": len(run.learner.replay.ids)}
-    if (run.iteration + 1) % run.settings.learning.every == 0:
+    if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
         with _clock(seconds, "learn"):
             row |= run.learner.learn(run.generator)
     return row

@@ -295,7 +295,7 @@ def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_pat
     monkeypatch.setattr(softmpm, "to_rerun", missing)
     monkeypatch.chdir(tmp_path)
     said = experiment.convert(tmp_path / "out")
-    assert said.startswith(f"python -m softmpm.recording {Path('out') / 'run.h5'} {Path('out') / 'run.rrd'}")
+    assert said.startswith(f"python -m softmpm {Path('out') / 'run.h5'} && rerun {Path('out') / 'run.rrd'}")
 
 
 def test_the_configuration_is_found_in_a_wheel(tmp_path):

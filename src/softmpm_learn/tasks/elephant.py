@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle, Particles, Scene
-from softmpm_learn.objective import Effort, Progress
+from softmpm_learn.objective import Effort, Progress, Upright
 from softmpm_learn.tasks.outline import Limb, fill, smooth, smooth_line
 from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean, track
 
@@ -67,12 +67,18 @@ class ElephantConf(TaskConf):
     """An elephant that walks to the right."""
 
     name: str = "elephant"
+    strength: float = 8e3
+    """Stress of a muscle at full activation [Pa]."""
+    effort: float = 1e-2
+    """Weight of the mean squared activation in the loss [m]."""
+    upright: float = 1.0
+    """Weight of the squared slope of the torso in the loss [m]; without it the elephant ends on its head."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("friction")
+        self.need_not_negative("friction", "upright")
 
 
 def elephant(conf: ElephantConf) -> Task:
@@ -98,7 +104,7 @@ def elephant(conf: ElephantConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(terms=(Effort(conf.effort),)),
+        objective=Progress(terms=(Effort(conf.effort), _level(conf.upright, rest, regions["body"]))),
         body_length=float(np.ptp(rest[:, 0])),
     )
 
@@ -120,6 +126,12 @@ def actuate(
         regions[name] = taken[free[taken]]
         free[taken] = False
     return regions | {"body": np.flatnonzero(free)}, muscles
+
+
+def _level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
+    """The hind and the front quarter of the torso stay level."""
+    low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
+    return Upright(weight, torso[rest[torso, 0] > high], torso[rest[torso, 0] < low], rest)
 
 
 def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:

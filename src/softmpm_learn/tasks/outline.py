@@ -71,12 +71,12 @@ class Limb:
         left = step[nearest, 0] * offset[row, nearest, 1] - step[nearest, 1] * offset[row, nearest, 0]
         return along / length.sum(), left / length[nearest]
 
-    def direction(self, start: float, end: float) -> np.ndarray:
+    def direction(self, start: float, end: float) -> tuple[float, ...]:
         """Unit vector from one place along the limb to another, both in [0, 1]."""
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.line, axis=0), axis=1))])
         along /= along[-1]
         first, last = (np.array([np.interp(t, along, axis) for axis in self.line.T]) for t in (start, end))
-        return (last - first) / np.linalg.norm(last - first)
+        return tuple((last - first) / np.linalg.norm(last - first))
 
     def part(self, points: np.ndarray, start: float, end: float, side: int = 0) -> np.ndarray:
         """Indices of the points of a piece of the limb; ``side`` 1 keeps its left half, -1 its right."""
