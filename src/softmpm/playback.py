@@ -44,7 +44,7 @@ class Recording:
         if not self.path.is_file():
             raise FileNotFoundError(f"there is no recording {self.path}.")
         try:
-            self._file = h5py.File(self.path, "r", swmr=True, locking="best-effort")
+            self._file = h5py.File(self.path, "r", swmr=_unclosed(self.path), locking="best-effort")
         except OSError as error:
             raise OSError(f"{self.path} is not a readable recording: {error}.") from error
         try:
@@ -193,6 +193,22 @@ class Recording:
 
     def __exit__(self, *_) -> None:
         self.close()
+
+
+def _unclosed(path: Path) -> bool:
+    """Whether its writer still writes or was killed. Only such a file is read in the mode for that: on a damaged
+    file this mode would wait for a writer to mend it, for ever.
+
+    Source: HDF5 File Format Specification 3.0, II.A, superblock version 3.
+    """
+    with open(path, "rb") as file:
+        head = file.read(36)
+    version, flags, end = head[8:9], head[11:12], int.from_bytes(head[28:36], "little")
+    if version != b"\x03" or not flags or not flags[0] & 4:
+        return False
+    if path.stat().st_size < end:
+        raise OSError(f"it was cut to {path.stat().st_size} of at least {end} bytes")
+    return True
 
 
 def _chunk_bytes(dataset: h5py.Dataset) -> int:

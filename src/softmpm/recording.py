@@ -6,8 +6,10 @@ writes so that the file is always consistent; and a frame counts only once its r
 followed its data. Layout: ``layout.py``.
 """
 
+import contextlib
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -22,7 +24,7 @@ from softmpm.state import GridField, State
 
 _OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
 _PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot tear what does not cross a page
-_CLAIM_EXTRA = 2**20  # for HDF5's own tables
+_ROOM_EXTRA = 2**20  # for HDF5's own tables
 
 
 class Recorder:
@@ -101,18 +103,12 @@ class Recorder:
     def _frame(
         self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]
     ) -> None:
-        """One row in each table of a frame; it counts when the last one, ``frame/index``, is written."""
-        names = {f"frame/{name}": one for name, one in values.items()} | {
-            PARTS[name]: one for name, one in parts.items()
-        }
-        _claim(self._file, sum(one.nbytes for one in names.values()))
-        for table, one in names.items():
-            put(
-                self._tables[table],
-                self._count["frame/index" if table not in PARTS.values() else table],
-                one[None],
-            )
-        self._file.flush()  # the data goes before the row that declares it complete
+        """One row in each table of a frame; it counts once the last, ``frame/index``, is written."""
+        rows = {f"frame/{name}": ("frame/index", one) for name, one in values.items()}
+        rows |= {PARTS[name]: (PARTS[name], one) for name, one in parts.items()}
+        with _room(self._file, sum(one.nbytes for _, one in rows.values())):
+            for table, (counted, one) in rows.items():
+                put(self._tables[table], self._count[counted], one[None])
         field, latent = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
         self._write("frame/index", np.array([(episode, time, field, latent)], FRAME))
         for name in parts:
@@ -120,9 +116,8 @@ class Recorder:
 
     def _write(self, name: str, rows: np.ndarray) -> None:
         self._need_open()
-        _claim(self._file, rows.nbytes)
-        put(self._tables[name], self._count[name], rows)
-        self._file.flush()
+        with _room(self._file, rows.nbytes):
+            put(self._tables[name], self._count[name], rows)
         self._count[name] += len(rows)
 
     def _need_open(self) -> None:
@@ -227,8 +222,8 @@ def _begin(
 ) -> None:
     """Write a recording with what is kept of the one at ``path``."""
     kept = path.stat().st_size if path.exists() else 0
-    with h5py.File(draft, "w", **_OPEN, **_PAGES) as file:
-        _claim(file, sum(values.nbytes for values in static.values()) + kept)
+    size = sum(values.nbytes for values in static.values()) + kept
+    with h5py.File(draft, "w", **_OPEN, **_PAGES) as file, _room(file, size):
         create(file, model, static)
         if kept and resume_before is not None:
             with Recording(path) as old:
@@ -265,17 +260,23 @@ def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before
         extend("scalar", np.array(kept, SCALAR))
 
 
-def _claim(file: h5py.File, size: int) -> None:
-    """Make sure that ``size`` more bytes fit on the disk; a failed write of HDF5 itself crashes the process."""
+@contextlib.contextmanager
+def _room(file: h5py.File, size: int) -> Iterator[None]:
+    """Claim room for ``size`` bytes on the disk, write, and give back the rest.
+
+    HDF5 must not meet a full disk itself: after a write that failed it crashes the process.
+    """
     handle, end = file.id.get_vfd_handle(), file.id.get_filesize()
     try:
-        if hasattr(os, "posix_fallocate"):  # HDF5 cuts the file to its true size at the next flush
-            os.posix_fallocate(handle, end, size + _CLAIM_EXTRA)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(handle, end, size + _ROOM_EXTRA)
     except OSError as error:
         os.ftruncate(handle, end)
-        raise OSError(
-            error.errno, f"no room to record ({error.strerror}); what was recorded is safe", file.filename
-        ) from error
+        text = f"no room to record ({error.strerror}); what was recorded is safe"
+        raise OSError(error.errno, text, file.filename) from error
+    yield
+    file.flush()
+    os.ftruncate(handle, file.id.get_filesize())
 
 
 def _open_to_append(path: Path) -> h5py.File:

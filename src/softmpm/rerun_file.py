@@ -54,21 +54,27 @@ def to_rerun(
             raise ValueError(f"{name} must be at least 1, got {value}.")
     rrd = Path(recording).with_suffix(".rrd") if rrd is None else Path(rrd)
     draft = rrd.with_name(f"{rrd.name}.new")
-    with Recording(recording) as source, warnings.catch_warnings():
-        warnings.simplefilter("error", RerunWarning)  # rerun would warn and leave data out
-        show = plan(source, every, max_particles)
-        stream = rr.RecordingStream("softmpm")
-        try:
+    stream = rr.RecordingStream("softmpm")
+    try:
+        with Recording(recording) as source, warnings.catch_warnings():
+            warnings.simplefilter("error", RerunWarning)  # rerun would warn and leave data out
+            show = plan(source, every, max_particles)
             stream.save(draft, default_blueprint=_blueprint(source, show))
-            _log_static(stream, source, show)
-            for simulation in show.simulations:
-                _log_simulation(stream, source, show, simulation)
-            _log_scalars(stream, source, show)
-            stream.flush()
-        finally:
-            stream.disconnect()
-    os.replace(draft, rrd)
+            _log_all(stream, source, show)
+        stream.flush()
+        stream.disconnect()
+        os.replace(draft, rrd)
+    finally:
+        stream.disconnect()
+        draft.unlink(missing_ok=True)
     return rrd
+
+
+def _log_all(stream, source: Recording, show: Show) -> None:
+    _log_static(stream, source, show)
+    for simulation in show.simulations:
+        _log_simulation(stream, source, show, simulation)
+    _log_scalars(stream, source, show)
 
 
 def _log_static(stream, source: Recording, show: Show) -> None:

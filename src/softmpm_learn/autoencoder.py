@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from softmpm_learn.settings import LearningConf
 
-VALIDATION_PICTURES = 512
-"""Most pictures that a validation loss looks at, evenly chosen."""
+QUIET = 0.1
+"""A latent that deviates less than this, in units of the prior, is not blown up to deviation 1: it says next to nothing."""
 
 
 def _halvings(shape: tuple[int, ...], times: int) -> list[tuple[int, ...]]:
@@ -105,10 +105,10 @@ class Autoencoder(nn.Module):
 
     @torch.no_grad()
     def standardise(self, pictures: Tensor) -> None:
-        """Bring the latent of these pictures to mean 0 and deviation 1."""
+        """Bring the latent of these pictures to mean 0 and deviation 1, quiet ones to less."""
         mean = self.encoder.moments(pictures)[0]
         self.encoder.centre.copy_(mean.mean(dim=0))
-        self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=1e-3))
+        self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=QUIET))
 
     def loss(self, pictures: Tensor, kl: float | None, generator: torch.Generator | None = None) -> Tensor:
         """(A1); ``kl`` is β, or None for a plain autoencoder. Without a generator the latent is its mean."""
@@ -158,7 +158,6 @@ def train_autoencoder(
             return autoencoder.loss(validation, kl).item()
 
     if validation is not None:
-        validation = validation[:: -(-len(validation) // VALIDATION_PICTURES)]
         best_loss, best = judge(), copy.deepcopy(autoencoder.state_dict())
     for epoch in range(1, conf.epochs + 1):
         losses = []

@@ -82,7 +82,10 @@ def read(path: Path) -> dict:
     body, footer = data[:-_FOOTER], data[-_FOOTER:]
     if footer != _MARK + hashlib.sha256(body).hexdigest().encode():
         raise CheckpointError(f"{path} is damaged: its SHA-256 does not match.")
-    content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    try:
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # PyTorch raises many kinds, all of which mean this
+        raise CheckpointError(f"{path} is no checkpoint of tensors, numbers and texts: {error}") from error
     if content.get("format") != FORMAT:
         raise CheckpointError(f"{path} has format {content.get('format')!r}, this version reads {FORMAT}.")
     return content

@@ -11,9 +11,8 @@ from softmpm_learn.replay import Replay
 from softmpm_learn.settings import LearningConf
 from softmpm_learn.target import TargetNetwork
 
-
-STANDARD = 4
-"""Every fourth picture is enough to standardise the latent."""
+MANY = 512
+"""So many pictures, evenly chosen, are enough to validate with and to standardise by."""
 
 
 class Learner:
@@ -48,11 +47,11 @@ class Learner:
             self.autoencoder,
             self.optimizer,
             lambda: self.replay.sample(generator, self.conf.batch).to(self.device),
-            torch.cat(validation).to(self.device) if validation else None,
+            _some(torch.cat(validation)).to(self.device) if validation else None,
             self.conf,
             generator,
         )
-        self.autoencoder.standardise(torch.cat([pictures[::STANDARD] for pictures in training]).to(self.device))
+        self.autoencoder.standardise(_some(torch.cat(training)).to(self.device))
         if self.target is not None:
             rate = self.conf.target_rate if self.phases else 1.0  # what it copies at first is only noise
             self.target.follow(self.autoencoder.encoder, rate)
@@ -77,3 +76,7 @@ class Learner:
             self.target.load_state_dict(content["target"])
         self.replay.load(content["replay"])
         self.phases = content["phases"]
+
+
+def _some(pictures: Tensor) -> Tensor:
+    return pictures[:: -(-len(pictures) // MANY)]

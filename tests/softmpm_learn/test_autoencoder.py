@@ -14,7 +14,9 @@ def make(dim=2, shape=(11, 6), variational_size=2, **kwargs) -> Autoencoder:
 def waves(count: int, shape=(11, 6)) -> torch.Tensor:
     """Pictures with two numbers in them: the strengths of two patterns."""
     generator = torch.Generator().manual_seed(1)
-    pattern = torch.randn(2, 2, *shape, generator=generator)
+    x, y = (torch.linspace(0, 3, n) for n in shape)
+    pattern = torch.stack([torch.sin(x)[:, None] * torch.cos(y), torch.cos(x)[:, None] * torch.sin(y)])
+    pattern = torch.stack([pattern, pattern.flip(0)])
     return torch.einsum("bk,kcij->bcij", torch.randn(count, 2, generator=generator), pattern)
 
 

@@ -28,8 +28,10 @@ class ArmConf(TaskConf):
     name: str = "arm"
     gravity: float = 0.0
     """Downward acceleration [m/s²]; 0: the arm lies on a table."""
-    damping: float = 2.0
-    """Rate at which velocity decays [1/s]."""
+    damping: float = 4.0
+    """Rate at which velocity decays [1/s]: an arm that swings for long is hard to stop at its goal."""
+    strength: float = 6e3
+    """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
     """Where the tip should be when the episode ends: x and y [m]; at rest it is at (0.45, 0.41)."""
 
@@ -67,7 +69,7 @@ def arm(conf: ArmConf) -> Task:
     ]
     nodes = conf.resolution.value
     scene = Scene(
-        grid=Grid(shape=(round(0.9 * nodes), round(0.6 * nodes)), spacing=conf.spacing),
+        grid=Grid(shape=(round(0.9 * nodes), round(0.7 * nodes)), spacing=conf.spacing),
         bodies=[Body(Particles(rest, (conf.spacing / 2) ** 2), neo_hookean(conf))],
         muscles=muscles,
         walls=[Wall(normal=(0.0, 1.0), offset=BASE[1], contact="stick")],

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle, Particles, Scene
-from softmpm_learn.objective import Effort, Height, Progress
+from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth
-from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean, track
+from softmpm_learn.tasks.task import Task, TaskConf, clock, level, neo_hookean, track
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -25,10 +25,14 @@ class BipedConf(TaskConf):
     """A two-legged walker that walks to the right."""
 
     name: str = "biped"
+    strength: float = 6e3
+    """Stress of a muscle at full activation [Pa]."""
+    effort: float = 1e-2
+    """Weight of the mean squared activation in the loss [m]."""
+    upright: float = 1.0
+    """Weight of the squared slope of the body in the loss [m]; without it the walker tumbles forward."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
-    upright: float = 50.0
-    """Weight of the squared distance [m²] of its mean height below three quarters of that at rest."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -67,13 +71,12 @@ def biped(conf: BipedConf) -> Task:
         dt=conf.control_period,
     )
     scene, control_steps, substeps = clock(conf, scene)
-    lowest = walls[0].offset + 0.75 * float(rest[:, 1].mean())
     return Task(
         name="biped",
         scene=scene,
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(terms=(Effort(conf.effort), Height(conf.upright, lowest))),
+        objective=Progress(terms=(Effort(conf.effort), level(conf.upright, rest, regions["body"]))),
         body_length=float(np.ptp(rest[:, 0])),
     )

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle, Particles, Scene
-from softmpm_learn.objective import Effort, Progress, Upright
+from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean, track
+from softmpm_learn.tasks.task import Task, TaskConf, clock, level, neo_hookean, track
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -67,7 +67,7 @@ class ElephantConf(TaskConf):
     """An elephant that walks to the right."""
 
     name: str = "elephant"
-    strength: float = 8e3
+    strength: float = 6e3
     """Stress of a muscle at full activation [Pa]."""
     effort: float = 1e-2
     """Weight of the mean squared activation in the loss [m]."""
@@ -104,7 +104,7 @@ def elephant(conf: ElephantConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(terms=(Effort(conf.effort), _level(conf.upright, rest, regions["body"]))),
+        objective=Progress(terms=(Effort(conf.effort), level(conf.upright, rest, regions["body"]))),
         body_length=float(np.ptp(rest[:, 0])),
     )
 
@@ -126,12 +126,6 @@ def actuate(
         regions[name] = taken[free[taken]]
         free[taken] = False
     return regions | {"body": np.flatnonzero(free)}, muscles
-
-
-def _level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
-    """The hind and the front quarter of the torso stay level."""
-    low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
-    return Upright(weight, torso[rest[torso, 0] > high], torso[rest[torso, 0] < low], rest)
 
 
 def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:

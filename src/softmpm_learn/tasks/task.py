@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 
 import softmpm
-from softmpm_learn.objective import Objective
+from softmpm_learn.objective import Objective, Upright
 
 
 class Resolution(Enum):
@@ -111,6 +111,12 @@ def clock(conf: TaskConf, scene: softmpm.Scene) -> tuple[softmpm.Scene, int, int
 def neo_hookean(conf: TaskConf) -> softmpm.NeoHookean:
     """The material that the settings describe."""
     return softmpm.NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson)
+
+
+def level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
+    """The hind and the front quarter of the torso stay level."""
+    low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
+    return Upright(weight, torso[rest[torso, 0] > high], torso[rest[torso, 0] < low], rest)
 
 
 def track(conf: TaskConf, friction: float) -> tuple[softmpm.Grid, list[softmpm.Wall]]:

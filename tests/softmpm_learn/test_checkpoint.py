@@ -1,0 +1,119 @@
+import os
+
+import pytest
+import torch
+
+from softmpm_learn import checkpoint
+
+
+def content(value: float) -> dict:
+    return {"value": value, "weights": torch.full((50,), value), "ids": [1, 2], "name": "block"}
+
+
+def same(a: dict, b: dict) -> bool:
+    return a["value"] == b["value"] and torch.equal(a["weights"], b["weights"]) and a["ids"] == b["ids"]
+
+
+def test_what_is_saved_comes_back(tmp_path):
+    """The newest checkpoint is loaded; the file is also a plain PyTorch file that loads without running code."""
+    assert not checkpoint.exists(tmp_path)
+    checkpoint.save(tmp_path, content(1.0))
+    path = checkpoint.save(tmp_path, content(2.0))
+    assert checkpoint.exists(tmp_path) and same(checkpoint.load(tmp_path), content(2.0))
+    assert same(torch.load(path, weights_only=True), content(2.0))
+    assert same(checkpoint.read(tmp_path / checkpoint.PREVIOUS), content(1.0))
+
+
+def test_every_flipped_bit_is_noticed(tmp_path):
+    """One bit anywhere, a file cut short or emptied: the one before is loaded instead, with a warning in the log."""
+    checkpoint.save(tmp_path, content(1.0))
+    path = checkpoint.save(tmp_path, content(2.0))
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 13):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1 << (place % 8)
+        path.write_bytes(spoilt)
+        assert same(checkpoint.load(tmp_path), content(1.0)), place
+    for length in (0, 1, 100, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        assert same(checkpoint.load(tmp_path), content(1.0)), length
+
+
+def test_falling_back_is_said(tmp_path, caplog):
+    """The log names the damaged file; without an intact one the error names both."""
+    checkpoint.save(tmp_path, content(1.0))
+    checkpoint.save(tmp_path, content(2.0)).write_bytes(b"")
+    checkpoint.load(tmp_path)
+    assert "checkpoint.pt is damaged" in caplog.text and "Falling back to checkpoint.previous.pt" in caplog.text
+    (tmp_path / checkpoint.PREVIOUS).unlink()
+    with pytest.raises(checkpoint.CheckpointError, match=r"checkpoint\.pt is damaged.*previous\.pt cannot be read"):
+        checkpoint.load(tmp_path)
+
+
+@pytest.mark.parametrize("call", ["replace", "fsync"])
+@pytest.mark.parametrize("nth", [0, 1, 2])
+def test_a_kill_at_any_step_of_writing_loses_one_checkpoint_at_most(tmp_path, monkeypatch, call, nth):
+    """Ending at each system call of a save leaves either the new or the old content, whole."""
+    checkpoint.save(tmp_path, content(1.0))
+    checkpoint.save(tmp_path, content(2.0))
+    real, count = getattr(os, call), iter(range(99))
+
+    def dies(*args):
+        if next(count) == nth:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(os, call, dies)
+    try:
+        checkpoint.save(tmp_path, content(3.0))
+    except KeyboardInterrupt:
+        pass
+    monkeypatch.undo()
+    found = checkpoint.load(tmp_path)
+    assert same(found, content(2.0)) or same(found, content(3.0))
+
+
+def test_a_full_disk_leaves_the_old_checkpoint(tmp_path, monkeypatch):
+    """An error while writing reaches the caller and spoils nothing."""
+    checkpoint.save(tmp_path, content(1.0))
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint.save(tmp_path, content(2.0))
+    monkeypatch.undo()
+    assert same(checkpoint.load(tmp_path), content(1.0))
+
+
+def test_other_formats_are_named(tmp_path, monkeypatch):
+    """A file of another version says which one it is."""
+    monkeypatch.setattr(checkpoint, "FORMAT", 99)
+    path = checkpoint.save(tmp_path, content(1.0))
+    monkeypatch.undo()
+    with pytest.raises(checkpoint.CheckpointError, match="format 99, this version reads 1"):
+        checkpoint.read(path)
+
+
+def test_code_in_a_checkpoint_does_not_run(tmp_path):
+    """A pickle that calls a function is refused even if its digest is right."""
+
+    class Evil:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "evil"),))
+
+    path = checkpoint.save(tmp_path, {"evil": Evil()})
+    with pytest.raises(checkpoint.CheckpointError, match="no checkpoint of tensors"):
+        checkpoint.read(path)
+    assert not (tmp_path / "evil").exists()
+
+
+def test_one_run_at_a_time(tmp_path):
+    """A second lock on the folder is refused while the first is held, and not after."""
+    pytest.importorskip("fcntl")
+    with checkpoint.locked(tmp_path):
+        with pytest.raises(RuntimeError, match="another run is writing"), checkpoint.locked(tmp_path):
+            pass
+    with checkpoint.locked(tmp_path):
+        pass

@@ -1,0 +1,97 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import softmpm
+from softmpm_learn.design import Design
+from softmpm_learn.episode import run_episode
+from softmpm_learn.objective import Effort, Progress
+from softmpm_learn.observe import Centroids, Latent, Picture
+from softmpm_learn.policy import make_policy
+from softmpm_learn.seeding import seeded
+from softmpm_learn.settings import DesignConf, PolicyConf
+
+
+class Constant(nn.Module):
+    """The same activation always."""
+
+    def __init__(self, value: list[float]):
+        super().__init__()
+        self.value = torch.tensor([value])
+
+    def forward(self, z, time, goal=None):
+        return self.value.expand(len(z), -1).to(z)
+
+
+def test_equals_one_call_of_simulate(task, model):
+    """Under a constant activation the closed loop is one long simulation, and its losses are the objective's."""
+    observer = Centroids(model, list(task.regions.values()), task.body_length)
+    episode = run_episode(task, model, observer, Constant([0.5, -0.3]), model.params())
+    activation = torch.tensor([0.5, -0.3]).expand(task.control_steps, 1, 2).contiguous()
+    start = model.rest()
+    end = softmpm.simulate(model, start, activation, model.params(), substeps=task.substeps)
+    for got, want in zip(episode.end, end, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=0)
+    torch.testing.assert_close(episode.final, Progress().final(start, end, None))
+    torch.testing.assert_close(episode.running, torch.full((1,), 1e-3 * (0.25 + 0.09) / 2))
+    torch.testing.assert_close(episode.loss, episode.final + episode.running)
+    assert episode.effort == pytest.approx(np.sqrt((0.25 + 0.09) / 2)) and episode.seen is None
+
+
+def test_gradient_of_policy_and_design(task):
+    """Autograd through policy, observer, simulator and design agrees with a central difference along a random direction."""
+    model = softmpm.build(task.scene, device="cpu", dtype=torch.float64, worlds=2)
+    with seeded(0):
+        net = nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3), nn.Tanh()).double()
+    observer = Latent(Picture(model), net, size=3)
+    policy = make_policy(PolicyConf(name="linear"), 3, 2, 0.1, seed=0).double()
+    design = Design(DesignConf(), model, task.regions)
+    variables = [*policy.parameters(), *design.parameters()]
+
+    def loss():
+        return run_episode(task, model, observer, policy, design()).loss.mean()
+
+    gradient = torch.autograd.grad(loss(), variables)
+    generator = torch.Generator().manual_seed(0)
+    direction = [torch.randn(v.shape, generator=generator, dtype=v.dtype) for v in variables]
+    for part in (slice(0, 2), slice(2, None)):  # policy, design
+
+        def shifted(h, part=part):
+            with torch.no_grad():
+                for v, d in zip(variables[part], direction[part], strict=True):
+                    v += h * d
+                value = loss()
+                for v, d in zip(variables[part], direction[part], strict=True):
+                    v -= h * d
+            return value
+
+        want = (shifted(1e-5) - shifted(-1e-5)) / 2e-5
+        got = sum((g * d).sum() for g, d in zip(gradient[part], direction[part], strict=True))
+        assert abs(want) > 1e-8  # not a difference of nothing
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=0)
+
+
+def test_frames_and_pictures(task, model):
+    """A frame at every control step and one at the end; every second look is kept, and keeps no graph."""
+    observer = Latent(Picture(model), nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3)), size=3)
+    frames = []
+    episode = run_episode(
+        task, model, observer, Constant([0.5, 0.5]), model.params(), keep_every=2, on_frame=frames.append
+    )
+    assert len(frames) == task.control_steps + 1 and frames[-1].activation is None
+    np.testing.assert_allclose([f.time for f in frames], 0.016 * np.arange(7))
+    assert episode.seen.shape == (3, 1, 2, 13, 9) and not episode.seen.requires_grad
+    torch.testing.assert_close(episode.seen[1], observer.look(model, frames[2].state))
+    assert torch.equal(frames[-1].state.x, episode.end.x)
+
+
+def test_a_failure_names_the_control_step(task, model):
+    """An unstable simulation says in which control step; a fast throw out of the grid is one."""
+    thrown = dataclasses.replace(task, substeps=400, objective=Progress(terms=(Effort(0.0),)))
+    observer = Centroids(model, [np.arange(4)], 1.0)
+    with pytest.raises(softmpm.UnstableError) as caught:
+        run_episode(thrown, model, observer, Constant([40.0, -40.0]), model.params())
+    assert "control step 0 of 6" in caught.value.__notes__[0]

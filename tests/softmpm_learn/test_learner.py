@@ -1,0 +1,72 @@
+import copy
+
+import torch
+
+from softmpm_learn.autoencoder import Autoencoder
+from softmpm_learn.learner import Learner
+from softmpm_learn.replay import Replay
+from softmpm_learn.seeding import seeded
+from softmpm_learn.settings import LearningConf
+
+
+def learner(folder, **changes) -> Learner:
+    conf = LearningConf(**({"epochs": 2, "batches": 2, "batch": 4, "validation": 0.5, "target_rate": 0.5} | changes))
+    with seeded(0):
+        autoencoder = Autoencoder(2, (6, 5), 2, [4])
+    return Learner(conf, autoencoder, Replay(folder, simulations=8, validation=conf.validation))
+
+
+def seen(number: int) -> torch.Tensor:
+    return torch.randn(5, 1, 2, 6, 5, generator=torch.Generator().manual_seed(number))
+
+
+def taught(folder, simulations=4, **changes) -> tuple[Learner, dict]:
+    subject, generator = learner(folder, **changes), torch.Generator().manual_seed(0)
+    for number in range(simulations):
+        subject.watch(number, seen(number))
+    return subject, subject.learn(generator)
+
+
+def test_the_policy_looks_through_the_target(tmp_path):
+    """The target copies after the first phase and then follows at its rate; without it the network itself is looked through."""
+    subject, _ = taught(tmp_path / "with")
+    online, x = subject.autoencoder.encoder, seen(9)[:, 0]
+    assert torch.equal(subject.encoder(x), online(x))
+    before = copy.deepcopy(subject.target.copy.state_dict())
+    subject.learn(torch.Generator().manual_seed(1))
+    for name, tensor in subject.target.copy.state_dict().items():
+        torch.testing.assert_close(tensor, 0.5 * (before[name] + online.state_dict()[name]))
+    subject, _ = taught(tmp_path / "without", target_network=False)
+    assert subject.encoder is subject.autoencoder.encoder
+
+
+def test_features_are_standardised(tmp_path):
+    """After a phase the features of the training pictures have about mean 0 and deviation 1."""
+    subject, _ = taught(tmp_path, simulations=8)
+    z = subject.encoder(torch.cat(subject.replay.split("training")))
+    assert z.mean(dim=0).abs().max() < 0.7 and (z.std(dim=0) - 1).abs().max() < 0.5
+
+
+def test_validation_needs_a_second_simulation(tmp_path):
+    """With one simulation there is no validation loss; with both splits filled there is one."""
+    _, figures = taught(tmp_path / "one", simulations=1)
+    assert figures["validation_loss"] != figures["validation_loss"]
+    _, figures = taught(tmp_path / "four")
+    assert figures["validation_loss"] > 0 and figures["epochs"] == 2
+
+
+def test_without_replay_the_past_is_forgotten(tmp_path):
+    """The switch empties the buffer after each phase; with replay it stays."""
+    assert taught(tmp_path / "without", replay=False)[0].replay.ids == []
+    assert taught(tmp_path / "with")[0].replay.ids == [0, 1, 2, 3]
+
+
+def test_goes_on_from_its_state(tmp_path):
+    """A learner restored from a state learns on exactly as the one that was saved."""
+    subject, _ = taught(tmp_path)
+    state = copy.deepcopy(subject.state_dict())
+    figures = subject.learn(torch.Generator().manual_seed(3))
+    other = learner(tmp_path)
+    other.load_state_dict(state)
+    assert other.learn(torch.Generator().manual_seed(3)) == figures
+    assert torch.equal(other.encoder(seen(9)[:, 0]), subject.encoder(seen(9)[:, 0]))

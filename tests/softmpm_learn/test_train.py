@@ -1,0 +1,287 @@
+import dataclasses
+import itertools
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import softmpm
+from softmpm_learn import checkpoint, train
+from softmpm_learn.settings import DesignConf, ObserverConf, Settings
+
+HERE = Path(__file__).parent
+SOURCE = HERE.parents[1] / "src"
+
+
+def copy_of(settings: Settings, **changes) -> Settings:
+    """Settings with other values, given as group=dict(name=value)."""
+    parts = {group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()}
+    return dataclasses.replace(settings, **parts)
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    header, *lines = ((folder / "metrics.csv").read_text()).splitlines()
+    return [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing of ours catches it."""
+
+
+@pytest.fixture
+def unbroken(task, model, settings, tmp_path) -> Path:
+    """Folder of a run of five iterations, undisturbed."""
+    train.train(task, model, settings, tmp_path / "unbroken")
+    return tmp_path / "unbroken"
+
+
+def assert_same(folder: Path, unbroken: Path) -> None:
+    """Metrics equal to the byte, and final weights, replay and generator to the bit."""
+    assert (folder / "metrics.csv").read_bytes() == (unbroken / "metrics.csv").read_bytes()
+    a, b = (checkpoint.load(f) for f in (folder, unbroken))
+    assert torch.equal(a["generator"], b["generator"]) and a["learner"]["replay"] == b["learner"]["replay"]
+    for part in ("policy", "design"):
+        assert all(torch.equal(a[part][k], b[part][k]) for k in a[part])
+    for part in ("autoencoder", "target"):
+        assert all(torch.equal(a["learner"][part][k], b["learner"][part][k]) for k in a["learner"][part])
+
+
+def test_every_iteration_is_a_row(unbroken, settings):
+    """metrics.csv has a row for each iteration, learning phases where they are due, and a loss that is no nan."""
+    found = rows(unbroken)
+    assert [int(r["iteration"]) for r in found] == list(range(5))
+    assert [bool(r["epochs"]) for r in found] == [True, True, False, True, False]  # after the first, and every 2
+    assert all(abs(float(r["loss"])) < 1 for r in found)
+    assert float(found[-1]["best"]) == min(float(r["loss"]) for r in found)
+    assert len((unbroken / "timing.csv").read_text().splitlines()) == 6
+
+
+def test_equal_seeds_give_equal_runs(task, model, settings, unbroken, tmp_path):
+    """The same seed repeats every bit, another seed does not."""
+    train.train(task, model, settings, tmp_path / "again")
+    assert_same(tmp_path / "again", unbroken)
+    train.train(task, model, copy_of(settings, train=dict(seed=1)), tmp_path / "other")
+    assert rows(tmp_path / "other")[0]["loss"] != rows(unbroken)[0]["loss"]
+
+
+@pytest.mark.parametrize("where", ["optimise", "learn", "metrics", "checkpoint", "between renames", "prune"])
+def test_interrupted_anywhere_it_goes_on_as_if_nothing_had_been(
+    task, model, settings, unbroken, tmp_path, monkeypatch, where
+):
+    """Ended at any stage of the third iteration, a resumed run equals the unbroken one."""
+    out, count = tmp_path / "out", iter(range(99))
+    owner, name, nth = {
+        "optimise": (train, "optimise", 2),
+        "learn": (train, "learn", 2),
+        "metrics": (train.Table, "append", 4),  # two tables
+        "checkpoint": (train.checkpoint, "save", 3),  # one save before the first iteration
+        "between renames": (os, "replace", None),
+        "prune": (train.Run, "state_dict", 3),
+    }[where]
+    real = getattr(owner, name)
+
+    def dies(*args, **kwargs):
+        if nth is None:
+            if str(args[0]).endswith(checkpoint.NAME + ".new") and next(count) == 3:
+                raise Killed
+        elif next(count) == nth:
+            raise Killed
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, dies)
+    with pytest.raises(Killed):
+        train.train(task, model, settings, out)
+    monkeypatch.undo()
+    train.train(task, model, settings, out)
+    assert_same(out, unbroken)
+
+
+def test_killed_processes_resume(task, model, settings, unbroken, tmp_path):
+    """Killed by SIGKILL in the middle of three different iterations, the run ends as the unbroken one did."""
+    out = tmp_path / "out"
+    script = f"""
+import os, signal, sys
+sys.path[:0] = [{str(SOURCE)!r}, {str(HERE)!r}]
+import torch
+torch.set_num_threads(1)
+import conftest
+from softmpm_learn import train
+import softmpm
+task = conftest.task.__wrapped__()
+settings = conftest.settings.__wrapped__()
+kill_at, calls, real = int(sys.argv[1]), iter(range(999)), softmpm.simulate
+def simulate(*args, **kwargs):
+    if next(calls) == kill_at:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(*args, **kwargs)
+softmpm.simulate = simulate
+train.train(task, softmpm.build(task.scene, device="cpu"), settings, {str(out)!r})
+"""
+    ends = [subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode for n in (8, 10, 999)]
+    assert ends == [-signal.SIGKILL, -signal.SIGKILL, 0]
+    assert_same(out, unbroken)
+
+
+def test_falls_back_to_the_previous_checkpoint(task, model, settings, unbroken, tmp_path):
+    """With the newest checkpoint damaged, the run goes on from the one before and ends the same."""
+    out = tmp_path / "out"
+    train.train(task, model, copy_of(settings, train=dict(iterations=3)), out)
+    (out / checkpoint.NAME).write_bytes(b"spoilt")
+    train.train(task, model, settings, out)
+    assert_same(out, unbroken)
+
+
+def test_stops_when_asked_and_goes_on(task, model, settings, unbroken, tmp_path):
+    """Asked to stop after two iterations, it returns unfinished; called again, it finishes as if never stopped."""
+    done = []
+    result = train.train(
+        task, model, settings, tmp_path / "out", progress=lambda k, row: done.append(k), stop=lambda: len(done) == 2
+    )
+    assert not result.finished and done == [0, 1]
+    result = train.train(task, model, settings, tmp_path / "out")
+    assert result.finished and result.best_loss == float(rows(unbroken)[-1]["best"])
+    assert_same(tmp_path / "out", unbroken)
+
+
+def test_other_settings_do_not_resume(task, model, settings, unbroken):
+    """A checkpoint of other settings is refused, naming each difference; more iterations are welcome."""
+    with pytest.raises(ValueError, match=r"policy\.gain: .* then, 0\.5 now"):
+        train.train(task, model, copy_of(settings, policy=dict(gain=0.5)), unbroken)
+    assert train.train(task, model, copy_of(settings, train=dict(iterations=6)), unbroken).finished
+    assert len(rows(unbroken)) == 6
+
+
+@pytest.mark.parametrize("observer", ["latent", "centroids", "kmeans"])
+@pytest.mark.parametrize("alone", ["policy", "design"])
+def test_it_gets_better(task, model, settings, tmp_path, observer, alone):
+    """Whatever it observes, gradient descent lowers the crawler's loss from each step to the next, by policy or design alone."""
+    longer = dataclasses.replace(task, control_steps=12)
+    off = dict(design=dict(enabled=False)) if alone == "policy" else dict(optimizer=dict(policy_rate=1e-12))
+    conf = copy_of(settings, observer=dict(name=observer, clusters=3), learning=dict(every=99), **off)
+    train.train(longer, model, copy_of(conf, train=dict(iterations=8)), tmp_path)
+    losses = [float(row["loss"]) for row in rows(tmp_path)][1:]  # the encoder learned after the first
+    assert all(after < before for before, after in itertools.pairwise(losses)), losses
+
+
+def test_each_refinement_can_be_switched_off(task, model, settings, tmp_path):
+    """Early stopping, replay, target network and the variational term: every switch runs and makes a different run."""
+    ends = {}
+    switches = ("early_stopping", "replay", "target_network", "variational")
+    for switch in ("none", *switches):
+        conf = copy_of(settings, learning={"patience": 1} | ({} if switch == "none" else {switch: False}))
+        out = tmp_path / switch
+        train.train(task, model, copy_of(conf, train=dict(iterations=7)), out)
+        ends[switch] = [float(r["loss"]) for r in rows(out)]
+    assert all(ends[s] != ends["none"] for s in switches if s != "early_stopping"), ends
+
+
+def test_random_goals_are_drawn_anew(task, settings, tmp_path):
+    """Each world and iteration has its own goal inside the box; a task without a goal refuses."""
+    model = softmpm.build(task.scene, device="cpu", worlds=3)
+    conf = copy_of(settings, train=dict(worlds=3, iterations=2, goal_spread=[0.1, 0.0]))
+    run = train.Run(task, model, conf, tmp_path)
+    goals = torch.stack([run.draw_goals() for _ in range(200)])
+    assert goals[..., 0].unique().numel() == 600 and ((goals[..., 0] - 0.6).abs() <= 0.1).all()
+    assert goals[..., 0].std() > 0.04 and (goals[..., 1] == 0.3).all()
+    assert train.train(task, model, conf, tmp_path / "out").finished
+    with pytest.raises(ValueError, match="goal_spread needs a task with a goal"):
+        train.Run(dataclasses.replace(task, goal=None), model, conf, tmp_path)
+    with pytest.raises(ValueError, match=r"train\.worlds is 1, but the model was built with 3"):
+        train.Run(task, model, settings, tmp_path)
+
+
+def fails(real, at: set[int]):
+    """``simulate`` that reports an inverted particle at some of its calls."""
+    calls = iter(range(9999))
+
+    def simulate(*args, **kwargs):
+        if next(calls) in at:
+            raise softmpm.UnstableError(
+                "particle 3 is inverted.", kind=KIND, world=0, particle=3, substep=1, value=-1.0, limit="det F > 0"
+            )
+        return real(*args, **kwargs)
+
+    return simulate
+
+
+KIND = type("Kind", (), {"name": "INVERTED"})
+
+
+def test_a_failed_simulation_is_tried_again_from_halfway_back(task, model, settings, tmp_path, monkeypatch, caplog):
+    """After a failure policy and design go halfway back to where the last simulation went well; it is counted and logged."""
+    conf = copy_of(settings, observer=dict(name="centroids"), train=dict(iterations=2))
+    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    halfway = [(p + s) / 2 for p, s in zip(first.parameters, first.safe, strict=True)]
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8}))
+    second = train.train(task, model, conf, tmp_path / "two").run
+    for now, want in zip(second.safe, halfway, strict=True):
+        torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
+    assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"] and "Going halfway back" in caplog.text
+
+
+@pytest.mark.parametrize("at, iteration", [({0}, 0), (set(range(13, 99)), 2)])
+def test_a_run_that_cannot_go_on_names_the_iteration(task, model, settings, tmp_path, monkeypatch, at, iteration):
+    """A failure without a way back ends with the iteration, the particle and advice; the run resumes from before it."""
+    conf = copy_of(settings, optimizer=dict(retries=1))
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at))
+    with pytest.raises(train.TrainingError, match=f"iteration {iteration}: particle 3 is inverted. In control") as caught:
+        train.train(task, model, conf, tmp_path)
+    assert caught.value.iteration == iteration == checkpoint.load(tmp_path)["iteration"]
+    monkeypatch.undo()
+    assert train.train(task, model, conf, tmp_path).finished
+
+
+def test_a_gradient_that_is_not_finite_ends_the_run(task, model, settings, tmp_path, monkeypatch):
+    """No step is taken along nan: the error names the iteration and the weights are finite."""
+    real = torch.autograd.grad
+    monkeypatch.setattr(torch.autograd, "grad", lambda *a, **k: [g * float("nan") for g in real(*a, **k)])
+    with pytest.raises(train.TrainingError, match="iteration 0: the loss or its gradient is not finite"):
+        train.train(task, model, settings, tmp_path)
+    assert all(t.isfinite().all() for t in checkpoint.load(tmp_path)["policy"].values())
+
+
+def test_clipping_is_counted(task, model, settings, tmp_path):
+    """A longer gradient is shortened to max_norm and counted; its full length is what the metrics show."""
+    conf = copy_of(settings, optimizer=dict(max_norm=1e-9), train=dict(iterations=2))
+    run = train.train(task, model, conf, tmp_path).run
+    length = sum(p.grad.square().sum() for p in run.parameters).sqrt().item()
+    assert length == pytest.approx(1e-9, rel=1e-3)
+    assert all(r["clipped"] == "1" and float(r["gradient_policy"]) > 1e-6 for r in rows(tmp_path))
+
+
+def test_the_recording_holds_the_run(task, model, settings, tmp_path):
+    """First, every second, last (of either part) and best episode are in run.h5, all their frames, and every loss."""
+    conf = copy_of(settings, train=dict(record_every=2))
+    train.train(task, model, copy_of(conf, train=dict(iterations=2)), tmp_path)
+    train.train(task, model, conf, tmp_path)
+    with softmpm.Recording(tmp_path / "run.h5") as recording:
+        assert list(recording.episodes) == [0, 1, 2, 4, 5]
+        assert recording.attributes(5)["kind"] == "best"
+        frames = recording.frames(4)
+        assert len(frames["time"]) == task.control_steps + 1
+        iterations, losses = recording.scalars["loss"]
+    assert list(iterations) == list(range(5)) and [float(r["loss"]) for r in rows(tmp_path)] == pytest.approx(losses)
+
+
+def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path):
+    """Centroids need no replay buffer: none is written, and learning columns stay empty."""
+    train.train(task, model, copy_of(settings, observer=dict(name="centroids")), tmp_path)
+    assert not (tmp_path / "replay").exists() and all(r["replay"] == r["epochs"] == "" for r in rows(tmp_path))
+
+
+def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):
+    """The folder holds what the last two checkpoints name, and no more."""
+    train.train(task, model, copy_of(settings, learning=dict(simulations=2)), tmp_path)
+    assert sorted(p.stem for p in (tmp_path / "replay").iterdir()) == ["00000002", "00000003", "00000004"]
+
+
+def test_control_only(task, model, settings, tmp_path):
+    """With the design off the materials stay and only the policy has a gradient."""
+    conf = copy_of(settings, observer=dataclasses.asdict(ObserverConf(name="centroids")), design={"enabled": False})
+    assert not DesignConf(enabled=False).enabled
+    train.train(task, model, conf, tmp_path)
+    assert all(float(r["young_change"]) == 0 == float(r["gradient_design"]) for r in rows(tmp_path))
