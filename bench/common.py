@@ -13,14 +13,18 @@ import torch
 import softmpm
 
 
-def cube(dim: int, particles: int, nodes: int, *, law=softmpm.NeoHookean, muscles=False, floor=False, seed=0) -> softmpm.Scene:
+def cube(
+    dim: int, particles: int, nodes: int, *, law=softmpm.NeoHookean, muscles=False, floor=False, seed=0
+) -> softmpm.Scene:
     """An elastic cube with 2^dim particles per cell in the middle of the grid, particles in random order."""
     dx = 1.0 / nodes
     side = round(particles ** (1 / dim))
     axis = (np.arange(side) - (side - 1) / 2) * dx / 2 + 0.5
     positions = np.stack(np.meshgrid(*[axis] * dim, indexing="ij"), -1).reshape(-1, dim)
     np.random.default_rng(seed).shuffle(positions)
-    body = softmpm.Body(softmpm.Particles(positions, (dx / 2) ** dim), law(density=1.0, young=100.0, poisson=0.3))
+    body = softmpm.Body(
+        softmpm.Particles(positions, (dx / 2) ** dim), law(density=1.0, young=100.0, poisson=0.3)
+    )
     up = (0.0, 1.0) + (0.0,) * (dim - 2)
     index = np.arange(len(positions))
     scene = dict(
@@ -76,4 +80,6 @@ def report(title: str, rows: list[dict], device: torch.device, path: Path | None
         print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"title": title, "machine": machine(device), "rows": rows}, indent=1) + "\n")
+        path.write_text(
+            json.dumps({"title": title, "machine": machine(device), "rows": rows}, indent=1) + "\n"
+        )

@@ -23,7 +23,9 @@ def main():
         for name, features in VARIANTS.items():
             model = softmpm.build(cube(dim, particles, nodes, **features), device=device)
             start, params = model.rest(), softmpm.Params(*(p.requires_grad_() for p in model.params()))
-            activation = torch.full((1, 1, 1), 0.2, device=device, requires_grad=True) if model.muscle_count else None
+            activation = (
+                torch.full((1, 1, 1), 0.2, device=device, requires_grad=True) if model.muscle_count else None
+            )
             forward = []
 
             def work(model=model, start=start, activation=activation, params=params, forward=forward):

@@ -34,7 +34,15 @@ def main():
                     softmpm.simulate(model, start, activation, params, substeps=substeps)
 
             us = median_seconds(work, device, args.repeats) / substeps * 1e6
-            rows.append({"dim": dim, "particles": model.particle_count, "nodes": nodes, "scene": name, "us/substep": us})
+            rows.append(
+                {
+                    "dim": dim,
+                    "particles": model.particle_count,
+                    "nodes": nodes,
+                    "scene": name,
+                    "us/substep": us,
+                }
+            )
     report("Forward, float32", rows, device, args.json)
 
 

@@ -38,7 +38,9 @@ def unchecked(model: softmpm.Model):
         pass
 
     report_of, check_of = failure.report, failure.check
-    failure.report = lambda *_: SimpleNamespace(running=running, report=report_of(spec.dim, spec.dtype).report)
+    failure.report = lambda *_: SimpleNamespace(
+        running=running, report=report_of(spec.dim, spec.dtype).report
+    )
     failure.check = lambda *_: SimpleNamespace(sound=sound, complain=complain)
     transfer(spec)
     failure.report, failure.check = report_of, check_of
@@ -63,14 +65,22 @@ def main():
         for _ in range(args.repeats):
             for k, model in enumerate(models):
 
-                def work(model=model):
+                def work(model=model, start=start, params=params):
                     with torch.no_grad():
                         softmpm.simulate(model, start, None, params, substeps=substeps)
 
                 seconds[k].append(median_seconds(work, device, 3))
         with_watch, without = (statistics.median(s) / substeps * 1e6 for s in seconds)
         ratio = statistics.median(a / b for a, b in zip(*seconds, strict=True))
-        rows.append({"dim": dim, "particles": particles, "watched us": with_watch, "unwatched us": without, "ratio": ratio})
+        rows.append(
+            {
+                "dim": dim,
+                "particles": particles,
+                "watched us": with_watch,
+                "unwatched us": without,
+                "ratio": ratio,
+            }
+        )
     report("Cost of watching for failures, float32", rows, device, args.json)
 
 

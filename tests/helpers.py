@@ -9,7 +9,9 @@ LAWS = {"neo_hookean": softmpm.NeoHookean, "fixed_corotated": softmpm.FixedCorot
 INPUTS = ("x", "v", "C", "F", "activation", "young", "poisson", "density")
 
 
-def busy_scene(dim: int, laws=("neo_hookean", "fixed_corotated"), *, per_law=12, dt=1e-3, seed=0, **changes) -> softmpm.Scene:
+def busy_scene(
+    dim: int, laws=("neo_hookean", "fixed_corotated"), *, per_law=12, dt=1e-3, seed=0, **changes
+) -> softmpm.Scene:
     """Small and full: every law given, two overlapping muscles, a rough floor, a tilted wall, gravity and damping."""
     rng = np.random.default_rng(seed)
     bodies = []
@@ -24,7 +26,9 @@ def busy_scene(dim: int, laws=("neo_hookean", "fixed_corotated"), *, per_law=12,
         bodies=bodies,
         muscles=[
             softmpm.Muscle(particles=np.arange(count * 2 // 3), direction=up, strength=10.0),
-            softmpm.Muscle(particles=np.arange(count // 3, count), direction=(1.0, 0.5, 0.2)[:dim], strength=8.0),
+            softmpm.Muscle(
+                particles=np.arange(count // 3, count), direction=(1.0, 0.5, 0.2)[:dim], strength=8.0
+            ),
         ],
         walls=[
             softmpm.Wall(normal=up, offset=0.41, contact="separate", friction=0.4),
@@ -42,7 +46,9 @@ def busy_inputs(model: softmpm.Model, control_steps=2, seed=1) -> dict[str, torc
     generator = torch.Generator().manual_seed(seed)
 
     def noise(shape, scale):
-        return (scale * torch.randn(shape, generator=generator, dtype=torch.float64)).to(model.device, model.dtype)
+        return (scale * torch.randn(shape, generator=generator, dtype=torch.float64)).to(
+            model.device, model.dtype
+        )
 
     rest, params = model.rest(), model.params()
     lead = (model.worlds, model.particle_count)
@@ -69,7 +75,9 @@ def run(simulate, model_or_scene, inputs: dict[str, torch.Tensor], substeps: int
 def cotangent(state: softmpm.State, seed=2) -> softmpm.State:
     """Random weights of a linear loss: unlike a square, it sees every direction, a wrong rotation among them."""
     generator = torch.Generator().manual_seed(seed)
-    return softmpm.State(*(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state))
+    return softmpm.State(
+        *(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state)
+    )
 
 
 def dot(a, b) -> torch.Tensor:

@@ -14,7 +14,9 @@ def test_the_code_of_the_readme_runs():
     names: dict = {}
     exec(code, names)
     gradient = names["activation"].grad
-    assert gradient.shape == (10, 1, 1) and bool(torch.isfinite(gradient).all()) and bool((gradient != 0).all())
+    assert (
+        gradient.shape == (10, 1, 1) and bool(torch.isfinite(gradient).all()) and bool((gradient != 0).all())
+    )
 
 
 def test_every_file_that_the_readme_names_is_there():

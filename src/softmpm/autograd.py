@@ -11,7 +11,6 @@ from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Horizon, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
 
-
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
     "call backward without create_graph=True."
@@ -19,7 +18,9 @@ _SECOND = (
 
 
 @torch.compiler.disable
-def simulate(model: Model, start: State, activation: Tensor | None, params: Params, *, substeps: int) -> State:
+def simulate(
+    model: Model, start: State, activation: Tensor | None, params: Params, *, substeps: int
+) -> State:
     """Advance a soft robot, differentiably.
 
     Each row of ``activation`` drives ``substeps`` MLS-MPM substeps (Hu et al. 2018, Eq. 29). Second derivatives raise.
@@ -124,9 +125,14 @@ class _SimulateBackward(torch.autograd.Function):
         shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
         shapes += 2 * ((*shapes[0], model.dim),)
         adj_end = State(
-            *(mass.new_zeros(shape) if adj is None else adj for adj, shape in zip(adj_end, shapes, strict=True))
+            *(
+                mass.new_zeros(shape) if adj is None else adj
+                for adj, shape in zip(adj_end, shapes, strict=True)
+            )
         )
-        adj, solid, adj_pull = rollout_adj(model, horizon, kept, pull, Solid(mass, mu, lam, pull), adj_end, wanted)
+        adj, solid, adj_pull = rollout_adj(
+            model, horizon, kept, pull, Solid(mass, mu, lam, pull), adj_end, wanted
+        )
         return adj_pull, solid.mu, solid.lam, solid.mass, *adj
 
     @staticmethod
@@ -158,7 +164,9 @@ class _RasterizeBackward(torch.autograd.Function):
 
     @staticmethod
     def forward(model, adj_mass, adj_velocity, x, v, C, mass, velocity):
-        adj = rasterize_nodes_adj(model, State(x, v, C, None), GridField(mass, velocity), GridField(adj_mass, adj_velocity))
+        adj = rasterize_nodes_adj(
+            model, State(x, v, C, None), GridField(mass, velocity), GridField(adj_mass, adj_velocity)
+        )
         return adj.x, adj.v, adj.C
 
     @staticmethod

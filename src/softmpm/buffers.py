@@ -44,7 +44,9 @@ class Motion:
     @staticmethod
     def empty(model: Model, *lead: int) -> "Motion":
         def tensor(*tail, dtype=model.dtype):
-            return torch.empty(*lead, model.worlds, model.particle_count, *tail, dtype=dtype, device=model.device)
+            return torch.empty(
+                *lead, model.worlds, model.particle_count, *tail, dtype=dtype, device=model.device
+            )
 
         d = model.dim
         low = tensor(d) if model.dtype == torch.float32 else None
@@ -134,7 +136,9 @@ class SolidAdj:
     @staticmethod
     def zeros(model: Model, wanted: Wanted) -> "SolidAdj":
         def tensor(*tail):
-            return torch.zeros(model.worlds, model.particle_count, *tail, dtype=model.dtype, device=model.device)
+            return torch.zeros(
+                model.worlds, model.particle_count, *tail, dtype=model.dtype, device=model.device
+            )
 
         adj = SolidAdj(wanted)
         if wanted.material:

@@ -61,7 +61,9 @@ def memory(model, substeps: int) -> Memory:
     """Evaluates (memory) for one call of ``substeps`` substeps in one control step, all gradients wanted."""
     state, grid, real = model.state_bytes(), model.node_bytes(), model.dtype.itemsize
     particles = model.worlds * model.particle_count
-    boundary = particles * real * (2 * model.dim + 2 * model.dim**2)  # x, v, C, F of the end or their adjoints
+    boundary = (
+        particles * real * (2 * model.dim + 2 * model.dim**2)
+    )  # x, v, C, F of the end or their adjoints
     low = boundary // 2 if real == 4 else 0
     material = 3 * particles * real
     pull = particles * model.spec.muscle_slots * real
@@ -69,4 +71,6 @@ def memory(model, substeps: int) -> Memory:
     forward = 2 * state + grid + material + boundary + low
     kept = chosen.kept * state + material
     adjoints = 2 * boundary + 2 * material + pull
-    return Memory(forward, kept, kept + boundary + low + chosen.recomputed * state + 2 * grid + adjoints + boundary)
+    return Memory(
+        forward, kept, kept + boundary + low + chosen.recomputed * state + 2 * grid + adjoints + boundary
+    )

@@ -8,8 +8,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.types import Spec, solid_types, types
 from softmpm.checks import check_scene
+from softmpm.kernels.types import Spec, solid_types, types
 from softmpm.memory import memory
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
 from softmpm.stability import stable_dt, warn_unstable
@@ -81,7 +81,9 @@ class Model:
         spec: What the kernels are specialised for.
     """
 
-    def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, memory_budget: int | None):
+    def __init__(
+        self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, memory_budget: int | None
+    ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
         self.memory_budget = memory_budget
         self.dim = scene.grid.dim
@@ -136,7 +138,11 @@ class Model:
         """State at rest, in every world: x at the rest positions, v = C = 0, F = I. Fresh tensors."""
         lead = (self.worlds, self.particle_count)
         x = self.positions.expand(*lead, self.dim).clone()
-        eye = torch.eye(self.dim, dtype=self.dtype, device=self.device).expand(*lead, self.dim, self.dim).clone()
+        eye = (
+            torch.eye(self.dim, dtype=self.dtype, device=self.device)
+            .expand(*lead, self.dim, self.dim)
+            .clone()
+        )
         state = State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye)
         if self.dtype == torch.float64:
             return state
@@ -146,13 +152,17 @@ class Model:
     def params(self) -> Params:
         """Material of each particle as the scene gives it, shape (particle,) each. Fresh tensors."""
         materials = [body.material for body in self.scene.bodies]
-        return Params(*(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields))
+        return Params(
+            *(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields)
+        )
 
     def state_bytes(self) -> int:
         """Memory of one stored state of all worlds [B]."""
         real = self.dtype.itemsize
         low = self.dim if self.dtype == torch.float32 else 0
-        return self.worlds * self.particle_count * (4 * self.dim + real * (low + 2 * self.dim + 2 * self.dim**2))
+        return (
+            self.worlds * self.particle_count * (4 * self.dim + real * (low + 2 * self.dim + 2 * self.dim**2))
+        )
 
     def node_bytes(self) -> int:
         """Memory of momentum, mass and velocity on the grid of all worlds [B]; a backward pass has twice that."""

@@ -60,7 +60,15 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     return end, kept
 
 
-def rollout_adj(model: Model, horizon: Horizon, kept: Motion, pull: Tensor | None, solid: Solid, adj_end: State, wanted: Wanted):
+def rollout_adj(
+    model: Model,
+    horizon: Horizon,
+    kept: Motion,
+    pull: Tensor | None,
+    solid: Solid,
+    adj_end: State,
+    wanted: Wanted,
+):
     """Adjoint of :func:`rollout`.
 
     Returns:
@@ -90,7 +98,9 @@ def rollout_adj(model: Model, horizon: Horizon, kept: Motion, pull: Tensor | Non
             row.copy_(pull[s // horizon.substeps])
         clear(adjoints[s % 2].flat)
         back = horizon.total - 1 - s  # the first failure on the way back has the smallest word
-        step.adjoint(wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, back)
+        step.adjoint(
+            wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, back
+        )
         if wanted.activation and s % horizon.substeps == 0:
             step.collect_pull(adj_solid, adj_pull[s // horizon.substeps])
     raise_gradient_failure(model, horizon, step.watch_words, adj_end)
@@ -102,7 +112,14 @@ class _Segments:
     """Hands out the states around a substep, going backward; recomputes a segment when it is first asked for."""
 
     def __init__(self, model: Model, horizon: Horizon, kept: Motion, step: Substep, pull, row, schedule):
-        self.horizon, self.kept, self.step, self.pull, self.row, self.plan = horizon, kept, step, pull, row, schedule
+        self.horizon, self.kept, self.step, self.pull, self.row, self.plan = (
+            horizon,
+            kept,
+            step,
+            pull,
+            row,
+            schedule,
+        )
         count = schedule.recomputed or schedule.kept
         self.buffers = Motion.empty(model, count) if schedule.recomputed else kept
         self.slots = [self.buffers[i].struct(model) for i in range(count)]
@@ -138,7 +155,9 @@ def raise_failure(model: Model, watch: Tensor, end: State | None) -> None:
     when = "in the start state" if kind is Kind.START else f"at {time}"
     raise UnstableError(
         f"{where} {value} {when}; {limit}. {advice}{others}",
-        **dict(kind=kind, world=world, particle=particle, substep=substep, value=value, limit=limit, state=end),
+        **dict(
+            kind=kind, world=world, particle=particle, substep=substep, value=value, limit=limit, state=end
+        ),
     )
 
 
@@ -151,8 +170,10 @@ def raise_gradient_failure(model: Model, horizon: Horizon, watch: Tensor, adj_en
     back, kind, particle = decode(words[world])
     substep, limit = horizon.total - 1 - back, "gradients must be finite"
     given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end)
-    cause = "It overflowed on the way back: shorten the horizon or scale the loss" if given else (
-        "The gradient of the loss with respect to the end state came in like that: look at the loss"
+    cause = (
+        "It overflowed on the way back: shorten the horizon or scale the loss"
+        if given
+        else ("The gradient of the loss with respect to the end state came in like that: look at the loss")
     )
     raise UnstableError(
         f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite at substep "
@@ -167,15 +188,27 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State | N
     low = 0.5 * dx
     high = tuple((n - 1.5) * dx for n in model.scene.grid.shape)
     box = "a particle must stay in " + " x ".join(f"[{low:.4g}, {h:.4g})" for h in high) + " m"
-    smaller = "Use a smaller dt (softmpm.stable_dt gives a safe one), a weaker activation, or a softer material."
+    smaller = (
+        "Use a smaller dt (softmpm.stable_dt gives a safe one), a weaker activation, or a softer material."
+    )
     x, F = end.x[world, particle].tolist(), end.F[world, particle]
-    if kind is Kind.LEFT_GRID or (kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))):
-        return f"is at {_numbers(x)} m, off the grid", box, "Make the grid larger, add walls, or start further inside."
+    if kind is Kind.LEFT_GRID or (
+        kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))
+    ):
+        return (
+            f"is at {_numbers(x)} m, off the grid",
+            box,
+            "Make the grid larger, add walls, or start further inside.",
+        )
     if kind is Kind.INVERTED:
         J = torch.linalg.det(F.double()).item()
         return f"is inverted, det F = {J:.4g}", "a neo-Hookean particle needs det F > 0", smaller
     bad = [name for name in "xvCF" if not bool(torch.isfinite(getattr(end, name)[world, particle]).all())]
-    return f"has a value in {', '.join(bad) or 'its norm'} that is not finite", "every value must be finite", smaller
+    return (
+        f"has a value in {', '.join(bad) or 'its norm'} that is not finite",
+        "every value must be finite",
+        smaller,
+    )
 
 
 def _numbers(values) -> str:

@@ -36,7 +36,10 @@ class Substep:
     def __init__(self, model: Model, solid):
         self.model, self.solid, self.stream = model, solid, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
-        transfer(model.spec), grid(model.spec)  # all of a module is defined before it is first loaded, and so compiled once
+        (
+            transfer(model.spec),
+            grid(model.spec),
+        )  # all of a module is defined before it is first loaded, and so compiled once
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
         self.watch_words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
@@ -49,7 +52,9 @@ class Substep:
     def _array(self, name: str) -> wp.array:
         """Warp's view of one of the grid buffers below, made once."""
         if name not in self._arrays:
-            self._arrays[name] = view(getattr(self, name), self.types.node if name.endswith("node") else self.types.vec)
+            self._arrays[name] = view(
+                getattr(self, name), self.types.node if name.endswith("node") else self.types.vec
+            )
         return self._arrays[name]
 
     @cached_property
@@ -127,7 +132,9 @@ class Substep:
         low = start.low
         if low is None:
             low = Low(torch.zeros_like(state.x), torch.zeros_like(state.F))
-        arrays = [view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*state, *low)]
+        arrays = [
+            view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*state, *low)
+        ]
         kernel = boundary(self.model.dim, self.model.spec.dtype).enter
         self.launch(kernel, self.particles, self.model.scale, *arrays, self.watch, motion)
 
@@ -138,8 +145,13 @@ class Substep:
         if self.model.dtype == torch.float32:
             vectors += [(*lead, d), (*lead, d, d)]
         out = [torch.empty(shape, dtype=self.model.dtype, device=self.model.device) for shape in vectors]
-        low = out[4:] or [torch.empty(0, 0, d, dtype=self.model.dtype), torch.empty(0, 0, d, d, dtype=self.model.dtype)]
+        low = out[4:] or [
+            torch.empty(0, 0, d, dtype=self.model.dtype),
+            torch.empty(0, 0, d, d, dtype=self.model.dtype),
+        ]
         arrays = [view(tensor, t.vec if tensor.ndim == 3 else t.mat) for tensor in (*out[:4], *low)]
-        self.launch(boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.scale, motion, *arrays)
+        self.launch(
+            boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.scale, motion, *arrays
+        )
         state = State(*out[:4])
         return state.with_low(Low(*out[4:])) if out[4:] else state

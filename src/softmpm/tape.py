@@ -1,10 +1,10 @@
 """The same substep for users of Warp: :func:`step` works on Warp arrays and records its explicit adjoint on a ``wp.Tape``.
 
-    solid = softmpm.warp_solid(model, params, activation, requires_grad=True)
-    states = [softmpm.warp_state(model, start, requires_grad=True), softmpm.warp_state(model, requires_grad=True)]
-    tape = wp.Tape()
-    softmpm.step(model, states[0], states[1], solid, tape=tape)
-    tape.backward(grads={states[1].v: ...})             # fills states[0].v.grad, solid.mu.grad, ...
+solid = softmpm.warp_solid(model, params, activation, requires_grad=True)
+states = [softmpm.warp_state(model, start, requires_grad=True), softmpm.warp_state(model, requires_grad=True)]
+tape = wp.Tape()
+softmpm.step(model, states[0], states[1], solid, tape=tape)
+tape.backward(grads={states[1].v: ...})             # fills states[0].v.grad, solid.mu.grad, ...
 """
 
 from dataclasses import dataclass, fields
@@ -97,7 +97,10 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     motion, work = Motion.empty(model), Substep(model, None)
     work.enter(state, motion.struct(model))
     raise_failure(model, work.watch_words, state)
-    arrays = (_owned(getattr(motion, n), d, requires_grad) for n, d in zip("fx v C H".split(), (t.vec, t.vec, t.mat, t.mat)))
+    arrays = (
+        _owned(getattr(motion, n), d, requires_grad)
+        for n, d in zip("fx v C H".split(), (t.vec, t.vec, t.mat, t.mat), strict=True)
+    )
     low = None if motion.fx_low is None else _owned(motion.fx_low, t.vec, False)
     return WarpState(_owned(motion.base, t.ivec, False), *arrays, low)
 
@@ -108,7 +111,11 @@ def torch_state(model: Model, state: WarpState) -> State:
 
 
 def warp_solid(
-    model: Model, params: Params | None = None, activation: Tensor | None = None, *, requires_grad: bool = False
+    model: Model,
+    params: Params | None = None,
+    activation: Tensor | None = None,
+    *,
+    requires_grad: bool = False,
 ) -> WarpSolid:
     """Material and muscles for :func:`step`.
 
@@ -157,14 +164,18 @@ def step(
         ValueError: The two states are the same, or a tape is given and an array carries no gradient.
     """
     if state_in is state_out:
-        raise ValueError("state_in and state_out must be two different states; make another with softmpm.warp_state.")
+        raise ValueError(
+            "state_in and state_out must be two different states; make another with softmpm.warp_state."
+        )
     solid.work.stream = stream_of(model.device)
     solid.work.advance(state_in.struct(model), state_out.struct(model), substep)
     if tape is None:
         return
     arrays = [*state_in.differentiable(), *state_out.differentiable(), *solid.differentiable()]
     if any(array.grad is None for array in arrays):
-        raise ValueError("with a tape, states and solid need requires_grad=True; give it to warp_state and warp_solid.")
+        raise ValueError(
+            "with a tape, states and solid need requires_grad=True; give it to warp_state and warp_solid."
+        )
     tape.record_func(lambda: _adjoint(model, state_in, state_out, solid, substep), arrays)
 
 
@@ -176,6 +187,8 @@ def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: War
     if wanted.activation:
         struct.pull = view(slots.slot, types(model.spec.dim, model.spec.dtype).real)
     now, then = state_in.struct(model), state_out.struct(model)
-    solid.work.adjoint(wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), struct, substep)
+    solid.work.adjoint(
+        wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), struct, substep
+    )
     if wanted.activation:
         solid.work.collect_pull(slots, wp.to_torch(solid.pull.grad))

@@ -34,7 +34,18 @@ class UnstableError(RuntimeError):
         state: State in which every world stopped: at the failure where it failed, at the end elsewhere; None in a backward pass.
     """
 
-    def __init__(self, message: str, *, kind: Kind, world: int, particle: int, substep: int, value, limit: str, state=None):
+    def __init__(
+        self,
+        message: str,
+        *,
+        kind: Kind,
+        world: int,
+        particle: int,
+        substep: int,
+        value,
+        limit: str,
+        state=None,
+    ):
         super().__init__(message)
         self.kind = kind.name.lower()
         self.world, self.particle, self.substep = world, particle, substep

@@ -5,7 +5,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -117,9 +117,10 @@ def sentence(error: BaseException) -> str:
         return sentence(cause)  # from a resolver of ours
     if isinstance(error, OverrideParseException):
         return f"cannot read {error.override!r}: write key=value, in quotes if it has spaces or brackets."
-    kind: Any = getattr(error, "object_type", None)
-    if isinstance(error, (ConfigAttributeError, ConfigKeyError)) and dataclasses.is_dataclass(kind):
-        return unknown_key(str(error.full_key), kind)
+    if isinstance(error, (ConfigAttributeError, ConfigKeyError)):
+        kind = error.object_type
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            return unknown_key(str(error.full_key), kind)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
     if isinstance(error, MissingConfigException) and error.options:

@@ -6,12 +6,13 @@ Kingma & Welling 2014, "Auto-encoding variational Bayes". Layers and channels ar
 """
 
 import copy
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn import functional
 
 from softmpm_learn.settings import LearningConf
 
@@ -34,12 +35,14 @@ class Encoder(nn.Module):
     the latent of a fresh network and of a trained one differ tenfold, and a policy between them saturates.
     """
 
-    def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float):
+    def __init__(
+        self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float
+    ):
         super().__init__()
         conv = nn.Conv2d if dim == 2 else nn.Conv3d
         widths = [dim, *channels]
         self.convs = nn.ModuleList(
-            conv(a, b, kernel_size=3, stride=2, padding=1) for a, b in zip(widths, widths[1:], strict=False)
+            conv(a, b, kernel_size=3, stride=2, padding=1) for a, b in itertools.pairwise(widths)
         )
         corner = _halvings(shape, len(channels))[-1]
         self.head = nn.Linear(channels[-1] * torch.Size(corner).numel(), 2 * latent_size)
@@ -51,7 +54,7 @@ class Encoder(nn.Module):
         """Mean and log variance of the latent, each (picture, latent_size), of velocities [m/s] (picture, dim, *nodes)."""
         h = picture / self.scale
         for conv in self.convs:
-            h = F.silu(conv(h))
+            h = functional.silu(conv(h))
         return self.head(h.flatten(start_dim=1)).chunk(2, dim=-1)
 
     def forward(self, picture: Tensor) -> Tensor:
@@ -68,12 +71,14 @@ class Decoder(nn.Module):
         *self.sizes, self.corner = _halvings(shape, len(channels))
         self.tail = nn.Linear(latent_size, channels[-1] * torch.Size(self.corner).numel())
         widths = [*reversed(channels), dim]
-        self.convs = nn.ModuleList(conv(a, b, kernel_size=3, padding=1) for a, b in zip(widths, widths[1:], strict=False))
+        self.convs = nn.ModuleList(
+            conv(a, b, kernel_size=3, padding=1) for a, b in itertools.pairwise(widths)
+        )
 
     def forward(self, z: Tensor) -> Tensor:
         h = self.tail(z).unflatten(1, (-1, *self.corner))
         for conv, size in zip(self.convs, reversed(self.sizes), strict=True):
-            h = conv(F.interpolate(F.silu(h), size=size))
+            h = conv(functional.interpolate(functional.silu(h), size=size))
         return h
 
 
@@ -87,7 +92,9 @@ class Autoencoder(nn.Module):
         scale: Typical velocity [m/s], until :meth:`rescale` has seen some.
     """
 
-    def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float = 1.0):
+    def __init__(
+        self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float = 1.0
+    ):
         super().__init__()
         self.encoder = Encoder(dim, shape, latent_size, channels, scale)
         self.decoder = Decoder(dim, shape, latent_size, channels)
@@ -117,9 +124,10 @@ class Autoencoder(nn.Module):
         if kl is not None and generator is not None:
             noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype).to(mean.device)
             z = mean + noise * (0.5 * log_variance).exp()
-        loss = F.mse_loss(self.decoder(z), pictures / self.encoder.scale)
+        loss = functional.mse_loss(self.decoder(z), pictures / self.encoder.scale)
         if kl is not None:
-            loss = loss + kl * 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1).mean()
+            divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
+            loss = loss + kl * divergence.mean()
         return loss
 
 
@@ -151,7 +159,7 @@ def train_autoencoder(
         generator: Source of the variational noise.
     """
     kl = conf.kl if conf.variational else None
-    best_loss, best, training, waited, epoch = float("inf"), None, float("nan"), 0, 0
+    best_loss, best, training, waited, epochs = float("inf"), None, float("nan"), 0, 0
 
     def judge() -> float:
         with torch.no_grad():
@@ -159,7 +167,7 @@ def train_autoencoder(
 
     if validation is not None:
         best_loss, best = judge(), copy.deepcopy(autoencoder.state_dict())
-    for epoch in range(1, conf.epochs + 1):
+    while epochs < conf.epochs and waited < conf.patience:
         losses = []
         for _ in range(conf.batches):
             loss = autoencoder.loss(sample(), kl, generator)
@@ -167,7 +175,7 @@ def train_autoencoder(
             loss.backward()
             optimizer.step()
             losses.append(loss.detach())
-        training = torch.stack(losses).mean().item()
+        training, epochs = torch.stack(losses).mean().item(), epochs + 1
         if validation is None:
             continue
         now = judge()
@@ -175,9 +183,7 @@ def train_autoencoder(
             best_loss, best, waited = now, copy.deepcopy(autoencoder.state_dict()), 0
         else:
             waited += 1
-            if waited >= conf.patience:
-                break
-    if validation is None:
-        return Learned(epoch, training, float("nan"))
+    if best is None:
+        return Learned(epochs, training, float("nan"))
     autoencoder.load_state_dict(best)
-    return Learned(epoch, training, best_loss)
+    return Learned(epochs, training, best_loss)

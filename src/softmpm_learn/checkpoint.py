@@ -103,7 +103,8 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise RuntimeError(f"another run is writing to {folder}; choose another folder or wait for it.") from error
+            message = f"another run is writing to {folder}; choose another folder or wait for it."
+            raise RuntimeError(message) from error
         yield
 
 

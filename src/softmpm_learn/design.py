@@ -1,6 +1,6 @@
 """Bounded material parameters: what the gradient may change about the body.
 
-    value = low + (high − low) · sigmoid(θ)        (D1)   θ is free, the value stays between its bounds
+value = low + (high − low) · sigmoid(θ)        (D1)   θ is free, the value stays between its bounds
 """
 
 import numpy as np
@@ -57,10 +57,8 @@ class Design(nn.Module):
     def change(self) -> dict[str, float]:
         """Mean over the particles of |now / start − 1| of each parameter [-]."""
         now = self()
-        return {
-            name: (getattr(now, name) / getattr(self.start, name) - 1).abs().mean().item() if name in self.free else 0.0
-            for name in Params._fields
-        }
+        change = {name: getattr(now, name) / getattr(self.start, name) - 1 for name in self.free}
+        return {name: change[name].abs().mean().item() if name in change else 0.0 for name in Params._fields}
 
 
 def _groups(per: str, count: int, regions: dict[str, np.ndarray]) -> Tensor:

@@ -84,7 +84,8 @@ def run_episode(
         try:
             state = softmpm.simulate(model, state, activation[None], params, substeps=task.substeps)
         except softmpm.UnstableError as error:
-            error.add_note(f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s.")
+            when = f"which began at {step * period:.4g} s"
+            error.add_note(f"In control step {step} of {task.control_steps}, {when}.")
             raise
         running = running + task.objective.running(state, activation)
         effort += activation.detach().square().mean()

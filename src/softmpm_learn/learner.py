@@ -12,7 +12,7 @@ from softmpm_learn.settings import LearningConf
 from softmpm_learn.target import TargetNetwork
 
 MANY = 512
-"""So many pictures, evenly chosen, are enough to validate with and to standardise by."""
+"""So many pictures, evenly chosen, are enough to validate with and to take means of."""
 
 
 class Learner:
@@ -28,10 +28,6 @@ class Learner:
     def encoder(self) -> nn.Module:
         return self.target or self.autoencoder.encoder
 
-    @property
-    def device(self) -> torch.device:
-        return self.autoencoder.encoder.scale.device
-
     def watch(self, first: int, seen: Tensor) -> None:
         """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on."""
         for world, pictures in enumerate(seen.unbind(dim=1)):
@@ -42,23 +38,29 @@ class Learner:
         training, validation = self.replay.split("training"), self.replay.split("validation")
         if not training:
             return {}
-        self.autoencoder.rescale(torch.cat(training))
+        scale = self.autoencoder.encoder.scale  # tells device and precision
+        pictures = _some(torch.cat(training)).to(scale)
+        self.autoencoder.rescale(pictures)
         learned = train_autoencoder(
             self.autoencoder,
             self.optimizer,
-            lambda: self.replay.sample(generator, self.conf.batch).to(self.device),
-            _some(torch.cat(validation)).to(self.device) if validation else None,
+            lambda: self.replay.sample(generator, self.conf.batch).to(scale),
+            _some(torch.cat(validation)).to(scale) if validation else None,
             self.conf,
             generator,
         )
-        self.autoencoder.standardise(_some(torch.cat(training)).to(self.device))
+        self.autoencoder.standardise(pictures)
         if self.target is not None:
             rate = self.conf.target_rate if self.phases else 1.0  # what it copies at first is only noise
             self.target.follow(self.autoencoder.encoder, rate)
         self.phases += 1
         if not self.conf.replay:
             self.replay.clear()
-        return {"epochs": learned.epochs, "training_loss": learned.training, "validation_loss": learned.validation}
+        return {
+            "epochs": learned.epochs,
+            "training_loss": learned.training,
+            "validation_loss": learned.validation,
+        }
 
     def state_dict(self) -> dict:
         return {

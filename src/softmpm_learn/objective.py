@@ -30,7 +30,7 @@ class Effort(Running):
 
 @dataclass(frozen=True)
 class Height(Running):
-    """Keep the particles' mean height above ``lowest`` [m]: weight · max(0, lowest − height)², as a walker that should not fall."""
+    """Do not fall: weight · max(0, lowest − height)², of the particles' mean height and ``lowest`` [m]."""
 
     weight: float
     lowest: float
@@ -70,7 +70,8 @@ class Objective(ABC):
 
     def running(self, state: State, activation: Tensor) -> Tensor:
         """Cost of one control step, shape (world,)."""
-        return sum((term(state, activation) for term in self.terms), activation.new_zeros(activation.shape[0]))
+        nothing = activation.new_zeros(activation.shape[0])
+        return sum((term(state, activation) for term in self.terms), nothing)
 
 
 @dataclass(frozen=True)

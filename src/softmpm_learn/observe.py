@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn import functional
 
 import softmpm
 from softmpm import Model, State
@@ -71,7 +71,7 @@ class Centroids(Observer):
 
 
 def clusters(positions: np.ndarray, count: int) -> list[np.ndarray]:
-    """k-means clusters of points (particle, dim), the same in every run: each first centre is the point farthest from the others."""
+    """k-means clusters of points (particle, dim), the same in every run: a first centre is the point farthest from the others."""
     from scipy.cluster.vq import kmeans2
 
     if count > len(positions):
@@ -115,8 +115,8 @@ class Picture:
             state = state._replace(x=torch.minimum(torch.maximum(x, self._low), self._high))
         field = softmpm.rasterize(model, state)
         velocity = field.velocity * (field.mass / (field.mass + self._thin))[..., None]
-        pool = F.avg_pool2d if model.dim == 2 else F.avg_pool3d
-        return pool(F.pad(velocity.movedim(-1, 1), self._pad), self.block)
+        pool = functional.avg_pool2d if model.dim == 2 else functional.avg_pool3d
+        return pool(functional.pad(velocity.movedim(-1, 1), self._pad), self.block)
 
 
 class Latent(Observer):

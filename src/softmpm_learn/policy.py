@@ -39,10 +39,16 @@ class Goal(nn.Module):
 
 
 class Feedback(nn.Module):
-    """tanh of a network of features, clock and goal (Spielberg et al. 2021); without hidden layers tanh(Wz + b) (Hu et al. 2019)."""
+    """tanh of a network of features, clock and goal (Spielberg et al. 2021) or tanh(Wz + b), without hidden layers (Hu et al. 2019)."""
 
     def __init__(
-        self, size: int, muscles: int, hidden: list[int], gain: float, clock: Clock | None = None, goal: Goal | None = None
+        self,
+        size: int,
+        muscles: int,
+        hidden: list[int],
+        gain: float,
+        clock: Clock | None = None,
+        goal: Goal | None = None,
     ):
         super().__init__()
         self.clock, self.goal = clock, goal
@@ -90,7 +96,8 @@ class Knots(nn.Module):
         last = len(self.values) - 1
         place = min(max(time / self.seconds, 0.0), 1.0) * last
         left = min(int(place), last - 1)
-        return torch.tanh(torch.lerp(self.values[left], self.values[left + 1], place - left)).expand(len(z), -1)
+        value = torch.lerp(self.values[left], self.values[left + 1], place - left)
+        return torch.tanh(value).expand(len(z), -1)
 
 
 def make_policy(

@@ -20,19 +20,20 @@ class Replay:
     """The last so many simulations.
 
     Args:
-        folder: Where the files are; None keeps nothing on disk.
+        folder: Where the files are.
         simulations: Most simulations.
         megabytes: Most memory [MB]; at least the newest simulation stays.
         validation: Share of the simulations held out: every ⌈1/validation⌉-th, by its number, for good.
     """
 
-    def __init__(self, folder: Path | None, *, simulations: int, megabytes: float = math.inf, validation: float = 0.2):
+    def __init__(
+        self, folder: Path, *, simulations: int, megabytes: float = math.inf, validation: float = 0.2
+    ):
         self.folder = folder
         self.simulations, self.megabytes = simulations, megabytes
         self.hold_out = round(1 / validation)
         self._pictures: dict[int, Tensor] = {}
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def ids(self) -> list[int]:
@@ -44,8 +45,7 @@ class Replay:
         if self._pictures and number <= self.ids[-1]:
             raise ValueError(f"simulations are numbered upwards: {number} cannot follow {self.ids[-1]}.")
         pictures = pictures.detach().to("cpu", torch.float32).contiguous()
-        if self.folder is not None:
-            _write(self._path(number), pictures.numpy())
+        _write(self._path(number), pictures.numpy())
         self._pictures[number] = pictures
         while len(self.ids) > 1 and (len(self.ids) > self.simulations or self.nbytes > 1e6 * self.megabytes):
             del self._pictures[self.ids[0]]
@@ -64,7 +64,11 @@ class Replay:
         if name not in SPLITS:
             raise ValueError(f"split must be training or validation, got {name!r}.")
         last, validation = self.hold_out - 1, name == "validation"
-        return [pictures for number, pictures in self._pictures.items() if (number % self.hold_out == last) == validation]
+        return [
+            pictures
+            for number, pictures in self._pictures.items()
+            if (number % self.hold_out == last) == validation
+        ]
 
     def sample(self, generator: torch.Generator, batch: int, split: str = "training") -> Tensor:
         """``batch`` pictures drawn evenly, with repetition, shape (batch, dim, *nodes)."""
@@ -74,7 +78,9 @@ class Replay:
         ends = torch.tensor([len(pictures) for pictures in simulations]).cumsum(0)
         drawn = torch.randint(int(ends[-1]), (batch,), generator=generator)
         which = torch.bucketize(drawn, ends, right=True)
-        return torch.stack([simulations[k][i - ends[k]] for k, i in zip(which.tolist(), drawn.tolist(), strict=True)])
+        return torch.stack(
+            [simulations[k][i - ends[k]] for k, i in zip(which.tolist(), drawn.tolist(), strict=True)]
+        )
 
     def load(self, ids: list[int]) -> None:
         """Hold exactly these simulations, from the folder; files of others are removed."""
@@ -96,7 +102,9 @@ def _write(path: Path, pictures: np.ndarray) -> None:
     """Whole or not at all, also after a loss of power."""
     draft = path.with_name(path.name + ".new")
     with h5py.File(draft, "w") as file:
-        file.create_dataset("velocity", data=pictures, chunks=True, shuffle=True, compression=1, fletcher32=True)
+        file.create_dataset(
+            "velocity", data=pictures, chunks=True, shuffle=True, compression=1, fletcher32=True
+        )
     descriptor = os.open(draft, os.O_RDWR)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""What a run is made of: observer, policy, design, optimiser and learner, put together from settings, saved and restored as one."""
+"""What a run is made of: observer, policy, design, optimiser and learner, made from settings, saved and restored as one."""
 
 import dataclasses
 import hashlib
@@ -42,7 +42,9 @@ class Run:
 
     def __init__(self, task: "Task", model: Model, settings: Settings, out: Path):
         if settings.train.worlds != model.worlds:
-            raise ValueError(f"train.worlds is {settings.train.worlds}, but the model was built with {model.worlds}.")
+            raise ValueError(
+                f"train.worlds is {settings.train.worlds}, but the model was built with {model.worlds}."
+            )
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
         self.generator = torch.Generator().manual_seed(settings.train.seed)
@@ -89,7 +91,9 @@ class Run:
                 f"train.goal_spread needs a task with a goal and {self.model.dim} lengths; "
                 f"task {self.task.name} has goal {self.task.goal}, train.goal_spread is {list(spread)}."
             )
-        centre, width = (torch.tensor(np.asarray(v), dtype=self.model.dtype) for v in (self.task.goal, spread))
+        centre, width = (
+            torch.tensor(np.asarray(v), dtype=self.model.dtype) for v in (self.task.goal, spread)
+        )
         return Goal(centre, width).to(self.model.device)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
@@ -121,9 +125,9 @@ class Run:
         """A goal for each world [m], shape (world, dim), or None for the task's own."""
         if self._goal is None:
             return None
-        place = 2 * torch.rand(self.model.worlds, self.model.dim, generator=self.generator, dtype=self.model.dtype) - 1
         spread = torch.tensor(list(self.settings.train.goal_spread)).to(self._goal.centre)
-        return self._goal.centre + spread * place.to(spread.device)
+        place = torch.rand(self.model.worlds, self.model.dim, generator=self.generator, dtype=spread.dtype)
+        return self._goal.centre + spread * (2 * place.to(spread.device) - 1)
 
     def actor(self) -> dict:
         """Copies of what decides how the robot moves: policy, design and what the policy sees through."""
@@ -154,9 +158,10 @@ class Run:
             ValueError: Task or settings are others; names each difference.
         """
         theirs, ours = json.loads(content["about"]), json.loads(self.about())
-        other = [f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in ours if theirs.get(name) != ours[name]]
-        if other:
-            raise ValueError("this run cannot go on from its checkpoint, it was made with other settings: " + "; ".join(other))
+        changed = [name for name in ours if theirs.get(name) != ours[name]]
+        if changed:
+            both = "; ".join(f"{name}: {theirs.get(name)} then, {ours[name]} now" for name in changed)
+            raise ValueError(f"this run cannot go on from its checkpoint, made with other settings: {both}.")
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])

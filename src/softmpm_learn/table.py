@@ -23,7 +23,9 @@ class Table:
         if rows:
             old = path.read_text().splitlines(keepends=True) if path.exists() else []
             if len(old) < 1 + rows or old[0] != header:
-                raise ValueError(f"{path} should have {rows} rows of {header.strip()}; it has {max(len(old) - 1, 0)}.")
+                raise ValueError(
+                    f"{path} should have {rows} rows of {header.strip()}; it has {max(len(old) - 1, 0)}."
+                )
             kept = old[: 1 + rows]
         draft = path.with_name(path.name + ".new")
         draft.write_text("".join(kept))

@@ -1,11 +1,11 @@
 """Learning in the loop (2019): optimise by the gradient of whole simulations, learn from what they showed, and again.
 
-    for each iteration:
-        optimise   simulate in closed loop, then step policy and design along the gradient of the loss,
-                   which passes through every substep, every activation and every look of the encoder
-        learn      every few iterations: train the autoencoder on the grid velocity of past simulations,
-                   and let the target network, through which the policy looks, follow it
-        save       metrics, recording, checkpoint
+for each iteration:
+    optimise   simulate in closed loop, then step policy and design along the gradient of the loss,
+               which passes through every substep, every activation and every look of the encoder
+    learn      every few iterations: train the autoencoder on the grid velocity of past simulations,
+               and let the target network, through which the policy looks, follow it
+    save       metrics, recording, checkpoint
 """
 
 import contextlib
@@ -28,7 +28,8 @@ from softmpm_learn.settings import Settings
 from softmpm_learn.table import Table
 
 METRICS = [
-    *("loss", "final", "running", "best", "effort", "gradient_policy", "gradient_design", "clipped", "retries"),
+    *("loss", "final", "running", "best", "effort"),
+    *("gradient_policy", "gradient_design", "clipped", "retries"),
     *("young_change", "poisson_change", "density_change"),
     *("epochs", "training_loss", "validation_loss", "replay"),
 ]
@@ -175,8 +176,9 @@ def differentiate(run: Run, episode: Episode) -> dict[str, float]:
     for parameter, gradient in zip(policy + design, gradients, strict=True):
         parameter.grad = gradient
     lengths = {"gradient_policy": _length(policy), "gradient_design": _length(design)}
-    if not all(math.isfinite(length) for length in lengths.values()) or not bool(episode.loss.isfinite().all()):
-        raise TrainingError(run.iteration, f"the loss or its gradient is not finite ({episode.loss.mean():g}; {lengths}).")
+    loss = episode.loss.mean().item()
+    if not all(math.isfinite(value) for value in (loss, *lengths.values())):
+        raise TrainingError(run.iteration, f"the loss or its gradient is not finite: {loss:g}, {lengths}.")
     limit, clipped = run.settings.optimizer.max_norm, 0
     if limit is not None and math.hypot(*lengths.values()) > limit:
         torch.nn.utils.clip_grad_norm_(policy + design, limit)
@@ -193,7 +195,7 @@ def learn(run: Run, seconds: dict[str, float]) -> dict[str, float]:
     seconds["learn"] = 0.0
     if run.learner is None:
         return {}
-    row = {"replay": len(run.learner.replay.ids)}
+    row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
         with _clock(seconds, "learn"):
             row |= run.learner.learn(run.generator)
@@ -234,7 +236,7 @@ def _recorder(run: Run, out: Path) -> contextlib.AbstractContextManager:
 
 
 @contextlib.contextmanager
-def _record(run: Run, recorder: softmpm.Recorder | None, iteration: int, **about) -> Iterator[Callable | None]:
+def _record(run: Run, recorder: softmpm.Recorder | None, iteration: int, **about) -> Iterator:
     """Gives what to call at each frame, or None without a recorder."""
     if recorder is None:
         yield None

@@ -4,10 +4,10 @@ import warnings
 
 import pytest
 import torch
+from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 from torch.utils.checkpoint import checkpoint
 
 import softmpm
-from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,9 @@ def test_rasterize_gradcheck(model, device):
         return tuple(softmpm.rasterize(model, softmpm.State(x, v, C, inputs["F"])))
 
     repeatable = 0.0 if device == "cpu" else 1e-10
-    assert torch.autograd.gradcheck(function, tuple(inputs[n] for n in "xvC"), fast_mode=True, nondet_tol=repeatable)
+    assert torch.autograd.gradcheck(
+        function, tuple(inputs[n] for n in "xvC"), fast_mode=True, nondet_tol=repeatable
+    )
 
 
 def test_rasterize_keeps_mass_and_momentum(model):
@@ -104,7 +106,12 @@ def test_only_what_is_asked_for_is_computed(model):
 def test_broadcast_parameters_get_gradients_of_their_own_shape(model):
     """One Young's modulus for all particles gets the sum of the particles' gradients."""
     inputs = busy_inputs(model)
-    per_particle = gradients(softmpm.simulate, model, inputs | {"young": torch.full_like(inputs["young"], 80.0).requires_grad_()}, 3)
+    per_particle = gradients(
+        softmpm.simulate,
+        model,
+        inputs | {"young": torch.full_like(inputs["young"], 80.0).requires_grad_()},
+        3,
+    )
     one = torch.tensor(80.0, dtype=torch.float64, requires_grad=True)
     shared = gradients(softmpm.simulate, model, inputs | {"young": one}, 3)
     assert shared["young"].shape == ()
@@ -147,7 +154,9 @@ def test_rasterize_has_finite_gradients_at_vanishing_mass():
     """A node with a mass of 1e-30 or less: p/m² would overflow in float32, and a gradient of zero turn into NaN."""
     particles = softmpm.Particles(torch.full((1, 2), 0.5).numpy(), 1e-12)
     body = softmpm.Body(particles, softmpm.NeoHookean(density=1e-9, young=1.0))
-    model = softmpm.build(softmpm.Scene(grid=softmpm.Grid(shape=(12, 12), spacing=0.1), bodies=[body], dt=1e-9), device="cpu")
+    model = softmpm.build(
+        softmpm.Scene(grid=softmpm.Grid(shape=(12, 12), spacing=0.1), bodies=[body], dt=1e-9), device="cpu"
+    )
     for off in (1e-3, 1e-6, 1e-8):
         x = (model.rest().x * 0 + 0.45 + off).requires_grad_()
         v = torch.ones_like(x).requires_grad_()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from helpers import assert_relative, busy_inputs, busy_scene, gradients
 
 import softmpm
-from helpers import assert_relative, busy_inputs, busy_scene, gradients
 from softmpm.buffers import SolidAdj
 from softmpm.kernels.types import Wanted, adj_module, solid_types
 from softmpm.step import Substep
@@ -18,7 +18,9 @@ from softmpm.step import Substep
 
 def plain_scene(**changes):
     """One law in empty space, nothing else."""
-    return busy_scene(2, ("neo_hookean",), **({"muscles": (), "walls": (), "gravity": None, "damping": 0.0} | changes))
+    return busy_scene(
+        2, ("neo_hookean",), **({"muscles": (), "walls": (), "gravity": None, "damping": 0.0} | changes)
+    )
 
 
 def fields(struct) -> set[str]:
@@ -39,11 +41,20 @@ def test_what_a_scene_lacks_is_not_passed():
 
 def test_what_a_scene_lacks_is_not_compiled(tmp_path):
     """The source of the kernels holds the words of a feature only if the scene has it."""
-    words = {"log": "neo_hookean", "rotation": "fixed_corotated", "muscle_stress": "muscles", "slide": "walls"}
+    words = {
+        "log": "neo_hookean",
+        "rotation": "fixed_corotated",
+        "muscle_stress": "muscles",
+        "slide": "walls",
+    }
     scenes = {
         "neo_hookean": plain_scene(),
-        "fixed_corotated": busy_scene(2, ("fixed_corotated",), muscles=(), walls=(), gravity=None, damping=0.0),
-        "muscles": plain_scene(muscles=[softmpm.Muscle(particles=np.arange(5), direction=(0, 1), strength=1.0)]),
+        "fixed_corotated": busy_scene(
+            2, ("fixed_corotated",), muscles=(), walls=(), gravity=None, damping=0.0
+        ),
+        "muscles": plain_scene(
+            muscles=[softmpm.Muscle(particles=np.arange(5), direction=(0, 1), strength=1.0)]
+        ),
         "walls": plain_scene(walls=[softmpm.Wall(normal=(0, 1), offset=0.3, friction=0.1)]),
     }
     for name, scene in scenes.items():
@@ -76,7 +87,11 @@ def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):
     """P2G, grid, G2P; the adjoint computes the grid again and adds G2P, grid and P2G twins."""
     counted = []
     launch = Substep.launch
-    monkeypatch.setattr(Substep, "launch", lambda self, kernel, *args: (counted.append(kernel.key), launch(self, kernel, *args)))
+    monkeypatch.setattr(
+        Substep,
+        "launch",
+        lambda self, kernel, *args: (counted.append(kernel.key), launch(self, kernel, *args)),
+    )
     model = softmpm.build(plain_scene(), device="cpu")
     start = model.rest()
     start.v.requires_grad_()
@@ -99,10 +114,22 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
 def test_describe_says_what_was_compiled_and_left_out():
     """Dimension, laws, muscles, contacts, gradients, dt and memory, in words."""
     text = softmpm.build(plain_scene(), device="cpu").describe()
-    for phrase in ("2D, float32", "neo_hookean; others left out", "muscles    left out", "contacts   left out", "stable up to"):
+    for phrase in (
+        "2D, float32",
+        "neo_hookean; others left out",
+        "muscles    left out",
+        "contacts   left out",
+        "stable up to",
+    ):
         assert phrase in text, phrase
     busy = softmpm.build(busy_scene(3), device="cpu", dtype=torch.float64, worlds=4).describe(substeps=500)
-    for phrase in ("3D, float64", "4 world(s)", "at most 2 on one particle", "friction   compiled", "500 substeps"):
+    for phrase in (
+        "3D, float64",
+        "4 world(s)",
+        "at most 2 on one particle",
+        "friction   compiled",
+        "500 substeps",
+    ):
         assert phrase in busy, phrase
 
 
@@ -130,9 +157,18 @@ def test_the_chosen_device_is_said_in_the_log(caplog):
 
 def test_building_and_running_changes_no_global_state():
     """Default dtype, seeds, threads and Warp's settings stay as they were."""
+
     def settings():
-        config = {name: getattr(wp.config, name) for name in ("mode", "verify_fp", "enable_backward", "log_level")}
-        return torch.get_default_dtype(), torch.initial_seed(), torch.get_num_threads(), torch.get_rng_state().sum(), config
+        config = {
+            name: getattr(wp.config, name) for name in ("mode", "verify_fp", "enable_backward", "log_level")
+        }
+        return (
+            torch.get_default_dtype(),
+            torch.initial_seed(),
+            torch.get_num_threads(),
+            torch.get_rng_state().sum(),
+            config,
+        )
 
     before = settings()
     model = softmpm.build(busy_scene(2), device="cpu")
@@ -144,7 +180,9 @@ def test_two_models_in_two_threads_give_what_they_give_alone(device):
     """Forward and backward of different scenes at the same time; on a GPU each thread on a stream of its own."""
     models = [softmpm.build(busy_scene(dim), device=device, dtype=torch.float64) for dim in (2, 3)]
     inputs = [busy_inputs(model) for model in models]
-    alone = [gradients(softmpm.simulate, model, given, 10) for model, given in zip(models, inputs, strict=True)]
+    alone = [
+        gradients(softmpm.simulate, model, given, 10) for model, given in zip(models, inputs, strict=True)
+    ]
     together = [[], []]
 
     def work(k):
@@ -207,7 +245,9 @@ def test_memory_follows_the_formula():
         end = softmpm.simulate(model, start, None, params, substeps=substeps)
         end.x.sum().backward()
         got, want = torch.cuda.max_memory_allocated() - before, memory(model, substeps).backward
-        print(f"substeps {substeps}: measured {got / 2**20:.2f} MiB, formula {want / 2**20:.2f} MiB, {got / want - 1:+.1%}")
+        print(
+            f"substeps {substeps}: measured {got / 2**20:.2f} MiB, formula {want / 2**20:.2f} MiB, {got / want - 1:+.1%}"
+        )
         assert abs(got / want - 1) < 0.2, substeps
 
 

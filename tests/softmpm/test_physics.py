@@ -10,7 +10,9 @@ def block(dim=2, law=softmpm.NeoHookean, cells=3, dx=0.1, shape=None, lower=None
     lower = (0.5,) * dim if lower is None else lower
     axes = [np.arange(2 * cells) * dx / 2 + dx / 4 + corner for corner in lower]
     positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, dim)
-    body = softmpm.Body(softmpm.Particles(positions, (dx / 2) ** dim), law(density=2.0, young=50.0, poisson=0.3))
+    body = softmpm.Body(
+        softmpm.Particles(positions, (dx / 2) ** dim), law(density=2.0, young=50.0, poisson=0.3)
+    )
     settings = dict(grid=softmpm.Grid(shape=shape or (16,) * dim, spacing=dx), bodies=[body], dt=2e-3)
     return softmpm.Scene(**(settings | scene))
 
@@ -45,7 +47,9 @@ def test_momentum_and_angular_momentum_are_kept(device):
     rest = model.rest()
     centre = rest.x.mean(1, keepdim=True)
     v = torch.stack([-(rest.x - centre)[..., 1], (rest.x - centre)[..., 0]], -1) * 3 + 0.2
-    start = rest._replace(v=v, F=rest.F * torch.tensor([[1.1], [0.95]], dtype=torch.float64, device=model.device))
+    start = rest._replace(
+        v=v, F=rest.F * torch.tensor([[1.1], [0.95]], dtype=torch.float64, device=model.device)
+    )
     activation = torch.full((1, 1, 1), 0.7, dtype=torch.float64, device=model.device)
     end = softmpm.simulate(model, start, activation, model.params(), substeps=200)
     (p0, l0, scale), (p1, l1, _) = momenta(model, start), momenta(model, end)
@@ -83,13 +87,17 @@ def test_a_muscle_shortens_a_free_block_to_the_exact_equilibrium():
     """At rest under constant pull, τ(F) = 0: F follows from two scalar equations. Sign and direction of actuation."""
     pull, mu, lam = 10.0, 50.0 / 2.6, 50.0 * 0.3 / (1.3 * 0.4)
     every = np.arange(36)
-    scene = block(muscles=[softmpm.Muscle(particles=every, direction=(0.0, 1.0), strength=pull)], damping=40.0)
+    scene = block(
+        muscles=[softmpm.Muscle(particles=every, direction=(0.0, 1.0), strength=pull)], damping=40.0
+    )
     model = softmpm.build(scene, device="cpu", dtype=torch.float64)
     activation = torch.ones(1, 1, 1, dtype=torch.float64)
     end = softmpm.simulate(model, model.rest(), activation, model.params(), substeps=4000)
     a, b = 1.0, 1.0  # F = diag(a, b): μ(a² − 1) + λ log ab = 0, μ(b² − 1) + λ log ab + pull b² = 0
     for _ in range(60):
-        r = np.array([mu * (a * a - 1) + lam * np.log(a * b), mu * (b * b - 1) + lam * np.log(a * b) + pull * b * b])
+        r = np.array(
+            [mu * (a * a - 1) + lam * np.log(a * b), mu * (b * b - 1) + lam * np.log(a * b) + pull * b * b]
+        )
         J = np.array([[2 * mu * a + lam / a, lam / b], [lam / a, 2 * (mu + pull) * b + lam / b]])
         a, b = np.array([a, b]) - np.linalg.solve(J, r)
     assert b < 0.9 < 1.0 < a
@@ -112,7 +120,9 @@ def test_walls_do_what_their_names_say(device):
         for v, want in (((1.0, -0.8), inward), ((1.0, 0.8), outward)):
             v, want = (torch.tensor(t, dtype=torch.float64, device=model.device) for t in (v, want))
             end = softmpm.simulate(model, rest._replace(v=rest.v + v), None, model.params(), substeps=1)
-            torch.testing.assert_close(end.v, want.expand_as(end.v), rtol=0, atol=1e-13, msg=f"{contact} {friction}")
+            torch.testing.assert_close(
+                end.v, want.expand_as(end.v), rtol=0, atol=1e-13, msg=f"{contact} {friction}"
+            )
 
 
 def test_damping_is_a_rate():
@@ -120,5 +130,7 @@ def test_damping_is_a_rate():
     for dt in (4e-3, 1e-3):
         model = softmpm.build(block(damping=5.0, dt=dt), device="cpu", dtype=torch.float64)
         rest = model.rest()
-        end = softmpm.simulate(model, rest._replace(v=rest.v + 0.4), None, model.params(), substeps=round(0.1 / dt))
+        end = softmpm.simulate(
+            model, rest._replace(v=rest.v + 0.4), None, model.params(), substeps=round(0.1 / dt)
+        )
         torch.testing.assert_close(end.v, torch.full_like(end.v, 0.4 * np.exp(-0.5)), rtol=1e-12, atol=0)

@@ -179,16 +179,19 @@ def test_a_shortened_file_is_an_error(copy):
             read_all(copy)
 
 
-def test_a_flipped_bit_is_found(copy):
-    """Particle data carries checksums: one flipped bit is an error that names the place."""
+@pytest.mark.parametrize("name", ["frame/x", "frame/index", "field/velocity", "scalar", "static/positions"])
+def test_a_flipped_bit_is_found(copy, name):
+    """Data carries checksums: one flipped bit is an error that names the file, and the row if it is in a frame."""
     with h5py.File(copy, "r") as file:
-        chunk = file["frame/x"].id.get_chunk_info(4)
+        chunk = file[name].id.get_chunk_info(0)
     whole = copy.read_bytes()
-    for at in (chunk.byte_offset, chunk.byte_offset + chunk.size // 2, chunk.byte_offset + chunk.size - 1):
+    for at in np.linspace(chunk.byte_offset, chunk.byte_offset + chunk.size - 1, 9).astype(int):
         damaged = bytearray(whole)
         damaged[at] ^= 4
         copy.write_bytes(damaged)
-        with pytest.raises(OSError, match=r"copy\.h5 is damaged: row 4 of frame/x"):
+        with pytest.raises(
+            OSError, match=r"copy\.h5 is damaged: " + ("row 0 of " + name if "/x" in name else "")
+        ):
             read_all(copy)
     copy.write_bytes(whole)
     assert read_all(copy) == 6

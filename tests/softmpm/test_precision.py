@@ -2,15 +2,17 @@
 
 import numpy as np
 import torch
+from helpers import assert_relative, busy_inputs, busy_scene, gradients, run
 
 import softmpm
-from helpers import assert_relative, busy_inputs, busy_scene, gradients, run
 
 
 def bar(dtype):
     """A free bar of 16 cells at CFL 0.04 that vibrates along its length, confined by slip walls; one period in substeps."""
     dx, rho, young = 1 / 32, 1.0, 1.0
-    xs, ys = np.meshgrid(np.arange(32) * dx / 2 + dx / 4 + 0.25, np.arange(4) * dx / 2 + dx / 4 + 0.25, indexing="ij")
+    xs, ys = np.meshgrid(
+        np.arange(32) * dx / 2 + dx / 4 + 0.25, np.arange(4) * dx / 2 + dx / 4 + 0.25, indexing="ij"
+    )
     particles = softmpm.Particles(np.stack([xs, ys], -1).reshape(-1, 2), (dx / 2) ** 2)
     scene = softmpm.Scene(
         grid=softmpm.Grid(shape=(32, 20), spacing=dx),
@@ -49,7 +51,9 @@ def test_float32_gradients_are_those_of_float64(device):
             inputs = {k: t.detach().to(model.device, dtype).requires_grad_() for k, t in inputs.items()}
             found[dtype] = gradients(softmpm.simulate, model, inputs, substeps=50)
         for name in found[torch.float64]:
-            assert_relative(found[torch.float32][name].double(), found[torch.float64][name], 1e-3, f"{dim}D {name}")
+            assert_relative(
+                found[torch.float32][name].double(), found[torch.float64][name], 1e-3, f"{dim}D {name}"
+            )
 
 
 def test_slow_particles_move_in_float32():

@@ -4,6 +4,7 @@ import math
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import busy_scene
 
 import softmpm
 from softmpm.recording import strain
 
-SRC = Path(__file__).parents[2] / "src"
+ROOT = Path(__file__).parents[2]
 COUNT, NODES = 400, (16, 16)
 
 
@@ -99,8 +101,6 @@ def test_what_was_recorded_is_read(tmp_path):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_one_world_of_a_simulation_is_recorded(tmp_path, dim):
     """Of states, activations and rasterized fields of many worlds in float64, the chosen world is kept."""
-    from tests.helpers import busy_scene
-
     model = softmpm.build(busy_scene(dim), device="cpu", dtype=torch.float64, worlds=2)
     generator = torch.Generator().manual_seed(0)
     activation = torch.randn(1, 2, 2, generator=generator, dtype=torch.float64, requires_grad=True)
@@ -222,7 +222,7 @@ def test_wrong_use_is_explained(tmp_path):
         assert len(recording.rows(0)) == 1 and recording.episodes == (0,) and recording.scalars == {}
 
 
-KILLS = 24
+KILLS = 12
 
 
 def test_killed_at_any_instant(tmp_path):
@@ -264,10 +264,56 @@ def killing(path: Path, kills: str) -> None:
     assert frames_seen > int(kills)
 
 
-def write_for_ever(path: Path, model: softmpm.Model, start: int) -> None:
-    """Record three frames for each iteration, saying what is done; never returns."""
+def test_dying_at_any_line(tmp_path):
+    """Whichever line of the recorder was its last one, the file is there, readable, and holds what was acknowledged."""
+    run_here("dying", tmp_path, "first time")
+
+
+def dying(folder: Path, _: str) -> None:
+    """Fork a writer that ends, as if killed, when it reaches its n-th new line; for every other n until it gets through."""
+    model, begun, path = small_model(), folder / "begun.h5", folder / "run.h5"
+    with softmpm.Recorder(begun, model) as recorder:
+        record(recorder, model, 0)
+    lines, code = 0, DIED
+    while code == DIED:
+        shutil.copy(begun, path)
+        child = os.fork()
+        if child == 0:
+            sys.settrace(Countdown(lines))
+            write_for_ever(path, model, 1, until=2)
+            os._exit(0)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        with softmpm.Recording(path) as recording:
+            assert check(recording, model, 0) == 4
+            assert all(check(recording, model, k) <= 3 for k in recording.episodes[1:])
+        lines += 2
+    assert code == 0 and lines > 100 and recording.episodes == (0, 1), (code, lines)
+
+
+DIED = 9
+
+
+class Countdown:
+    """A trace function that ends the process when it reaches the n-th different line of the modules that write."""
+
+    def __init__(self, lines: int):
+        self.lines, self.seen = lines, set()
+
+    def __call__(self, frame, event, _argument):
+        place = (frame.f_code.co_filename, frame.f_lineno)
+        if not place[0].endswith(("recording.py", "layout.py")):
+            return None
+        if event == "line" and place not in self.seen:
+            if len(self.seen) == self.lines:
+                os._exit(DIED)  # runs nothing of Python or HDF5 any more
+            self.seen.add(place)
+        return self
+
+
+def write_for_ever(path: Path, model: softmpm.Model, start: int, until: int = 10**6) -> None:
+    """Record three frames for each iteration, saying what is done."""
     recorder = softmpm.Recorder(path, model, resume_before=start)
-    for iteration in range(start, 10**6):
+    for iteration in range(start, until):
         with recorder.episode(iteration, seed=iteration) as episode:
             print("episode", iteration, flush=True)
             for k in range(3):
@@ -318,7 +364,10 @@ def fill(path: Path, room: int) -> None:
 
 def run_here(function: str, *arguments: object) -> None:
     """Run a function of this file in a process of its own, to fork and die in."""
-    environment = os.environ | {"PYTHONPATH": str(SRC), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT / 'tests'}",
+        "OMP_NUM_THREADS": "1",
+    }
     command = [sys.executable, __file__, function, *map(str, arguments)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr

@@ -1,12 +1,13 @@
 """Whole rollouts against the float64 reference, finite differences and themselves."""
 
+import itertools
 import math
 
 import pytest
 import torch
+from helpers import INPUTS, LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 import softmpm
-from helpers import INPUTS, LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 from softmpm import reference
 
 
@@ -55,7 +56,15 @@ def special_start(model, kind: str) -> dict[str, torch.Tensor]:
     return {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
 
 
-POINTS = ("rest", "rotation", "equal stretches", "inverted", "still under friction", "cell edge", "no activation")
+POINTS = (
+    "rest",
+    "rotation",
+    "equal stretches",
+    "inverted",
+    "still under friction",
+    "cell edge",
+    "no activation",
+)
 
 
 @pytest.mark.parametrize("kind", POINTS)
@@ -109,7 +118,12 @@ def test_taylor_remainder_is_second_order(dim, device):
     model = softmpm.build(sliding_scene(dim), device=device, dtype=torch.float64)
     inputs = busy_inputs(model)
     rest, away = model.rest(), torch.tensor([2.0, -0.3, 0.1][:dim], dtype=torch.float64, device=model.device)
-    inputs |= {"x": rest.x, "v": rest.v + away, "C": rest.C, "F": rest.F + 0.1 * (inputs["F"].detach() - rest.F)}
+    inputs |= {
+        "x": rest.x,
+        "v": rest.v + away,
+        "C": rest.C,
+        "F": rest.F + 0.1 * (inputs["F"].detach() - rest.F),
+    }
     inputs = {name: tensor.detach().requires_grad_() for name, tensor in inputs.items()}
     weights = cotangent(softmpm.State(*(inputs[n] for n in "xvCF")))
     gradient = gradients(softmpm.simulate, model, inputs, 50, weights)
@@ -126,7 +140,7 @@ def test_taylor_remainder_is_second_order(dim, device):
         for step in STEPS:
             ahead = loss(inputs | {name: inputs[name].detach() + step * d})
             remainders.append(abs(ahead - here - step * (gradient[name] * d).sum().item()))
-        rates = [math.log2(a / b) for a, b in zip(remainders, remainders[1:], strict=False)]
+        rates = [math.log2(a / b) for a, b in itertools.pairwise(remainders)]
         assert all(1.95 <= rate <= 2.05 for rate in rates), (name, rates, remainders)
 
 
@@ -141,7 +155,10 @@ def test_dot_product(device):
     copies = {name: tensor.detach().cpu().requires_grad_() for name, tensor in inputs.items()}
     end = run(reference.simulate, scene, copies, 5)
     b = cotangent(end, seed=11)
-    a = {n: torch.randn(t.shape, generator=torch.Generator().manual_seed(12), dtype=torch.float64) for n, t in copies.items()}
+    a = {
+        n: torch.randn(t.shape, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
+        for n, t in copies.items()
+    }
     dual = [torch.zeros_like(t, requires_grad=True) for t in end]
     pulled = torch.autograd.grad(dot(dual, end), list(copies.values()), create_graph=True)
     pushed = torch.autograd.grad(dot(list(a.values()), pulled), dual)  # J a: linear in the dual
@@ -159,6 +176,7 @@ def test_worlds_are_single_runs(device):
     together = gradients(softmpm.simulate, models[3], inputs, 6)
     weights = cotangent(run(softmpm.simulate, models[3], inputs, 6))
     for world in range(3):
+
         def alone(name, tensor, world=world):
             part = tensor[:, world : world + 1] if name == "activation" else tensor[world : world + 1]
             return part.detach().clone().requires_grad_()
@@ -166,7 +184,9 @@ def test_worlds_are_single_runs(device):
         single = {name: alone(name, tensor) for name, tensor in inputs.items()}
         found = gradients(softmpm.simulate, models[1], single, 6, [w[world : world + 1] for w in weights])
         for name in INPUTS:
-            assert_relative(alone(name, together[name]).detach(), found[name], 1e-13, f"world {world}, {name}")
+            assert_relative(
+                alone(name, together[name]).detach(), found[name], 1e-13, f"world {world}, {name}"
+            )
 
 
 def test_recomputing_gives_the_gradient_of_keeping_everything():

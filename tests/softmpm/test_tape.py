@@ -3,9 +3,9 @@
 import pytest
 import torch
 import warp as wp
+from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, run
 
 import softmpm
-from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, run
 from softmpm.kernels.types import types
 
 
@@ -19,11 +19,18 @@ def test_tape_gives_the_gradients_of_simulate(dim, dtype, limit, device):
     by_lame = inputs | {"young": mu * (2 + lam / (lam + mu)), "poisson": lam / (2 * (lam + mu))}
     mass = inputs["density"] * model.volume
     end = run(softmpm.simulate, model, by_lame, 5)
-    leaves = {name: inputs[name] for name in ("x", "v", "C", "F", "activation", "density")} | {"mu": mu, "lam": lam}
-    want = dict(zip(leaves, torch.autograd.grad(dot(cotangent(end), end), list(leaves.values())), strict=True))
+    leaves = {name: inputs[name] for name in ("x", "v", "C", "F", "activation", "density")} | {
+        "mu": mu,
+        "lam": lam,
+    }
+    want = dict(
+        zip(leaves, torch.autograd.grad(dot(cotangent(end), end), list(leaves.values())), strict=True)
+    )
 
     start = softmpm.State(*(inputs[name].detach() for name in "xvCF"))
-    params = softmpm.Params(by_lame["young"].detach(), by_lame["poisson"].detach(), inputs["density"].detach())
+    params = softmpm.Params(
+        by_lame["young"].detach(), by_lame["poisson"].detach(), inputs["density"].detach()
+    )
     solid = softmpm.warp_solid(model, params, inputs["activation"][0].detach(), requires_grad=True)
     states = [softmpm.warp_state(model, start, requires_grad=True)]
     states += [softmpm.warp_state(model, requires_grad=True) for _ in range(5)]
@@ -33,7 +40,9 @@ def test_tape_gives_the_gradients_of_simulate(dim, dtype, limit, device):
     weights = cotangent(start)
     cotangents = {states[-1].fx: (weights.x * dx, t.vec), states[-1].v: (weights.v, t.vec)}
     cotangents |= {states[-1].C: (weights.C, t.mat), states[-1].H: (weights.F, t.mat)}
-    tape.backward(grads={array: wp.from_torch(g.contiguous(), dtype=d) for array, (g, d) in cotangents.items()})
+    tape.backward(
+        grads={array: wp.from_torch(g.contiguous(), dtype=d) for array, (g, d) in cotangents.items()}
+    )
 
     got = {name: wp.to_torch(getattr(states[0], name).grad) for name in ("v", "C")}
     got |= {"x": wp.to_torch(states[0].fx.grad) / dx, "F": wp.to_torch(states[0].H.grad)}
@@ -87,4 +96,6 @@ def test_step_advances_like_simulate(device):
     first, second = softmpm.warp_state(model, start), softmpm.warp_state(model)
     softmpm.step(model, first, second, softmpm.warp_solid(model))
     for name in "xvCF":
-        torch.testing.assert_close(getattr(softmpm.torch_state(model, second), name), getattr(want, name), rtol=0, atol=1e-13)
+        torch.testing.assert_close(
+            getattr(softmpm.torch_state(model, second), name), getattr(want, name), rtol=0, atol=1e-13
+        )

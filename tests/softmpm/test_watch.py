@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from helpers import LAWS, busy_inputs, busy_scene, run
 
 import softmpm
-from helpers import LAWS, busy_inputs, busy_scene, run
 
 
 def single(law="neo_hookean", device="cpu", worlds=1, dtype=torch.float32, **scene):
@@ -28,7 +28,11 @@ def test_leaving_the_grid_names_particle_world_and_substep(device):
     start.v[2, 1, 0] = 100.0  # 0.1 m a substep, from 0.7 m; the grid ends at 1.05 m
     error = fails(model, start)
     assert (error.kind, error.world, error.particle, error.substep) == ("left_grid", 2, 1, 3)
-    assert "particle 1 (body 0) of world 2" in str(error) and "off the grid" in str(error) and "1.05" in str(error)
+    assert (
+        "particle 1 (body 0) of world 2" in str(error)
+        and "off the grid" in str(error)
+        and "1.05" in str(error)
+    )
     calm = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
     for name in "xvCF":
         assert torch.equal(getattr(error.state, name)[:2], getattr(calm, name)[:2]), name

@@ -52,7 +52,7 @@ def test_kullback_leibler_term():
 
 @pytest.mark.parametrize("variational", [False, True])
 def test_it_learns(variational):
-    """Two numbers suffice for pictures with two numbers in them: the error on unseen ones falls below a tenth of their variance."""
+    """Two numbers suffice for pictures made of two numbers: the error on unseen ones falls below a tenth of their variance."""
     autoencoder, generator = make(), torch.Generator().manual_seed(2)
     training, held_out = waves(200)[:160], waves(200)[160:]
     autoencoder.rescale(training)
@@ -81,7 +81,9 @@ def test_early_stopping_keeps_the_best_weights():
     learned = train_autoencoder(
         other, torch.optim.Adam(other.parameters(), lr=0.01), sample, held_out, always, generator
     )
-    assert learned.epochs == 8 and other.loss(held_out, None).item() == pytest.approx(learned.validation, rel=1e-6)
+    assert learned.epochs == 8 and other.loss(held_out, None).item() == pytest.approx(
+        learned.validation, rel=1e-6
+    )
 
 
 def test_global_randomness_is_left_alone():

@@ -1,3 +1,4 @@
+import contextlib
 import os
 
 import pytest
@@ -44,9 +45,13 @@ def test_falling_back_is_said(tmp_path, caplog):
     checkpoint.save(tmp_path, content(1.0))
     checkpoint.save(tmp_path, content(2.0)).write_bytes(b"")
     checkpoint.load(tmp_path)
-    assert "checkpoint.pt is damaged" in caplog.text and "Falling back to checkpoint.previous.pt" in caplog.text
+    assert (
+        "checkpoint.pt is damaged" in caplog.text and "Falling back to checkpoint.previous.pt" in caplog.text
+    )
     (tmp_path / checkpoint.PREVIOUS).unlink()
-    with pytest.raises(checkpoint.CheckpointError, match=r"checkpoint\.pt is damaged.*previous\.pt cannot be read"):
+    with pytest.raises(
+        checkpoint.CheckpointError, match=r"checkpoint\.pt is damaged.*previous\.pt cannot be read"
+    ):
         checkpoint.load(tmp_path)
 
 
@@ -64,10 +69,8 @@ def test_a_kill_at_any_step_of_writing_loses_one_checkpoint_at_most(tmp_path, mo
         return real(*args)
 
     monkeypatch.setattr(os, call, dies)
-    try:
+    with contextlib.suppress(KeyboardInterrupt):
         checkpoint.save(tmp_path, content(3.0))
-    except KeyboardInterrupt:
-        pass
     monkeypatch.undo()
     found = checkpoint.load(tmp_path)
     assert same(found, content(2.0)) or same(found, content(3.0))
@@ -112,8 +115,8 @@ def test_code_in_a_checkpoint_does_not_run(tmp_path):
 def test_one_run_at_a_time(tmp_path):
     """A second lock on the folder is refused while the first is held, and not after."""
     pytest.importorskip("fcntl")
-    with checkpoint.locked(tmp_path):
-        with pytest.raises(RuntimeError, match="another run is writing"), checkpoint.locked(tmp_path):
-            pass
+    refused = pytest.raises(RuntimeError, match="another run is writing")
+    with checkpoint.locked(tmp_path), refused, checkpoint.locked(tmp_path):
+        pass
     with checkpoint.locked(tmp_path):
         pass

@@ -10,7 +10,9 @@ from softmpm_learn.settings import LearningConf
 
 
 def learner(folder, **changes) -> Learner:
-    conf = LearningConf(**({"epochs": 2, "batches": 2, "batch": 4, "validation": 0.5, "target_rate": 0.5} | changes))
+    conf = LearningConf(
+        **({"epochs": 2, "batches": 2, "batch": 4, "validation": 0.5, "target_rate": 0.5} | changes)
+    )
     with seeded(0):
         autoencoder = Autoencoder(2, (6, 5), 2, [4])
     return Learner(conf, autoencoder, Replay(folder, simulations=8, validation=conf.validation))

@@ -9,7 +9,8 @@ GENERATOR = torch.Generator().manual_seed(0)
 
 def states() -> tuple[State, State]:
     start, end = (
-        State(x, 0 * x, *(torch.zeros(2, 5, 2, 2) for _ in "CF")) for x in torch.rand(2, 2, 5, 2, generator=GENERATOR)
+        State(x, 0 * x, *(torch.zeros(2, 5, 2, 2) for _ in "CF"))
+        for x in torch.rand(2, 2, 5, 2, generator=GENERATOR)
     )
     return start, end
 
@@ -47,5 +48,7 @@ def test_running_terms_add_up():
     lowest = height.max().item() + 0.1
     got = Progress(terms=(Effort(2.0), Height(3.0, lowest))).running(state, activation)
     torch.testing.assert_close(got, 2 * torch.tensor([0.25, 0.5]) + 3 * (lowest - height) ** 2)
-    torch.testing.assert_close(Progress(terms=(Height(3.0, -9.0),)).running(state, activation), torch.zeros(2))
+    torch.testing.assert_close(
+        Progress(terms=(Height(3.0, -9.0),)).running(state, activation), torch.zeros(2)
+    )
     torch.testing.assert_close(Progress().running(state, activation), torch.zeros(2))

@@ -59,7 +59,9 @@ def test_picture_follows_the_robot(exact):
     follow, fixed = Picture(exact), Picture(exact, follow=False)
     torch.testing.assert_close(follow(exact, away), follow(exact, state))
     assert (fixed(exact, away) - fixed(exact, state)).abs().max() > 0.05
-    wide = state._replace(x=state.x + 0.4 * torch.randn(state.x.shape, generator=torch.Generator().manual_seed(1)).double())
+    wide = state._replace(
+        x=state.x + 0.4 * torch.randn(state.x.shape, generator=torch.Generator().manual_seed(1)).double()
+    )
     assert follow(exact, wide).isfinite().all()
 
 
@@ -70,15 +72,22 @@ def test_features_are_differentiable(exact, kind):
     if kind == "centroids":
         observer = Centroids(exact, [np.arange(12)], body_length=0.4)
     else:
-        net = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(2 * 13 * 9, 3), torch.nn.Tanh()).double()
+        net = torch.nn.Sequential(
+            torch.nn.Flatten(), torch.nn.Linear(2 * 13 * 9, 3), torch.nn.Tanh()
+        ).double()
         observer = Latent(Picture(exact), net, size=3)
     state, direction = moving(exact), [torch.randn_like(t) for t in exact.rest()]
     leaves = [t.clone().requires_grad_() for t in state]
     weight = torch.randn(2, observer.size, dtype=torch.float64)
 
     def value(h):
-        return (weight * observer(exact, softmpm.State(*(t + h * d for t, d in zip(state, direction, strict=True))))).sum()
+        return (
+            weight
+            * observer(exact, softmpm.State(*(t + h * d for t, d in zip(state, direction, strict=True))))
+        ).sum()
 
-    gradient = torch.autograd.grad((weight * observer(exact, softmpm.State(*leaves))).sum(), leaves, allow_unused=True)
+    gradient = torch.autograd.grad(
+        (weight * observer(exact, softmpm.State(*leaves))).sum(), leaves, allow_unused=True
+    )
     got = sum((g * d).sum() for g, d in zip(gradient, direction, strict=True) if g is not None)
     torch.testing.assert_close((value(1e-5) - value(-1e-5)) / 2e-5, got, rtol=1e-6, atol=1e-9)

@@ -10,7 +10,9 @@ NAMES = ("linear", "mlp", "sinusoids", "knots")
 
 
 def make(name: str, seed=0, goal=None, **settings):
-    return make_policy(PolicyConf(name=name, **settings), size=4, muscles=3, seconds=2.0, seed=seed, goal=goal)
+    return make_policy(
+        PolicyConf(name=name, **settings), size=4, muscles=3, seconds=2.0, seed=seed, goal=goal
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -72,9 +74,13 @@ def test_knots_are_joined_by_straight_lines():
 def test_goals_are_seen_in_units_of_their_box():
     """The centre of the box is 0, its corner ±1, an axis without spread always 0; a policy with a goal reacts to it."""
     goal = Goal(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 0.0]))
-    torch.testing.assert_close(goal(torch.tensor([[1.5, 2.0], [0.5, 7.0]])), torch.tensor([[1.0, 0.0], [-1.0, 0.0]]))
+    torch.testing.assert_close(
+        goal(torch.tensor([[1.5, 2.0], [0.5, 7.0]])), torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
+    )
     policy, z = make("linear", goal=goal), torch.zeros(1, 4)
-    assert not torch.equal(policy(z, 0.0, torch.tensor([[1.4, 2.0]])), policy(z, 0.0, torch.tensor([[0.6, 2.0]])))
+    assert not torch.equal(
+        policy(z, 0.0, torch.tensor([[1.4, 2.0]])), policy(z, 0.0, torch.tensor([[0.6, 2.0]]))
+    )
 
 
 def test_first_weights_are_scaled_by_the_number_of_inputs():

@@ -97,7 +97,7 @@ def test_the_arm_is_clamped_and_bends_to_the_side_that_pulls():
     tip = task.objective.particles
     for side, sign in ((0, -1), (1, 1)):  # muscles come in pairs, left and right
         activation = torch.zeros(len(task.scene.muscles))
-        activation[side::2] = 0.5
+        activation[side::2] = 1.0
         model, end = simulate(task, activation, 0.15)
         moved = (end.x - model.rest().x)[0]
         assert sign * float(moved[tip, 0].mean()) > 0.02
@@ -114,7 +114,7 @@ def test_a_leg_swings_when_its_halves_work_against_each_other():
     positions = task.scene.bodies[0].particles.positions
     means = [positions[muscles[pair + k].particles, 0].mean() for k in (0, 1)]
     front = pair + int(np.argmax(means))
-    activation[front], activation[2 * pair + 1 - front] = 0.5, -0.5
+    activation[front], activation[2 * pair + 1 - front] = 1.0, -1.0
     model, end = simulate(task, activation, 0.1)
     leg = task.regions["leg4"]
     foot = leg[positions[leg, 1] < positions[leg, 1].min() + 0.02]

@@ -19,7 +19,9 @@ SOURCE = HERE.parents[1] / "src"
 
 def copy_of(settings: Settings, **changes) -> Settings:
     """Settings with other values, given as group=dict(name=value)."""
-    parts = {group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()}
+    parts = {
+        group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()
+    }
     return dataclasses.replace(settings, **parts)
 
 
@@ -54,7 +56,13 @@ def test_every_iteration_is_a_row(unbroken, settings):
     """metrics.csv has a row for each iteration, learning phases where they are due, and a loss that is no nan."""
     found = rows(unbroken)
     assert [int(r["iteration"]) for r in found] == list(range(5))
-    assert [bool(r["epochs"]) for r in found] == [True, True, False, True, False]  # after the first, and every 2
+    assert [bool(r["epochs"]) for r in found] == [
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]  # after the first, and every 2
     assert all(abs(float(r["loss"])) < 1 for r in found)
     assert float(found[-1]["best"]) == min(float(r["loss"]) for r in found)
     assert len((unbroken / "timing.csv").read_text().splitlines()) == 6
@@ -121,7 +129,9 @@ def simulate(*args, **kwargs):
 softmpm.simulate = simulate
 train.train(task, softmpm.build(task.scene, device="cpu"), settings, {str(out)!r})
 """
-    ends = [subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode for n in (8, 10, 999)]
+    ends = [
+        subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode for n in (8, 10, 999)
+    ]
     assert ends == [-signal.SIGKILL, -signal.SIGKILL, 0]
     assert_same(out, unbroken)
 
@@ -139,7 +149,12 @@ def test_stops_when_asked_and_goes_on(task, model, settings, unbroken, tmp_path)
     """Asked to stop after two iterations, it returns unfinished; called again, it finishes as if never stopped."""
     done = []
     result = train.train(
-        task, model, settings, tmp_path / "out", progress=lambda k, row: done.append(k), stop=lambda: len(done) == 2
+        task,
+        model,
+        settings,
+        tmp_path / "out",
+        progress=lambda k, row: done.append(k),
+        stop=lambda: len(done) == 2,
     )
     assert not result.finished and done == [0, 1]
     result = train.train(task, model, settings, tmp_path / "out")
@@ -201,7 +216,13 @@ def fails(real, at: set[int]):
     def simulate(*args, **kwargs):
         if next(calls) in at:
             raise softmpm.UnstableError(
-                "particle 3 is inverted.", kind=KIND, world=0, particle=3, substep=1, value=-1.0, limit="det F > 0"
+                "particle 3 is inverted.",
+                kind=KIND,
+                world=0,
+                particle=3,
+                substep=1,
+                value=-1.0,
+                limit="det F > 0",
             )
         return real(*args, **kwargs)
 
@@ -211,7 +232,9 @@ def fails(real, at: set[int]):
 KIND = type("Kind", (), {"name": "INVERTED"})
 
 
-def test_a_failed_simulation_is_tried_again_from_halfway_back(task, model, settings, tmp_path, monkeypatch, caplog):
+def test_a_failed_simulation_is_tried_again_from_halfway_back(
+    task, model, settings, tmp_path, monkeypatch, caplog
+):
     """After a failure policy and design go halfway back to where the last simulation went well; it is counted and logged."""
     conf = copy_of(settings, observer=dict(name="centroids"), train=dict(iterations=2))
     first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
@@ -220,15 +243,22 @@ def test_a_failed_simulation_is_tried_again_from_halfway_back(task, model, setti
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, halfway, strict=True):
         torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
-    assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"] and "Going halfway back" in caplog.text
+    assert [r["retries"] for r in rows(tmp_path / "two")] == [
+        "0",
+        "1",
+    ] and "Going halfway back" in caplog.text
 
 
 @pytest.mark.parametrize("at, iteration", [({0}, 0), (set(range(13, 99)), 2)])
-def test_a_run_that_cannot_go_on_names_the_iteration(task, model, settings, tmp_path, monkeypatch, at, iteration):
+def test_a_run_that_cannot_go_on_names_the_iteration(
+    task, model, settings, tmp_path, monkeypatch, at, iteration
+):
     """A failure without a way back ends with the iteration, the particle and advice; the run resumes from before it."""
     conf = copy_of(settings, optimizer=dict(retries=1))
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at))
-    with pytest.raises(train.TrainingError, match=f"iteration {iteration}: particle 3 is inverted. In control") as caught:
+    with pytest.raises(
+        train.TrainingError, match=f"iteration {iteration}: particle 3 is inverted. In control"
+    ) as caught:
         train.train(task, model, conf, tmp_path)
     assert caught.value.iteration == iteration == checkpoint.load(tmp_path)["iteration"]
     monkeypatch.undo()
@@ -264,13 +294,17 @@ def test_the_recording_holds_the_run(task, model, settings, tmp_path):
         frames = recording.frames(4)
         assert len(frames["time"]) == task.control_steps + 1
         iterations, losses = recording.scalars["loss"]
-    assert list(iterations) == list(range(5)) and [float(r["loss"]) for r in rows(tmp_path)] == pytest.approx(losses)
+    assert list(iterations) == list(range(5)) and [float(r["loss"]) for r in rows(tmp_path)] == pytest.approx(
+        losses
+    )
 
 
 def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path):
     """Centroids need no replay buffer: none is written, and learning columns stay empty."""
     train.train(task, model, copy_of(settings, observer=dict(name="centroids")), tmp_path)
-    assert not (tmp_path / "replay").exists() and all(r["replay"] == r["epochs"] == "" for r in rows(tmp_path))
+    assert not (tmp_path / "replay").exists() and all(
+        r["replay"] == r["epochs"] == "" for r in rows(tmp_path)
+    )
 
 
 def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):
@@ -281,7 +315,9 @@ def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):
 
 def test_control_only(task, model, settings, tmp_path):
     """With the design off the materials stay and only the policy has a gradient."""
-    conf = copy_of(settings, observer=dataclasses.asdict(ObserverConf(name="centroids")), design={"enabled": False})
+    conf = copy_of(
+        settings, observer=dataclasses.asdict(ObserverConf(name="centroids")), design={"enabled": False}
+    )
     assert not DesignConf(enabled=False).enabled
     train.train(task, model, conf, tmp_path)
     assert all(float(r["young_change"]) == 0 == float(r["gradient_design"]) for r in rows(tmp_path))

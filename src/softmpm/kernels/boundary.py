@@ -1,6 +1,6 @@
 """Between what users hold (x, F) and what the kernels hold (base node and fraction, F − I). Exact to the last digit.
 
-    base = ⌊x/dx − ½⌋,  fx = x/dx − base,  H = F − I        both ways in float64, whatever the precision of the scene.
+base = ⌊x/dx − ½⌋,  fx = x/dx − base,  H = F − I        both ways in float64, whatever the precision of the scene.
 """
 
 import functools
@@ -98,7 +98,9 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
             high_x[axis] = real(exact)
             rest_x[axis] = real(exact - wp.float64(real(exact)))
             for other in range(dim):
-                full = wp.float64(end.H[world, p][axis, other]) + wp.float64(wp.where(axis == other, 1.0, 0.0))
+                full = wp.float64(end.H[world, p][axis, other]) + wp.float64(
+                    wp.where(axis == other, 1.0, 0.0)
+                )
                 high_F[axis, other] = real(full)
                 rest_F[axis, other] = real(full - wp.float64(real(full)))
         x[world, p] = high_x

@@ -64,7 +64,11 @@ def contact(spec: Spec) -> SimpleNamespace:
                 if speed <= limit:
                     return vec()
                 along = wp.dot(adj, v_t) / speed
-                return adj * (real(1.0) - limit / speed) + (along * limit / (speed * speed)) * v_t + (c * along) * n
+                return (
+                    adj * (real(1.0) - limit / speed)
+                    + (along * limit / (speed * speed)) * v_t
+                    + (c * along) * n
+                )
         return adj
 
     @wp.func

@@ -20,7 +20,11 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def write(watch: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
-        word = (wp.int64(substep) << wp.int64(SUBSTEP_SHIFT)) | (wp.int64(kind) << wp.int64(KIND_SHIFT)) | wp.int64(particle)
+        word = (
+            (wp.int64(substep) << wp.int64(SUBSTEP_SHIFT))
+            | (wp.int64(kind) << wp.int64(KIND_SHIFT))
+            | wp.int64(particle)
+        )
         wp.atomic_min(watch, world, word)
 
     return SimpleNamespace(running=running, report=write)

@@ -20,11 +20,13 @@ from softmpm.kernels.types import Spec, solid_types, types
 @functools.lru_cache(maxsize=None)
 def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, node_vec, ivec, Scale = t.real, t.vec, t.node, t.ivec, t.Scale
+    real, vec, node_vec, Scale = t.real, t.vec, t.node, t.Scale
     Walls = solid_types(spec).Walls
     nodes = spline(spec.dim, spec.dtype)
     node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
-    inside, respond, respond_adj = (getattr(contact(spec), name) for name in ("inside", "respond", "respond_adj"))
+    inside, respond, respond_adj = (
+        getattr(contact(spec), name) for name in ("inside", "respond", "respond_adj")
+    )
     dim, walled, gravity, damping = spec.dim, bool(spec.contacts), spec.gravity, spec.damping
 
     @wp.func

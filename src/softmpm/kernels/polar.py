@@ -154,7 +154,11 @@ def _polar3(dtype: str) -> SimpleNamespace:
         R = wp.identity(n=3, dtype=real) + Q
         S = wp.transpose(R) * (wp.identity(n=3, dtype=real) + H)
         A = gap(S)
-        y = wp.inverse(A) * axl(wp.transpose(R) * adj_R) / wp.where(wp.determinant(A) == real(0.0), real(0.0), real(1.0))
+        y = (
+            wp.inverse(A)
+            * axl(wp.transpose(R) * adj_R)
+            / wp.where(wp.determinant(A) == real(0.0), real(0.0), real(1.0))
+        )
         return R * wp.skew(y)
 
     return SimpleNamespace(rotation=rotation, rotation_adj=rotation_adj)

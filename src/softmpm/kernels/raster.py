@@ -1,7 +1,7 @@
 """Mass and momentum on the grid as an observer sees them: P2G without any force, and its twin. Derivation: docs/math/transfer.md.
 
-    (p, m)_i += w m (v + C r, 1)                                                                     (O1)
-    g = p̄_i·(v + C r) + m̄_i,  x̄ += m Σ g ∇w − w Cᵀ p̄_i,  v̄ += m Σ w p̄_i,  C̄ += m Σ w p̄_i rᵀ        (O1.adj)
+(p, m)_i += w m (v + C r, 1)                                                                     (O1)
+g = p̄_i·(v + C r) + m̄_i,  x̄ += m Σ g ∇w − w Cᵀ p̄_i,  v̄ += m Σ w p̄_i,  C̄ += m Σ w p̄_i rᵀ        (O1.adj)
 """
 
 import functools
@@ -16,9 +16,23 @@ from softmpm.kernels.types import types
 @functools.lru_cache(maxsize=None)
 def raster(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
-    real, vec, mat, node_vec, Scale, Motion, MotionAdj = t.real, t.vec, t.mat, t.node, t.Scale, t.Motion, t.MotionAdj
+    real, vec, mat, node_vec, Scale, Motion, MotionAdj = (
+        t.real,
+        t.vec,
+        t.mat,
+        t.node,
+        t.Scale,
+        t.Motion,
+        t.MotionAdj,
+    )
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
-    weight, weight_slope, node_index, pack, momentum = s.weight, s.weight_slope, s.node_index, s.pack, s.momentum
+    weight, weight_slope, node_index, pack, momentum = (
+        s.weight,
+        s.weight_slope,
+        s.node_index,
+        s.pack,
+        s.momentum,
+    )
     module = f"softmpm.raster.d{dim}.{dtype}"
 
     @wp.kernel(module=module, enable_backward=False)
@@ -41,7 +55,12 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         for n in range(s.count):
             o = offset(n)
             share = m * weight(w, o)
-            wp.atomic_add(node, world, node_index(base, o, scale.shape), share * pack(v + C * (position(o) - fx), real(1.0)))
+            wp.atomic_add(
+                node,
+                world,
+                node_index(base, o, scale.shape),
+                share * pack(v + C * (position(o) - fx), real(1.0)),
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def splat_adj(
@@ -71,7 +90,9 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
             adj_i = adj_node[world, node_index(base, o, scale.shape)]
             adj_p = momentum(adj_i)
             share = weight(w, o)
-            adj_fx += (wp.dot(adj_p, v + C * r) + adj_i[dim]) * weight_slope(w, slope, o) - share * (wp.transpose(C) * adj_p)
+            adj_fx += (wp.dot(adj_p, v + C * r) + adj_i[dim]) * weight_slope(w, slope, o) - share * (
+                wp.transpose(C) * adj_p
+            )
             adj_v += share * adj_p
             B += wp.outer(share * adj_p, r)
         adj_now.fx[world, p] = adj_now.fx[world, p] + m * adj_fx

@@ -69,7 +69,9 @@ def transfer(spec: Spec) -> SimpleNamespace:
         for n in range(s.count):
             o = offset(n)
             share = weight(w, o)
-            wp.atomic_add(node, world, node_index(base, o, scale.shape), share * pack(mv + A * (position(o) - fx), m))
+            wp.atomic_add(
+                node, world, node_index(base, o, scale.shape), share * pack(mv + A * (position(o) - fx), m)
+            )
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def g2p(
@@ -134,8 +136,20 @@ def transfer(spec: Spec) -> SimpleNamespace:
 @functools.lru_cache(maxsize=None)
 def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, mat, node_vec, Scale, Motion, MotionAdj = t.real, t.vec, t.mat, t.node, t.Scale, t.Motion, t.MotionAdj
-    Solid, SolidAdj, stress_adj = solid_types(spec).Solid, solid_adj_type(spec, wanted), solid_adj(spec, wanted).stress_adj
+    real, vec, mat, node_vec, Scale, Motion, MotionAdj = (
+        t.real,
+        t.vec,
+        t.mat,
+        t.node,
+        t.Scale,
+        t.Motion,
+        t.MotionAdj,
+    )
+    Solid, SolidAdj, stress_adj = (
+        solid_types(spec).Solid,
+        solid_adj_type(spec, wanted),
+        solid_adj(spec, wanted).stress_adj,
+    )
     s, dim = spline(spec.dim, spec.dtype), spec.dim
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
@@ -218,7 +232,9 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         adj_fx = adj_then.fx[world, p]
         adj_v = adj_then.v[world, p] + (scale.dt / scale.spacing) * adj_fx
         adj_C = adj_then.C[world, p] + scale.dt * (adj_H * wp.transpose(identity() + now.H[world, p]))
-        adj_now.H[world, p] = adj_now.H[world, p] + adj_H + scale.dt * (wp.transpose(then.C[world, p]) * adj_H)  # (T3.adj)
+        adj_now.H[world, p] = (
+            adj_now.H[world, p] + adj_H + scale.dt * (wp.transpose(then.C[world, p]) * adj_H)
+        )  # (T3.adj)
         adj_B = (real(4.0) / scale.spacing) * adj_C
         w = weights(fx)
         slope = slopes(fx)

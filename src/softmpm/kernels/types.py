@@ -28,7 +28,9 @@ class Spec:
         """Name of the Warp module that holds every kernel of this specialisation."""
         features = [name for name in ("friction", "gravity", "damping") if getattr(self, name)]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
-        return ".".join(["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *self.contacts, *features])
+        return ".".join(
+            ["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *self.contacts, *features]
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,9 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         H: wp.array2d(dtype=mat)  # F - I
 
     if dtype == "float32":
-        Motion.__annotations__["fx_low"] = wp.array2d(dtype=vec)  # what rounding took off fx (compensated sum)
+        Motion.__annotations__["fx_low"] = wp.array2d(
+            dtype=vec
+        )  # what rounding took off fx (compensated sum)
 
     class MotionAdj:
         fx: wp.array2d(dtype=vec)  # ∂L/∂fx = dx ∂L/∂x
@@ -119,7 +123,9 @@ def solid_types(spec: Spec) -> SimpleNamespace:
         walls["contact"] = wp.array(dtype=wp.int32)  # index into spec.contacts
     if spec.friction:
         walls["friction"] = wp.array(dtype=t.real)
-    return SimpleNamespace(Solid=_struct("Solid", spec.module, solid), Walls=_struct("Walls", spec.module, walls))
+    return SimpleNamespace(
+        Solid=_struct("Solid", spec.module, solid), Walls=_struct("Walls", spec.module, walls)
+    )
 
 
 @functools.lru_cache(maxsize=None)
@@ -138,4 +144,6 @@ def solid_adj_type(spec: Spec, wanted: Wanted):
 
 def adj_module(spec: Spec, wanted: Wanted) -> str:
     """Name of the Warp module that holds the adjoint kernels."""
-    return ".".join([spec.module, "adj", *(name for name in ("material", "activation") if getattr(wanted, name))])
+    return ".".join(
+        [spec.module, "adj", *(name for name in ("material", "activation") if getattr(wanted, name))]
+    )

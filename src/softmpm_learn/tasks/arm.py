@@ -28,9 +28,9 @@ class ArmConf(TaskConf):
     name: str = "arm"
     gravity: float = 0.0
     """Downward acceleration [m/s²]; 0: the arm lies on a table."""
-    damping: float = 4.0
+    damping: float = 6.0
     """Rate at which velocity decays [1/s]: an arm that swings for long is hard to stop at its goal."""
-    strength: float = 6e3
+    strength: float = 4e3
     """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
     """Where the tip should be when the episode ends: x and y [m]; at rest it is at (0.45, 0.41)."""
@@ -50,7 +50,7 @@ class ArmConf(TaskConf):
 
 
 def arm(conf: ArmConf) -> Task:
-    """Build the arm: about 740 particles as a draft, 1,900 at the standard resolution."""
+    """Build the arm: about 700 particles as a draft, 1,700 at the standard resolution."""
     root = 3 * conf.spacing  # so much of the arm is inside the clamp
     way = np.array([-root / LENGTH, 0.0, 1.0])
     line = np.array(BASE) + way[:, None] * np.array([0.0, LENGTH])

@@ -27,7 +27,9 @@ def _map(function, count: int, out, *arguments):
     elif count == 3:
 
         @wp.kernel(module="unique", enable_backward=False)
-        def kernel(x: wp.array(dtype=A), y: wp.array(dtype=B), z: wp.array(dtype=C), result: wp.array(dtype=out)):
+        def kernel(
+            x: wp.array(dtype=A), y: wp.array(dtype=B), z: wp.array(dtype=C), result: wp.array(dtype=out)
+        ):
             i = wp.tid()
             result[i] = function(x[i], y[i], z[i])
     else:
@@ -52,7 +54,10 @@ def apply(function, out, out_shape, *arguments: tuple[torch.Tensor, object]) -> 
     wp.init()
     kernel = _map(function, len(tensors), out, *dtypes)
     result = torch.empty(len(tensors[0]), *out_shape, dtype=tensors[0].dtype, device=tensors[0].device)
-    arrays = [wp.from_torch(t.contiguous(), dtype=dtype) for t, dtype in zip((*tensors, result), (*dtypes, out), strict=True)]
+    arrays = [
+        wp.from_torch(t.contiguous(), dtype=dtype)
+        for t, dtype in zip((*tensors, result), (*dtypes, out), strict=True)
+    ]
     wp.launch(kernel, dim=len(result), inputs=arrays, device=wp.device_from_torch(result.device))
     return result
 
@@ -64,7 +69,9 @@ def special_deformations(dim: int) -> dict[str, torch.Tensor]:
     def rotation():
         q, r = torch.linalg.qr(torch.randn(dim, dim, generator=generator, dtype=torch.float64))
         q = q * torch.sign(torch.diagonal(r))
-        return q * torch.linalg.det(q) if dim % 2 else torch.cat([q[:, :-1], q[:, -1:] * torch.linalg.det(q)], 1)
+        return (
+            q * torch.linalg.det(q) if dim % 2 else torch.cat([q[:, :-1], q[:, -1:] * torch.linalg.det(q)], 1)
+        )
 
     eye = torch.eye(dim, dtype=torch.float64)
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0][:dim], dtype=torch.float64))
@@ -77,9 +84,13 @@ def special_deformations(dim: int) -> dict[str, torch.Tensor]:
         "uniform stretch": 1.7 * rotation(),
         "equal stretches": rotation() @ equal @ rotation(),
         "equal stretches along the axes": equal,
-        "slender": rotation() @ torch.diag(torch.tensor([8.0, 0.2, 0.1][:dim], dtype=torch.float64)) @ rotation(),
+        "slender": rotation()
+        @ torch.diag(torch.tensor([8.0, 0.2, 0.1][:dim], dtype=torch.float64))
+        @ rotation(),
         "inverted": rotation() @ inverted @ rotation(),
-        "nearly flat": rotation() @ torch.diag(torch.tensor([1.0, 1e-7, 0.8][:dim], dtype=torch.float64)) @ rotation(),
+        "nearly flat": rotation()
+        @ torch.diag(torch.tensor([1.0, 1e-7, 0.8][:dim], dtype=torch.float64))
+        @ rotation(),
         "small strain": eye + 1e-6 * torch.randn(dim, dim, generator=generator, dtype=torch.float64),
         "random": torch.randn(dim, dim, generator=generator, dtype=torch.float64) + 2 * eye,
     }

@@ -56,7 +56,9 @@ def test_small_strain_keeps_its_digits_in_float32(law, dim):
     """At strain 1e-6 the stress is Hooke's to 1e-5 relative: F − I and J − 1 are never formed by subtraction."""
     H = 1e-6 * torch.randn(10, dim, dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     mat = types(dim, "float32").mat
-    got = apply(elasticity(dim, "float32").stress[law], mat, (dim, dim), *arguments(dim, "float32", H)).double()
+    got = apply(
+        elasticity(dim, "float32").stress[law], mat, (dim, dim), *arguments(dim, "float32", H)
+    ).double()
     trace = H.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     hooke = MU * (H + H.mT) + LAM * trace * torch.eye(dim, dtype=torch.float64)
     assert ((got - hooke).abs().max() / hooke.abs().max()).item() < 1e-5
@@ -83,7 +85,9 @@ def test_stress_adj_is_the_finite_difference(law, dim, device):
         out[dim * dim + 1] = adj.lam
         return out
 
-    got = apply(flattened, flat, (dim * dim + 2,), *arguments(dim, "float64", H.to(device)), (W.to(device), t.mat)).cpu()
+    got = apply(
+        flattened, flat, (dim * dim + 2,), *arguments(dim, "float64", H.to(device)), (W.to(device), t.mat)
+    ).cpu()
     for n, (name, F) in enumerate(given.items()):
         F, w = F.numpy(), W[n].numpy()
 
@@ -130,4 +134,6 @@ def test_muscle_stress_and_its_adjoint(dim, device):
     adj = apply(flattened, flat, (dim * dim + 1,), *given, (W.to(device), t.mat)).cpu()
     F, p = (eye + H).requires_grad_(), pull.clone().requires_grad_()
     want = torch.autograd.grad((W * stress(F, p)).sum(), (F, p))
-    torch.testing.assert_close(adj, torch.cat([want[0].flatten(1), want[1][:, None]], 1), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        adj, torch.cat([want[0].flatten(1), want[1][:, None]], 1), rtol=1e-12, atol=1e-12
+    )

@@ -57,7 +57,9 @@ def test_rotation_adj_is_the_finite_difference(dim, device):
     W = torch.randn(H.shape, generator=generator, dtype=torch.float64)
     blocks = polar(dim, "float64")
     Q = rotation(dim, "float64", H.to(device))
-    got = apply(blocks.rotation_adj, mat, (dim, dim), (H.to(device), mat), (Q, mat), (W.to(device), mat)).cpu()
+    got = apply(
+        blocks.rotation_adj, mat, (dim, dim), (H.to(device), mat), (Q, mat), (W.to(device), mat)
+    ).cpu()
     for n, (name, F) in enumerate(points.items()):
         want = torch.zeros(dim, dim, dtype=torch.float64)
         for i in range(dim):

@@ -12,7 +12,7 @@ from softmpm.kernels.types import types
 def stencil(dim: int, fx: torch.Tensor, device: str):
     """Weights (particle, node), their derivative (particle, node, dim), r in cells (particle, node, dim)."""
     t, s = types(dim, "float64"), spline(dim, "float64")
-    count, vec, ivec, real = s.count, t.vec, t.ivec, t.real
+    count, vec, _ivec, _real = s.count, t.vec, t.ivec, t.real
     offset, position, weights, slopes, weight, weight_slope = (
         getattr(s, name) for name in ("offset", "position", "weights", "slopes", "weight", "weight_slope")
     )
@@ -67,7 +67,10 @@ def test_moments(dim, device):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_slopes_are_the_derivative(dim):
     """Central differences of the weights; piecewise quadratic, so exact but for rounding."""
-    fx, h = 0.6 + 0.8 * torch.rand(10, dim, generator=torch.Generator().manual_seed(1), dtype=torch.float64), 1e-3
+    fx, h = (
+        0.6 + 0.8 * torch.rand(10, dim, generator=torch.Generator().manual_seed(1), dtype=torch.float64),
+        1e-3,
+    )
     _, slope, _ = stencil(dim, fx, "cpu")
     for axis in range(dim):
         step = torch.zeros(dim, dtype=torch.float64)

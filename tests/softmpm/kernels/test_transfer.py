@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from helpers import assert_relative, busy_inputs, busy_scene
 
 import softmpm
-from helpers import assert_relative, busy_inputs, busy_scene
 from softmpm import reference
 from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj, lame
 from softmpm.kernels.types import Wanted
@@ -26,7 +26,9 @@ class Bench:
         params = softmpm.Params(*(inputs[name].detach() for name in softmpm.Params._fields))
         mu, lam = lame(params)
         pull = (inputs["activation"].detach()[0] * self.model.strength).contiguous()
-        solid = Solid((params.density * self.model.volume).contiguous(), mu.contiguous(), lam.contiguous(), pull)
+        solid = Solid(
+            (params.density * self.model.volume).contiguous(), mu.contiguous(), lam.contiguous(), pull
+        )
         self.step = Substep(self.model, solid.struct(self.model))
         self.motion, self.end = Motion.empty(self.model), Motion.empty(self.model)
         self.now, self.then = self.motion.struct(self.model), self.end.struct(self.model)
@@ -42,7 +44,9 @@ class Bench:
         mu, lam = reference.lame(c["young"], c["poisson"])
         mass = c["density"] * volume
         tau = reference.stress(self.scene, c["F"], mu, lam, c["activation"][0])
-        affine = mass[..., None, None] * c["C"] - (4 * self.scene.dt / self.dx**2 * volume)[:, None, None] * tau
+        affine = (
+            mass[..., None, None] * c["C"] - (4 * self.scene.dt / self.dx**2 * volume)[:, None, None] * tau
+        )
         return reference.p2g(self.scene, c["x"], mass, mass[..., None] * c["v"], affine)
 
 
@@ -70,7 +74,9 @@ def test_grid_velocity(bench):
 def test_g2p(bench):
     """v, C, x and F after the substep (T2, T3)."""
     bench.step.advance(bench.now, bench.then, 0)
-    v, C = reference.g2p(bench.scene, bench.cpu["x"], reference.grid_velocity(bench.scene, *bench.reference_p2g()))
+    v, C = reference.g2p(
+        bench.scene, bench.cpu["x"], reference.grid_velocity(bench.scene, *bench.reference_p2g())
+    )
     end = bench.step.leave(bench.then)
     dt, F = bench.scene.dt, bench.cpu["F"]
     for name, got, want in zip("xvCF", end, (bench.cpu["x"] + dt * v, v, C, F + dt * C @ F), strict=True):
@@ -150,7 +156,9 @@ def test_twins_add_into_their_outputs(bench):
     then.flat.copy_(bench.random(then.flat, 6))
     once = None
     for _ in range(2):
-        step.adjoint(EVERYTHING, bench.now, bench.then, then.struct(model), now.struct(model), solid.struct(model), 0)
+        step.adjoint(
+            EVERYTHING, bench.now, bench.then, then.struct(model), now.struct(model), solid.struct(model), 0
+        )
         once = now.flat.clone() if once is None else once
     torch.testing.assert_close(now.flat, 2 * once, rtol=1e-12, atol=1e-12)
 
