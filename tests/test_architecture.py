@@ -9,7 +9,7 @@ SRC = Path(__file__).parents[1] / "src"
 ORDER = """scene state watch silhouette surface shapes checks stability memory
     kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact kernels.grid
     kernels.failure kernels.transfer kernels.boundary kernels.raster
-    model buffers step rollout raster autograd tape reference layout playback recording appearance rerun_file __main__""".split()
+    model buffers step rollout raster autograd tape reference layout playback recording appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
     "h5py": {"layout", "recording", "playback"},

@@ -187,7 +187,8 @@ class Model:
             f"  damping    {has(spec.damping)}",
             "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
             f"  dt         {self.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
-            f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, {mib['backward']} at the peak",
+            f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, "
+            f"{mib['backward']} at the peak",
         ]
         return "\n".join(lines)
 

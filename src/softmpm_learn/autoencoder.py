@@ -35,6 +35,10 @@ class Encoder(nn.Module):
     the latent of a fresh network and of a trained one differ tenfold, and a policy between them saturates.
     """
 
+    scale: Tensor
+    centre: Tensor
+    spread: Tensor
+
     def __init__(
         self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float
     ):

@@ -20,6 +20,8 @@ class Design(nn.Module):
         regions: Regions of the task, for ``per="region"``; particles of none share a value of their own.
     """
 
+    group: Tensor
+
     def __init__(self, conf: DesignConf, model: Model, regions: dict[str, np.ndarray]):
         super().__init__()
         self.start = model.params()

@@ -48,6 +48,9 @@ class Centroids(Observer):
     body lengths per second. So the features do not tell where the robot is.
     """
 
+    mean: Tensor
+    rest: Tensor
+
     def __init__(self, model: Model, regions: Sequence[np.ndarray], body_length: float):
         super().__init__()
         mean = torch.zeros(len(regions), model.particle_count, dtype=model.dtype)

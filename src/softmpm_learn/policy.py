@@ -15,6 +15,8 @@ from softmpm_learn.settings import PolicyConf
 class Clock(nn.Module):
     """sin and cos of 2π h t / period for h = 1 … harmonics."""
 
+    rate: Tensor
+
     def __init__(self, period: float, harmonics: int):
         super().__init__()
         self.register_buffer("rate", 2 * math.pi / period * torch.arange(1, harmonics + 1), persistent=False)
@@ -28,6 +30,9 @@ class Clock(nn.Module):
 class Goal(nn.Module):
     """A goal [m] as its place in the box that goals are drawn from, in [-1, 1] along each axis."""
 
+    centre: Tensor
+    inverse: Tensor
+
     def __init__(self, centre: Tensor, spread: Tensor):
         super().__init__()
         self.register_buffer("centre", centre, persistent=False)
@@ -39,7 +44,7 @@ class Goal(nn.Module):
 
 
 class Feedback(nn.Module):
-    """tanh of a network of features, clock and goal (Spielberg et al. 2021) or tanh(Wz + b), without hidden layers (Hu et al. 2019)."""
+    """tanh of a network of features, clock and goal (Spielberg et al. 2021), or tanh(Wz + b) if it has no hidden layers."""
 
     def __init__(
         self,

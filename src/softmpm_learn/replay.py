@@ -120,9 +120,10 @@ def _read(path: Path) -> np.ndarray:
             if not isinstance(file.get("velocity", getlink=True), h5py.HardLink):
                 raise ValueError("no plain dataset 'velocity'")
             data = file["velocity"]
-            plain = isinstance(data, h5py.Dataset) and not data.is_virtual and data.external is None
-            if not plain or data.dtype != np.float32 or data.nbytes > 1000 * max(path.stat().st_size, 2**20):
-                raise ValueError("not a plain float32 dataset of a believable size")
+            if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external is not None:
+                raise ValueError("its dataset is not plain")
+            if data.dtype != np.float32 or data.nbytes > 1000 * max(path.stat().st_size, 2**20):
+                raise ValueError(f"{data.dtype} of {data.nbytes} bytes is not what this file could hold")
             return data[()]
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path} is not a readable simulation of the replay buffer: {error}") from error

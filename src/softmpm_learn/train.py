@@ -12,7 +12,7 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -142,7 +142,7 @@ def optimise(run: Run, recorder: softmpm.Recorder | None, seconds: dict[str, flo
         run.best = {"loss": row["loss"], "iteration": run.iteration, **run.actor()}
     run.keep_safe()
     run.optimizer.step()
-    if run.learner:
+    if run.learner and episode.seen is not None:
         run.learner.watch(run.iteration * run.model.worlds, episode.seen)
     return row | {"best": run.best["loss"]}
 
@@ -175,7 +175,10 @@ def differentiate(run: Run, episode: Episode) -> dict[str, float]:
     gradients = torch.autograd.grad(episode.loss.mean(), policy + design)
     for parameter, gradient in zip(policy + design, gradients, strict=True):
         parameter.grad = gradient
-    lengths = {"gradient_policy": _length(policy), "gradient_design": _length(design)}
+    lengths = {
+        "gradient_policy": _length(gradients[: len(policy)]),
+        "gradient_design": _length(gradients[len(policy) :]),
+    }
     loss = episode.loss.mean().item()
     if not all(math.isfinite(value) for value in (loss, *lengths.values())):
         raise TrainingError(run.iteration, f"the loss or its gradient is not finite: {loss:g}, {lengths}.")
@@ -186,8 +189,8 @@ def differentiate(run: Run, episode: Episode) -> dict[str, float]:
     return lengths | {"clipped": clipped}
 
 
-def _length(parameters: list[Tensor]) -> float:
-    return math.sqrt(sum(p.grad.double().square().sum().item() for p in parameters))
+def _length(gradients: Sequence[Tensor]) -> float:
+    return math.sqrt(sum(g.double().square().sum().item() for g in gradients))
 
 
 def learn(run: Run, seconds: dict[str, float]) -> dict[str, float]:
