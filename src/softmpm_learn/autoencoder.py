@@ -165,12 +165,12 @@ def train_autoencoder(
     kl = conf.kl if conf.variational else None
     best_loss, best, training, waited, epochs = float("inf"), None, float("nan"), 0, 0
 
-    def judge() -> float:
+    def judge(pictures: Tensor) -> float:
         with torch.no_grad():
-            return autoencoder.loss(validation, kl).item()
+            return autoencoder.loss(pictures, kl).item()
 
     if validation is not None:
-        best_loss, best = judge(), copy.deepcopy(autoencoder.state_dict())
+        best_loss, best = judge(validation), copy.deepcopy(autoencoder.state_dict())
     while epochs < conf.epochs and waited < conf.patience:
         losses = []
         for _ in range(conf.batches):
@@ -182,7 +182,7 @@ def train_autoencoder(
         training, epochs = torch.stack(losses).mean().item(), epochs + 1
         if validation is None:
             continue
-        now = judge()
+        now = judge(validation)
         if now < best_loss or not conf.early_stopping:
             best_loss, best, waited = now, copy.deepcopy(autoencoder.state_dict()), 0
         else:

@@ -28,7 +28,7 @@ class CheckpointError(RuntimeError):
 
 
 def save(folder: Path, content: dict) -> Path:
-    """Write ``folder/checkpoint.pt``; the one before it becomes ``checkpoint.previous.pt``.
+    """Write ``folder/checkpoint.pt``; the one before it, if it is intact, becomes ``checkpoint.previous.pt``.
 
     Args:
         content: Tensors, numbers, strings, lists and dicts: what ``torch.load(weights_only=True)`` reads.
@@ -42,7 +42,7 @@ def save(folder: Path, content: dict) -> Path:
         file.write(body + _MARK + hashlib.sha256(body).hexdigest().encode())
         file.flush()
         os.fsync(file.fileno())
-    if path.exists():
+    if path.exists() and _intact(path.read_bytes()):
         os.replace(path, folder / PREVIOUS)
     os.replace(draft, path)
     _sync(folder)
@@ -79,8 +79,7 @@ def read(path: Path) -> dict:
         data = path.read_bytes()
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror}.") from error
-    body, footer = data[:-_FOOTER], data[-_FOOTER:]
-    if footer != _MARK + hashlib.sha256(body).hexdigest().encode():
+    if not _intact(data):
         raise CheckpointError(f"{path} is damaged: its SHA-256 does not match.")
     try:
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
@@ -89,6 +88,11 @@ def read(path: Path) -> dict:
     if content.get("format") != FORMAT:
         raise CheckpointError(f"{path} has format {content.get('format')!r}, this version reads {FORMAT}.")
     return content
+
+
+def _intact(data: bytes) -> bool:
+    body, footer = data[:-_FOOTER], data[-_FOOTER:]
+    return footer == _MARK + hashlib.sha256(body).hexdigest().encode()
 
 
 @contextmanager

@@ -83,9 +83,8 @@ class Replay:
         )
 
     def load(self, ids: list[int]) -> None:
-        """Hold exactly these simulations, from the folder; files of others are removed."""
+        """Hold exactly these simulations, from the folder."""
         self._pictures = {number: torch.from_numpy(_read(self._path(number))) for number in ids}
-        self.prune(ids)
 
     def prune(self, keep: list[int]) -> None:
         """Remove the files of simulations that are not in ``keep``, and what an interrupted write left behind."""

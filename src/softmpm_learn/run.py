@@ -129,6 +129,10 @@ class Run:
         place = torch.rand(self.model.worlds, self.model.dim, generator=self.generator, dtype=spread.dtype)
         return self._goal.centre + spread * (2 * place.to(spread.device) - 1)
 
+    def middle_goals(self) -> Tensor | None:
+        """As :meth:`draw_goals`, without chance: the middle of the box."""
+        return None if self._goal is None else self._goal.centre.expand(self.model.worlds, -1)
+
     def actor(self) -> dict:
         """Copies of what decides how the robot moves: policy, design and what the policy sees through."""
         parts = {"observer": self.observer, "policy": self.policy, "design": self.design}

@@ -82,7 +82,7 @@ class PolicyConf:
     def __post_init__(self):
         _one_of("policy.name", self.name, POLICIES)
         _positive("policy", self, "period", "harmonics")
-        if self.name == "mlp" and (not self.hidden or min(self.hidden) < 1):
+        if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
         if self.knots < 2:
             raise ValueError(f"policy.knots must be at least 2, got {self.knots}.")

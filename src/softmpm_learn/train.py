@@ -95,17 +95,17 @@ def train(
         if checkpoint.exists(out):
             run.load_state_dict(checkpoint.load(out))
             logger.info("Going on after iteration %d of %s.", run.iteration, out)
-        elif run.learner is not None:
-            run.learner.replay.prune([])
         return _loop(run, out, progress, stop)
 
 
 def _loop(run: Run, out: Path, progress, stop) -> Result:
     metrics = Table(out / "metrics.csv", METRICS, rows=run.iteration)
     timing = Table(out / "timing.csv", TIMING, rows=run.iteration)
-    last, seconds, named = run.settings.train.iterations, dict.fromkeys(TIMING, 0.0), []
+    last, seconds = run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
+    named = run.learner.replay.ids if run.learner else []
     with _recorder(run, out) as recorder:
-        named = _save(run, out, named)
+        if run.iteration == 0:
+            named = _save(run, out, named)
         while run.iteration < last and not stop():
             k = run.iteration
             row = optimise(run, recorder, seconds) | learn(run, seconds)
@@ -211,7 +211,15 @@ def play_best(run: Run, recorder: softmpm.Recorder) -> None:
     now = run.actor()
     run.load_actor(run.best)
     with _record(run, recorder, run.iteration, of=run.best["iteration"], kind="best") as on_frame:
-        run_episode(run.task, run.model, run.observer, run.policy, run.params(), on_frame=on_frame)
+        run_episode(
+            run.task,
+            run.model,
+            run.observer,
+            run.policy,
+            run.params(),
+            goal=run.middle_goals(),
+            on_frame=on_frame,
+        )
     run.load_actor(now)
 
 

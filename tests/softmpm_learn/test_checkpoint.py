@@ -55,6 +55,14 @@ def test_falling_back_is_said(tmp_path, caplog):
         checkpoint.load(tmp_path)
 
 
+def test_a_damaged_checkpoint_does_not_push_out_a_good_one(tmp_path):
+    """Saving over a damaged file keeps the intact one before it as the previous."""
+    checkpoint.save(tmp_path, content(1.0))
+    checkpoint.save(tmp_path, content(2.0)).write_bytes(b"spoilt")
+    checkpoint.save(tmp_path, content(3.0)).write_bytes(b"spoilt too")
+    assert same(checkpoint.load(tmp_path), content(1.0))
+
+
 @pytest.mark.parametrize("call", ["replace", "fsync"])
 @pytest.mark.parametrize("nth", [0, 1, 2])
 def test_a_kill_at_any_step_of_writing_loses_one_checkpoint_at_most(tmp_path, monkeypatch, call, nth):

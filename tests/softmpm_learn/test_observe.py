@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers import busy_scene
 
 import softmpm
 from softmpm_learn.observe import Centroids, Latent, Picture, clusters
@@ -63,6 +64,17 @@ def test_picture_follows_the_robot(exact):
         x=state.x + 0.4 * torch.randn(state.x.shape, generator=torch.Generator().manual_seed(1)).double()
     )
     assert follow(exact, wide).isfinite().all()
+
+
+def test_picture_in_three_dimensions():
+    """A 3D grid gives a 3D picture, components first, with the velocity of a uniform motion where the robot is."""
+    model = softmpm.build(busy_scene(3), device="cpu", worlds=2)
+    rest = model.rest()
+    velocity = torch.tensor([0.3, -0.2, 0.1])
+    picture = Picture(model, nodes=6, follow=False)(model, rest._replace(v=rest.v + velocity))
+    assert picture.shape == (2, 3, 6, 6, 5)
+    brightest = picture[0].flatten(1)[:, picture[0, 0].argmax()]
+    torch.testing.assert_close(brightest / brightest.norm(), velocity / velocity.norm(), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["centroids", "latent"])

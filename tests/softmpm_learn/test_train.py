@@ -136,13 +136,16 @@ train.train(task, softmpm.build(task.scene, device="cpu"), settings, {str(out)!r
     assert_same(out, unbroken)
 
 
-def test_falls_back_to_the_previous_checkpoint(task, model, settings, unbroken, tmp_path):
-    """With the newest checkpoint damaged, the run goes on from the one before and ends the same."""
+def test_falls_back_to_the_previous_checkpoint(task, model, settings, tmp_path):
+    """With the newest checkpoint damaged, the run goes on from the one before and ends the same; the replay buffer too."""
+    small = copy_of(settings, learning=dict(simulations=2))
+    train.train(task, model, small, tmp_path / "small")
     out = tmp_path / "out"
-    train.train(task, model, copy_of(settings, train=dict(iterations=3)), out)
+    train.train(task, model, copy_of(small, train=dict(iterations=3)), out)
+    train.train(task, model, copy_of(small, train=dict(iterations=3)), out)  # resumed, nothing to do
     (out / checkpoint.NAME).write_bytes(b"spoilt")
-    train.train(task, model, settings, out)
-    assert_same(out, unbroken)
+    train.train(task, model, small, out)
+    assert_same(out, tmp_path / "small")
 
 
 def test_stops_when_asked_and_goes_on(task, model, settings, unbroken, tmp_path):
@@ -197,7 +200,7 @@ def test_each_refinement_can_be_switched_off(task, model, settings, tmp_path):
 def test_random_goals_are_drawn_anew(task, settings, tmp_path):
     """Each world and iteration has its own goal inside the box; a task without a goal refuses."""
     model = softmpm.build(task.scene, device="cpu", worlds=3)
-    conf = copy_of(settings, train=dict(worlds=3, iterations=2, goal_spread=[0.1, 0.0]))
+    conf = copy_of(settings, train=dict(worlds=3, iterations=2, goal_spread=[0.1, 0.0], record_every=1))
     run = train.Run(task, model, conf, tmp_path)
     goals = torch.stack([run.draw_goals() for _ in range(200)])
     assert goals[..., 0].unique().numel() == 600 and ((goals[..., 0] - 0.6).abs() <= 0.1).all()
@@ -321,3 +324,18 @@ def test_control_only(task, model, settings, tmp_path):
     assert not DesignConf(enabled=False).enabled
     train.train(task, model, conf, tmp_path)
     assert all(float(r["young_change"]) == 0 == float(r["gradient_design"]) for r in rows(tmp_path))
+
+
+def test_double_precision(task, settings, tmp_path):
+    """A float64 model trains in float64 throughout; its first loss is the float32 one to single precision."""
+    model = softmpm.build(task.scene, device="cpu", dtype=torch.float64)
+    result = train.train(task, model, settings, tmp_path / "double")
+    assert all(p.dtype == torch.float64 for p in result.run.parameters)
+    train.train(
+        task,
+        softmpm.build(task.scene, device="cpu"),
+        copy_of(settings, train=dict(iterations=1)),
+        tmp_path / "single",
+    )
+    double, single = (float(rows(tmp_path / name)[0]["loss"]) for name in ("double", "single"))
+    assert double != single and double == pytest.approx(single, rel=1e-3)
