@@ -1,5 +1,7 @@
 """The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -17,7 +19,10 @@ _SECOND = (
 )
 
 
-@torch.compiler.disable
+_opaque: Any = torch.compiler.disable
+"""What torch.compile calls instead of tracing it. On inner functions: it would hide the signature of a public one."""
+
+
 def simulate(
     model: Model, start: State, activation: Tensor | None, params: Params, *, substeps: int
 ) -> State:
@@ -41,6 +46,11 @@ def simulate(
         ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
         UnstableError: A particle became non-finite, inverted or left the grid; names world, particle, substep and limit.
     """
+    return _simulate(model, start, activation, params, substeps)
+
+
+@_opaque
+def _simulate(model: Model, start: State, activation: Tensor | None, params: Params, substeps: int) -> State:
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
@@ -65,7 +75,6 @@ def simulate(
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
 
 
-@torch.compiler.disable
 def rasterize(model: Model, state: State) -> GridField:
     """Mass and velocity of the particles on the grid, as an observer sees them: P2G without forces (APIC, Jiang et al. 2015).
 
@@ -79,12 +88,17 @@ def rasterize(model: Model, state: State) -> GridField:
     Raises:
         ValueError, UnstableError: As :func:`simulate`, for the state.
     """
+    return _rasterize(model, state)
+
+
+@_opaque
+def _rasterize(model: Model, state: State) -> GridField:
     state = _cast(model, state)
     check_state(model, state)
     return GridField(*_Rasterize.apply(model, state.x, state.v, state.C))
 
 
-def _cast(model: Model, value):
+def _cast(model: Model, value: Any) -> Any:
     """Under autocast, tensors in the model's precision: a policy then gives half precision without being asked."""
     if value is None or not torch.is_autocast_enabled(model.device.type):
         return value
@@ -147,7 +161,7 @@ class _SimulateBackward(torch.autograd.Function):
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(model, x, v, C):
-        return rasterize_nodes(model, State(x, v, C, None))
+        return rasterize_nodes(model, State(x, v, C, F=C))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -165,7 +179,7 @@ class _RasterizeBackward(torch.autograd.Function):
     @staticmethod
     def forward(model, adj_mass, adj_velocity, x, v, C, mass, velocity):
         adj = rasterize_nodes_adj(
-            model, State(x, v, C, None), GridField(mass, velocity), GridField(adj_mass, adj_velocity)
+            model, State(x, v, C, F=C), GridField(mass, velocity), GridField(adj_mass, adj_velocity)
         )
         return adj.x, adj.v, adj.C
 

@@ -116,7 +116,7 @@ class Solid:
         solid.volume = view(model.volume, t.real)
         if len(model.spec.laws) > 1:
             solid.law = view(model.law, wp.int32)
-        if model.spec.muscle_slots:
+        if self.pull is not None:
             solid.muscle = view(model.muscle_slots, wp.int32)
             solid.fibre = view(model.fibre, t.vec)
             solid.pull = view(self.pull, t.real)
@@ -152,6 +152,6 @@ class SolidAdj:
         if self.wanted.material:
             for name in ("mass", "mu", "lam"):
                 setattr(struct, name, view(getattr(self, name), t.real))
-        if self.wanted.activation:
+        if self.slot is not None:
             struct.pull = view(self.slot, t.real)
         return struct

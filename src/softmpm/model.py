@@ -115,7 +115,7 @@ class Model:
         scale.shape = t.ivec(*scene.grid.shape)
         scale.dt = scene.dt
         scale.spacing = scale.exact_spacing = scene.grid.spacing
-        scale.gravity = t.vec(*scene.gravity)
+        scale.gravity = t.vec(*(scene.gravity or ()))
         scale.decay = math.exp(-scene.damping * scene.dt)
         return scale
 
@@ -216,6 +216,6 @@ def _spec(scene: Scene, dtype: torch.dtype, slots: int) -> Spec:
         muscle_slots=slots,
         contacts=tuple(kind for kind in CONTACTS if kind in contacts),
         friction=any(wall.friction > 0 for wall in scene.walls),
-        gravity=any(g != 0 for g in scene.gravity),
+        gravity=any(g != 0 for g in scene.gravity or ()),
         damping=scene.damping > 0,
     )

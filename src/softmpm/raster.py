@@ -51,4 +51,6 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
     mass, nodes = _arguments(model, adj_node)
     kernel = raster(model.dim, model.spec.dtype).splat_adj
     step.launch(kernel, step.particles, model.scale, mass, now, nodes, adj_state.struct(model))
-    return State(adj_state.fx / model.scene.grid.spacing, adj_state.v, adj_state.C, None)
+    return State(
+        adj_state.fx / model.scene.grid.spacing, adj_state.v, adj_state.C, F=torch.zeros_like(adj_state.C)
+    )

@@ -1,6 +1,5 @@
 """Many substeps: what is kept on the way forward, what is computed again on the way back, and how failures are raised."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -50,9 +49,9 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     step.enter(start, slots[0])
     for s in range(horizon.total):
         now, then = (s, s + 1) if keep_all else (s % 2, (s + 1) % 2)
-        if row is not None and s % horizon.substeps == 0:
+        if row is not None and pull is not None and s % horizon.substeps == 0:
             row.copy_(pull[s // horizon.substeps])
-        if keep and not keep_all and s % schedule.segment == 0:
+        if kept is not None and not keep_all and s % schedule.segment == 0:
             kept[s // schedule.segment].copy_(buffers[now])
         step.advance(slots[now], slots[then], s)
     end = step.leave(slots[horizon.total if keep_all else horizon.total % 2])
@@ -81,7 +80,7 @@ def rollout_adj(
     row = None if pull is None else torch.empty_like(pull[0])
     step = Substep(model, Solid(solid.mass, solid.mu, solid.lam, row).struct(model))
     adj_solid = SolidAdj.zeros(model, wanted)
-    adj_pull = torch.zeros_like(pull) if wanted.activation else None
+    adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
     adjoints = MotionAdj.zeros(model), MotionAdj.zeros(model)
     structs = [adj.struct(model) for adj in adjoints]
     adj_solid_struct = adj_solid.struct(model)
@@ -94,14 +93,14 @@ def rollout_adj(
     segments = _Segments(model, horizon, kept, step, pull, row, schedule)
     for s in reversed(range(horizon.total)):
         now_slot, then_slot = segments.states(s)
-        if row is not None:
+        if row is not None and pull is not None:
             row.copy_(pull[s // horizon.substeps])
         clear(adjoints[s % 2].flat)
         back = horizon.total - 1 - s  # the first failure on the way back has the smallest word
         step.adjoint(
             wanted, now_slot, then_slot, structs[(s + 1) % 2], structs[s % 2], adj_solid_struct, back
         )
-        if wanted.activation and s % horizon.substeps == 0:
+        if adj_pull is not None and s % horizon.substeps == 0:
             step.collect_pull(adj_solid, adj_pull[s // horizon.substeps])
     raise_gradient_failure(model, horizon, step.watch_words, adj_end)
     start = adjoints[0]
@@ -123,7 +122,7 @@ class _Segments:
         count = schedule.recomputed or schedule.kept
         self.buffers = Motion.empty(model, count) if schedule.recomputed else kept
         self.slots = [self.buffers[i].struct(model) for i in range(count)]
-        self.first = 0 if schedule.recomputed == 0 else math.inf
+        self.first = 0 if schedule.recomputed == 0 else horizon.total
 
     def states(self, s: int):
         if s < self.first:
@@ -140,7 +139,7 @@ class _Segments:
             self.step.advance(self.slots[s - self.first], self.slots[s - self.first + 1], s)
 
 
-def raise_failure(model: Model, watch: Tensor, end: State | None) -> None:
+def raise_failure(model: Model, watch: Tensor, end: State) -> None:
     """Raise what the kernels reported, if anything; waits for the device."""
     words = watch.tolist()
     failed = [world for world, word in enumerate(words) if word != NEVER]
@@ -155,9 +154,13 @@ def raise_failure(model: Model, watch: Tensor, end: State | None) -> None:
     when = "in the start state" if kind is Kind.START else f"at {time}"
     raise UnstableError(
         f"{where} {value} {when}; {limit}. {advice}{others}",
-        **dict(
-            kind=kind, world=world, particle=particle, substep=substep, value=value, limit=limit, state=end
-        ),
+        kind=kind,
+        world=world,
+        particle=particle,
+        substep=substep,
+        value=value,
+        limit=limit,
+        state=end,
     )
 
 
@@ -178,11 +181,16 @@ def raise_gradient_failure(model: Model, horizon: Horizon, watch: Tensor, adj_en
     raise UnstableError(
         f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite at substep "
         f"{substep} of {horizon.total}, counted from the start of the call; {limit}. {cause}.",
-        **dict(kind=kind, world=world, particle=particle, substep=substep, value="not finite", limit=limit),
+        kind=kind,
+        world=world,
+        particle=particle,
+        substep=substep,
+        value="not finite",
+        limit=limit,
     )
 
 
-def _explain(model: Model, kind: Kind, world: int, particle: int, end: State | None) -> tuple[str, str, str]:
+def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) -> tuple[str, str, str]:
     """What came, what must hold, what to do."""
     dx = model.scene.grid.spacing
     low = 0.5 * dx

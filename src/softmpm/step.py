@@ -36,10 +36,11 @@ class Substep:
     def __init__(self, model: Model, solid):
         self.model, self.solid, self.stream = model, solid, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
-        (
-            transfer(model.spec),
-            grid(model.spec),
-        )  # all of a module is defined before it is first loaded, and so compiled once
+        for define in (
+            transfer,
+            grid,
+        ):  # all of a module before it is first loaded, so that it is compiled once
+            define(model.spec)
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
         self.watch_words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
@@ -119,12 +120,11 @@ class Substep:
 
     def collect_pull(self, adj_solid: SolidAdj, adj_pull: Tensor) -> None:
         """Add what the particles found for the muscles' pull into ``adj_pull`` (world, muscle) and start afresh."""
-        real, slots = self.types.real, self.model.spec.muscle_slots
-        self.launch(
-            collect_pull(self.model.spec),
-            (*self.particles, slots),
-            *(view(self.model.muscle_slots, wp.int32), view(adj_solid.slot, real), view(adj_pull, real)),
-        )
+        if adj_solid.slot is None:
+            raise ValueError("the adjoint of the pull was not asked for.")
+        real, muscles = self.types.real, view(self.model.muscle_slots, wp.int32)
+        arrays = (muscles, view(adj_solid.slot, real), view(adj_pull, real))
+        self.launch(collect_pull(self.model.spec), adj_solid.slot.shape, *arrays)
 
     def enter(self, start: State, motion) -> None:
         """From what users hold to what the kernels hold."""

@@ -97,12 +97,14 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     motion, work = Motion.empty(model), Substep(model, None)
     work.enter(state, motion.struct(model))
     raise_failure(model, work.watch_words, state)
-    arrays = (
-        _owned(getattr(motion, n), d, requires_grad)
-        for n, d in zip("fx v C H".split(), (t.vec, t.vec, t.mat, t.mat), strict=True)
+    return WarpState(
+        base=_owned(motion.base, t.ivec, False),
+        fx=_owned(motion.fx, t.vec, requires_grad),
+        v=_owned(motion.v, t.vec, requires_grad),
+        C=_owned(motion.C, t.mat, requires_grad),
+        H=_owned(motion.H, t.mat, requires_grad),
+        fx_low=None if motion.fx_low is None else _owned(motion.fx_low, t.vec, False),
     )
-    low = None if motion.fx_low is None else _owned(motion.fx_low, t.vec, False)
-    return WarpState(_owned(motion.base, t.ivec, False), *arrays, low)
 
 
 def torch_state(model: Model, state: WarpState) -> State:
@@ -132,14 +134,13 @@ def warp_solid(
         if activation is None:
             activation = torch.zeros(model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
         pull = (activation * model.strength).detach()
-    solid = Solid(*(tensor.detach().contiguous() for tensor in (mass, mu, lam)), pull)
-    arrays = (_owned(tensor, real, requires_grad) for tensor in (solid.mass, solid.mu, solid.lam))
-    owned = WarpSolid(*arrays, None if pull is None else _owned(pull, real, requires_grad), None)
-    struct = solid.struct(model)
-    for name in ("mass", "mu", "lam", *(("pull",) if pull is not None else ())):
-        setattr(struct, name, getattr(owned, name))
-    owned.work = Substep(model, struct)
-    return owned
+    mass, mu, lam = (tensor.detach().contiguous() for tensor in (mass, mu, lam))
+    struct = Solid(mass, mu, lam, pull).struct(model)
+    arrays = {"mass": mass, "mu": mu, "lam": lam} | ({} if pull is None else {"pull": pull})
+    owned = {name: _owned(tensor, real, requires_grad) for name, tensor in arrays.items()}
+    for name, array in owned.items():
+        setattr(struct, name, array)
+    return WarpSolid(owned["mass"], owned["mu"], owned["lam"], owned.get("pull"), Substep(model, struct))
 
 
 def step(
@@ -184,11 +185,11 @@ def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: War
     struct = solid_adj_type(model.spec, wanted)()
     struct.mass, struct.mu, struct.lam = solid.mass.grad, solid.mu.grad, solid.lam.grad
     slots = SolidAdj.zeros(model, Wanted(material=False, activation=wanted.activation))
-    if wanted.activation:
+    if slots.slot is not None:
         struct.pull = view(slots.slot, types(model.spec.dim, model.spec.dtype).real)
     now, then = state_in.struct(model), state_out.struct(model)
     solid.work.adjoint(
         wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), struct, substep
     )
-    if wanted.activation:
+    if solid.pull is not None and solid.pull.grad is not None:
         solid.work.collect_pull(slots, wp.to_torch(solid.pull.grad))
