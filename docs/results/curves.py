@@ -13,7 +13,7 @@ KINDS = {"co": ("controller and body", "#1f6f8b"), "ctrl": ("controller only", "
 
 
 def best_so_far(path: Path) -> list[float]:
-    """Distance travelled [m] of the best simulation up to each iteration."""
+    """Minus the smallest final loss up to each iteration: for a walker the distance travelled [m]."""
     best, curve = float("-inf"), []
     with path.open() as file:
         for row in csv.DictReader(file):
@@ -22,7 +22,23 @@ def best_so_far(path: Path) -> list[float]:
     return curve
 
 
-def main():
+def others() -> None:
+    """Arm and biped, a curve for each observer."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.2))
+    for observer, colour in (("latent", "#1f6f8b"), ("centroids", "#c8553d")):
+        left.plot(best_so_far(HERE / f"biped_{observer}.csv"), color=colour, label=observer)
+        miss = [1e3 * (-squared) ** 0.5 for squared in best_so_far(HERE / f"arm_{observer}.csv")]
+        right.semilogy(miss, color=colour, label=observer)
+    left.set(title="biped", xlabel="iteration", ylabel="best distance so far [m]", ylim=(0, None))
+    right.set(title="arm", xlabel="iteration", ylabel="best miss so far [mm]")
+    for axes in (left, right):
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(HERE.parent / "images" / "arm_biped_curves.png", dpi=120)
+
+
+def main() -> None:
     figure, axes = plt.subplots(figsize=(6.5, 3.6))
     for kind, (label, colour) in KINDS.items():
         curves = [best_so_far(path) for path in sorted(HERE.glob(f"elephant_standard_{kind}_seed*.csv"))]
@@ -41,3 +57,4 @@ def main():
 
 if __name__ == "__main__":
     main()
+    others()

@@ -260,3 +260,14 @@ def test_shapes_of_what_a_model_gives():
     rest.x.zero_()
     assert model.rest().x.abs().sum() > 0
     assert model.body.tolist() == [0] * 12 + [1] * 12
+
+
+def test_results_are_of_the_promised_types():
+    """What functions return can be named: for annotations and for isinstance."""
+    model = softmpm.build(busy_scene(2), device="cpu")
+    end = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1)
+    assert isinstance(end, softmpm.State) and isinstance(end.low, softmpm.Low)
+    assert isinstance(softmpm.rasterize(model, end), softmpm.GridField)
+    assert isinstance(softmpm.stable_dt(model.scene), softmpm.StableDt)
+    assert isinstance(softmpm.warp_state(model), softmpm.WarpState)
+    assert isinstance(softmpm.warp_solid(model), softmpm.WarpSolid)
