@@ -64,7 +64,7 @@ class ObserverConf:
 class PolicyConf:
     """What turns an observation into the activation of each muscle, in (-1, 1)."""
 
-    name: str = "linear"
+    name: str = "mlp"
     """linear, tanh(Wz + b); mlp; sinusoids or knots, which are open loop and see nothing but the time."""
     hidden: list[int] = field(default_factory=lambda: [64, 64])
     """mlp: width of each hidden layer; two of 64 as in Spielberg et al. 2021 (Robotica)."""
