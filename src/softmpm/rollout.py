@@ -111,14 +111,9 @@ class _Segments:
     """Hands out the states around a substep, going backward; recomputes a segment when it is first asked for."""
 
     def __init__(self, model: Model, horizon: Horizon, kept: Motion, step: Substep, pull, row, schedule):
-        self.horizon, self.kept, self.step, self.pull, self.row, self.plan = (
-            horizon,
-            kept,
-            step,
-            pull,
-            row,
-            schedule,
-        )
+        self.horizon, self.plan = horizon, schedule
+        self.kept, self.step = kept, step
+        self.pull, self.row = pull, row
         count = schedule.recomputed or schedule.kept
         self.buffers = Motion.empty(model, count) if schedule.recomputed else kept
         self.slots = [self.buffers[i].struct(model) for i in range(count)]

@@ -7,7 +7,7 @@ import numpy as np
 from softmpm import Body, Muscle, Particles, Scene
 from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth
-from softmpm_learn.tasks.task import Task, TaskConf, clock, level, neo_hookean, track
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, level, neo_hookean, track
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -21,22 +21,10 @@ LEG_MUSCLE = (0.12, 1.01)
 
 
 @dataclass(kw_only=True)
-class BipedConf(TaskConf):
+class BipedConf(WalkerConf):
     """A two-legged walker that walks to the right."""
 
     name: str = "biped"
-    strength: float = 6e3
-    """Stress of a muscle at full activation [Pa]."""
-    effort: float = 1e-2
-    """Weight of the mean squared activation in the loss [m]."""
-    upright: float = 1.0
-    """Weight of the squared slope of the body in the loss [m]; without it the walker tumbles forward."""
-    friction: float = 0.8
-    """Coulomb friction of the floor [-]."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        self.need_not_negative("friction", "upright")
 
 
 def biped(conf: BipedConf) -> Task:

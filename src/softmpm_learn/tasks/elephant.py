@@ -11,7 +11,7 @@ import numpy as np
 from softmpm import Body, Muscle, Particles, Scene
 from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, fill, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, TaskConf, clock, level, neo_hookean, track
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, level, neo_hookean, track
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -63,22 +63,10 @@ TRUNK_MUSCLES = ((0.25, 0.60), (0.60, 1.01))  # way along the trunk
 
 
 @dataclass(kw_only=True)
-class ElephantConf(TaskConf):
+class ElephantConf(WalkerConf):
     """An elephant that walks to the right."""
 
     name: str = "elephant"
-    strength: float = 6e3
-    """Stress of a muscle at full activation [Pa]."""
-    effort: float = 1e-2
-    """Weight of the mean squared activation in the loss [m]."""
-    upright: float = 1.0
-    """Weight of the squared slope of the torso in the loss [m]; without it the elephant ends on its head."""
-    friction: float = 0.8
-    """Coulomb friction of the floor [-]."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        self.need_not_negative("friction", "upright")
 
 
 def elephant(conf: ElephantConf) -> Task:

@@ -72,6 +72,24 @@ class TaskConf:
         return 1.0 / self.resolution.value
 
 
+@dataclass(kw_only=True)
+class WalkerConf(TaskConf):
+    """Settings that robots on legs have besides."""
+
+    strength: float = 6e3
+    """Stress of a muscle at full activation [Pa]."""
+    effort: float = 1e-2
+    """Weight of the mean squared activation in the loss [m]."""
+    upright: float = 1.0
+    """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
+    friction: float = 0.8
+    """Coulomb friction of the floor [-]."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.need_not_negative("friction", "upright")
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
     """A robot, its world and what it should do."""
