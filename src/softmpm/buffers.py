@@ -113,12 +113,14 @@ class Solid:
         t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
         for name in ("mass", "mu", "lam"):
             setattr(solid, name, view(getattr(self, name), t.real))
-        solid.volume = view(model.volume, t.real)
+        lead = (model.worlds, model.particle_count)
+        solid.volume = view(model.volume.expand(lead), t.real)
         if len(model.spec.laws) > 1:
-            solid.law = view(model.law, wp.int32)
-        if self.pull is not None:
-            solid.muscle = view(model.muscle_slots, wp.int32)
+            solid.law = view(model.law.expand(lead), wp.int32)
+        if model.spec.muscle_slots:
+            solid.muscle = view(model.muscle_slots.expand(*lead, -1), wp.int32)
             solid.fibre = view(model.fibre, t.vec)
+        if self.pull is not None:
             solid.pull = view(self.pull, t.real)
         return solid
 

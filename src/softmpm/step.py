@@ -122,7 +122,8 @@ class Substep:
         """Add what the particles found for the muscles' pull into ``adj_pull`` (world, muscle) and start afresh."""
         if adj_solid.slot is None:
             raise ValueError("the adjoint of the pull was not asked for.")
-        real, muscles = self.types.real, view(self.model.muscle_slots, wp.int32)
+        slots = self.model.muscle_slots.expand(*adj_solid.slot.shape)
+        real, muscles = self.types.real, view(slots, wp.int32)
         arrays = (muscles, view(adj_solid.slot, real), view(adj_pull, real))
         self.launch(collect_pull(self.model.spec), adj_solid.slot.shape, *arrays)
 

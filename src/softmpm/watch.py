@@ -20,6 +20,8 @@ class Kind(IntEnum):
     LEFT_GRID = 2
     INVERTED = 3
     GRADIENT = 4
+    LEFT_WINDOW = 5
+    """Not the grid but the part of it that is in memory: the call starts again with a larger one."""
 
 
 class UnstableError(RuntimeError):

@@ -21,6 +21,63 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
     bad_start, rounds = int(Kind.START), dtype == "float32"
     module = f"softmpm.boundary.d{dim}.{dtype}"
 
+    @wp.struct
+    class Entered:
+        base: ivec
+        fx: vec
+        low: vec
+        H: mat
+        sound: bool
+
+    @wp.struct
+    class Left:
+        x: vec
+        low_x: vec
+        F: mat
+        low_F: mat
+
+    @wp.func
+    def entered(scale: Scale, x: vec, v: vec, C: mat, F: mat, low_x: vec, low_F: mat) -> Entered:
+        """One particle as the kernels hold it; not sound if it is not finite or off the grid."""
+        at = Entered()
+        at.sound = wp.isfinite(wp.ddot(F, F) + wp.dot(v, v) + wp.ddot(C, C))
+        for axis in range(dim):
+            exact = wp.float64(x[axis])
+            if wp.static(rounds):
+                exact += wp.float64(low_x[axis])
+            cell = exact / scale.exact_spacing
+            first = wp.floor(cell - wp.float64(0.5))
+            inside = first >= wp.float64(0.0) and first <= wp.float64(scale.shape[axis] - 3)
+            if inside:
+                at.base[axis] = int(first)
+            else:
+                at.sound = False
+            at.fx[axis] = real(cell - wp.float64(at.base[axis]))
+            at.low[axis] = real(cell - wp.float64(at.base[axis]) - wp.float64(at.fx[axis]))
+            for other in range(dim):
+                change = wp.float64(F[axis, other]) - wp.float64(wp.where(axis == other, 1.0, 0.0))
+                if wp.static(rounds):
+                    change += wp.float64(low_F[axis, other])
+                at.H[axis, other] = real(change)
+        return at
+
+    @wp.func
+    def left(scale: Scale, base: ivec, fx: vec, low: vec, H: mat) -> Left:
+        """One particle as users hold it, with what rounding takes off."""
+        out = Left()
+        for axis in range(dim):
+            cell = wp.float64(base[axis]) + wp.float64(fx[axis])
+            if wp.static(rounds):
+                cell += wp.float64(low[axis])
+            exact = cell * scale.exact_spacing
+            out.x[axis] = real(exact)
+            out.low_x[axis] = real(exact - wp.float64(real(exact)))
+            for other in range(dim):
+                full = wp.float64(H[axis, other]) + wp.float64(wp.where(axis == other, 1.0, 0.0))
+                out.F[axis, other] = real(full)
+                out.low_F[axis, other] = real(full - wp.float64(real(full)))
+        return out
+
     @wp.kernel(module=module, enable_backward=False)
     def enter(
         # Parameters:
@@ -37,38 +94,15 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         start: Motion,
     ):
         world, p = wp.tid()
-        base = ivec()
-        fx = vec()
-        fx_low = vec()
-        H = F[world, p]
-        size = wp.ddot(H, H) + wp.dot(v[world, p], v[world, p]) + wp.ddot(C[world, p], C[world, p])
-        sound = wp.isfinite(size)
-        for axis in range(dim):
-            exact = wp.float64(x[world, p][axis])
-            if wp.static(rounds):
-                exact += wp.float64(low_x[world, p][axis])
-            cell = exact / scale.exact_spacing
-            first = wp.floor(cell - wp.float64(0.5))
-            inside = first >= wp.float64(0.0) and first <= wp.float64(scale.shape[axis] - 3)
-            if inside:
-                base[axis] = int(first)
-            else:
-                sound = False
-            fx[axis] = real(cell - wp.float64(base[axis]))
-            fx_low[axis] = real(cell - wp.float64(base[axis]) - wp.float64(fx[axis]))
-            for other in range(dim):
-                change = wp.float64(F[world, p][axis, other]) - wp.float64(wp.where(axis == other, 1.0, 0.0))
-                if wp.static(rounds):
-                    change += wp.float64(low_F[world, p][axis, other])
-                H[axis, other] = real(change)
-        start.base[world, p] = base
-        start.fx[world, p] = fx
+        at = entered(scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p])
+        start.base[world, p] = at.base
+        start.fx[world, p] = at.fx
         start.v[world, p] = v[world, p]
         start.C[world, p] = C[world, p]
-        start.H[world, p] = H
+        start.H[world, p] = at.H
         if wp.static(rounds):
-            start.fx_low[world, p] = fx_low
-        if not sound:
+            start.fx_low[world, p] = at.low
+        if not at.sound:
             report(watch, world, 0, bad_start, p)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -86,29 +120,16 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         low_F: wp.array2d(dtype=mat),
     ):
         world, p = wp.tid()
-        high_x = vec()
-        rest_x = vec()
-        high_F = mat()
-        rest_F = mat()
-        for axis in range(dim):
-            cell = wp.float64(end.base[world, p][axis]) + wp.float64(end.fx[world, p][axis])
-            if wp.static(rounds):
-                cell += wp.float64(end.fx_low[world, p][axis])
-            exact = cell * scale.exact_spacing
-            high_x[axis] = real(exact)
-            rest_x[axis] = real(exact - wp.float64(real(exact)))
-            for other in range(dim):
-                full = wp.float64(end.H[world, p][axis, other]) + wp.float64(
-                    wp.where(axis == other, 1.0, 0.0)
-                )
-                high_F[axis, other] = real(full)
-                rest_F[axis, other] = real(full - wp.float64(real(full)))
-        x[world, p] = high_x
+        low = vec()
+        if wp.static(rounds):
+            low = end.fx_low[world, p]
+        out = left(scale, end.base[world, p], end.fx[world, p], low, end.H[world, p])
+        x[world, p] = out.x
         v[world, p] = end.v[world, p]
         C[world, p] = end.C[world, p]
-        F[world, p] = high_F
+        F[world, p] = out.F
         if wp.static(rounds):
-            low_x[world, p] = rest_x
-            low_F[world, p] = rest_F
+            low_x[world, p] = out.low_x
+            low_F[world, p] = out.low_F
 
-    return SimpleNamespace(enter=enter, leave=leave)
+    return SimpleNamespace(entered=entered, left=left, enter=enter, leave=leave)

@@ -39,9 +39,10 @@ def check(spec: Spec) -> SimpleNamespace:
     dim, mixed = spec.dim, len(spec.laws) > 1
     hookean = spec.laws.index("neo_hookean") if "neo_hookean" in spec.laws else -1
     not_finite, left_grid, inverted = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.INVERTED)
+    left_window = int(Kind.LEFT_WINDOW)
 
     @wp.func
-    def allowed(body: Solid, p: int, H: mat) -> bool:
+    def allowed(body: Solid, world: int, p: int, H: mat) -> bool:
         """H is finite, and det F > 0 where the law needs it; a comparison with NaN is false."""
         if wp.static(not mixed and hookean == 0):
             return volume_change(H) > real(-1.0)
@@ -50,24 +51,38 @@ def check(spec: Spec) -> SimpleNamespace:
             for j in range(dim):
                 total += H[i, j]
         if wp.static(mixed):
-            if body.law[p] == hookean:
+            if body.law[world, p] == hookean:
                 return volume_change(H) > real(-1.0)
         return wp.isfinite(total)
 
     @wp.func
-    def sound(body: Solid, shape: ivec, p: int, fx: vec, base: ivec, H: mat) -> bool:
-        """The new state may be kept: ``fx`` as it came, ``base`` as it would be."""
-        if not (allowed(body, p, H) and wp.dot(fx, fx) < real(1.0e12)):
+    def sound(
+        body: Solid, corner: ivec, shape: ivec, world: int, p: int, fx: vec, base: ivec, H: mat
+    ) -> bool:
+        """The new state may be kept: ``fx`` as it came, ``base`` as it would be, on ``shape`` nodes from ``corner``."""
+        if not (allowed(body, world, p, H) and wp.dot(fx, fx) < real(1.0e12)):
             return False
         for axis in range(dim):
-            if wp.uint32(base[axis]) > wp.uint32(shape[axis] - 3):  # also below zero
+            if wp.uint32(base[axis] - corner[axis]) > wp.uint32(shape[axis] - 3):  # also below zero
                 return False
         return True
 
     @wp.func
-    def complain(watch: wp.array(dtype=wp.int64), world: int, p: int, substep: int, fx: vec, H: mat):
+    def complain(
+        watch: wp.array(dtype=wp.int64),
+        shape: ivec,
+        world: int,
+        p: int,
+        substep: int,
+        fx: vec,
+        base: ivec,
+        H: mat,
+    ):
         """Say which rule a state that is not sound breaks; NaN before place before inversion."""
-        kind = left_grid
+        kind = left_window
+        for axis in range(dim):
+            if wp.uint32(base[axis]) > wp.uint32(shape[axis] - 3):
+                kind = left_grid
         if not wp.isfinite(wp.ddot(H, H) + wp.dot(fx, fx)):
             kind = not_finite
         elif wp.static(hookean >= 0) and volume_change(H) <= real(-1.0):

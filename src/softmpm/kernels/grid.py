@@ -20,7 +20,7 @@ from softmpm.kernels.types import Spec, solid_types, types
 @functools.lru_cache(maxsize=None)
 def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, node_vec, Scale = t.real, t.vec, t.node, t.Scale
+    real, vec, ivec, node_vec, Scale = t.real, t.vec, t.ivec, t.node, t.Scale
     Walls = solid_types(spec).Walls
     nodes = spline(spec.dim, spec.dtype)
     node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
@@ -28,6 +28,11 @@ def grid(spec: Spec) -> SimpleNamespace:
         getattr(contact(spec), name) for name in ("inside", "respond", "respond_adj")
     )
     dim, walled, gravity, damping = spec.dim, bool(spec.contacts), spec.gravity, spec.damping
+
+    @wp.struct
+    class NodeAdj:
+        p: vec
+        m: real
 
     @wp.func
     def free_velocity(scale: Scale, u: vec) -> vec:
@@ -39,14 +44,41 @@ def grid(spec: Spec) -> SimpleNamespace:
         return v
 
     @wp.func
-    def after_walls(scale: Scale, walls: Walls, n: int, count: int, v: vec) -> vec:
+    def after_walls(scale: Scale, walls: Walls, here: ivec, count: int, v: vec) -> vec:
         """v after the first ``count`` walls (G2)."""
-        here = node_coordinates(n, scale.shape)
         w = v
         for k in range(count):
             if inside(walls, k, here, scale.exact_spacing):
                 w = respond(walls, k, w)
         return w
+
+    @wp.func
+    def node_velocity(scale: Scale, walls: Walls, here: ivec, p: vec, m: real) -> vec:
+        """Velocity of the node at ``here`` from its momentum and mass (G1), (G2)."""
+        v = vec()
+        if m > real(0.0):
+            v = free_velocity(scale, p / m)
+            if wp.static(walled):
+                v = after_walls(scale, walls, here, walls.count, v)
+        return v
+
+    @wp.func
+    def node_velocity_adj(scale: Scale, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec) -> NodeAdj:
+        adj = NodeAdj()
+        if m > real(0.0):
+            u = p / m
+            adj_v = adj_velocity
+            if wp.static(walled):
+                v = free_velocity(scale, u)
+                for i in range(walls.count):
+                    k = walls.count - 1 - i
+                    if inside(walls, k, here, scale.exact_spacing):
+                        adj_v = respond_adj(walls, k, after_walls(scale, walls, here, k, v), adj_v)
+            adj.p = adj_v / m
+            if wp.static(damping):
+                adj.p = scale.decay * adj.p
+            adj.m = -wp.dot(adj.p, u)
+        return adj
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def grid_velocity(
@@ -59,14 +91,9 @@ def grid(spec: Spec) -> SimpleNamespace:
         velocity: wp.array2d(dtype=vec),
     ):
         world, n = wp.tid()
-        here = node[world, n]
-        m = here[dim]
-        v = vec()
-        if m > real(0.0):
-            v = free_velocity(scale, momentum(here) / m)
-            if wp.static(walled):
-                v = after_walls(scale, walls, n, walls.count, v)
-        velocity[world, n] = v
+        node_n = node[world, n]
+        here = node_coordinates(n, scale.shape)
+        velocity[world, n] = node_velocity(scale, walls, here, momentum(node_n), node_n[dim])
 
     @wp.kernel(module=spec.module + ".adj", enable_backward=False)
     def grid_velocity_adj(
@@ -80,23 +107,14 @@ def grid(spec: Spec) -> SimpleNamespace:
         adj_node: wp.array2d(dtype=node_vec),
     ):
         world, n = wp.tid()
-        here = node[world, n]
-        m = here[dim]
-        adj = node_vec()
-        if m > real(0.0):
-            u = momentum(here) / m
-            adj_v = adj_velocity[world, n]
-            if wp.static(walled):
-                v = free_velocity(scale, u)
-                coordinates = node_coordinates(n, scale.shape)
-                for i in range(walls.count):
-                    k = walls.count - 1 - i
-                    if inside(walls, k, coordinates, scale.exact_spacing):
-                        adj_v = respond_adj(walls, k, after_walls(scale, walls, n, k, v), adj_v)
-            adj_p = adj_v / m
-            if wp.static(damping):
-                adj_p = scale.decay * adj_p
-            adj = pack(adj_p, -wp.dot(adj_p, u))
-        adj_node[world, n] = adj
+        node_n = node[world, n]
+        here = node_coordinates(n, scale.shape)
+        adj = node_velocity_adj(scale, walls, here, momentum(node_n), node_n[dim], adj_velocity[world, n])
+        adj_node[world, n] = pack(adj.p, adj.m)
 
-    return SimpleNamespace(grid_velocity=grid_velocity, grid_velocity_adj=grid_velocity_adj)
+    return SimpleNamespace(
+        node_velocity=node_velocity,
+        node_velocity_adj=node_velocity_adj,
+        grid_velocity=grid_velocity,
+        grid_velocity_adj=grid_velocity_adj,
+    )

@@ -7,7 +7,7 @@ import warp as wp
 
 from softmpm.kernels.elasticity import elasticity
 from softmpm.kernels.muscle import muscle
-from softmpm.kernels.types import Spec, Wanted, solid_adj_type, solid_types, types
+from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
 
 
 @functools.lru_cache(maxsize=None)
@@ -24,7 +24,7 @@ def solid(spec: Spec) -> SimpleNamespace:
         """Kirchhoff stress τ [Pa]."""
         tau = mat()
         if wp.static(mixed):
-            if body.law[p] == 0:
+            if body.law[world, p] == 0:
                 tau = first(H, body.mu[world, p], body.lam[world, p])
             else:
                 tau = last(H, body.mu[world, p], body.lam[world, p])
@@ -32,7 +32,7 @@ def solid(spec: Spec) -> SimpleNamespace:
             tau = first(H, body.mu[world, p], body.lam[world, p])
         if wp.static(slots > 0):
             for slot in range(slots):
-                k = body.muscle[p, slot]
+                k = body.muscle[world, p, slot]
                 if k >= 0:
                     tau += muscle_stress(H, body.fibre[k], body.pull[world, k])
         return tau
@@ -54,7 +54,7 @@ def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         """∂L/∂F; adds what is wanted of the material and of the muscles' pull into ``adj_body``."""
         adj = ElasticAdj()
         if wp.static(mixed):
-            if body.law[p] == 0:
+            if body.law[world, p] == 0:
                 adj = first_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
             else:
                 adj = last_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
@@ -66,7 +66,7 @@ def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             adj_body.lam[world, p] = adj_body.lam[world, p] + adj.lam
         if wp.static(slots > 0):
             for slot in range(slots):
-                k = body.muscle[p, slot]
+                k = body.muscle[world, p, slot]
                 if k >= 0:
                     adj_muscle = muscle_stress_adj(H, body.fibre[k], body.pull[world, k], adj_tau)
                     adj_F += adj_muscle.F
@@ -78,6 +78,58 @@ def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
 
 
 @functools.lru_cache(maxsize=None)
+def sorted_solid(spec: Spec):
+    """Kernel that puts the material into the order of the packed particles."""
+    Solid, mixed, slots = solid_types(spec).Solid, len(spec.laws) > 1, spec.muscle_slots
+
+    @wp.kernel(module=spec.module + ".sorted", enable_backward=False)
+    def sort(
+        # Parameters:
+        order: wp.array2d(dtype=wp.int32),
+        # In:
+        body: Solid,
+        # Out:
+        packed: Solid,
+    ):
+        world, place = wp.tid()
+        p = order[world, place]
+        packed.mass[world, place] = body.mass[world, p]
+        packed.mu[world, place] = body.mu[world, p]
+        packed.lam[world, place] = body.lam[world, p]
+        packed.volume[world, place] = body.volume[world, p]
+        if wp.static(mixed):
+            packed.law[world, place] = body.law[world, p]
+        if wp.static(slots > 0):
+            for slot in range(slots):
+                packed.muscle[world, place, slot] = body.muscle[world, p, slot]
+
+    return sort
+
+
+@functools.lru_cache(maxsize=None)
+def sorted_solid_adj(spec: Spec, wanted: Wanted):
+    """Twin of :func:`sorted_solid` for what is wanted of the material: adds to the particle what its place found."""
+    SolidAdj = solid_adj_type(spec, wanted)
+
+    @wp.kernel(module=adj_module(spec, wanted) + ".sorted", enable_backward=False)
+    def sort_adj(
+        # Parameters:
+        order: wp.array2d(dtype=wp.int32),
+        # In:
+        adj_packed: SolidAdj,
+        # Out, added into:
+        adj_body: SolidAdj,
+    ):
+        world, place = wp.tid()
+        p = order[world, place]
+        adj_body.mass[world, p] = adj_body.mass[world, p] + adj_packed.mass[world, place]
+        adj_body.mu[world, p] = adj_body.mu[world, p] + adj_packed.mu[world, place]
+        adj_body.lam[world, p] = adj_body.lam[world, p] + adj_packed.lam[world, place]
+
+    return sort_adj
+
+
+@functools.lru_cache(maxsize=None)
 def collect_pull(spec: Spec):
     """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
     t = types(spec.dim, spec.dtype)
@@ -85,14 +137,14 @@ def collect_pull(spec: Spec):
     @wp.kernel(module=spec.module + ".pull", enable_backward=False)
     def collect(
         # In:
-        muscle: wp.array2d(dtype=wp.int32),
+        muscle: wp.array3d(dtype=wp.int32),
         # In, cleared:
         adj_slot: wp.array3d(dtype=t.real),
         # Out, added into:
         adj_pull: wp.array2d(dtype=t.real),
     ):
         world, p, slot = wp.tid()
-        k = muscle[p, slot]
+        k = muscle[world, p, slot]
         if k >= 0:
             wp.atomic_add(adj_pull, world, k, adj_slot[world, p, slot])
             adj_slot[world, p, slot] = t.real(0.0)

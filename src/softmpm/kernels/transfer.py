@@ -24,8 +24,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels import failure
-from softmpm.kernels.elasticity import elasticity
-from softmpm.kernels.solid import solid, solid_adj
+from softmpm.kernels.particle import particle, particle_adj
 from softmpm.kernels.spline import spline
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
 from softmpm.watch import Kind
@@ -34,20 +33,12 @@ from softmpm.watch import Kind
 @functools.lru_cache(maxsize=None)
 def transfer(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, mat, node_vec, Scale, Motion = t.real, t.vec, t.mat, t.node, t.Scale, t.Motion
-    Solid, stress = solid_types(spec).Solid, solid(spec).stress
-    s, dim = spline(spec.dim, spec.dtype), spec.dim
+    vec, mat, node_vec, Scale, Motion, ivec = t.vec, t.mat, t.node, t.Scale, t.Motion, t.ivec
+    Solid, s, one = solid_types(spec).Solid, spline(spec.dim, spec.dtype), particle(spec)
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
-    pack = s.pack
-    identity = elasticity(spec.dim, spec.dtype).identity
+    pack, Particle, affine_momentum, moved = s.pack, one.Particle, one.affine_momentum, one.moved
     running, rounds = failure.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
-    sound, complain = failure.check(spec).sound, failure.check(spec).complain
-
-    @wp.func
-    def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat) -> mat:
-        """A [kg/s] of (T1)."""
-        impulse = real(4.0) * scale.dt * body.volume[p] / (scale.spacing * scale.spacing)
-        return body.mass[world, p] * C - impulse * stress(body, world, p, H)
+    complain = failure.check(spec).complain
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def p2g(
@@ -64,7 +55,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
         fx = now.fx[world, p]
         m = body.mass[world, p]
         mv = m * now.v[world, p]
-        A = scale.spacing * affine_momentum(scale, body, world, p, now.C[world, p], now.H[world, p])
+        A = affine_momentum(scale, body, world, p, now.C[world, p], now.H[world, p])
         w = weights(fx)
         for n in range(s.count):
             o = offset(n)
@@ -87,74 +78,52 @@ def transfer(spec: Spec) -> SimpleNamespace:
         then: Motion,
     ):
         world, p = wp.tid()
-        base = now.base[world, p]
-        fx = now.fx[world, p]
-        H = now.H[world, p]
-        if not running(watch, world):
-            then.base[world, p] = base
-            then.fx[world, p] = fx
-            then.v[world, p] = now.v[world, p]
-            then.C[world, p] = now.C[world, p]
-            then.H[world, p] = H
-            if wp.static(rounds):
-                then.fx_low[world, p] = now.fx_low[world, p]
-            return
-        v = vec()
-        B = mat()
-        w = weights(fx)
-        for n in range(s.count):
-            o = offset(n)
-            share = weight(w, o) * velocity[world, node_index(base, o, scale.shape)]
-            v += share
-            B += wp.outer(share, position(o) - fx)
-        C = (real(4.0) / scale.spacing) * B
-        H = H + scale.dt * (C + C * H)
-        step = (scale.dt / scale.spacing) * v
+        old = Particle()
+        old.base = now.base[world, p]
+        old.fx = now.fx[world, p]
+        old.H = now.H[world, p]
         if wp.static(rounds):
-            step += now.fx_low[world, p]
-            then.fx_low[world, p] = step - ((fx + step) - fx)
-        fx = fx + step
-        cells = vec()
-        new_base = base
-        for axis in range(dim):
-            cells[axis] = wp.floor(fx[axis] - real(0.5))
-            new_base[axis] = base[axis] + int(cells[axis])
-        if sound(body, scale.shape, p, fx, new_base, H):
-            base = new_base
-            fx = fx - cells
+            old.low = now.fx_low[world, p]
+        new = Particle()
+        if running(watch, world):
+            v = vec()
+            B = mat()
+            w = weights(old.fx)
+            for n in range(s.count):
+                o = offset(n)
+                share = weight(w, o) * velocity[world, node_index(old.base, o, scale.shape)]
+                v += share
+                B += wp.outer(share, position(o) - old.fx)
+            new = moved(scale, body, ivec(), scale.shape, world, p, old, v, B)
+            if not new.sound:
+                complain(watch, scale.shape, world, p, substep, new.fx, new.base, new.H)
+                new.base = old.base
         else:
-            complain(watch, world, p, substep, fx, H)
-        then.base[world, p] = base
-        then.fx[world, p] = fx
-        then.v[world, p] = v
-        then.C[world, p] = C
-        then.H[world, p] = H
+            new = old
+            new.v = now.v[world, p]
+            new.C = now.C[world, p]
+        then.base[world, p] = new.base
+        then.fx[world, p] = new.fx
+        then.v[world, p] = new.v
+        then.C[world, p] = new.C
+        then.H[world, p] = new.H
+        if wp.static(rounds):
+            then.fx_low[world, p] = new.low
 
-    return SimpleNamespace(affine_momentum=affine_momentum, p2g=p2g, g2p=g2p, identity=identity)
+    return SimpleNamespace(p2g=p2g, g2p=g2p)
 
 
 @functools.lru_cache(maxsize=None)
 def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, mat, node_vec, Scale, Motion, MotionAdj = (
-        t.real,
-        t.vec,
-        t.mat,
-        t.node,
-        t.Scale,
-        t.Motion,
-        t.MotionAdj,
-    )
-    Solid, SolidAdj, stress_adj = (
-        solid_types(spec).Solid,
-        solid_adj_type(spec, wanted),
-        solid_adj(spec, wanted).stress_adj,
-    )
-    s, dim = spline(spec.dim, spec.dtype), spec.dim
+    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.node
+    Scale, Motion, MotionAdj = t.Scale, t.Motion, t.MotionAdj
+    Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
+    s, dim, one = spline(spec.dim, spec.dtype), spec.dim, particle_adj(spec, wanted)
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
-    weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
-    momentum, identity = s.momentum, elasticity(spec.dim, spec.dtype).identity
-    affine_momentum, report = transfer(spec).affine_momentum, failure.report(spec.dim, spec.dtype).report
+    weight, weight_slope, node_index, momentum = s.weight, s.weight_slope, s.node_index, s.momentum
+    ParticleAdj, momentum_adj, moved_adj = one.ParticleAdj, one.momentum_adj, one.moved_adj
+    affine_momentum, report = particle(spec).affine_momentum, failure.report(spec.dim, spec.dtype).report
     bad_gradient = int(Kind.GRADIENT)
 
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
@@ -178,12 +147,12 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         C = now.C[world, p]
         H = now.H[world, p]
         m = body.mass[world, p]
-        A = scale.spacing * affine_momentum(scale, body, world, p, C, H)  # per cell, as B below
+        A = affine_momentum(scale, body, world, p, C, H)
         w = weights(fx)
         slope = slopes(fx)
         adj_mv = vec()
         adj_m = real(0.0)
-        B = mat()  # Σ w p̄_i (r / dx)ᵀ
+        B = mat()  # Σ w p̄_i rᵀ, r in cells
         adj_fx = vec()
         for n in range(s.count):
             o = offset(n)
@@ -196,19 +165,16 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             adj_mv += share * adj_p
             adj_m += share * adj_i[dim]
             B += wp.outer(share * adj_p, r)
-        adj_A = scale.spacing * B
-        impulse = real(4.0) * scale.dt * body.volume[p] / (scale.spacing * scale.spacing)
-        adj_v = adj_now.v[world, p] + m * adj_mv
-        adj_C = adj_now.C[world, p] + m * adj_A
-        adj_H = adj_now.H[world, p] + stress_adj(body, world, p, H, -impulse * adj_A, adj_body)
-        adj_fx += adj_now.fx[world, p]
-        if wp.static(wanted.material):
-            adj_body.mass[world, p] = adj_body.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
-        adj_now.fx[world, p] = adj_fx
-        adj_now.v[world, p] = adj_v
-        adj_now.C[world, p] = adj_C
-        adj_now.H[world, p] = adj_H
-        size = wp.dot(adj_fx, adj_fx) + wp.dot(adj_v, adj_v) + wp.ddot(adj_C, adj_C) + wp.ddot(adj_H, adj_H)
+        adj = momentum_adj(scale, body, world, p, v, C, H, adj_mv, adj_m, B, adj_body)
+        adj.fx = adj_fx + adj_now.fx[world, p]
+        adj.v += adj_now.v[world, p]
+        adj.C += adj_now.C[world, p]
+        adj.H += adj_now.H[world, p]
+        adj_now.fx[world, p] = adj.fx
+        adj_now.v[world, p] = adj.v
+        adj_now.C[world, p] = adj.C
+        adj_now.H[world, p] = adj.H
+        size = wp.dot(adj.fx, adj.fx) + wp.dot(adj.v, adj.v) + wp.ddot(adj.C, adj.C) + wp.ddot(adj.H, adj.H)
         if not wp.isfinite(size):
             report(watch, world, substep, bad_gradient, p)
 
@@ -228,14 +194,14 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         world, p = wp.tid()
         base = now.base[world, p]
         fx = now.fx[world, p]
-        adj_H = adj_then.H[world, p]
-        adj_fx = adj_then.fx[world, p]
-        adj_v = adj_then.v[world, p] + (scale.dt / scale.spacing) * adj_fx
-        adj_C = adj_then.C[world, p] + scale.dt * (adj_H * wp.transpose(identity() + now.H[world, p]))
-        adj_now.H[world, p] = (
-            adj_now.H[world, p] + adj_H + scale.dt * (wp.transpose(then.C[world, p]) * adj_H)
-        )  # (T3.adj)
-        adj_B = (real(4.0) / scale.spacing) * adj_C
+        adj_new = ParticleAdj()
+        adj_new.fx = adj_then.fx[world, p]
+        adj_new.v = adj_then.v[world, p]
+        adj_new.C = adj_then.C[world, p]
+        adj_new.H = adj_then.H[world, p]
+        adj = moved_adj(scale, now.H[world, p], then.C[world, p], adj_new)
+        adj_now.H[world, p] = adj_now.H[world, p] + adj.H
+        adj_fx = adj.fx
         w = weights(fx)
         slope = slopes(fx)
         for n in range(s.count):
@@ -243,10 +209,10 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             i = node_index(base, o, scale.shape)
             r = position(o) - fx
             v_i = velocity[world, i]
-            adj_i = adj_v + adj_B * r
+            adj_i = adj.v + adj.C * r
             share = weight(w, o)
             wp.atomic_add(adj_velocity, world, i, share * adj_i)
-            adj_fx += wp.dot(v_i, adj_i) * weight_slope(w, slope, o) - share * (wp.transpose(adj_B) * v_i)
+            adj_fx += wp.dot(v_i, adj_i) * weight_slope(w, slope, o) - share * (wp.transpose(adj.C) * v_i)
         adj_now.fx[world, p] = adj_now.fx[world, p] + adj_fx
 
     return SimpleNamespace(p2g_adj=p2g_adj, g2p_adj=g2p_adj)

@@ -3,7 +3,7 @@
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -41,6 +41,21 @@ class Wanted:
     activation: bool
 
 
+class Rows(NamedTuple):
+    """First row of each quantity in packed particles, and how many rows there are."""
+
+    row_fx: int
+    row_low: int
+    row_v: int
+    row_H: int
+    row_C: int
+    rows: int
+
+
+def packed_rows(dim: int) -> Rows:
+    return Rows(0, dim, 2 * dim, 3 * dim, 3 * dim + dim * dim, 3 * dim + 2 * dim * dim)
+
+
 @functools.lru_cache(maxsize=None)
 def types(dim: int, dtype: str) -> SimpleNamespace:
     """Scalar, vector, matrix and struct types of one dimension and precision."""
@@ -48,6 +63,7 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
     vec = wp.types.vector(dim, real)
     mat = wp.types.matrix((dim, dim), real)
     node = wp.types.vector(dim + 1, real)  # momentum and mass of a grid node, packed
+    aligned = wp.types.vector(4, real)  # the same in the fast scheme: 16 bytes in float32, padded in 2D
     ivec = wp.types.vector(dim, wp.int32)
 
     class Scale:
@@ -78,6 +94,19 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         C: wp.array2d(dtype=mat)
         H: wp.array2d(dtype=mat)
 
+    class Packed:
+        """The same in the fast scheme: rows of blocks of 32 particles, sorted by cell (kernels/scatter.h)."""
+
+        base: wp.array(dtype=wp.int32)  # first node of the stencil, its coordinates in 10 (3D) or 16 (2D) bits each
+        rows: wp.array(dtype=real)  # fx, fx_low, v, H, C
+
+    class Window:
+        """The nodes that are held in memory: ``shape`` of them along each axis from ``origin`` on, in each world."""
+
+        shape: ivec
+        count: int  # nodes of one world
+        origin: wp.array(dtype=ivec)  # (world,)
+
     def struct(cls):
         return wp.struct(cls, module=f"softmpm.types.d{dim}.{dtype}")
 
@@ -87,6 +116,11 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         vec=vec,
         mat=mat,
         node=node,
+        aligned=aligned,
+        c_name={"float32": "float", "float64": "double"}[dtype],
+        Packed=struct(Packed),
+        Window=struct(Window),
+        **packed_rows(dim)._asdict(),
         ivec=ivec,
         Scale=struct(Scale),
         Motion=struct(Motion),
@@ -106,12 +140,12 @@ def solid_types(spec: Spec) -> SimpleNamespace:
         mass=wp.array2d(dtype=t.real),  # m_p [kg], (world, particle)
         mu=wp.array2d(dtype=t.real),  # Lamé's μ [Pa], (world, particle)
         lam=wp.array2d(dtype=t.real),  # Lamé's λ [Pa], (world, particle)
-        volume=wp.array(dtype=t.real),  # V⁰ [m³], (particle,)
+        volume=wp.array2d(dtype=t.real),  # V⁰ [m³], (world, particle)
     )
     if len(spec.laws) > 1:
-        solid["law"] = wp.array(dtype=wp.int32)  # index into spec.laws, (particle,)
+        solid["law"] = wp.array2d(dtype=wp.int32)  # index into spec.laws, (world, particle)
     if spec.muscle_slots:
-        solid["muscle"] = wp.array2d(dtype=wp.int32)  # muscle of each slot or -1, (particle, slot)
+        solid["muscle"] = wp.array3d(dtype=wp.int32)  # of each slot or -1, (world, particle, slot)
         solid["fibre"] = wp.array(dtype=t.vec)  # unit direction d, (muscle,)
         solid["pull"] = wp.array2d(dtype=t.real)  # activation times strength [Pa], (world, muscle)
 

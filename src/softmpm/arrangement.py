@@ -1,0 +1,124 @@
+"""Where the fast scheme keeps things: particles in the order of their cells, and only the nodes around them.
+
+Neither has to be exact. An order that has grown stale costs speed, never correctness, and is renewed when particles that stand
+next to each other share their cell too rarely. The window is the part of the grid that is in memory, in each world at a place of
+its own; a particle that is about to leave it is seen in time, one that does leave it stops the call, which then starts again
+with a larger window. The cost of a substep follows the window, not the grid.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from softmpm.buffers import view
+from softmpm.kernels.types import types
+from softmpm.model import Model
+
+MARGIN = 6
+"""Nodes of a new window around the particles' stencils, on each side."""
+STALE = 1.3
+"""Renew the order when going along it meets so many times more cells than when it was new."""
+BITS = {2: 16, 3: 10}
+"""Bits of a node's coordinate in packed particles."""
+
+
+class Arrangement:
+    """Order of the particles and window of the grid; moves in place, but for a window that must grow.
+
+    Attributes:
+        order: Particle at each place, shape (world, particle), int32.
+        origin: First node of the window, shape (world, dim), int32.
+        shape: Nodes of the window along each axis.
+    """
+
+    def __init__(self, model: Model, x: Tensor, least: tuple[int, ...] = ()):
+        self.model = model
+        self.fresh_cells: int | None = None
+        self.stale = False
+        first, last = self._reach(x)
+        shape = []
+        for axis, nodes in enumerate(model.scene.grid.shape):
+            wide = max(h - low for low, h in zip(first[axis], last[axis], strict=True)) + 3 + 2 * MARGIN
+            wide = max(wide, least[axis] if least else 0)
+            shape.append(min(nodes, 4 * math.ceil(wide / 4)))
+        self.shape = tuple(shape)
+        self.order = torch.empty(model.worlds, model.particle_count, dtype=torch.int32, device=model.device)
+        self.origin = torch.empty(model.worlds, model.dim, dtype=torch.int32, device=model.device)
+        self._renew(x)
+
+    @property
+    def node_count(self) -> int:
+        """Nodes of one world in memory."""
+        return math.prod(self.shape)
+
+    def _base(self, x: Tensor) -> Tensor:
+        """First node of each particle's stencil, kept on the grid; shape (world, particle, dim)."""
+        last = torch.tensor(self.model.scene.grid.shape, device=x.device) - 3
+        cells = torch.floor(x.double() / self.model.scene.grid.spacing - 0.5).nan_to_num(0.0)
+        return torch.minimum(cells.clamp(min=0), last).long()
+
+    def _reach(self, x: Tensor) -> tuple[list, list]:
+        """Smallest and largest base in each axis and world; waits for the device."""
+        base = self._base(x)
+        both = torch.stack([base.amin(dim=1), base.amax(dim=1)]).tolist()
+        first, last = ([list(axis) for axis in zip(*side, strict=True)] for side in both)
+        return first, last
+
+    def fits(self, x: Tensor) -> bool:
+        """Whether the particles would fit into the window, wherever it is put."""
+        first, last = self._reach(x)
+        return all(
+            high - low + 3 <= nodes
+            for axis, nodes in enumerate(self.shape)
+            for low, high in zip(first[axis], last[axis], strict=True)
+        )
+
+    def _renew(self, x: Tensor) -> None:
+        """Sort by cell and centre the window on the particles."""
+        base, grid = self._base(x), self.model.scene.grid.shape
+        key = base[..., 0]
+        for axis in range(1, self.model.dim):
+            key = key * grid[axis] + base[..., axis]
+        self.order.copy_(torch.argsort(key, dim=1, stable=True))
+        shape, grid = (torch.tensor(s, device=x.device) for s in (self.shape, grid))
+        middle = (base.amin(dim=1) + base.amax(dim=1) + 3 - shape) // 2
+        self.origin.copy_(torch.minimum(middle.clamp(min=0), grid - shape))
+        self.fresh_cells, self.stale = None, False
+
+    def renewed(self, x: Tensor) -> "Arrangement":
+        """Itself with a new order and place, or another one if the window is too small for these positions."""
+        if not self.fits(x):
+            return Arrangement(self.model, x, least=self.shape)
+        self._renew(x)
+        return self
+
+    def grown(self, x: Tensor) -> "Arrangement":
+        """Another one with a window half as large again."""
+        return Arrangement(self.model, x, least=tuple(math.ceil(1.5 * n) for n in self.shape))
+
+    def judge(self, cells: int, near_edge: bool) -> None:
+        """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""
+        if self.fresh_cells is None:
+            self.fresh_cells = cells
+        self.stale = near_edge or cells > STALE * self.fresh_cells
+
+    def window(self, origin: Tensor):
+        """Struct for the kernels."""
+        t = types(self.model.spec.dim, self.model.spec.dtype)
+        window = t.Window()
+        window.shape, window.count = t.ivec(*self.shape), self.node_count
+        window.origin = view(origin, t.ivec)
+        return window
+
+
+def packable(model: Model) -> str | None:
+    """Why the fast scheme cannot hold this model, or None."""
+    largest = 2 ** BITS[model.dim]
+    if max(model.scene.grid.shape) > largest:
+        return f"the grid has more than {largest} nodes along an axis"
+    rows = types(model.spec.dim, model.spec.dtype).rows
+    if model.worlds * model.particle_count * rows >= 2**31:
+        return "there are more particles than 32-bit indices reach"
+    return None
+

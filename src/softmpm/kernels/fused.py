@@ -1,0 +1,275 @@
+"""The fast scheme: G2P and the next P2G in one kernel, particles sorted by cell, sums taken by warps. Derivation: docs/math/scatter.md.
+
+A substep is two launches. With M the nodes' momentum and mass, V their velocity:
+
+    grid      V ← (G1), (G2) of M,  next M ← 0
+    advance   particles: V → (T2), (T3) → new state → (T1) → next M
+
+and backward, with a bar for adjoints and the same sums the other way round:
+
+    grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
+    advance_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
+
+All that is particle- or node-wise is shared with the plain scheme: particle.py, grid.py, failure.py.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels import failure
+from softmpm.kernels.grid import grid
+from softmpm.kernels.native import native, native_module
+from softmpm.kernels.particle import particle, particle_adj
+from softmpm.kernels.stencil import stencil
+from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
+from softmpm.watch import Kind
+
+
+@functools.lru_cache(maxsize=None)
+def fused(spec: Spec) -> SimpleNamespace:
+    t, one = types(spec.dim, spec.dtype), particle(spec)
+    real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
+    Scale, Packed, Window, Particle = t.Scale, t.Packed, t.Window, one.Particle
+    Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
+    s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
+    gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
+    aligned, head, coordinates = s.aligned, s.head, s.coordinates
+    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
+    affine_momentum, moved, node_velocity = one.affine_momentum, one.moved, grid(spec).node_velocity
+    running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
+    row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_H, t.row_C
+    module = native_module(spec.module + ".fused")
+
+    @wp.func
+    def centre(fx: vec) -> vec:
+        """From the distance to the base node to that from the middle node, in cells."""
+        g = fx
+        for axis in range(dim):
+            g[axis] = fx[axis] - real(1.0)
+        return g
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def clear(node: wp.array(dtype=node_vec)):
+        store_node(node, wp.tid(), node_vec())
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def grid_velocity(
+        # Parameters:
+        scale: Scale,
+        walls: Walls,
+        window: Window,
+        # In:
+        node: wp.array(dtype=node_vec),
+        # Out:
+        velocity: wp.array(dtype=node_vec),
+        cleared: wp.array(dtype=node_vec),
+    ):
+        i = wp.tid()
+        here = load_node(node, i)
+        v = vec()
+        if here[dim] > real(0.0):
+            world = i / window.count
+            place = coordinates(i - world * window.count, window.shape) + window.origin[world]
+            v = node_velocity(scale, walls, place, head(here), here[dim])
+        store_node(velocity, i, aligned(v, real(0.0)))
+        if i < cleared.shape[0]:
+            store_node(cleared, i, node_vec())
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def advance(
+        # Parameters:
+        scale: Scale,
+        body: Solid,
+        window: Window,
+        substep: int,  # -1: only the P2G of the start
+        last: bool,  # no P2G afterwards
+        count: int,  # particles of one world
+        total: int,  # particles of all worlds
+        order: wp.array(dtype=wp.int32),
+        # In:
+        velocity: wp.array(dtype=node_vec),
+        now: Packed,
+        # Out:
+        watch: wp.array(dtype=wp.int64),
+        then: Packed,
+        # Out, added into:
+        node: wp.array(dtype=node_vec),
+    ):
+        i = wp.tid()
+        first = int(-1)
+        g = vec()
+        b = vec()
+        A = mat()
+        m = real(0.0)
+        if i < total:
+            world = i / count
+            p = i - world * count
+            at = Particle()
+            at.base = unpack_base(now.base[i])
+            at.fx = load_vec(now.rows, i, row_fx)
+            at.low = load_vec(now.rows, i, row_low)
+            at.H = load_mat(now.rows, i, row_H)
+            origin = window.origin[world]
+            held = world * window.count  # nodes of the worlds before
+            if substep >= 0 and running(watch, world):
+                g = centre(at.fx)
+                sums = gather(velocity, held + first_node(at.base, origin, window.shape), window.shape, g)
+                B = sums.outer - wp.outer(sums.value, g)
+                new = moved(scale, body, origin, window.shape, world, p, at, sums.value, B)
+                if not new.sound:
+                    complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
+                    new.base = at.base
+                at = new
+            else:
+                at.v = load_vec(now.rows, i, row_v)
+                at.C = load_mat(now.rows, i, row_C)
+            if substep >= 0:
+                then.base[i] = pack_base(at.base)
+                store_vec(then.rows, i, row_fx, at.fx)
+                store_vec(then.rows, i, row_low, at.low)
+                store_vec(then.rows, i, row_v, at.v)
+                store_mat(then.rows, i, row_H, at.H)
+                store_mat(then.rows, i, row_C, at.C)
+            if not last:
+                m = body.mass[world, p]
+                g = centre(at.fx)
+                A = affine_momentum(scale, body, world, p, at.C, at.H)
+                b = m * at.v - A * g
+                first = held + first_node(at.base, origin, window.shape)
+        if not last:
+            scatter(node, window.shape, first, g, b, A, m)
+
+    return SimpleNamespace(clear=clear, grid_velocity=grid_velocity, advance=advance, centre=centre)
+
+
+@functools.lru_cache(maxsize=None)
+def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+    t, one, twin = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
+    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
+    Scale, Packed, Window, ParticleAdj = t.Scale, t.Packed, t.Window, twin.ParticleAdj
+    Solid, Walls, SolidAdj = (
+        solid_types(spec).Solid,
+        solid_types(spec).Walls,
+        solid_adj_type(spec, wanted),
+    )
+    s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
+    gather_adj, slope_adj, first_node, unpack_base = s.gather_adj, s.slope_adj, s.first_node, s.unpack_base
+    aligned, head, coordinates, centre = s.aligned, s.head, s.coordinates, fused(spec).centre
+    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
+    affine_momentum, momentum_adj, moved_adj = one.affine_momentum, twin.momentum_adj, twin.moved_adj
+    node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
+    report, bad_gradient = failure.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
+    row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_H, t.row_C
+    module = native_module(adj_module(spec, wanted) + ".fused")
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def grid_velocity_adj(
+        # Parameters:
+        scale: Scale,
+        walls: Walls,
+        window: Window,
+        # In:
+        node: wp.array(dtype=node_vec),  # of this substep; empty after the last
+        node_before: wp.array(dtype=node_vec),  # of the substep before; empty in the first
+        # In and out:
+        adj: wp.array(dtype=node_vec),  # adjoint of the velocity, then of momentum and mass
+        # Out:
+        velocity: wp.array(dtype=node_vec),  # of the substep before
+        cleared: wp.array(dtype=node_vec),
+    ):
+        i = wp.tid()
+        world = i / window.count
+        place = coordinates(i - world * window.count, window.shape) + window.origin[world]
+        if i < node.shape[0]:
+            here = load_node(node, i)
+            back = node_velocity_adj(
+                scale, walls, place, head(here), here[dim], head(load_node(adj, i))
+            )
+            store_node(adj, i, aligned(back.p, back.m))
+        if i < node_before.shape[0]:
+            there = load_node(node_before, i)
+            v = node_velocity(scale, walls, place, head(there), there[dim])
+            store_node(velocity, i, aligned(v, real(0.0)))
+            store_node(cleared, i, node_vec())
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def advance_adj(
+        # Parameters:
+        scale: Scale,
+        body: Solid,
+        window: Window,
+        back: int,  # substeps from the end
+        start: bool,  # nothing before
+        end: bool,  # nothing after
+        count: int,
+        total: int,
+        order: wp.array(dtype=wp.int32),
+        # In:
+        before: Packed,
+        now: Packed,
+        velocity: wp.array(dtype=node_vec),  # of the substep before
+        adj_node: wp.array(dtype=node_vec),  # of this substep
+        # In and out:
+        adj_now: wp.array(dtype=real),
+        # Out:
+        watch: wp.array(dtype=wp.int64),
+        # Out, added into:
+        adj_body: SolidAdj,
+        adj_velocity: wp.array(dtype=node_vec),  # of the substep before
+    ):
+        i = wp.tid()
+        first = int(-1)
+        g = vec()
+        b = vec()
+        B = mat()
+        if i < total:
+            world = i / count
+            p = i - world * count
+            origin = window.origin[world]
+            adj = ParticleAdj()
+            adj.fx = load_vec(adj_now, i, row_fx)
+            adj.H = load_mat(adj_now, i, row_H)
+            v = load_vec(now.rows, i, row_v)
+            C = load_mat(now.rows, i, row_C)
+            if end:
+                adj.v = load_vec(adj_now, i, row_v)
+                adj.C = load_mat(adj_now, i, row_C)
+            else:
+                H = load_mat(now.rows, i, row_H)
+                g = centre(load_vec(now.rows, i, row_fx))
+                m = body.mass[world, p]
+                A = affine_momentum(scale, body, world, p, C, H)
+                here = world * window.count + first_node(unpack_base(now.base[i]), origin, window.shape)
+                sums = gather_adj(adj_node, here, window.shape, g, m * v - A * g, A, m)
+                B = sums.outer - wp.outer(sums.value, g)
+                more = momentum_adj(scale, body, world, p, v, C, H, sums.value, sums.mass, B, adj_body)
+                adj.fx += sums.slope - wp.transpose(A) * sums.value
+                adj.v = more.v
+                adj.C = more.C
+                adj.H += more.H
+                size = (
+                    wp.dot(adj.fx, adj.fx) + wp.dot(adj.v, adj.v) + wp.ddot(adj.C, adj.C) + wp.ddot(adj.H, adj.H)
+                )
+                if not wp.isfinite(size):
+                    report(watch, world, back, bad_gradient, order[i])
+            if start:
+                store_vec(adj_now, i, row_v, adj.v)
+                store_mat(adj_now, i, row_C, adj.C)
+            else:
+                g = centre(load_vec(before.rows, i, row_fx))
+                adj = moved_adj(scale, load_mat(before.rows, i, row_H), C, adj)
+                B = adj.C
+                b = adj.v - B * g
+                first = world * window.count + first_node(unpack_base(before.base[i]), origin, window.shape)
+                sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
+                adj.fx += sums.slope - wp.transpose(B) * v
+            store_vec(adj_now, i, row_fx, adj.fx)
+            store_mat(adj_now, i, row_H, adj.H)
+        if not start:
+            scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
+
+    return SimpleNamespace(grid_velocity_adj=grid_velocity_adj, advance_adj=advance_adj)

@@ -1,0 +1,72 @@
+"""What Warp's language cannot say: 16-byte loads and reductions, and the sum over a warp. The code is in scatter.h.
+
+Everything has a plain form as well, for the CPU, for double precision and for GPUs before sm_90, chosen when it is compiled.
+"""
+
+import functools
+from pathlib import Path
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.types import types
+
+HEADER = Path(__file__).with_name("scatter.h")
+BLOCK = 128
+"""Threads of a block; scatter.h reserves shared memory for so many particles."""
+
+
+def native_module(name: str) -> str:
+    """Give the Warp module of this name what native functions need; returns the name.
+
+    Machine code of the very GPU ("cubin"): PTX would be that of the oldest GPU in the machine, without 16-byte reductions.
+    """
+    source = HEADER.read_text()
+    build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)
+    options = {"extra_build_options": build, "cuda_output": "cubin", "enable_backward": False}
+    wp.set_module_options(options, module=wp.get_module(name))
+    return name
+
+
+@functools.lru_cache(maxsize=None)
+def native(dim: int, dtype: str) -> SimpleNamespace:
+    t = types(dim, dtype)
+    real, vec, mat, ivec, node_vec, rows = t.real, t.vec, t.mat, t.ivec, t.aligned, t.rows
+
+    @wp.func_native(f"softmpm::scatter<{dim}>(node.data, shape, first, g, b, A, m);")
+    def scatter(
+        node: wp.array(dtype=node_vec), shape: ivec, first: int, g: vec, b: vec, A: mat, m: real
+    ): ...
+
+    @wp.func_native("return softmpm::load_node(node.data, i);")
+    def load_node(node: wp.array(dtype=node_vec), i: int) -> node_vec: ...
+
+    @wp.func_native("softmpm::store_node(node.data, i, value);")
+    def store_node(node: wp.array(dtype=node_vec), i: int, value: node_vec): ...
+
+    @wp.func_native(
+        f"wp::vec_t<{dim}, {t.c_name}> value; softmpm::load_rows<{rows}, {dim}>(packed.data, i, r, value.c); return value;"
+    )
+    def load_vec(packed: wp.array(dtype=real), i: int, r: int) -> vec: ...
+
+    @wp.func_native(
+        f"wp::mat_t<{dim}, {dim}, {t.c_name}> value; "
+        f"softmpm::load_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]); return value;"
+    )
+    def load_mat(packed: wp.array(dtype=real), i: int, r: int) -> mat: ...
+
+    @wp.func_native(f"softmpm::store_rows<{rows}, {dim}>(packed.data, i, r, value.c);")
+    def store_vec(packed: wp.array(dtype=real), i: int, r: int, value: vec): ...
+
+    @wp.func_native(f"softmpm::store_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]);")
+    def store_mat(packed: wp.array(dtype=real), i: int, r: int, value: mat): ...
+
+    return SimpleNamespace(
+        scatter=scatter,
+        load_node=load_node,
+        store_node=store_node,
+        load_vec=load_vec,
+        load_mat=load_mat,
+        store_vec=store_vec,
+        store_mat=store_mat,
+    )

@@ -1,0 +1,307 @@
+// Adding what particles give to the nodes of a grid, and reading nodes and packed particles. Derivation: docs/math/scatter.md.
+//
+// A particle gives node o of its 3^DIM stencil, o along each axis in {-1, 0, 1} from the middle node, the vector
+//
+//     w_o (b + A o, m),   w_o = product over the axes of w(o_a, g_a)                                 (A1)
+//
+// with g the distance from the middle node in cells, -1/2 <= g < 1/2. Both scatters have this form: momentum and mass of the
+// forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
+// share their nodes. The warp therefore turns the sum around: it writes its particles' (b, A, m, g) to shared memory, then
+// three groups of nine lanes own the nodes, walk through a third of the particles each, add up in registers while the cell
+// stays the same, and send one 16-byte reduction per node and cell.
+namespace softmpm {
+
+constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
+
+#if defined(__CUDA_ARCH__)
+
+template <typename T> struct Node {
+    T x, y, z, m;
+};
+
+template <typename T> CUDA_CALLABLE inline Node<T> load(const T* p) { return { p[0], p[1], p[2], p[3] }; }
+template <> CUDA_CALLABLE inline Node<float> load(const float* p)
+{
+    float4 v = __ldg(reinterpret_cast<const float4*>(p));
+    return { v.x, v.y, v.z, v.w };
+}
+
+template <typename T> CUDA_CALLABLE inline void add(T* p, T x, T y, T z, T m)
+{
+    atomicAdd(p, x);
+    atomicAdd(p + 1, y);
+    atomicAdd(p + 2, z);
+    atomicAdd(p + 3, m);
+}
+#if __CUDA_ARCH__ >= 900
+template <> CUDA_CALLABLE inline void add(float* p, float x, float y, float z, float m)
+{
+    asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(p), "f"(x), "f"(y), "f"(z), "f"(m) : "memory");
+}
+#endif
+
+// w(o, g) = level + bend (g - peak)^2, for the o that a lane owns
+struct Weight {
+    float level, bend, peak;
+    CUDA_CALLABLE inline explicit Weight(int o)
+        : level(o == 0 ? 0.75f : 0.0f)
+        , bend(o == 0 ? -1.0f : 0.5f)
+        , peak(-0.5f * float(o))
+    {
+    }
+    CUDA_CALLABLE inline float operator()(float g) const
+    {
+        float d = g - peak;
+        return level + bend * d * d;
+    }
+};
+
+// Three dimensions: a lane owns a column of three nodes along z, and hands it on when the next cell is the one above.
+CUDA_CALLABLE inline void add_warp(
+    float* node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, float>& g, const wp::vec_t<3, float>& b,
+    const wp::mat_t<3, 3, float>& A, float m)
+{
+    constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
+    __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
+    int lane = threadIdx.x & (LANES - 1);
+    float4* all = box + (threadIdx.x - lane) * WIDTH;
+    float4* mine = all + lane * WIDTH;
+    float low = 0.5f - g[2], high = 0.5f + g[2];
+    mine[0] = make_float4(b[0], b[1], b[2], m);
+    mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], g[0]);
+    mine[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], g[1]);
+    mine[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], 0.5f * low * low);
+    mine[4] = make_float4(0.75f - g[2] * g[2], 0.5f * high * high, __int_as_float(first), 0.0f);
+    __syncwarp();
+
+    int group = lane / 9, column = lane % 9;
+    int ox = column / 3 - 1, oy = column % 3 - 1;
+    Weight wx(ox), wy(oy);
+    float fx = float(ox), fy = float(oy);
+    int begin = group * 11, end = min(begin + 11, LANES);
+    if (group == 3)
+        begin = end;  // lanes 27 to 31 own nothing
+    float* origin = node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]);
+    float4 below = make_float4(0.0f, 0.0f, 0.0f, 0.0f), middle = below, above = below;
+    const float4 zero = below;
+    int current = -1;
+    for (int p = begin; p < end; ++p) {
+        const float4* q = all + p * WIDTH;
+        float4 q4 = q[4];
+        int next = __float_as_int(q4.z);
+        if (next < 0)
+            break;  // the last particle was the one before
+        if (next != current) {
+            if (current >= 0) {
+                float* at = origin + 4 * (long long)current;
+                add(at, below.x, below.y, below.z, below.w);
+                if (next == current + 1) {
+                    below = middle;
+                    middle = above;
+                } else {
+                    add(at + 4, middle.x, middle.y, middle.z, middle.w);
+                    add(at + 8, above.x, above.y, above.z, above.w);
+                    below = middle = zero;
+                }
+                above = zero;
+            }
+            current = next;
+        }
+        float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
+        float w = wx(q1.w) * wy(q2.w);
+        float x = q0.x + q1.x * fx + q2.x * fy, y = q0.y + q1.y * fx + q2.y * fy, z = q0.z + q1.z * fx + q2.z * fy;
+        float w0 = w * q3.w, w1 = w * q4.x, w2 = w * q4.y;
+        below.x += w0 * (x - q3.x);
+        below.y += w0 * (y - q3.y);
+        below.z += w0 * (z - q3.z);
+        below.w += w0 * q0.w;
+        middle.x += w1 * x;
+        middle.y += w1 * y;
+        middle.z += w1 * z;
+        middle.w += w1 * q0.w;
+        above.x += w2 * (x + q3.x);
+        above.y += w2 * (y + q3.y);
+        above.z += w2 * (z + q3.z);
+        above.w += w2 * q0.w;
+    }
+    if (current >= 0) {
+        float* at = origin + 4 * (long long)current;
+        add(at, below.x, below.y, below.z, below.w);
+        add(at + 4, middle.x, middle.y, middle.z, middle.w);
+        add(at + 8, above.x, above.y, above.z, above.w);
+    }
+    __syncwarp();
+}
+
+// Two dimensions: a lane owns one node. The node is (x, y, m, 0).
+CUDA_CALLABLE inline void add_warp(
+    float* node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, float>& g, const wp::vec_t<2, float>& b,
+    const wp::mat_t<2, 2, float>& A, float m)
+{
+    constexpr int WIDTH = 3;
+    __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
+    int lane = threadIdx.x & (LANES - 1);
+    float4* all = box + (threadIdx.x - lane) * WIDTH;
+    float4* mine = all + lane * WIDTH;
+    mine[0] = make_float4(b[0], b[1], m, __int_as_float(first));
+    mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[0][1], A.data[1][1]);
+    mine[2] = make_float4(g[0], g[1], 0.0f, 0.0f);
+    __syncwarp();
+
+    int group = lane / 9, own = lane % 9;
+    int ox = own / 3 - 1, oy = own % 3 - 1;
+    Weight wx(ox), wy(oy);
+    float fx = float(ox), fy = float(oy);
+    int begin = group * 11, end = min(begin + 11, LANES);
+    if (group == 3)
+        begin = end;
+    float* origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
+    float x = 0.0f, y = 0.0f, mass = 0.0f;
+    int current = -1;
+    for (int p = begin; p < end; ++p) {
+        const float4* q = all + p * WIDTH;
+        float4 q0 = q[0];
+        int next = __float_as_int(q0.w);
+        if (next < 0)
+            break;
+        if (next != current) {
+            if (current >= 0)
+                add(origin + 4 * (long long)current, x, y, mass, 0.0f);
+            x = y = mass = 0.0f;
+            current = next;
+        }
+        float4 q1 = q[1], q2 = q[2];
+        float w = wx(q2.x) * wy(q2.y);
+        x += w * (q0.x + q1.x * fx + q1.z * fy);
+        y += w * (q0.y + q1.y * fx + q1.w * fy);
+        mass += w * q0.z;
+    }
+    if (current >= 0)
+        add(origin + 4 * (long long)current, x, y, mass, 0.0f);
+    __syncwarp();
+}
+
+#else
+
+template <typename T> struct Node {
+    T x, y, z, m;
+};
+template <typename T> inline Node<T> load(const T* p) { return { p[0], p[1], p[2], p[3] }; }
+template <typename T> inline void add(T* p, T x, T y, T z, T m)
+{
+    p[0] += x;
+    p[1] += y;
+    p[2] += z;
+    p[3] += m;
+}
+
+#endif
+
+// (A1) node by node: on the CPU, and in double precision.
+template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
+{
+    T low = T(0.5) - g, high = T(0.5) + g;
+    w[0] = T(0.5) * low * low;
+    w[1] = T(0.75) - g * g;
+    w[2] = T(0.5) * high * high;
+}
+
+template <typename T>
+CUDA_CALLABLE inline void add_each(
+    T* node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, T>& g, const wp::vec_t<3, T>& b,
+    const wp::mat_t<3, 3, T>& A, T m)
+{
+    if (first < 0)
+        return;
+    T w[3][3];
+    for (int a = 0; a < 3; ++a)
+        weights(g[a], w[a]);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+            T wij = w[0][i] * w[1][j], x[3];
+            for (int a = 0; a < 3; ++a)
+                x[a] = b[a] + A.data[a][0] * T(i - 1) + A.data[a][1] * T(j - 1) - A.data[a][2];
+            T* at = node + 4 * (long long)(first + (i * shape[1] + j) * shape[2]);
+            for (int k = 0; k < 3; ++k) {
+                T share = wij * w[2][k];
+                add(at + 4 * k, share * x[0], share * x[1], share * x[2], share * m);
+                for (int a = 0; a < 3; ++a)
+                    x[a] += A.data[a][2];
+            }
+        }
+}
+
+template <typename T>
+CUDA_CALLABLE inline void add_each(
+    T* node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, T>& g, const wp::vec_t<2, T>& b,
+    const wp::mat_t<2, 2, T>& A, T m)
+{
+    if (first < 0)
+        return;
+    T w[2][3];
+    for (int a = 0; a < 2; ++a)
+        weights(g[a], w[a]);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+            T share = w[0][i] * w[1][j], x = T(i - 1), y = T(j - 1);
+            T* at = node + 4 * (long long)(first + i * shape[1] + j);
+            add(at, share * (b[0] + A.data[0][0] * x + A.data[0][1] * y),
+                share * (b[1] + A.data[1][0] * x + A.data[1][1] * y), share * m, T(0));
+        }
+}
+
+// The whole warp must come here together: particles beyond the last one with first = -1.
+template <unsigned DIM, typename T>
+CUDA_CALLABLE inline void scatter(
+    wp::vec_t<4, T>* node, const wp::vec_t<DIM, int>& shape, int first, const wp::vec_t<DIM, T>& g,
+    const wp::vec_t<DIM, T>& b, const wp::mat_t<DIM, DIM, T>& A, T m)
+{
+#if defined(__CUDA_ARCH__)
+    if constexpr (sizeof(T) == 4) {
+        add_warp(reinterpret_cast<T*>(node), shape, first, g, b, A, m);
+        return;
+    }
+#endif
+    add_each(reinterpret_cast<T*>(node), shape, first, g, b, A, m);
+}
+
+template <typename T> CUDA_CALLABLE inline wp::vec_t<4, T> load_node(const wp::vec_t<4, T>* node, int i)
+{
+    Node<T> n = load(reinterpret_cast<const T*>(node + i));
+    return wp::vec_t<4, T>(n.x, n.y, n.z, n.m);
+}
+
+template <typename T> CUDA_CALLABLE inline void store_node(wp::vec_t<4, T>* node, int i, const wp::vec_t<4, T>& v)
+{
+    T* p = reinterpret_cast<T*>(node + i);
+#if defined(__CUDA_ARCH__)
+    if constexpr (sizeof(T) == 4) {
+        *reinterpret_cast<float4*>(p) = make_float4(v[0], v[1], v[2], v[3]);
+        return;
+    }
+#endif
+    for (int a = 0; a < 4; ++a)
+        p[a] = v[a];
+}
+
+// Packed particles: blocks of 32, in each block one row of 32 numbers after the other. Particle i, row r.
+template <int ROWS, typename T> CUDA_CALLABLE inline T* packed(T* rows, int i, int r)
+{
+    return rows + (long long)(i / LANES) * (ROWS * LANES) + (i % LANES) + r * LANES;
+}
+
+template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(const T* rows, int i, int r, T* out)
+{
+    const T* at = packed<ROWS>(rows, i, r);
+    for (int k = 0; k < COUNT; ++k)
+        out[k] = at[k * LANES];
+}
+
+template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(T* rows, int i, int r, const T* in)
+{
+    T* at = packed<ROWS>(rows, i, r);
+    for (int k = 0; k < COUNT; ++k)
+        at[k * LANES] = in[k];
+}
+
+}  // namespace softmpm

@@ -1,0 +1,196 @@
+"""The fast scheme's substeps of one chunk as a fixed list of launches on buffers of its own, replayed as a graph.
+
+A graph holds addresses, so everything that changes between calls is copied to fixed places first: the start, the material, the
+pull of the muscles. A program that kept its states is lent to one call until its backward pass is done.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.arrangement import Arrangement
+from softmpm.buffers import Solid, view
+from softmpm.kernels.fused import fused
+from softmpm.kernels.native import BLOCK
+from softmpm.kernels.packing import packing
+from softmpm.kernels.solid import sorted_solid
+from softmpm.kernels.types import solid_types, types
+from softmpm.model import Model
+from softmpm.replay import Replay
+from softmpm.state import Low, State
+from softmpm.step import stream_of
+from softmpm.watch import NEVER
+
+@dataclass(frozen=True)
+class Shape:
+    """What makes two chunks the same program."""
+
+    length: int
+    """Substeps."""
+    substeps: int
+    """Substeps of a control step."""
+    offset: int
+    """Substep of its control step that the first one is."""
+    keep: bool
+    """Whether a backward pass will follow."""
+
+    @property
+    def rows(self) -> int:
+        """Control steps that it touches."""
+        return (self.offset + self.length - 1) // self.substeps + 1
+
+    def row(self, s: int) -> int:
+        return (self.offset + s) // self.substeps
+
+
+class Program:
+    """One chunk on one arrangement."""
+
+    def __init__(self, model: Model, arrangement: Arrangement, shape: Shape):
+        self.model, self.arrangement, self.shape = model, arrangement, shape
+        self.types = t = types(model.spec.dim, model.spec.dtype)
+        self.lead = (model.worlds, model.particle_count)
+        self.total = model.worlds * model.particle_count
+        padded = -(-self.total // 32) * 32
+
+        def tensor(*size, dtype=model.dtype):
+            return torch.empty(*size, dtype=dtype, device=model.device)
+
+        self._tensor, self._padded = tensor, padded
+        self.order = tensor(*self.lead, dtype=torch.int32)
+        self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
+        self.words = tensor(model.worlds + 2, dtype=torch.int64)
+        slots, grids = (shape.length + 1, shape.length) if shape.keep else (1, 2)
+        self.base = tensor(slots, padded, dtype=torch.int32)
+        self.rows = tensor(slots, padded * t.rows)
+        self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
+        self.velocity = tensor(model.worlds * arrangement.node_count, 4)
+        self.pull = tensor(shape.rows, model.worlds, model.muscle_count) if model.muscle_count else None
+        self._structs()
+        self._forward = Replay(model, self._launch_all)
+
+    def _structs(self) -> None:
+        """What the kernels see of the buffers."""
+        model, t = self.model, self.types
+        self.window = self.arrangement.window(self.origin)
+        self.packed = []
+        for base, rows in zip(self.base, self.rows, strict=True):
+            packed = t.Packed()
+            packed.base, packed.rows = view(base, wp.int32), view(rows, t.real)
+            self.packed.append(packed)
+        self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
+        self.nothing = view(self._tensor(0, 4), t.aligned)
+        self.velocity_array = view(self.velocity, t.aligned)
+        self.order_array = view(self.order, wp.int32)
+        self.order_flat = view(self.order.view(-1), wp.int32)
+        self.watch = view(self.words, wp.int64)
+        material = [self._tensor(*self.lead) for _ in range(4)]
+        solid = solid_types(model.spec).Solid()
+        for name, tensor in zip(("mass", "mu", "lam", "volume"), material, strict=True):
+            setattr(solid, name, view(tensor, t.real))
+        if len(model.spec.laws) > 1:
+            solid.law = view(self._tensor(*self.lead, dtype=torch.int32), wp.int32)
+        if model.spec.muscle_slots:
+            slots = self._tensor(*self.lead, model.spec.muscle_slots, dtype=torch.int32)
+            self.muscle_array = view(slots, wp.int32)
+            solid.muscle, solid.fibre = self.muscle_array, view(model.fibre, t.vec)
+        self._solid = solid
+        self.solids = []
+        for row in self.pull if self.pull is not None else [None]:
+            solid = solid_types(model.spec).Solid()
+            for name in solid_types(model.spec).Solid.vars:
+                if name != "pull":
+                    setattr(solid, name, getattr(self._solid, name))
+            if row is not None:
+                solid.pull = view(row, t.real)
+            self.solids.append(solid)
+
+    def solid(self, s: int):
+        """Material and pull of substep ``s``."""
+        return self.solids[self.shape.row(s) if self.pull is not None else 0]
+
+    # -- launches ------------------------------------------------------------------------------------------------
+
+    def launch(self, kernel, dim, *inputs, stream=None, block_dim=256) -> None:
+        device = self.model.wp_device
+        wp.launch(
+            kernel, dim=dim, inputs=inputs, device=device, stream=stream, block_dim=block_dim, record_tape=False
+        )
+
+    @functools.cached_property
+    def blocks(self) -> int:
+        """Threads of a launch over particles: whole warps, since they work together."""
+        return -(-self.total // BLOCK) * BLOCK if self.model.device.type == "cuda" else self.total
+
+    # -- forward -------------------------------------------------------------------------------------------------
+
+    def run(self, start: State, pull: Tensor | None, solid: Solid) -> State:
+        """All substeps from ``start``; the end in new tensors. Failures are in :attr:`words`."""
+        model, stream, pack = self.model, stream_of(self.model.device), self.packing
+        self.order.copy_(self.arrangement.order)
+        self.origin.copy_(self.arrangement.origin)
+        self.words[:-2] = NEVER
+        self.words[-2:] = 0
+        if self.pull is not None:
+            self.pull.copy_(pull)
+        low = start.low or Low(torch.zeros_like(start.x), torch.zeros_like(start.F))
+        arrays = self.state_arrays(*start, *low)
+        given = Solid(solid.mass, solid.mu, solid.lam, None).struct(model)
+        self.launch(sorted_solid(model.spec), self.lead, self.order_array, given, self._solid, stream=stream)
+        enter = (model.scale, self.window, self.order_array, *arrays, self.watch, self.packed[0])
+        self.launch(pack.enter, self.lead, *enter, stream=stream)
+        self._forward.run(stream)
+        return self._leave(stream)
+
+    @property
+    def packing(self):
+        return packing(self.model.spec.dim, self.model.spec.dtype)
+
+    def state_arrays(self, *tensors: Tensor) -> list[wp.array]:
+        t = self.types
+        return [view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in tensors]
+
+    def _leave(self, stream) -> State:
+        model, d, rounds = self.model, self.model.dim, self.model.dtype == torch.float32
+        tails = 2 * [(d,)] + 2 * [(d, d)]
+        out = [self._tensor(*self.lead, *tail) for tail in tails]
+        low = [self._tensor(*(self.lead if rounds else (0, 0)), *tail) for tail in ((d,), (d, d))]
+        report = view(self.words[-2:], wp.int64)
+        leave = (self.window, self.order_array, self.packed[-1], *self.state_arrays(*out, *low), report)
+        self.launch(self.packing.leave, self.lead, model.scale, *leave, stream=stream)
+        state = State(*out)
+        return state.with_low(Low(*low)) if rounds else state
+
+    def _launch_all(self, stream) -> None:
+        nodes, spec = self.node_arrays, self.model.spec
+        self.launch(fused(spec).clear, len(self.velocity), nodes[0], stream=stream, block_dim=BLOCK)
+        self._advance(-1, stream)
+        for s in range(self.shape.length):
+            last = s + 1 == self.shape.length
+            cleared = self.nothing if last else nodes[(s + 1) % len(nodes)]
+            arguments = (self.model.scale, self.model.walls, self.window, nodes[s % len(nodes)])
+            self.launch(
+                fused(spec).grid_velocity,
+                len(self.velocity),
+                *arguments,
+                self.velocity_array,
+                cleared,
+                stream=stream,
+                block_dim=BLOCK,
+            )
+            self._advance(s, stream)
+
+    def _advance(self, s: int, stream) -> None:
+        """G2P of substep ``s`` and P2G of the next; the P2G of the first if ``s`` is -1."""
+        model, packed, nodes = self.model, self.packed, self.node_arrays
+        last = s + 1 == self.shape.length
+        now, then = (max(s, 0), s + 1) if self.shape.keep else (0, 0)
+        parameters = (model.scale, self.solid(min(s + 1, self.shape.length - 1)), self.window, s, last)
+        sizes = (model.particle_count, self.total, self.order_flat)
+        out = (self.watch, packed[then], nodes[(s + 1) % len(nodes)])
+        kernel = fused(model.spec).advance
+        arguments = (*parameters, *sizes, self.velocity_array, packed[now], *out)
+        self.launch(kernel, self.blocks, *arguments, stream=stream, block_dim=BLOCK)

@@ -1,0 +1,119 @@
+"""The adjoint of a program: the same launches from the last substep to the first, replayed as a graph as well."""
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.buffers import SolidAdj, clear, view
+from softmpm.kernels.fused import fused_adj
+from softmpm.kernels.native import BLOCK
+from softmpm.kernels.solid import collect_pull, sorted_solid_adj
+from softmpm.kernels.types import Wanted
+from softmpm.program import Program
+from softmpm.replay import Replay
+from softmpm.state import State
+from softmpm.step import stream_of
+
+
+class Scratch:
+    """What a backward pass needs only while it runs; the programs of an arrangement share it."""
+
+    def __init__(self, program: Program, wanted: Wanted):
+        model, t = program.model, program.types
+
+        def tensor(*size):
+            return torch.empty(*size, dtype=model.dtype, device=model.device)
+
+        self.adj = tensor(program.rows.shape[1])
+        self.nodes = tensor(2, len(program.velocity), 4)
+        self.velocity = tensor(len(program.velocity), 4)
+        self.solid = SolidAdj.zeros(model, wanted)
+        self.adj_array = view(self.adj, t.real)
+        self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
+        self.velocity_array = view(self.velocity, t.aligned)
+        self.solid_struct = self.solid.struct(model)
+        self.tensors = [v for v in (self.solid.mass, self.solid.mu, self.solid.lam, self.solid.slot) if v is not None]
+
+
+class ProgramAdj:
+    """Pulls adjoints back through a program that kept its states."""
+
+    def __init__(self, program: Program, wanted: Wanted, scratch: Scratch):
+        self.program, self.wanted, self.scratch = program, wanted, scratch
+        self.adj_pull = None
+        if wanted.activation and program.pull is not None:
+            self.adj_pull = torch.zeros_like(program.pull)
+            self._adj_rows = [view(row, program.types.real) for row in self.adj_pull]
+        self._backward = Replay(program.model, self._launch_all)
+
+    def run(self, adj_end: State, adj_solid: SolidAdj) -> tuple[State, Tensor | None]:
+        """Adjoint of the start in new tensors, and of the pull (control step, world, muscle); adds into ``adj_solid``."""
+        program, scratch = self.program, self.scratch
+        model, stream, pack = program.model, stream_of(program.model.device), program.packing
+        for tensor in scratch.tensors:
+            clear(tensor)
+        if self.adj_pull is not None:
+            clear(self.adj_pull)
+        order, arrays = program.order_array, program.state_arrays(*adj_end)
+        program.launch(pack.enter_adj, program.lead, model.scale, order, *arrays, scratch.adj_array, stream=stream)
+        self._backward.run(stream)
+        start = State(*(torch.empty_like(adj) for adj in adj_end))
+        arrays = program.state_arrays(*start)
+        program.launch(pack.leave_adj, program.lead, model.scale, order, scratch.adj_array, *arrays, stream=stream)
+        if self.wanted.material:
+            kernel = sorted_solid_adj(model.spec, self.wanted)
+            structs = scratch.solid_struct, adj_solid.struct(model)
+            program.launch(kernel, program.lead, order, *structs, stream=stream)
+        return start, None if self.adj_pull is None else self.adj_pull.clone()
+
+    def _launch_all(self, stream) -> None:
+        for s in range(self.program.shape.length, -1, -1):
+            self._grid(s, stream)
+            self._particles(s, stream)
+            if self.adj_pull is not None and s < self.program.shape.length:
+                self._collect(s, stream)
+
+    def _grid(self, s: int, stream) -> None:
+        """Adjoint of the nodes of substep ``s``, velocity of the nodes of the substep before."""
+        program, nothing, (here, before) = self.program, self.program.nothing, self._adj_nodes(s)
+        model, nodes = program.model, program.node_arrays
+        last, first = s == program.shape.length, s == 0
+        if last and first:
+            return
+        now, then = nothing if last else nodes[s], nothing if first else nodes[s - 1]
+        arguments = (model.scale, model.walls, program.window, now, then, here)
+        program.launch(
+            fused_adj(model.spec, self.wanted).grid_velocity_adj,
+            len(self.scratch.velocity),
+            *arguments,
+            self.scratch.velocity_array,
+            before,
+            stream=stream,
+            block_dim=BLOCK,
+        )
+
+    def _adj_nodes(self, s: int) -> tuple[wp.array, wp.array]:
+        """Adjoint grids of substep ``s`` and of the one before."""
+        return self.scratch.node_arrays[s % 2], self.scratch.node_arrays[(s + 1) % 2]
+
+    def _particles(self, s: int, stream) -> None:
+        """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
+        program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
+        model, length = program.model, program.shape.length
+        solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
+        parameters = (model.scale, solid, program.window, length - s, start, end)
+        sizes = (model.particle_count, program.total, program.order_flat)
+        states = (program.packed[max(s - 1, 0)], program.packed[s])
+        grids = (scratch.velocity_array, here, scratch.adj_array)
+        out = (program.watch, scratch.solid_struct, before)
+        kernel = fused_adj(model.spec, self.wanted).advance_adj
+        arguments = (*parameters, *sizes, *states, *grids, *out)
+        program.launch(kernel, program.blocks, *arguments, stream=stream, block_dim=BLOCK)
+
+    def _collect(self, s: int, stream) -> None:
+        """Where a control step begins, add what the particles found for its pull."""
+        program, shape = self.program, self.program.shape
+        if s == 0 or shape.row(s - 1) != shape.row(s):
+            slot = self.scratch.solid.slot
+            arrays = program.muscle_array, view(slot, program.types.real), self._adj_rows[shape.row(s)]
+            program.launch(collect_pull(program.model.spec), tuple(slot.shape), *arrays, stream=stream)

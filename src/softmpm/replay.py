@@ -1,0 +1,41 @@
+"""A fixed list of launches, recorded as a graph when it first runs and replayed afterwards, on a GPU and on the CPU."""
+
+import threading
+from collections.abc import Callable
+
+import torch
+import warp as wp
+
+from softmpm.model import Model
+
+_recording = threading.Lock()
+"""Warp records one CPU graph at a time."""
+
+
+class Replay:
+    """Calls ``launches(stream)`` once to record it.
+
+    While PyTorch itself records a CUDA graph, the launches become part of that one.
+    """
+
+    def __init__(self, model: Model, launches: Callable[[wp.Stream | None], None]):
+        self.model, self.launches = model, launches
+        self._graph: wp.Graph | None = None
+
+    def run(self, stream: wp.Stream | None) -> None:
+        if stream is not None and torch.cuda.is_current_stream_capturing():
+            self.launches(stream)
+            return
+        if self._graph is None:
+            self._graph = self._record()
+        wp.capture_launch(self._graph, stream=stream)
+
+    def _record(self) -> wp.Graph:
+        if self.model.device.type == "cpu":
+            with _recording, wp.ScopedCapture(device=self.model.wp_device) as capture:
+                self.launches(None)
+            return capture.graph
+        stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
+        with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
+            self.launches(stream)
+        return capture.graph
