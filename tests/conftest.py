@@ -1,4 +1,4 @@
-"""What every test shares: quiet Warp, one thread, and a ``device`` that is the CPU and, where there is one, a GPU."""
+"""What every test shares: quiet Warp, one thread, a ``device`` that is the CPU and, where there is one, a GPU, both schemes."""
 
 import os
 
@@ -25,4 +25,9 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request) -> str:
+    return request.param
+
+
+@pytest.fixture(params=["plain", "fast"])
+def scheme(request) -> str:
     return request.param

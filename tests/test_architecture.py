@@ -6,10 +6,12 @@ import sys
 from pathlib import Path
 
 SRC = Path(__file__).parents[1] / "src"
-ORDER = """scene state watch silhouette surface shapes checks stability memory
+ORDER = """scene state watch silhouette surface shapes checks stability schedule horizon memory
     kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact kernels.grid
-    kernels.failure kernels.transfer kernels.boundary kernels.raster
-    model buffers step rollout raster autograd tape reference layout playback recording appearance show rerun_file __main__""".split()
+    kernels.failure kernels.particle kernels.transfer kernels.boundary kernels.raster
+    kernels.native kernels.stencil kernels.fused kernels.packing
+    model buffers failures step plain arrangement replay program program_adj fast rollout
+    raster autograd tape reference layout playback recording appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
     "h5py": {"layout", "recording", "playback"},

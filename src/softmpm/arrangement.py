@@ -13,14 +13,11 @@ from torch import Tensor
 
 from softmpm.buffers import view
 from softmpm.kernels.types import types
+from softmpm.memory import window_shape
 from softmpm.model import Model
 
-MARGIN = 6
-"""Nodes of a new window around the particles' stencils, on each side."""
 STALE = 1.3
 """Renew the order when going along it meets so many times more cells than when it was new."""
-BITS = {2: 16, 3: 10}
-"""Bits of a node's coordinate in packed particles."""
 
 
 class Arrangement:
@@ -37,12 +34,10 @@ class Arrangement:
         self.fresh_cells: int | None = None
         self.stale = False
         first, last = self._reach(x)
-        shape = []
-        for axis, nodes in enumerate(model.scene.grid.shape):
-            wide = max(h - low for low, h in zip(first[axis], last[axis], strict=True)) + 3 + 2 * MARGIN
-            wide = max(wide, least[axis] if least else 0)
-            shape.append(min(nodes, 4 * math.ceil(wide / 4)))
-        self.shape = tuple(shape)
+        grid = model.scene.grid.shape
+        reach = [max(h - low for low, h in zip(*axis, strict=True)) for axis in zip(first, last, strict=True)]
+        wide = window_shape(grid, reach)
+        self.shape = tuple(min(n, max(w, k)) for n, w, k in zip(grid, wide, least or wide, strict=True))
         self.order = torch.empty(model.worlds, model.particle_count, dtype=torch.int32, device=model.device)
         self.origin = torch.empty(model.worlds, model.dim, dtype=torch.int32, device=model.device)
         self._renew(x)
@@ -110,15 +105,3 @@ class Arrangement:
         window.shape, window.count = t.ivec(*self.shape), self.node_count
         window.origin = view(origin, t.ivec)
         return window
-
-
-def packable(model: Model) -> str | None:
-    """Why the fast scheme cannot hold this model, or None."""
-    largest = 2 ** BITS[model.dim]
-    if max(model.scene.grid.shape) > largest:
-        return f"the grid has more than {largest} nodes along an axis"
-    rows = types(model.spec.dim, model.spec.dtype).rows
-    if model.worlds * model.particle_count * rows >= 2**31:
-        return "there are more particles than 32-bit indices reach"
-    return None
-

@@ -5,12 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from softmpm.buffers import Motion, Solid, lame
+from softmpm.buffers import Solid, lame
 from softmpm.checks import check_activation, check_params, check_state, check_substeps, check_values
+from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
 from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
-from softmpm.rollout import Horizon, rollout, rollout_adj
+from softmpm.rollout import Trail, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
 
 _SECOND = (
@@ -69,7 +70,8 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
         pull = torch.zeros(1, model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
     low = start.low or (None, None)
     inputs = (pull, mu, lam, mass, *start)
-    keep = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs)
+    needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+    keep = _Kept() if needed else None
     end = _Simulate.apply(model, Horizon(control_steps, substeps), keep, *inputs, *low)
     state = State(*end[:4])
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
@@ -108,24 +110,34 @@ def _cast(model: Model, value: Any) -> Any:
     return cast.with_low(value.low) if isinstance(value, State) else cast
 
 
+class _Kept:
+    """Takes what a call keeps from its forward to its backward pass: not tensors, which PyTorch would want to track."""
+
+    trail: Trail | None = None
+
+
 class _Simulate(torch.autograd.Function):
     @staticmethod
     def forward(model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F):
         start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
-        end, kept = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep)
-        return (*end, *(end.low or (None, None)), *(kept.tensors() if kept else ()))
+        end, trail = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep is not None)
+        if keep is not None:
+            keep.trail = trail
+        return (*end, *(end.low or (None, None)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.model, ctx.horizon, _, *differentiable = inputs[:11]
+        ctx.model, ctx.horizon, keep, *differentiable = inputs[:11]
+        ctx.trail = None if keep is None else keep.trail
         ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*differentiable, *output[6:])
+        ctx.save_for_backward(*differentiable)
 
     @staticmethod
     def backward(ctx, *adj_end):
         wanted = Wanted(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
-        adj = _SimulateBackward.apply(ctx.model, ctx.horizon, wanted, *ctx.saved_tensors, *adj_end[:4])
+        about = ctx.model, ctx.horizon, ctx.trail, wanted
+        adj = _SimulateBackward.apply(*about, *ctx.saved_tensors, *adj_end[:4])
         return None, None, None, *adj, None, None
 
 
@@ -133,9 +145,9 @@ class _SimulateBackward(torch.autograd.Function):
     """A function of its own, so that a second derivative raises instead of silently losing this term."""
 
     @staticmethod
-    def forward(model, horizon, wanted, pull, mu, lam, mass, *tensors):
-        # The start is not read, its kept copy is; it stands here so that a second derivative finds this function.
-        kept, adj_end = Motion(*tensors[4:-4]), tensors[-4:]
+    def forward(model, horizon, trail, wanted, pull, mu, lam, mass, *tensors):
+        # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
+        adj_end = tensors[-4:]
         shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
         shapes += 2 * ((*shapes[0], model.dim),)
         adj_end = State(
@@ -145,7 +157,7 @@ class _SimulateBackward(torch.autograd.Function):
             )
         )
         adj, solid, adj_pull = rollout_adj(
-            model, horizon, kept, pull, Solid(mass, mu, lam, pull), adj_end, wanted
+            model, horizon, trail, pull, Solid(mass, mu, lam, pull), adj_end, wanted
         )
         return adj_pull, solid.mu, solid.lam, solid.mass, *adj
 

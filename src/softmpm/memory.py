@@ -1,49 +1,96 @@
-"""How much a differentiable call keeps, and what it recomputes instead. Formula and figures: docs/memory.md.
+"""How much a differentiable call keeps, and what it runs again instead. Formula and figures: docs/memory.md.
 
-With N substeps, S bytes of one stored state (all worlds) and G bytes of the grid:
+A call is cut into chunks. To pull a chunk back, what is inside it must be there: its states and the mass and momentum of the
+nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
 
-    keep all:   N + 1 states are kept by the forward pass, nothing is computed twice
-    segments:   ⌈N/L⌉ states are kept, L = ⌈√N⌉; the backward pass recomputes one segment at a time into L + 1 states
-
-    backward peak = kept + recomputed + 2 S' + 2 G + gradients                                       (memory)
+    keep all:  everything inside all chunks, N (S + G); nothing runs twice
+    schedule:  one chunk at a time is run again, L (S + G); of the ⌈N/L⌉ states between chunks, s are kept, s B,
+               and the others are found by running chunks again, as few as possible (schedule.py)
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
-KEEP_ALL_BYTES = 64 * 2**20
-"""Without a budget, a call keeps all its states up to this size; a closed loop makes a hundred such calls."""
+from softmpm.schedule import recomputed
+
+LONGEST = 128
+"""Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
+CPU_BUDGET = 64 * 2**20
+"""Without a budget, what a call on the CPU may keep; on a GPU it is a sixteenth of its memory."""
+
+
+MARGIN = 6
+"""Nodes of a window around the particles' stencils, on each side."""
+
+
+def window_shape(grid: Sequence[int], reach: Sequence[int]) -> tuple[int, ...]:
+    """Nodes along each axis of the part of the grid that is in memory.
+
+    Args:
+        grid: Nodes of the whole grid.
+        reach: How far the particles' base nodes lie apart.
+    """
+    wide = (apart + 3 + 2 * MARGIN for apart in reach)
+    return tuple(min(nodes, 4 * math.ceil(w / 4)) for nodes, w in zip(grid, wide, strict=True))
+
+
+class Sizes(NamedTuple):
+    """Bytes of what a call may keep."""
+
+    inside: int
+    """State of all worlds inside a chunk."""
+    nodes: int
+    """What is kept of the nodes of all worlds for each substep."""
+    between: int
+    """State of all worlds between chunks."""
 
 
 class Plan(NamedTuple):
     """What is kept of a call."""
 
-    segment: int
-    """Substeps from one kept state to the next."""
+    longest: int
+    """Substeps of a chunk, at most."""
+    slots: int
+    """States between chunks that are kept; 0 if everything is."""
     kept: int
-    """States that the forward pass keeps."""
+    """Bytes kept by the forward pass."""
     recomputed: int
-    """States of one recomputed segment; 0 if all are kept."""
+    """Bytes of what the backward pass runs again at a time."""
+
+    @property
+    def keep_all(self) -> bool:
+        return self.slots == 0
 
 
-def plan(substeps: int, state_bytes: int, budget: int | None) -> Plan:
-    """The plan that computes least within the budget [B].
+def plan(horizon, sizes: Sizes, budget: int) -> Plan:
+    """The plan that runs least again within the budget [B].
+
+    Args:
+        horizon: A :class:`softmpm.horizon.Horizon`.
 
     Raises:
-        ValueError: Not even segments of √N fit.
+        ValueError: Not even one substep at a time fits.
     """
-    everything = Plan(segment=1, kept=substeps + 1, recomputed=0)
-    if everything.kept * state_bytes <= (KEEP_ALL_BYTES if budget is None else budget):
-        return everything
-    length = max(1, math.isqrt(max(substeps - 1, 0)) + 1)
-    segments = Plan(segment=length, kept=math.ceil(substeps / length), recomputed=length + 1)
-    least = (segments.kept + segments.recomputed) * state_bytes
-    if budget is not None and least > budget:
+    chunks = len(horizon.chunks(LONGEST))
+    everything = horizon.total * (sizes.inside + sizes.nodes) + chunks * sizes.inside
+    if everything <= budget or horizon.total == 0:
+        return Plan(LONGEST, 0, everything, 0)
+    best, least = None, math.inf
+    for longest in (2**k for k in range(LONGEST.bit_length() - 1, -1, -1)):
+        chunks = horizon.chunks(longest)
+        length = max(chunk.length for chunk in chunks)
+        inside = (length + 1) * sizes.inside + length * sizes.nodes
+        slots = min(len(chunks), (budget - inside - sizes.between) // sizes.between)
+        if slots >= 1 and (again := recomputed(len(chunks), slots) * length) < least:
+            best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), again
+    if best is None:
+        smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes
         raise ValueError(
-            f"a gradient through {substeps} substeps needs at least {least / 2**20:.1f} MiB of states, memory_budget is "
-            f"{budget / 2**20:.1f} MiB: raise it, or cut the call into several and wrap them in torch.utils.checkpoint."
+            f"a gradient needs at least {smallest / 2**20:.1f} MiB for states, memory_budget is {budget / 2**20:.1f} MiB: "
+            "raise it, or make the scene smaller."
         )
-    return segments
+    return best
 
 
 class Memory(NamedTuple):
@@ -57,20 +104,19 @@ class Memory(NamedTuple):
     """Peak of the backward pass, kept states included."""
 
 
-def memory(model, substeps: int) -> Memory:
-    """Evaluates (memory) for one call of ``substeps`` substeps in one control step, all gradients wanted."""
-    state, grid, real = model.state_bytes(), model.node_bytes(), model.dtype.itemsize
+def memory(model, horizon) -> Memory:
+    """Evaluates (memory) for one call, all gradients wanted."""
+    real, sizes = model.dtype.itemsize, model.sizes()
     particles = model.worlds * model.particle_count
-    boundary = (
-        particles * real * (2 * model.dim + 2 * model.dim**2)
-    )  # x, v, C, F of the end or their adjoints
-    low = boundary // 2 if real == 4 else 0
-    material = 3 * particles * real
+    state = particles * real * (2 * model.dim + 2 * model.dim**2)  # x, v, C, F of the end, or their adjoints
+    low = state // 2 if real == 4 else 0
+    material = 4 * particles * real
     pull = particles * model.spec.muscle_slots * real
-    chosen = plan(substeps, state, model.memory_budget)
-    forward = 2 * state + grid + material + boundary + low
-    kept = chosen.kept * state + material
-    adjoints = 2 * boundary + 2 * material + pull
+    chosen = plan(horizon, sizes, model.budget)
+    forward = (
+        sizes.inside * (1 if model.scheme == "fast" else 2) + 3 * sizes.nodes + 2 * material + state + low
+    )
+    adjoints = 2 * state + 2 * material + pull + 3 * sizes.nodes + sizes.inside
     return Memory(
-        forward, kept, kept + boundary + low + chosen.recomputed * state + 2 * grid + adjoints + boundary
+        forward, chosen.kept + 2 * material, chosen.kept + chosen.recomputed + 2 * material + state + adjoints
     )

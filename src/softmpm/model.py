@@ -1,5 +1,6 @@
 """A scene made ready to run: fixed arrays on one device, and what was specialised for it."""
 
+import functools
 import logging
 import math
 
@@ -9,8 +10,9 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.checks import check_scene
-from softmpm.kernels.types import Spec, solid_types, types
-from softmpm.memory import memory
+from softmpm.horizon import Horizon
+from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
+from softmpm.memory import CPU_BUDGET, Sizes, memory, window_shape
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
 from softmpm.stability import stable_dt, warn_unstable
 from softmpm.state import Low, Params, State
@@ -26,6 +28,7 @@ def build(
     dtype: torch.dtype = torch.float32,
     worlds: int = 1,
     memory_budget: int | None = None,
+    scheme: str = "auto",
 ) -> "Model":
     """Make a scene ready to run.
 
@@ -36,6 +39,8 @@ def build(
         worlds: Number of independent copies of the scene that run in one launch.
         memory_budget: Most bytes that one ``simulate`` call may keep for its backward pass, None for a sensible choice;
             see docs/memory.md.
+        scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
+            docs/performance.md.
 
     Returns:
         The model: immutable, shared by any number of simulations.
@@ -50,8 +55,10 @@ def build(
         raise ValueError(f"worlds must be a whole number of at least 1, got {worlds!r}.")
     if memory_budget is not None and not memory_budget > 0:
         raise ValueError(f"memory_budget must be a positive number of bytes or None, got {memory_budget}.")
+    if scheme not in ("auto", "fast", "plain"):
+        raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     warn_unstable(scene)
-    return Model(scene, _device(device), dtype, worlds, memory_budget)
+    return Model(scene, _device(device), dtype, worlds, memory_budget, scheme)
 
 
 def _device(device: str | torch.device | None) -> torch.device:
@@ -82,7 +89,13 @@ class Model:
     """
 
     def __init__(
-        self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, memory_budget: int | None
+        self,
+        scene: Scene,
+        device: torch.device,
+        dtype: torch.dtype,
+        worlds: int,
+        memory_budget: int | None,
+        scheme: str,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
         self.memory_budget = memory_budget
@@ -105,6 +118,7 @@ class Model:
         wp.init()
         self.wp_device = wp.device_from_torch(device)
         self.scale, self.walls = self._scale(), self._walls()
+        self.scheme, self.scheme_reason = self._scheme(scheme)
 
     def _tensor(self, values) -> Tensor:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
@@ -156,23 +170,63 @@ class Model:
             *(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields)
         )
 
-    def state_bytes(self) -> int:
-        """Memory of one stored state of all worlds [B]."""
-        real = self.dtype.itemsize
-        low = self.dim if self.dtype == torch.float32 else 0
-        return (
-            self.worlds * self.particle_count * (4 * self.dim + real * (low + 2 * self.dim + 2 * self.dim**2))
-        )
+    def _scheme(self, wanted: str) -> tuple[str, str]:
+        """The scheme, and why."""
+        largest = 2 ** BASE_BITS[self.dim]
+        numbers = self.worlds * self.particle_count * packed_rows(self.dim).rows
+        obstacle = None
+        if max(self.scene.grid.shape) > largest:
+            obstacle = f"the grid has more than {largest} nodes along an axis"
+        elif numbers >= 2**31:
+            obstacle = "there are more particles than 32-bit indices reach"
+        if wanted == "fast" and obstacle:
+            raise ValueError(
+                f"scheme 'fast' cannot hold this scene: {obstacle}; use scheme='plain' or 'auto'."
+            )
+        if wanted != "auto":
+            return wanted, "as asked for"
+        if obstacle:
+            return "plain", obstacle
+        if self.dtype == torch.float64:
+            return "plain", "double precision gains nothing from 16-byte reductions"
+        return "fast", "single precision"
 
-    def node_bytes(self) -> int:
-        """Memory of momentum, mass and velocity on the grid of all worlds [B]; a backward pass has twice that."""
-        return self.worlds * self.node_count * self.dtype.itemsize * (2 * self.dim + 1)
+    @property
+    def budget(self) -> int:
+        """Bytes that one call may keep for its backward pass."""
+        if self.memory_budget is not None:
+            return self.memory_budget
+        if self.device.type == "cpu":
+            return CPU_BUDGET
+        return torch.cuda.get_device_properties(self.device).total_memory // 16
+
+    @functools.cached_property
+    def held_nodes(self) -> int:
+        """Nodes of one world in memory: all of them, or in the fast scheme those around the particles, counted at rest."""
+        if self.scheme == "plain":
+            return self.node_count
+        cells = np.floor(self._exact_positions / self.scene.grid.spacing - 0.5)
+        return math.prod(window_shape(self.scene.grid.shape, np.ptp(cells, axis=0).astype(int)))
+
+    def sizes(self) -> Sizes:
+        """Bytes of what a call may keep, see softmpm/memory.py."""
+        real, d, particles = self.dtype.itemsize, self.dim, self.worlds * self.particle_count
+        low = 1.5 if real == 4 else 1
+        between = round(particles * real * low * (2 * d + 2 * d * d))
+        if self.scheme == "fast":
+            inside = particles * (4 + real * packed_rows(d).rows)
+            return Sizes(inside, self.worlds * self.held_nodes * 4 * real, between)
+        inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
+        return Sizes(inside, 0, between)
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""
         spec, has = self.spec, lambda flag: "compiled" if flag else "left out"
         limit = stable_dt(self.scene)
-        mib = {name: f"{size / 2**20:.1f} MiB" for name, size in memory(self, substeps)._asdict().items()}
+        mib = {
+            name: f"{size / 2**20:.1f} MiB"
+            for name, size in memory(self, Horizon(1, substeps))._asdict().items()
+        }
         lines = [
             f"softmpm model: {spec.dim}D, {spec.dtype}, on {self.device}, {self.worlds} world(s) of "
             f"{self.particle_count} particles on {' x '.join(map(str, self.scene.grid.shape))} nodes",
@@ -187,6 +241,7 @@ class Model:
             f"  damping    {has(spec.damping)}",
             "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
             f"  dt         {self.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
+            f"  scheme     {self.scheme}: {self.scheme_reason}; {self.held_nodes} nodes of each world in memory",
             f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, "
             f"{mib['backward']} at the peak",
         ]

@@ -5,7 +5,6 @@ pull of the muscles. A program that kept its states is lent to one call until it
 """
 
 import functools
-from dataclasses import dataclass
 
 import torch
 import warp as wp
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid, view
+from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.packing import packing
@@ -24,33 +24,13 @@ from softmpm.state import Low, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
 
-@dataclass(frozen=True)
-class Shape:
-    """What makes two chunks the same program."""
-
-    length: int
-    """Substeps."""
-    substeps: int
-    """Substeps of a control step."""
-    offset: int
-    """Substep of its control step that the first one is."""
-    keep: bool
-    """Whether a backward pass will follow."""
-
-    @property
-    def rows(self) -> int:
-        """Control steps that it touches."""
-        return (self.offset + self.length - 1) // self.substeps + 1
-
-    def row(self, s: int) -> int:
-        return (self.offset + s) // self.substeps
-
 
 class Program:
     """One chunk on one arrangement."""
 
-    def __init__(self, model: Model, arrangement: Arrangement, shape: Shape):
-        self.model, self.arrangement, self.shape = model, arrangement, shape
+    def __init__(self, model: Model, arrangement: Arrangement, chunk: Chunk, keep: bool):
+        self.model, self.arrangement, self.chunk, self.keep = model, arrangement, chunk, keep
+        self.adjoints = {}
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
@@ -63,12 +43,13 @@ class Program:
         self.order = tensor(*self.lead, dtype=torch.int32)
         self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
         self.words = tensor(model.worlds + 2, dtype=torch.int64)
-        slots, grids = (shape.length + 1, shape.length) if shape.keep else (1, 2)
+        slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
         self.base = tensor(slots, padded, dtype=torch.int32)
         self.rows = tensor(slots, padded * t.rows)
         self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
         self.velocity = tensor(model.worlds * arrangement.node_count, 4)
-        self.pull = tensor(shape.rows, model.worlds, model.muscle_count) if model.muscle_count else None
+        rows = chunk.row(chunk.length - 1) + 1
+        self.pull = tensor(rows, model.worlds, model.muscle_count) if model.muscle_count else None
         self._structs()
         self._forward = Replay(model, self._launch_all)
 
@@ -110,14 +91,20 @@ class Program:
 
     def solid(self, s: int):
         """Material and pull of substep ``s``."""
-        return self.solids[self.shape.row(s) if self.pull is not None else 0]
+        return self.solids[self.chunk.row(s) if self.pull is not None else 0]
 
     # -- launches ------------------------------------------------------------------------------------------------
 
     def launch(self, kernel, dim, *inputs, stream=None, block_dim=256) -> None:
         device = self.model.wp_device
         wp.launch(
-            kernel, dim=dim, inputs=inputs, device=device, stream=stream, block_dim=block_dim, record_tape=False
+            kernel,
+            dim=dim,
+            inputs=inputs,
+            device=device,
+            stream=stream,
+            block_dim=block_dim,
+            record_tape=False,
         )
 
     @functools.cached_property
@@ -168,8 +155,8 @@ class Program:
         nodes, spec = self.node_arrays, self.model.spec
         self.launch(fused(spec).clear, len(self.velocity), nodes[0], stream=stream, block_dim=BLOCK)
         self._advance(-1, stream)
-        for s in range(self.shape.length):
-            last = s + 1 == self.shape.length
+        for s in range(self.chunk.length):
+            last = s + 1 == self.chunk.length
             cleared = self.nothing if last else nodes[(s + 1) % len(nodes)]
             arguments = (self.model.scale, self.model.walls, self.window, nodes[s % len(nodes)])
             self.launch(
@@ -186,9 +173,9 @@ class Program:
     def _advance(self, s: int, stream) -> None:
         """G2P of substep ``s`` and P2G of the next; the P2G of the first if ``s`` is -1."""
         model, packed, nodes = self.model, self.packed, self.node_arrays
-        last = s + 1 == self.shape.length
-        now, then = (max(s, 0), s + 1) if self.shape.keep else (0, 0)
-        parameters = (model.scale, self.solid(min(s + 1, self.shape.length - 1)), self.window, s, last)
+        last = s + 1 == self.chunk.length
+        now, then = (max(s, 0), s + 1) if self.keep else (0, 0)
+        parameters = (model.scale, self.solid(min(s + 1, self.chunk.length - 1)), self.window, s, last)
         sizes = (model.particle_count, self.total, self.order_flat)
         out = (self.watch, packed[then], nodes[(s + 1) % len(nodes)])
         kernel = fused(model.spec).advance

@@ -32,7 +32,9 @@ class Scratch:
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_array = view(self.velocity, t.aligned)
         self.solid_struct = self.solid.struct(model)
-        self.tensors = [v for v in (self.solid.mass, self.solid.mu, self.solid.lam, self.solid.slot) if v is not None]
+        self.tensors = [
+            v for v in (self.solid.mass, self.solid.mu, self.solid.lam, self.solid.slot) if v is not None
+        ]
 
 
 class ProgramAdj:
@@ -55,11 +57,15 @@ class ProgramAdj:
         if self.adj_pull is not None:
             clear(self.adj_pull)
         order, arrays = program.order_array, program.state_arrays(*adj_end)
-        program.launch(pack.enter_adj, program.lead, model.scale, order, *arrays, scratch.adj_array, stream=stream)
+        program.launch(
+            pack.enter_adj, program.lead, model.scale, order, *arrays, scratch.adj_array, stream=stream
+        )
         self._backward.run(stream)
         start = State(*(torch.empty_like(adj) for adj in adj_end))
         arrays = program.state_arrays(*start)
-        program.launch(pack.leave_adj, program.lead, model.scale, order, scratch.adj_array, *arrays, stream=stream)
+        program.launch(
+            pack.leave_adj, program.lead, model.scale, order, scratch.adj_array, *arrays, stream=stream
+        )
         if self.wanted.material:
             kernel = sorted_solid_adj(model.spec, self.wanted)
             structs = scratch.solid_struct, adj_solid.struct(model)
@@ -67,17 +73,17 @@ class ProgramAdj:
         return start, None if self.adj_pull is None else self.adj_pull.clone()
 
     def _launch_all(self, stream) -> None:
-        for s in range(self.program.shape.length, -1, -1):
+        for s in range(self.program.chunk.length, -1, -1):
             self._grid(s, stream)
             self._particles(s, stream)
-            if self.adj_pull is not None and s < self.program.shape.length:
+            if self.adj_pull is not None and s < self.program.chunk.length:
                 self._collect(s, stream)
 
     def _grid(self, s: int, stream) -> None:
         """Adjoint of the nodes of substep ``s``, velocity of the nodes of the substep before."""
         program, nothing, (here, before) = self.program, self.program.nothing, self._adj_nodes(s)
         model, nodes = program.model, program.node_arrays
-        last, first = s == program.shape.length, s == 0
+        last, first = s == program.chunk.length, s == 0
         if last and first:
             return
         now, then = nothing if last else nodes[s], nothing if first else nodes[s - 1]
@@ -99,9 +105,9 @@ class ProgramAdj:
     def _particles(self, s: int, stream) -> None:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
-        model, length = program.model, program.shape.length
+        model, length = program.model, program.chunk.length
         solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
-        parameters = (model.scale, solid, program.window, length - s, start, end)
+        parameters = (model.scale, solid, program.window, length - 1 - s, start, end)
         sizes = (model.particle_count, program.total, program.order_flat)
         states = (program.packed[max(s - 1, 0)], program.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
@@ -112,8 +118,8 @@ class ProgramAdj:
 
     def _collect(self, s: int, stream) -> None:
         """Where a control step begins, add what the particles found for its pull."""
-        program, shape = self.program, self.program.shape
-        if s == 0 or shape.row(s - 1) != shape.row(s):
+        program, chunk = self.program, self.program.chunk
+        if s == 0 or chunk.row(s - 1) != chunk.row(s):
             slot = self.scratch.solid.slot
-            arrays = program.muscle_array, view(slot, program.types.real), self._adj_rows[shape.row(s)]
+            arrays = program.muscle_array, view(slot, program.types.real), self._adj_rows[chunk.row(s)]
             program.launch(collect_pull(program.model.spec), tuple(slot.shape), *arrays, stream=stream)

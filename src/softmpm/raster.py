@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from softmpm.buffers import Motion, MotionAdj, view
+from softmpm.failures import raise_failure
 from softmpm.kernels.raster import raster
 from softmpm.kernels.types import types
 from softmpm.model import Model
-from softmpm.rollout import raise_failure
 from softmpm.state import GridField, State
 from softmpm.step import Substep
 
@@ -19,7 +19,7 @@ def _enter(model: Model, state: State):
     step, motion = Substep(model, None), Motion.empty(model)
     struct = motion.struct(model)
     step.enter(state, struct)
-    raise_failure(model, step.watch_words, state)
+    raise_failure(model, step.watch_words.tolist(), state)
     return step, motion, struct
 
 

@@ -12,6 +12,11 @@ _recording = threading.Lock()
 """Warp records one CPU graph at a time."""
 
 
+def recording(model: Model) -> bool:
+    """Whether PyTorch is recording a CUDA graph on the current stream: nothing may wait for the device then."""
+    return model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
 class Replay:
     """Calls ``launches(stream)`` once to record it.
 
@@ -23,7 +28,7 @@ class Replay:
         self._graph: wp.Graph | None = None
 
     def run(self, stream: wp.Stream | None) -> None:
-        if stream is not None and torch.cuda.is_current_stream_capturing():
+        if recording(self.model):
             self.launches(stream)
             return
         if self._graph is None:

@@ -14,9 +14,9 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.buffers import Motion, Solid, SolidAdj, lame, view
+from softmpm.failures import raise_failure
 from softmpm.kernels.types import Wanted, solid_adj_type, types
 from softmpm.model import Model
-from softmpm.rollout import raise_failure
 from softmpm.state import Params, State
 from softmpm.step import Substep, stream_of
 
@@ -77,7 +77,7 @@ class WarpSolid:
 
     def raise_failure(self, model: Model, state: WarpState) -> None:
         """Raise :class:`softmpm.UnstableError` if a step so far failed; waits for the device."""
-        raise_failure(model, self.work.watch_words, self.work.leave(state.struct(model)))
+        raise_failure(model, self.work.watch_words.tolist(), self.work.leave(state.struct(model)))
 
 
 def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
@@ -96,7 +96,7 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     t, state = types(model.spec.dim, model.spec.dtype), model.rest() if state is None else state
     motion, work = Motion.empty(model), Substep(model, None)
     work.enter(state, motion.struct(model))
-    raise_failure(model, work.watch_words, state)
+    raise_failure(model, work.watch_words.tolist(), state)
     return WarpState(
         base=_owned(motion.base, t.ivec, False),
         fx=_owned(motion.fx, t.vec, requires_grad),

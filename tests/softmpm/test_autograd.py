@@ -16,9 +16,9 @@ def model():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_gradcheck_of_every_input(dim, device):
+def test_gradcheck_of_every_input(dim, device, scheme):
     """torch.autograd.gradcheck in float64, all inputs at once, contact and friction active."""
-    model = softmpm.build(busy_scene(dim, per_law=5), device=device, dtype=torch.float64)
+    model = softmpm.build(busy_scene(dim, per_law=5), device=device, dtype=torch.float64, scheme=scheme)
     inputs = busy_inputs(model)
 
     def function(*tensors):

@@ -12,6 +12,7 @@ from helpers import assert_relative, busy_inputs, busy_scene, gradients
 
 import softmpm
 from softmpm.buffers import SolidAdj
+from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted, adj_module, solid_types
 from softmpm.step import Substep
 
@@ -80,7 +81,9 @@ def test_what_a_scene_lacks_is_not_stored():
     assert all(getattr(nothing, name) is None for name in ("mass", "mu", "lam", "slot"))
     assert everything.slot.shape == (1, model.particle_count, 2)
     passive = softmpm.build(plain_scene(), device="cpu")
-    assert passive.muscle_slots.numel() == 0 and passive.state_bytes() == 12 * (4 * 2 + 4 * (2 + 4 + 8))
+    assert passive.muscle_slots.numel() == 0 and passive.sizes().inside == 12 * (4 + 4 * (2 + 2 + 2 + 8))
+    plain = softmpm.build(plain_scene(), device="cpu", scheme="plain")
+    assert plain.sizes() == (12 * (4 * 2 + 4 * (2 + 4 + 8)), 0, 12 * 4 * 12 * 1.5)
 
 
 def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):
@@ -92,7 +95,7 @@ def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):
         "launch",
         lambda self, kernel, *args: (counted.append(kernel.key), launch(self, kernel, *args)),
     )
-    model = softmpm.build(plain_scene(), device="cpu")
+    model = softmpm.build(plain_scene(), device="cpu", scheme="plain")
     start = model.rest()
     start.v.requires_grad_()
     end = softmpm.simulate(model, start, None, model.params(), substeps=7)
@@ -244,7 +247,7 @@ def test_memory_follows_the_formula():
         before = torch.cuda.memory_allocated()
         end = softmpm.simulate(model, start, None, params, substeps=substeps)
         end.x.sum().backward()
-        got, want = torch.cuda.max_memory_allocated() - before, memory(model, substeps).backward
+        got, want = torch.cuda.max_memory_allocated() - before, memory(model, Horizon(1, substeps)).backward
         print(
             f"substeps {substeps}: measured {got / 2**20:.2f} MiB, formula {want / 2**20:.2f} MiB, {got / want - 1:+.1%}"
         )

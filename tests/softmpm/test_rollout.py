@@ -9,14 +9,16 @@ from helpers import INPUTS, LAWS, assert_relative, busy_inputs, busy_scene, cota
 
 import softmpm
 from softmpm import reference
+from softmpm.horizon import Horizon
+from softmpm.memory import plan
 
 
 @pytest.mark.parametrize("laws", [("neo_hookean",), ("fixed_corotated",), ("neo_hookean", "fixed_corotated")])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_state_and_every_gradient_are_the_references(dim, laws, device):
+def test_state_and_every_gradient_are_the_references(dim, laws, device, scheme):
     """Contact, friction, overlapping muscles, damping, two worlds, two control steps: ≤ 1e-10 for each input."""
     scene = busy_scene(dim, laws)
-    model = softmpm.build(scene, device=device, dtype=torch.float64, worlds=2)
+    model = softmpm.build(scene, device=device, dtype=torch.float64, scheme=scheme, worlds=2)
     inputs = busy_inputs(model)
     copies = {name: tensor.detach().cpu().requires_grad_() for name, tensor in inputs.items()}
     got, want = run(softmpm.simulate, model, inputs, 10), run(reference.simulate, scene, copies, 10)
@@ -73,12 +75,12 @@ POINTS = (
     [(law, kind) for law in LAWS for kind in POINTS if (law, kind) != ("neo_hookean", "inverted")],
 )
 @pytest.mark.parametrize("dim", [2, 3])
-def test_gradients_at_special_points(dim, law, kind, device):
+def test_gradients_at_special_points(dim, law, kind, device, scheme):
     """F = I, rotations, equal stretches, det F < 0, friction at rest, cell edges, zero activation: ≤ 1e-10 each."""
     gravity = (0.0, -9.8, 0.0)[:dim] if kind == "still under friction" else (0.3, -9.8, 0.2)[:dim]
     walls = busy_scene(dim).walls[:1] if kind == "still under friction" else busy_scene(dim).walls
     scene = busy_scene(dim, (law,), per_law=8, gravity=gravity, walls=walls)
-    model = softmpm.build(scene, device=device, dtype=torch.float64)
+    model = softmpm.build(scene, device=device, dtype=torch.float64, scheme=scheme)
     inputs = special_start(softmpm.build(scene, device="cpu", dtype=torch.float64), kind)
     there = {name: tensor.detach().to(model.device).requires_grad_() for name, tensor in inputs.items()}
     weights = cotangent(softmpm.State(*(inputs[n] for n in "xvCF")))
@@ -114,9 +116,9 @@ def sliding_scene(dim: int) -> softmpm.Scene:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_taylor_remainder_is_second_order(dim, device):
+def test_taylor_remainder_is_second_order(dim, device, scheme):
     """|L(θ + εd) − L(θ) − ε ⟨∇L, d⟩| falls with slope 1.95 to 2.05 over 100 substeps, for each input alone."""
-    model = softmpm.build(sliding_scene(dim), device=device, dtype=torch.float64)
+    model = softmpm.build(sliding_scene(dim), device=device, dtype=torch.float64, scheme=scheme)
     inputs = busy_inputs(model)
     rest, away = model.rest(), torch.tensor([2.0, -0.3, 0.1][:dim], dtype=torch.float64, device=model.device)
     inputs |= {
@@ -148,10 +150,10 @@ def test_taylor_remainder_is_second_order(dim, device):
 STEPS = (2.0**-13, 2.0**-14, 2.0**-15)  # below the distance to the next kink of contact and spline
 
 
-def test_dot_product(device):
+def test_dot_product(device, scheme):
     """⟨J a, b⟩ = ⟨a, Jᵀ b⟩ with J a from the reference by differentiating its backward pass: ≤ 1e-12."""
     scene = busy_scene(2)
-    model = softmpm.build(scene, device=device, dtype=torch.float64)
+    model = softmpm.build(scene, device=device, dtype=torch.float64, scheme=scheme)
     inputs = busy_inputs(model)
     copies = {name: tensor.detach().cpu().requires_grad_() for name, tensor in inputs.items()}
     end = run(reference.simulate, scene, copies, 5)
@@ -169,10 +171,12 @@ def test_dot_product(device):
     assert abs(got - want) <= 1e-12 * sum((a[name] * back[name].cpu()).abs().sum() for name in INPUTS)
 
 
-def test_worlds_are_single_runs(device):
+def test_worlds_are_single_runs(device, scheme):
     """Three worlds with their own start, activation and material equal three runs of one: end and gradients."""
     scene = busy_scene(2)
-    models = {n: softmpm.build(scene, device=device, dtype=torch.float64, worlds=n) for n in (1, 3)}
+    models = {
+        n: softmpm.build(scene, device=device, dtype=torch.float64, scheme=scheme, worlds=n) for n in (1, 3)
+    }
     inputs = busy_inputs(models[3])
     together = gradients(softmpm.simulate, models[3], inputs, 6)
     weights = cotangent(run(softmpm.simulate, models[3], inputs, 6))
@@ -190,20 +194,24 @@ def test_worlds_are_single_runs(device):
             )
 
 
-def test_recomputing_gives_the_gradient_of_keeping_everything():
-    """Whatever the memory budget, the same gradient: bitwise on the CPU."""
-    scene, found = busy_scene(2), []
-    sizes = softmpm.build(scene, device="cpu").state_bytes()
-    for budget in (1000 * sizes, 12 * sizes):
-        model = softmpm.build(scene, device="cpu", memory_budget=budget)
-        found.append(gradients(softmpm.simulate, model, busy_inputs(model, control_steps=4), substeps=7))
-    for name in INPUTS:
-        assert torch.equal(found[0][name], found[1][name]), name
+def test_recomputing_gives_the_gradient_of_keeping_everything(scheme):
+    """Whatever the memory budget, the same gradient but for rounding between chunks: everything, √N, and hardly anything."""
+    scene, found, plans = busy_scene(2), [], []
+    sizes = softmpm.build(scene, device="cpu", scheme=scheme).sizes()
+    least = 2 * (sizes.inside + sizes.between) + sizes.nodes
+    for budget in (1000 * sum(sizes), 6 * least, least + 2 * sizes.between):
+        model = softmpm.build(scene, device="cpu", memory_budget=budget, scheme=scheme)
+        plans.append(plan(Horizon(4, 14), model.sizes(), model.budget))
+        found.append(gradients(softmpm.simulate, model, busy_inputs(model, control_steps=4), substeps=14))
+    assert plans[0].keep_all and plans[1].longest > plans[2].longest
+    assert 1 < plans[2].slots < len(Horizon(4, 14).chunks(plans[2].longest)) / 2  # chunks run more than twice
+    for name, others in itertools.product(INPUTS, found[1:]):
+        assert_relative(found[0][name], others[name], 2e-6, name)
 
 
 def test_a_budget_that_is_too_small_says_what_it_needs():
     """Not even √N states fit: the message has both sizes and a way out."""
     scene = busy_scene(2)
     model = softmpm.build(scene, device="cpu", memory_budget=1000)
-    with pytest.raises(ValueError, match="needs at least .* MiB of states, memory_budget is"):
+    with pytest.raises(ValueError, match="needs at least .* MiB for states, memory_budget is"):
         gradients(softmpm.simulate, model, busy_inputs(model), substeps=50)

@@ -34,7 +34,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         x: vec
         low_x: vec
         F: mat
-        low_F: mat
+        low_f: mat
 
     @wp.func
     def entered(scale: Scale, x: vec, v: vec, C: mat, F: mat, low_x: vec, low_F: mat) -> Entered:
@@ -75,7 +75,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
             for other in range(dim):
                 full = wp.float64(H[axis, other]) + wp.float64(wp.where(axis == other, 1.0, 0.0))
                 out.F[axis, other] = real(full)
-                out.low_F[axis, other] = real(full - wp.float64(real(full)))
+                out.low_f[axis, other] = real(full - wp.float64(real(full)))
         return out
 
     @wp.kernel(module=module, enable_backward=False)
@@ -94,7 +94,9 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         start: Motion,
     ):
         world, p = wp.tid()
-        at = entered(scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p])
+        at = entered(
+            scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
+        )
         start.base[world, p] = at.base
         start.fx[world, p] = at.fx
         start.v[world, p] = v[world, p]
@@ -130,6 +132,6 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         F[world, p] = out.F
         if wp.static(rounds):
             low_x[world, p] = out.low_x
-            low_F[world, p] = out.low_F
+            low_F[world, p] = out.low_f
 
     return SimpleNamespace(entered=entered, left=left, enter=enter, leave=leave)

@@ -30,7 +30,7 @@ from softmpm.watch import Kind
 @functools.lru_cache(maxsize=None)
 def fused(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
-    real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
+    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
     Scale, Packed, Window, Particle = t.Scale, t.Packed, t.Window, one.Particle
     Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
@@ -40,7 +40,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     affine_momentum, moved, node_velocity = one.affine_momentum, one.moved, grid(spec).node_velocity
     running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
-    row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_H, t.row_C
+    row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     module = native_module(spec.module + ".fused")
 
     @wp.func
@@ -163,7 +163,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     affine_momentum, momentum_adj, moved_adj = one.affine_momentum, twin.momentum_adj, twin.moved_adj
     node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
     report, bad_gradient = failure.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
-    row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_H, t.row_C
+    row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
     module = native_module(adj_module(spec, wanted) + ".fused")
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -186,9 +186,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         place = coordinates(i - world * window.count, window.shape) + window.origin[world]
         if i < node.shape[0]:
             here = load_node(node, i)
-            back = node_velocity_adj(
-                scale, walls, place, head(here), here[dim], head(load_node(adj, i))
-            )
+            back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(load_node(adj, i)))
             store_node(adj, i, aligned(back.p, back.m))
         if i < node_before.shape[0]:
             there = load_node(node_before, i)
@@ -252,7 +250,10 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
                 adj.C = more.C
                 adj.H += more.H
                 size = (
-                    wp.dot(adj.fx, adj.fx) + wp.dot(adj.v, adj.v) + wp.ddot(adj.C, adj.C) + wp.ddot(adj.H, adj.H)
+                    wp.dot(adj.fx, adj.fx)
+                    + wp.dot(adj.v, adj.v)
+                    + wp.ddot(adj.C, adj.C)
+                    + wp.ddot(adj.H, adj.H)
                 )
                 if not wp.isfinite(size):
                     report(watch, world, back, bad_gradient, order[i])

@@ -63,7 +63,9 @@ def grid(spec: Spec) -> SimpleNamespace:
         return v
 
     @wp.func
-    def node_velocity_adj(scale: Scale, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec) -> NodeAdj:
+    def node_velocity_adj(
+        scale: Scale, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec
+    ) -> NodeAdj:
         adj = NodeAdj()
         if m > real(0.0):
             u = p / m

@@ -23,7 +23,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     entered, left = b.entered, b.left
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     pack_base, unpack_base, report = s.pack_base, s.unpack_base, failure.report(dim, dtype).report
-    row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_H, t.row_C
+    row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     bad_start, left_window = int(Kind.START), int(Kind.LEFT_WINDOW)
     module = native_module(f"softmpm.packing.d{dim}.{dtype}")
 
@@ -47,7 +47,9 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         world, place = wp.tid()
         i = world * order.shape[1] + place
         p = order[world, place]
-        at = entered(scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p])
+        at = entered(
+            scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
+        )
         if not at.sound:
             report(watch, world, 0, bad_start, p)
         base = at.base
@@ -80,20 +82,28 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         low_x: wp.array2d(dtype=vec),
         low_F: wp.array2d(dtype=mat),
         # Out, added into:
-        state_of_order: wp.array(dtype=wp.int64),  # cells met going along the order; particles near the window's edge
+        state_of_order: wp.array(
+            dtype=wp.int64
+        ),  # cells met going along the order; particles near the window's edge
     ):
         world, place = wp.tid()
         i = world * order.shape[1] + place
         p = order[world, place]
         base = unpack_base(packed.base[i])
-        out = left(scale, base, load_vec(packed.rows, i, row_fx), load_vec(packed.rows, i, row_low), load_mat(packed.rows, i, row_H))
+        out = left(
+            scale,
+            base,
+            load_vec(packed.rows, i, row_fx),
+            load_vec(packed.rows, i, row_low),
+            load_mat(packed.rows, i, row_H),
+        )
         x[world, p] = out.x
         v[world, p] = load_vec(packed.rows, i, row_v)
         C[world, p] = load_mat(packed.rows, i, row_C)
         F[world, p] = out.F
         if wp.static(dtype == "float32"):
             low_x[world, p] = out.low_x
-            low_F[world, p] = out.low_F
+            low_F[world, p] = out.low_f
         if place == 0 or packed.base[i] != packed.base[i - 1]:
             wp.atomic_add(state_of_order, 0, wp.int64(1))
         for axis in range(dim):

@@ -52,7 +52,15 @@ def particle(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def moved(
-        scale: Scale, body: Solid, corner: ivec, shape: ivec, world: int, p: int, old: Particle, v: vec, B: mat
+        scale: Scale,
+        body: Solid,
+        corner: ivec,
+        shape: ivec,
+        world: int,
+        p: int,
+        old: Particle,
+        v: vec,
+        B: mat,
     ) -> Particle:
         """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not sound keeps its base."""
         new = Particle()
@@ -75,7 +83,11 @@ def particle(spec: Spec) -> SimpleNamespace:
         return new
 
     return SimpleNamespace(
-        Particle=Particle, impulse=impulse, affine_momentum=affine_momentum, moved=moved, identity=laws.identity
+        Particle=Particle,
+        impulse=impulse,
+        affine_momentum=affine_momentum,
+        moved=moved,
+        identity=laws.identity,
     )
 
 

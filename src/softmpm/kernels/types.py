@@ -41,14 +41,18 @@ class Wanted:
     activation: bool
 
 
+BASE_BITS = {2: 16, 3: 10}
+"""Bits of a node's coordinate in packed particles."""
+
+
 class Rows(NamedTuple):
     """First row of each quantity in packed particles, and how many rows there are."""
 
     row_fx: int
     row_low: int
     row_v: int
-    row_H: int
-    row_C: int
+    row_h: int
+    row_c: int
     rows: int
 
 
@@ -97,7 +101,9 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
     class Packed:
         """The same in the fast scheme: rows of blocks of 32 particles, sorted by cell (kernels/scatter.h)."""
 
-        base: wp.array(dtype=wp.int32)  # first node of the stencil, its coordinates in 10 (3D) or 16 (2D) bits each
+        base: wp.array(
+            dtype=wp.int32
+        )  # first node of the stencil, its coordinates in 10 (3D) or 16 (2D) bits each
         rows: wp.array(dtype=real)  # fx, fx_low, v, H, C
 
     class Window:

@@ -1,0 +1,109 @@
+"""The fast scheme: chunks run as programs, on particles sorted by cell and on the part of the grid around them."""
+
+import threading
+import weakref
+from collections import defaultdict
+
+from torch import Tensor
+
+from softmpm.arrangement import Arrangement
+from softmpm.buffers import Solid, SolidAdj
+from softmpm.horizon import Chunk
+from softmpm.kernels.types import Wanted
+from softmpm.model import Model
+from softmpm.program import Program
+from softmpm.program_adj import ProgramAdj, Scratch
+from softmpm.replay import recording
+from softmpm.state import State
+
+
+class Pool:
+    """Programs that were made on one arrangement and are not in use."""
+
+    def __init__(self, model: Model, arrangement: Arrangement):
+        self.model, self.arrangement = model, arrangement
+        self._free: dict[tuple, list[Program]] = defaultdict(list)
+        self._scratch: dict[Wanted, Scratch] = {}
+
+    def take(self, chunk: Chunk, keep: bool) -> Program:
+        free = self._free[chunk.shape, keep]
+        return free.pop() if free else Program(self.model, self.arrangement, chunk, keep)
+
+    def give(self, program: Program) -> None:
+        self._free[program.chunk.shape, program.keep].append(program)
+
+    def adjoint(self, program: Program, wanted: Wanted) -> ProgramAdj:
+        if recording(self.model):
+            return ProgramAdj(program, wanted, Scratch(program, wanted))
+        if wanted not in self._scratch:
+            self._scratch[wanted] = Scratch(program, wanted)
+        if wanted not in program.adjoints:
+            program.adjoints[wanted] = ProgramAdj(program, wanted, self._scratch[wanted])
+        return program.adjoints[wanted]
+
+
+class FastRun:
+    """One chunk that ran; as long as it lives, its program keeps what is inside.
+
+    Attributes:
+        start, end: State before and after it.
+        words: What the kernels reported, see watch.py; then cells met along the order of the particles, and whether one is
+            near the window's edge; shape (world + 2,).
+    """
+
+    def __init__(self, pool: Pool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
+        self.pool, self.chunk, self.start = pool, chunk, start
+        self.program = program = pool.take(chunk, keep)
+        self.end = program.run(start, pull, solid)
+        self.words = program.words
+        if not recording(program.model):  # else the graph that is being recorded owns the memory
+            weakref.finalize(self, pool.give, program)
+
+    def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
+        """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
+        return self.pool.adjoint(self.program, wanted).run(adj_end, adj_solid)
+
+
+class Fast:
+    """Runs chunks by the fast scheme. One for each thread and stream: its buffers serve one run after the other."""
+
+    def __init__(self, model: Model):
+        self.model = model
+        self._pool: Pool | None = None
+
+    def run(self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool) -> FastRun:
+        return FastRun(self._arranged(start), chunk, start, pull, solid, keep)
+
+    def _arranged(self, start: State) -> Pool:
+        if self._pool is None:
+            if recording(self.model):
+                raise RuntimeError(
+                    "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work "
+                    "once first, or let softmpm.Graph do it."
+                )
+            self._use(Arrangement(self.model, start.x))
+        elif self._pool.arrangement.stale and not recording(self.model):
+            self._use(self._pool.arrangement.renewed(start.x))
+        return self._pool
+
+    def _use(self, arrangement: Arrangement) -> None:
+        if self._pool is None or arrangement is not self._pool.arrangement:
+            self._pool = Pool(self.model, arrangement)
+
+    def grow(self, run: FastRun) -> None:
+        """A particle left the window during ``run``: take a larger one from now on."""
+        self._use(run.pool.arrangement.grown(run.start.x))
+
+
+class _Local(threading.local):
+    def __init__(self):
+        self.of_stream: dict[int, Fast] = {}
+
+
+_per_model: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
+
+
+def fast(model: Model, stream: int) -> Fast:
+    """The runner of this model in this thread on this stream."""
+    local = _per_model.setdefault(model, _Local())
+    return local.of_stream.setdefault(stream, Fast(model))

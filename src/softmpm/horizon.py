@@ -1,0 +1,59 @@
+"""How the substeps of a call are cut into chunks; a chunk runs, and is pulled back, as one."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive substeps of a call. Two chunks with the same ``shape`` differ only in what they are given."""
+
+    first: int
+    """Its first substep in the call."""
+    length: int
+    substeps: int
+    """Substeps of a control step."""
+
+    @property
+    def offset(self) -> int:
+        """Which substep of its control step the first one is."""
+        return self.first % self.substeps
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.length, self.substeps, self.offset
+
+    @property
+    def rows(self) -> slice:
+        """Control steps that it touches."""
+        first = self.first // self.substeps
+        return slice(first, first + self.row(self.length - 1) + 1)
+
+    def row(self, s: int) -> int:
+        """Which of these its substep ``s`` belongs to."""
+        return (self.offset + s) // self.substeps
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """Control steps of equally many substeps."""
+
+    control_steps: int
+    substeps: int
+
+    @property
+    def total(self) -> int:
+        return self.control_steps * self.substeps
+
+    def chunks(self, longest: int) -> list[Chunk]:
+        """Whole control steps as far as they fit, or equal parts of one: few shapes, so that few programs are made."""
+        if self.substeps <= longest:
+            length = self.substeps * (longest // self.substeps)
+            starts = range(0, self.total, length)
+            return [Chunk(first, min(length, self.total - first), self.substeps) for first in starts]
+        length = math.ceil(self.substeps / math.ceil(self.substeps / longest))
+        return [
+            Chunk(step * self.substeps + first, min(length, self.substeps - first), self.substeps)
+            for step in range(self.control_steps)
+            for first in range(0, self.substeps, length)
+        ]
