@@ -1,8 +1,10 @@
 """The bridge from Hydra to plain objects: command line and ``conf/`` in, a run in its folder out."""
 
 import dataclasses
+import logging
 import os
 import sys
+import time
 import traceback
 from pathlib import Path
 from typing import NoReturn
@@ -20,8 +22,10 @@ from omegaconf.errors import (
 )
 
 from softmpm_learn.config import RunConf, conf_dir, load, save, to_run, unknown_key
+from softmpm_learn.distributed import Group, OtherProcessError, joined
 from softmpm_learn.experiment import run_experiment
 from softmpm_learn.tasks import TASKS
+from softmpm_learn.train import TrainingError
 
 CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "device")
 """What may differ when a run is resumed: how far it goes, what it records and where it runs."""
@@ -41,22 +45,33 @@ def main() -> None:
     """Entry of ``python -m softmpm_learn``: exit code 0, or 1 after one sentence on what went wrong."""
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))  # the user asks for tracebacks
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints an error its own way, in several lines
-    register()
+    group = Group()
     try:
-        hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")(job)()
+        with joined() as group:
+            if not group.first:
+                logging.disable(logging.WARNING)  # the first process says it
+            register(group.tell(time.time()))
+            run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
+            run(lambda config: job(config, group))()
     except Exception as error:
         if full:
             raise
+        if not group.first:
+            raise SystemExit(1) from None  # the first process says the same
         _give_up(error)
 
 
-def register() -> None:
-    """Give Hydra the schema; a group that starts with an underscore is not offered to users."""
+def register(began: float | None = None) -> None:
+    """Give Hydra the schema, and when the program began; a group that starts with an underscore is not offered to users."""
     store = ConfigStore.instance()
     store.store(group="_schema", name="run", node=RunConf)
     for name, (conf, _) in TASKS.items():
         store.store(group="_schema/task", name=name, node=conf)
     OmegaConf.register_new_resolver("run_dir", _run_dir, replace=True)
+    began = time.time() if began is None else began
+    OmegaConf.register_new_resolver(
+        "began", lambda pattern: time.strftime(pattern, time.localtime(began)), replace=True
+    )
 
 
 def _run_dir(resume: str | None, fresh: str) -> str:
@@ -68,23 +83,31 @@ def _run_dir(resume: str | None, fresh: str) -> str:
     return resume
 
 
-def job(config: DictConfig) -> None:
-    """One run. An error ends it with a sentence on stderr and the traceback in its folder."""
-    out = Path(HydraConfig.get().runtime.output_dir)
+def job(config: DictConfig, group: Group) -> None:
+    """One run. An error ends it with a sentence on stderr and the traceback in its folder, both from where it happened."""
+    out = Path(group.tell(HydraConfig.get().runtime.output_dir))
     try:
-        conf = to_run(config)
-        if conf.resume is not None:
-            conf = resumed(conf, [text.lstrip("+~") for text in HydraConfig.get().overrides.task])
-        elif (out / "config.yaml").exists():
-            raise ValueError(f"{out} holds a run already; go on with resume={out}, or choose another folder.")
+        with group.together():
+            conf = to_run(config)
+            if conf.resume is not None:
+                conf = resumed(conf, [text.lstrip("+~") for text in HydraConfig.get().overrides.task])
+            elif (out / "config.yaml").exists():
+                raise ValueError(
+                    f"{out} holds a run already; go on with resume={out}, or choose another folder."
+                )
+        group.once(save, conf, out / "config.yaml")
+    except OtherProcessError:
+        raise SystemExit(1) from None  # the other process says it
     except Exception as error:
         _give_up(error)
-    save(conf, out / "config.yaml")
     try:
-        run_experiment(conf, out)
+        run_experiment(conf, out, group)
     except Exception as error:
-        (out / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-        _give_up(error, "" if isinstance(error, EXPECTED) else f" The traceback is in {out / 'error.txt'}.")
+        if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
+            raise SystemExit(1) from None
+        place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
+        place.write_text(traceback.format_exc(), encoding="utf-8")
+        _give_up(error, "" if isinstance(error, EXPECTED) else f" The traceback is in {place}.")
 
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:

@@ -1,5 +1,6 @@
 """One experiment, from its settings to everything that it leaves in its folder. Nothing here knows Hydra."""
 
+import contextlib
 import csv
 import logging
 import math
@@ -12,7 +13,8 @@ import torch
 import warp as wp
 
 import softmpm
-from softmpm_learn.config import DeviceConf, RunConf
+from softmpm_learn.config import RunConf
+from softmpm_learn.distributed import Group
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
 from softmpm_learn.objective import Progress as Travel
 from softmpm_learn.objective import Reach
@@ -40,34 +42,46 @@ CURVES = {
 logger = logging.getLogger("softmpm_learn")
 
 
-def run_experiment(conf: RunConf, out: Path) -> None:
-    """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next."""
+def run_experiment(conf: RunConf, out: Path, group: Group | None = None) -> None:
+    """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next.
+
+    Of several processes, the first draws, converts and speaks.
+    """
+    group = group or Group()
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(conf.device.threads)
-    task = make_task(conf.task)
-    model = make_model(task, conf.device, conf.train.worlds)
+    with group.together():
+        task = make_task(conf.task)
+        model = make_model(task, conf, group)
     logger.info("%s", model.describe(task.control_steps * task.substeps))
-    with Progress(conf.train.iterations) as progress, stop_on_signals() as stop:
+    with contextlib.ExitStack() as held:
+        progress = held.enter_context(Progress(conf.train.iterations)) if group.first else None
+        stop = held.enter_context(stop_on_signals(insist=group.size == 1))
         result = train(
             task,
             model,
             conf.settings,
             out,
-            progress=lambda iteration, row: progress(iteration, row["loss"]),
+            progress=(lambda iteration, row: progress(iteration, row["loss"])) if progress else None,
             stop=stop,
+            group=group,
         )
-    draw(result, task, out)
-    logger.info("%s", farewell(result, task, out))
+    if group.first:
+        draw(result, task, out)
+        logger.info("%s", farewell(result, task, out))
 
 
-def make_model(task: Task, conf: DeviceConf, worlds: int) -> softmpm.Model:
-    """The task's scene on the device of the settings."""
+def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
+    """The task's scene on the device of the settings, with this process's share of the worlds."""
+    device, memory = group.device(conf.device.name), conf.device.memory
+    if device and device.startswith("cuda:"):
+        torch.cuda.set_device(device)  # else every process takes memory of the first GPU too
     return softmpm.build(
         task.scene,
-        device=None if conf.name == "auto" else conf.name,
-        dtype=getattr(torch, conf.dtype),
-        worlds=worlds,
-        memory_budget=None if conf.memory is None else round(1e6 * conf.memory),
+        device=device,
+        dtype=getattr(torch, conf.device.dtype),
+        worlds=len(group.split(conf.train.worlds)),
+        memory_budget=None if memory is None else round(1e6 * memory),
     )
 
 

@@ -28,6 +28,11 @@ class Learner:
     def encoder(self) -> nn.Module:
         return self.target or self.autoencoder.encoder
 
+    @property
+    def networks(self) -> list[nn.Module]:
+        """What a learning phase changes."""
+        return [self.autoencoder] if self.target is None else [self.autoencoder, self.target]
+
     def watch(self, first: int, seen: Tensor) -> None:
         """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on."""
         for world, pictures in enumerate(seen.unbind(dim=1)):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from softmpm import Model, Params
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
+from softmpm_learn.distributed import Group
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Centroids, Latent, Observer, Picture, clusters
 from softmpm_learn.policy import Goal, make_policy
@@ -32,6 +33,8 @@ class Run:
     """Everything that changes while a run goes on; a checkpoint is its :meth:`state_dict`.
 
     Attributes:
+        group: The processes that share the run; all but the first do without its replay buffer.
+        worlds: Which of the worlds of the run are those of this process's model.
         iteration: Iterations done.
         observer, policy, design, optimizer: What is optimised, and how.
         learner: The learning phase, None unless the observer is learned.
@@ -40,10 +43,13 @@ class Run:
         best: The lowest loss so far and what gave it.
     """
 
-    def __init__(self, task: "Task", model: Model, settings: Settings, out: Path):
-        if settings.train.worlds != model.worlds:
+    def __init__(self, task: "Task", model: Model, settings: Settings, out: Path, group: Group | None = None):
+        self.group = group or Group()
+        self.worlds = self.group.split(settings.train.worlds)
+        if len(self.worlds) != model.worlds:
+            share = f", {len(self.worlds)} for each process" if self.group.size > 1 else ""
             raise ValueError(
-                f"train.worlds is {settings.train.worlds}, but the model was built with {model.worlds}."
+                f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
@@ -72,7 +78,7 @@ class Run:
             size, channels = conf.latent_size, list(conf.channels)
             autoencoder = Autoencoder(model.dim, picture.shape, size, channels, scale=task.body_length)
         learning = self.settings.learning
-        since_last = learning.every * model.worlds
+        since_last = learning.every * self.settings.train.worlds
         replay = Replay(
             out / "replay",
             simulations=learning.simulations if learning.replay else since_last,
@@ -122,12 +128,16 @@ class Run:
         return self.design()
 
     def draw_goals(self) -> Tensor | None:
-        """A goal for each world [m], shape (world, dim), or None for the task's own."""
+        """A goal for each world [m], shape (world, dim), or None for the task's own.
+
+        Every process draws for all worlds and takes its own, so that goals do not depend on the number of processes.
+        """
         if self._goal is None:
             return None
-        spread = torch.tensor(list(self.settings.train.goal_spread)).to(self._goal.centre)
-        place = torch.rand(self.model.worlds, self.model.dim, generator=self.generator, dtype=spread.dtype)
-        return self._goal.centre + spread * (2 * place.to(spread.device) - 1)
+        conf, mine = self.settings.train, self.worlds
+        spread = torch.tensor(list(conf.goal_spread)).to(self._goal.centre)
+        place = torch.rand(conf.worlds, self.model.dim, generator=self.generator, dtype=spread.dtype)
+        return self._goal.centre + spread * (2 * place[mine.start : mine.stop].to(spread.device) - 1)
 
     def middle_goals(self) -> Tensor | None:
         """As :meth:`draw_goals`, without chance: the middle of the box."""

@@ -6,6 +6,9 @@ for each iteration:
     learn      every few iterations: train the autoencoder on the grid velocity of past simulations,
                and let the target network, through which the policy looks, follow it
     save       metrics, recording, checkpoint
+
+Several processes may share the worlds (see :mod:`softmpm_learn.distributed`); the first of them alone learns, from the pictures of
+all, and saves. To learn the same everywhere would take a replay buffer in each process, and bits that agree between GPUs.
 """
 
 import contextlib
@@ -22,20 +25,11 @@ from torch import Tensor
 import softmpm
 from softmpm import Model
 from softmpm_learn import checkpoint
-from softmpm_learn.episode import Episode, Frame, run_episode
+from softmpm_learn.distributed import Group, OtherProcessError
+from softmpm_learn.episode import Episode, run_episode
+from softmpm_learn.journal import TIMING, Journal
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
-from softmpm_learn.table import Table
-
-METRICS = [
-    *("loss", "final", "running", "best", "effort"),
-    *("gradient_policy", "gradient_design", "clipped", "retries"),
-    *("young_change", "poisson_change", "density_change"),
-    *("epochs", "training_loss", "validation_loss", "replay"),
-]
-"""Columns of metrics.csv; nothing in it depends on the clock."""
-TIMING = ["simulate", "backward", "learn", "save"]
-"""Columns of timing.csv [s]; ``save`` is that of the iteration before."""
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -71,6 +65,7 @@ def train(
     *,
     progress: Callable[[int, dict[str, float]], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
+    group: Group | None = None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
 
@@ -78,80 +73,93 @@ def train(
 
     Args:
         task: A :class:`softmpm_learn.tasks.task.Task`.
-        model: Built from ``task.scene`` with ``settings.train.worlds`` worlds.
+        model: Built from ``task.scene`` with ``settings.train.worlds`` worlds, or with this process's share of them.
         out: Folder for checkpoint.pt, metrics.csv, timing.csv, run.h5 and replay/.
-        progress: Called after each iteration with its number and metrics.
-        stop: Asked after each iteration; once it says True the run ends, ready to resume.
+        progress: Called after each iteration with its number and metrics; in the first process only.
+        stop: Asked after each iteration; once it says True in any process the run ends, ready to resume.
+        group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
 
     Raises:
-        TrainingError: A simulation or a gradient failed; names the iteration.
+        TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
+        softmpm_learn.distributed.OtherProcessError: The first process cannot go on, and says why.
         ValueError: Settings that do not go together, or with the checkpoint.
         softmpm_learn.checkpoint.CheckpointError: Every checkpoint in ``out`` is damaged.
     """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    with checkpoint.locked(out):
-        run = Run(task, model, settings, out)
-        if checkpoint.exists(out):
-            run.load_state_dict(checkpoint.load(out))
-            logger.info("Going on after iteration %d of %s.", run.iteration, out)
-        return _loop(run, out, progress, stop)
+    group = group or Group()
+    with contextlib.ExitStack() as held:
+        group.once(lambda: held.enter_context(checkpoint.locked(out)))
+        with group.together():
+            run = Run(task, model, settings, out, group)
+        _resume(run, out)
+        journal = group.once(lambda: held.enter_context(Journal(run, out)))
+        return _loop(run, journal, progress, stop)
 
 
-def _loop(run: Run, out: Path, progress, stop) -> Result:
-    metrics = Table(out / "metrics.csv", METRICS, rows=run.iteration)
-    timing = Table(out / "timing.csv", TIMING, rows=run.iteration)
-    last, seconds = run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
-    named = run.learner.replay.ids if run.learner else []
-    with _recorder(run, out) as recorder:
-        if run.iteration == 0:
-            named = _save(run, out, named)
-        while run.iteration < last and not stop():
-            k = run.iteration
-            row = optimise(run, recorder, seconds) | learn(run, seconds)
-            metrics.append(k, row)
-            timing.append(k, seconds)
-            if recorder:
-                recorder.scalars(k, {name: value for name, value in row.items() if math.isfinite(value)})
-            run.iteration += 1
-            with _clock(seconds, "save"):
-                named = _save(run, out, named)
-            if progress:
-                progress(k, row)
-        if run.iteration >= last and recorder and run.best["iteration"] >= 0:
-            play_best(run, recorder)
+def _resume(run: Run, out: Path) -> None:
+    """Go on where the checkpoint ends, if there is one; the replay buffer is for the first process."""
+    group = run.group
+    content = group.tell(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
+    if content is None:
+        return
+    if content["learner"] and not group.first:
+        content["learner"]["replay"] = []
+    with group.together():
+        run.load_state_dict(content)
+    logger.info("Going on after iteration %d of %s.", run.iteration, out)
+
+
+def _loop(run: Run, journal: Journal | None, progress, stop) -> Result:
+    group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
+    while run.iteration < last and not group.any(stop()):
+        k = run.iteration
+        row = optimise(run, journal, seconds) | learn(run, seconds)
+        with group.together():
+            if journal:
+                journal.add(k, row, seconds)
+        run.iteration += 1
+        with _clock(seconds, "save"), group.together():
+            if journal:
+                journal.save()
+        if progress and group.first:
+            progress(k, row)
+    if run.iteration >= last and journal and run.best["iteration"] >= 0:
+        play_best(run, journal)
     return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"])
 
 
-def optimise(run: Run, recorder: softmpm.Recorder | None, seconds: dict[str, float]) -> dict[str, float]:
+def optimise(run: Run, journal: Journal | None, seconds: dict[str, float]) -> dict[str, float]:
     """One optimisation step: simulate, differentiate, move policy and design. Gives figures for metrics.csv."""
     goal, retries = run.draw_goals(), 0
     while True:
         try:
-            episode, lengths = attempt(run, goal, recorder, seconds)
+            episode, row = attempt(run, goal, journal, seconds)
             break
-        except softmpm.UnstableError as error:
+        except (softmpm.UnstableError, OtherProcessError) as error:
             if not run.safe or retries == run.settings.optimizer.retries:
                 problem = " ".join([str(error), *getattr(error, "__notes__", [])])
                 raise TrainingError(run.iteration, problem) from error
             logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
             run.step_back()
             retries += 1
-    row = _figures(run, episode) | lengths | {"retries": retries}
+    row |= {f"{name}_change": change for name, change in run.design.change().items()}
     if row["loss"] < run.best["loss"]:
         run.best = {"loss": row["loss"], "iteration": run.iteration, **run.actor()}
     run.keep_safe()
     run.optimizer.step()
     if run.learner and episode.seen is not None:
-        run.learner.watch(run.iteration * run.model.worlds, episode.seen)
-    return row | {"best": run.best["loss"]}
+        seen = run.group.gather(episode.seen, dim=1)
+        with run.group.together():
+            if seen is not None:
+                run.learner.watch(run.iteration * run.settings.train.worlds, seen)
+    return row | {"retries": retries, "best": run.best["loss"]}
 
 
-def attempt(run: Run, goal, recorder, seconds) -> tuple[Episode, dict[str, float]]:
-    """Simulate and differentiate policy and design as they are."""
-    k, conf = run.iteration, run.settings.train
-    due = recorder is not None and (k % conf.record_every == 0 or k == conf.iterations - 1)
-    with _clock(seconds, "simulate"), _record(run, recorder if due else None, k) as on_frame:
+def attempt(run: Run, goal, journal: Journal | None, seconds) -> tuple[Episode, dict[str, float]]:
+    """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
+    film = journal.film(run.iteration) if journal and journal.due(run.iteration) else contextlib.nullcontext()
+    with _clock(seconds, "simulate"), _all_worlds(run), film as on_frame:
         episode = run_episode(
             run.task,
             run.model,
@@ -166,27 +174,55 @@ def attempt(run: Run, goal, recorder, seconds) -> tuple[Episode, dict[str, float
         return episode, differentiate(run, episode)
 
 
+@contextlib.contextmanager
+def _all_worlds(run: Run) -> Iterator[None]:
+    """A simulation that fails in one process fails in every one; the message has the world's number among all worlds."""
+    with run.group.together(softmpm.UnstableError):
+        try:
+            yield
+        except softmpm.UnstableError as error:
+            if run.group.size > 1:
+                world = run.worlds[error.world]
+                error.add_note(
+                    f"This was in process {run.group.rank}, whose world {error.world} is world {world} of the run."
+                )
+            raise
+
+
 def differentiate(run: Run, episode: Episode) -> dict[str, float]:
-    """Put the gradient of the mean loss into ``.grad`` of policy and design; gives its lengths.
+    """Put the gradient of the mean loss of all worlds into ``.grad`` of policy and design; gives its length and the losses.
 
     The encoder is left out: it learns from pictures, not from the loss.
     """
     policy, design = list(run.policy.parameters()), list(run.design.parameters())
-    gradients = torch.autograd.grad(episode.loss.mean(), policy + design)
+    with _all_worlds(run):
+        gradients = torch.autograd.grad(episode.loss.mean(), policy + design)
+    gradients = run.group.average(gradients)
     for parameter, gradient in zip(policy + design, gradients, strict=True):
         parameter.grad = gradient
     lengths = {
         "gradient_policy": _length(gradients[: len(policy)]),
         "gradient_design": _length(gradients[len(policy) :]),
     }
-    loss = episode.loss.mean().item()
-    if not all(math.isfinite(value) for value in (loss, *lengths.values())):
-        raise TrainingError(run.iteration, f"the loss or its gradient is not finite: {loss:g}, {lengths}.")
+    losses = _losses(run, episode)
+    if not all(math.isfinite(value) for value in (losses["loss"], *lengths.values())):
+        raise TrainingError(
+            run.iteration, f"the loss or its gradient is not finite: {losses['loss']:g}, {lengths}."
+        )
     limit, clipped = run.settings.optimizer.max_norm, 0
     if limit is not None and math.hypot(*lengths.values()) > limit:
         torch.nn.utils.clip_grad_norm_(policy + design, limit)
         clipped = 1
-    return lengths | {"clipped": clipped}
+    return losses | lengths | {"clipped": clipped}
+
+
+def _losses(run: Run, episode: Episode) -> dict[str, float]:
+    """Means over all worlds; the effort is a root mean square."""
+    means = {"loss": episode.loss.mean(), "final": episode.final.mean(), "running": episode.running.mean()}
+    *losses, square = run.group.average([*means.values(), torch.full_like(means["loss"], episode.effort**2)])
+    return {name: loss.item() for name, loss in zip(means, losses, strict=True)} | {
+        "effort": square.sqrt().item()
+    }
 
 
 def _length(gradients: Sequence[Tensor]) -> float:
@@ -194,23 +230,25 @@ def _length(gradients: Sequence[Tensor]) -> float:
 
 
 def learn(run: Run, seconds: dict[str, float]) -> dict[str, float]:
-    """The learning phase, where one is due. Gives figures for metrics.csv."""
+    """The learning phase, where one is due. Gives figures for metrics.csv; in the first process, which alone learns."""
     seconds["learn"] = 0.0
     if run.learner is None:
         return {}
     row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
         with _clock(seconds, "learn"):
-            row |= run.learner.learn(run.generator)
+            row |= run.group.once(run.learner.learn, run.generator) or {}
+            run.group.copy_first(t for network in run.learner.networks for t in network.state_dict().values())
+            run.generator.set_state(run.group.tell(run.generator.get_state()))
     return row
 
 
 @torch.no_grad()
-def play_best(run: Run, recorder: softmpm.Recorder) -> None:
+def play_best(run: Run, journal: Journal) -> None:
     """Record the best policy and design once more, as the episode after the last."""
     now = run.actor()
     run.load_actor(run.best)
-    with _record(run, recorder, run.iteration, of=run.best["iteration"], kind="best") as on_frame:
+    with journal.film(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
         run_episode(
             run.task,
             run.model,
@@ -221,45 +259,6 @@ def play_best(run: Run, recorder: softmpm.Recorder) -> None:
             on_frame=on_frame,
         )
     run.load_actor(now)
-
-
-def _figures(run: Run, episode: Episode) -> dict[str, float]:
-    parts = {"loss": episode.loss, "final": episode.final, "running": episode.running}
-    row = {name: value.mean().item() for name, value in parts.items()} | {"effort": episode.effort}
-    return row | {f"{name}_change": change for name, change in run.design.change().items()}
-
-
-def _save(run: Run, out: Path, named: list[int]) -> list[int]:
-    """Write a checkpoint, then drop the simulations that neither it nor the one before names."""
-    checkpoint.save(out, run.state_dict())
-    if run.learner is None:
-        return []
-    ids = run.learner.replay.ids
-    run.learner.replay.prune(named + ids)
-    return ids
-
-
-def _recorder(run: Run, out: Path) -> contextlib.AbstractContextManager:
-    conf = run.settings.train
-    if conf.record_every == 0:
-        return contextlib.nullcontext()
-    return softmpm.Recorder(out / "run.h5", run.model, resume_before=run.iteration, every=conf.frame_every)
-
-
-@contextlib.contextmanager
-def _record(run: Run, recorder: softmpm.Recorder | None, iteration: int, **about) -> Iterator:
-    """Gives what to call at each frame, or None without a recorder."""
-    if recorder is None:
-        yield None
-        return
-    with recorder.episode(iteration, task=run.task.name, **about) as film:
-
-        def on_frame(frame: Frame) -> None:
-            with torch.no_grad():
-                velocity = softmpm.rasterize(run.model, frame.state).velocity
-                film.frame(frame.time, frame.state, frame.activation, velocity, frame.features)
-
-        yield on_frame
 
 
 @contextlib.contextmanager

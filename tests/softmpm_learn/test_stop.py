@@ -17,3 +17,11 @@ def test_the_first_signal_asks_and_the_second_ends(number):
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
     assert signal.getsignal(number) is before
+
+
+def test_several_signals_can_be_one_wish():
+    """Without ``insist`` a second signal changes nothing: a launcher may pass one Ctrl-C on twice."""
+    with stop_on_signals(insist=False) as stop:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stop()

@@ -12,6 +12,7 @@ import torch
 import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
+from softmpm_learn.table import Table
 
 HERE = Path(__file__).parent
 SOURCE = HERE.parents[1] / "src"
@@ -85,7 +86,7 @@ def test_interrupted_anywhere_it_goes_on_as_if_nothing_had_been(
     owner, name, nth = {
         "optimise": (train, "optimise", 2),
         "learn": (train, "learn", 2),
-        "metrics": (train.Table, "append", 4),  # two tables
+        "metrics": (Table, "append", 4),  # two tables
         "checkpoint": (train.checkpoint, "save", 3),  # one save before the first iteration
         "between renames": (os, "replace", None),
         "prune": (train.Run, "state_dict", 3),

@@ -1,0 +1,89 @@
+"""What a run leaves on the disk while it goes on: metrics.csv and timing.csv, recording, checkpoint and replay buffer."""
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+
+import torch
+
+import softmpm
+from softmpm_learn import checkpoint
+from softmpm_learn.episode import Frame
+from softmpm_learn.run import Run
+from softmpm_learn.table import Table
+
+METRICS = [
+    *("loss", "final", "running", "best", "effort"),
+    *("gradient_policy", "gradient_design", "clipped", "retries"),
+    *("young_change", "poisson_change", "density_change"),
+    *("epochs", "training_loss", "validation_loss", "replay"),
+]
+"""Columns of metrics.csv; nothing in it depends on the clock."""
+TIMING = ["simulate", "backward", "learn", "save"]
+"""Columns of timing.csv [s]; ``save`` is that of the iteration before."""
+
+
+class Journal:
+    """Goes on where the run is, and begins with a checkpoint of a new one. Of several processes the first keeps it; it shows
+    the first of its worlds. Use as a context manager.
+    """
+
+    def __init__(self, run: Run, out: Path):
+        self.run, self.out = run, out
+        self._named = run.learner.replay.ids if run.learner else []
+        self._metrics = Table(out / "metrics.csv", METRICS, rows=run.iteration)
+        self._timing = Table(out / "timing.csv", TIMING, rows=run.iteration)
+        if run.iteration == 0:
+            self.save()
+        self._recorder: softmpm.Recorder | None = None
+        conf = run.settings.train
+        if conf.record_every:
+            path, done = out / "run.h5", run.iteration
+            self._recorder = softmpm.Recorder(path, run.model, resume_before=done, every=conf.frame_every)
+
+    def add(self, iteration: int, row: dict[str, float], seconds: dict[str, float]) -> None:
+        """A row of either table, and the figures to the recording."""
+        self._metrics.append(iteration, row)
+        self._timing.append(iteration, seconds)
+        if self._recorder:
+            known = {name: value for name, value in row.items() if math.isfinite(value)}
+            self._recorder.scalars(iteration, known)
+
+    def save(self) -> None:
+        """Write a checkpoint, then drop the simulations that neither it nor the one before names."""
+        checkpoint.save(self.out, self.run.state_dict())
+        if self.run.learner is not None:
+            ids = self.run.learner.replay.ids
+            self.run.learner.replay.prune(self._named + ids)
+            self._named = ids
+
+    def due(self, iteration: int) -> bool:
+        """Whether the episode of this iteration is to be recorded."""
+        conf = self.run.settings.train
+        return bool(conf.record_every) and (
+            iteration % conf.record_every == 0 or iteration == conf.iterations - 1
+        )
+
+    @contextlib.contextmanager
+    def film(self, iteration: int, **about) -> Iterator[Callable[[Frame], None] | None]:
+        """Record an episode: gives what to call at each frame, or None if nothing is recorded."""
+        if self._recorder is None:
+            yield None
+            return
+        with self._recorder.episode(iteration, task=self.run.task.name, **about) as film:
+
+            def on_frame(frame: Frame) -> None:
+                with torch.no_grad():
+                    velocity = softmpm.rasterize(self.run.model, frame.state).velocity
+                    film.frame(frame.time, frame.state, frame.activation, velocity, frame.features)
+
+            yield on_frame
+
+    def __enter__(self) -> "Journal":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._recorder:
+            self._recorder.close()

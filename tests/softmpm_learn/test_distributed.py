@@ -1,0 +1,288 @@
+"""Two processes do what one does. Run as a script by torchrun, this file is one of the processes."""
+
+import csv
+import dataclasses
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import softmpm
+from softmpm_learn import checkpoint, distributed, train
+from softmpm_learn.config import load
+from softmpm_learn.distributed import Group, OtherProcessError
+from softmpm_learn.experiment import make_model
+from softmpm_learn.settings import Settings
+from softmpm_learn.tasks import make_task
+
+HERE = Path(__file__).parent
+SAME = 1e-5
+"""Sums over the worlds have another order: a rounding of 1e-7, a few iterations on."""
+ARM = [
+    *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025"),
+    *("train.worlds=4", "train.goal_spread=[0.05,0.05]", "train.record_every=2"),
+]
+"""Three iterations; goals of their own give each world a gradient of its own."""
+
+
+def shared(settings: Settings, **changes) -> Settings:
+    """Four worlds with goals of their own, three iterations, each with a learning phase but the last."""
+    conf = dict(worlds=4, iterations=3, goal_spread=[0.1, 0.05]) | changes
+    optimizer = dataclasses.replace(settings.optimizer, retries=1, max_norm=CLIPPED)
+    return dataclasses.replace(
+        settings, train=dataclasses.replace(settings.train, **conf), optimizer=optimizer
+    )
+
+
+def fails(real, at):
+    """``simulate`` that reports an inverted particle in its world 1 at some of its calls; an iteration has six."""
+    calls = itertools.count()
+
+    def simulate(*args, **kwargs):
+        if next(calls) in at:
+            what = dict(kind=KIND, world=1, particle=3, substep=1, value=-1.0, limit="det F > 0")
+            raise softmpm.UnstableError("particle 3 of world 1 is inverted.", **what)
+        return real(*args, **kwargs)
+
+    return simulate
+
+
+CLIPPED = 2e-3
+"""Shorter than the mean gradient: each process has to shorten the same one."""
+KIND = type("Kind", (), {"name": "INVERTED"})
+
+
+def one_of_two(out: Path, group: Group) -> None:
+    """What each process does; leaves in ``said.RANK.json`` how each run ended there."""
+    import conftest
+
+    torch.set_num_threads(1)
+    task, settings = conftest.task.__wrapped__(), conftest.settings.__wrapped__()
+    model, said, first = softmpm.build(task.scene, device="cpu", worlds=2), {}, group.first
+    simulate, save = softmpm.simulate, checkpoint.save
+
+    def go(name: str, into: str | None = None, **options):
+        conf = shared(settings, **options.pop("change", {}))
+        try:
+            result = train.train(task, model, conf, out / (into or name), group=group, **options)
+            said[name] = [result.finished, result.run.iteration]
+            weights = [p.detach() for p in result.run.parameters]
+            torch.save(weights, out / f"{name}.{group.rank}.pt")
+        except Exception as error:
+            said[name] = [type(error).__name__, str(error)]
+
+    def full(*_):
+        raise OSError("no space left.")
+
+    go("two")
+    ended = iter([False] if not first else itertools.repeat(False))
+    go("stopped", stop=lambda: next(ended, True))
+    go("resumed", into="stopped")
+    for name, at in (("retried", {8}), ("failed", range(8, 999))):
+        softmpm.simulate = simulate if first else fails(simulate, at)
+        go(name)
+    softmpm.simulate = simulate
+    checkpoint.save = full if first else save
+    go("full")
+    checkpoint.save = save
+    go("uneven", change=dict(worlds=3))
+    (out / f"said.{group.rank}.json").write_text(json.dumps(said))
+
+
+def torchrun(*words: str, cwd: Path) -> subprocess.CompletedProcess:
+    paths = [str(HERE.parents[1] / "src"), str(HERE), os.environ.get("PYTHONPATH", "")]
+    return subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *words],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """Folder of the runs of :func:`one_of_two`, and how they ended in the first and in the other process."""
+    out = tmp_path_factory.mktemp("both")
+    done = torchrun(str(Path(__file__)), str(out), cwd=out)
+    assert done.returncode == 0, done.stderr
+    return out, *(json.loads((out / f"said.{rank}.json").read_text()) for rank in range(2))
+
+
+@pytest.fixture(scope="module")
+def four(task):
+    """All four worlds in one process."""
+    return softmpm.build(task.scene, device="cpu", worlds=4)
+
+
+def figures(folder: Path) -> list[dict[str, float]]:
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{name: float(cell or "nan") for name, cell in row.items()} for row in csv.DictReader(file)]
+
+
+def assert_same(folder: Path, other: Path) -> None:
+    """Every metric, and the weights, what the policy looks through and the generator of the checkpoint."""
+    for row, want in zip(figures(folder), figures(other), strict=True):
+        assert row == pytest.approx(want, rel=SAME, nan_ok=True)
+    now, want = checkpoint.load(folder), checkpoint.load(other)
+    for part in ("policy", "design"):
+        torch.testing.assert_close(now[part], want[part], rtol=SAME, atol=SAME)
+    for part in ("autoencoder", "target"):
+        torch.testing.assert_close(now["learner"][part], want["learner"][part], rtol=SAME, atol=SAME)
+    assert torch.equal(now["generator"], want["generator"]) and now["iteration"] == want["iteration"] == 3
+    assert now["learner"]["replay"] == want["learner"]["replay"] == list(range(12))
+
+
+def assert_in_step(out: Path, name: str) -> None:
+    """Both processes end with the same weights, to the bit."""
+    first, other = (torch.load(out / f"{name}.{rank}.pt") for rank in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+# What two processes do
+
+
+def test_two_processes_give_the_run_of_one(task, four, settings, both, tmp_path):
+    """Metrics, weights, autoencoder and replay buffer of three iterations do not depend on the number of processes."""
+    out, *said = both
+    train.train(task, four, shared(settings), tmp_path)
+    assert_same(out / "two", tmp_path)
+    assert all(row["clipped"] for row in figures(tmp_path))
+    assert_in_step(out, "two")
+    assert [s["two"] for s in said] == [[True, 3]] * 2
+
+
+def test_a_wish_of_one_process_stops_both(both):
+    """Both end after the same iteration; resumed, they give the very run that was not stopped."""
+    out, *said = both
+    assert [s["stopped"] for s in said] == [[False, 1]] * 2
+    assert [s["resumed"] for s in said] == [[True, 3]] * 2
+    assert (out / "stopped" / "metrics.csv").read_bytes() == (out / "two" / "metrics.csv").read_bytes()
+    assert_in_step(out, "stopped")
+    assert_in_step(out, "resumed")
+
+
+def test_a_failure_in_one_process_is_a_retry_in_both(task, four, settings, both, tmp_path, monkeypatch):
+    """Both go halfway back together, as one process would, and are still in step."""
+    out, *_ = both
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, {8}))
+    train.train(task, four, shared(settings), tmp_path)
+    assert [row["retries"] for row in figures(out / "retried")] == [0, 1, 0]
+    assert_same(out / "retried", tmp_path)
+    assert_in_step(out, "retried")
+
+
+def test_a_failure_without_a_way_back_ends_both(both):
+    """Both raise the same error, which names the world by its number in the run; what was done before is saved."""
+    out, first, other = both
+    assert first["failed"] == other["failed"] and first["failed"][0] == "TrainingError"
+    message = "iteration 1: particle 3 of world 1 is inverted. In control step"
+    assert first["failed"][1].startswith(message)
+    assert "in process 1, whose world 1 is world 3 of the run" in first["failed"][1]
+    assert checkpoint.load(out / "failed")["iteration"] == 1
+
+
+def test_what_the_first_process_cannot_write_ends_both(both):
+    """The error stays what it is where it happened; the other process says the same and does not wait."""
+    _, first, other = both
+    assert first["full"] == ["OSError", "no space left."]
+    assert other["full"] == ["OtherProcessError", "no space left."]
+
+
+def test_worlds_that_cannot_be_shared_are_refused(both):
+    """The number of worlds must be a multiple of that of the processes; the message says which would do."""
+    _, first, other = both
+    assert first["uneven"][0] == "ValueError" and other["uneven"][0] == "OtherProcessError"
+    assert first["uneven"][1] == other["uneven"][1]
+    assert (
+        "multiple of the 2 processes that share the worlds, got 3; take train.worlds=4" in first["uneven"][1]
+    )
+
+
+def test_one_process_goes_on_where_two_stopped(task, four, settings, both, tmp_path):
+    """A run may be resumed by another number of processes."""
+    out, *_ = both
+    shutil.copytree(out / "failed", tmp_path / "failed")
+    for name in ("failed", "whole"):
+        train.train(task, four, shared(settings), tmp_path / name)
+    assert_same(tmp_path / "failed", tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("device", "dtype"),
+    [("cpu", "float32"), pytest.param("cuda", "float64", marks=pytest.mark.gpu)],  # a GPU adds in any order
+)
+def test_the_command_line_through_torchrun(tmp_path, device, dtype):
+    """One folder with everything in it, one log, and the metrics of the same settings in one process."""
+    if device == "cuda" and torch.cuda.device_count() < 2:
+        pytest.skip("needs two GPUs")
+    words = (*ARM, f"device.name={device}", f"device.dtype={dtype}")
+    done = torchrun("-m", "softmpm_learn", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("after 3 of 3 iterations: loss") == 1
+    (out,) = (tmp_path / "outputs" / "arm").iterdir()
+    left = {path.name for path in out.iterdir()}
+    assert left >= {"run.h5", "run.rrd", "loss.png", "latent.png", "robot.png"} and "error.txt" not in left
+    conf = load(out / "config.yaml")
+    task, one = make_task(conf.task), tmp_path / "one"
+    train.train(task, make_model(task, conf, Group()), conf.settings, one)
+    for row, want in zip(figures(out), figures(one), strict=True):
+        assert row == pytest.approx(want, rel=SAME, nan_ok=True)
+
+
+# One process alone
+
+
+def test_alone_nothing_is_communicated():
+    """A group of one has all worlds, averages and gathers nothing, and lets errors pass as they are."""
+    group, tensor = Group(), torch.ones(2)
+    assert group.split(5) == range(5) and group.any(True) and not group.any(False)
+    assert group.average([tensor])[0] is tensor and group.gather(tensor, dim=0) is tensor
+    assert group.tell("text") == "text" and group.once(max, 2, 3) == 3
+    with pytest.raises(KeyError) as caught, group.together():
+        raise KeyError
+    assert not isinstance(caught.value, OtherProcessError) and not torch.distributed.is_initialized()
+
+
+def test_without_torchrun_there_is_no_process_group(monkeypatch):
+    """``joined`` gives a group of one where torchrun has not been, or started one process only."""
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    with distributed.joined() as group:
+        assert group == Group() and not torch.distributed.is_initialized()
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    with distributed.joined() as group:
+        assert group == Group() and not torch.distributed.is_initialized()
+
+
+def test_worlds_are_split_evenly():
+    """Shares are as large as each other, without gaps, in the order of the processes."""
+    shares = [Group(rank=rank, size=3).split(6) for rank in range(3)]
+    assert shares == [range(2), range(2, 4), range(4, 6)]
+
+
+def test_each_process_has_its_own_gpu(monkeypatch):
+    """A process takes the GPU of its number on its machine; too few GPUs are refused, with what to do."""
+    alone, third = Group(), Group(rank=6, size=8, local_rank=2, local_size=4)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert [alone.device(name) for name in ("auto", "cpu", "cuda")] == [None, "cpu", "cuda"]
+    assert [third.device(name) for name in ("auto", "cpu", "cuda")] == ["cuda:2", "cpu", "cuda:2"]
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(
+        ValueError, match=r"4 processes, but PyTorch sees 1 GPUs; take torchrun --nproc-per-node=1"
+    ):
+        third.device("auto")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert third.device("auto") is None
+
+
+if __name__ == "__main__":
+    with distributed.joined() as the_group:
+        one_of_two(Path(sys.argv[1]), the_group)
