@@ -11,7 +11,7 @@ ORDER = """scene state watch silhouette surface shapes checks stability schedule
     kernels.failure kernels.particle kernels.transfer kernels.boundary kernels.raster
     kernels.native kernels.stencil kernels.fused kernels.packing
     model buffers failures step plain arrangement replay program program_adj fast rollout
-    raster autograd tape reference layout playback recording appearance show rerun_file __main__""".split()
+    raster autograd graph tape reference layout playback recording appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
     "h5py": {"layout", "recording", "playback"},

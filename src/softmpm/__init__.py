@@ -8,6 +8,7 @@ differentiable in the start, the activation and the material:
 """
 
 from softmpm.autograd import rasterize, simulate
+from softmpm.graph import Graph
 from softmpm.model import Model, build
 from softmpm.playback import Recording
 from softmpm.recording import Recorder
@@ -22,6 +23,7 @@ from softmpm.watch import UnstableError
 __all__ = [
     "Body",
     "FixedCorotated",
+    "Graph",
     "Grid",
     "GridField",
     "Low",

@@ -33,14 +33,16 @@ class Arrangement:
         self.model = model
         self.fresh_cells: int | None = None
         self.stale = False
+        self._grid = torch.tensor(model.scene.grid.shape, device=model.device)
         first, last = self._reach(x)
         grid = model.scene.grid.shape
         reach = [max(h - low for low, h in zip(*axis, strict=True)) for axis in zip(first, last, strict=True)]
         wide = window_shape(grid, reach)
         self.shape = tuple(min(n, max(w, k)) for n, w, k in zip(grid, wide, least or wide, strict=True))
+        self._shape = torch.tensor(self.shape, device=model.device)
         self.order = torch.empty(model.worlds, model.particle_count, dtype=torch.int32, device=model.device)
         self.origin = torch.empty(model.worlds, model.dim, dtype=torch.int32, device=model.device)
-        self._renew(x)
+        self.renew(x)
 
     @property
     def node_count(self) -> int:
@@ -49,9 +51,8 @@ class Arrangement:
 
     def _base(self, x: Tensor) -> Tensor:
         """First node of each particle's stencil, kept on the grid; shape (world, particle, dim)."""
-        last = torch.tensor(self.model.scene.grid.shape, device=x.device) - 3
         cells = torch.floor(x.double() / self.model.scene.grid.spacing - 0.5).nan_to_num(0.0)
-        return torch.minimum(cells.clamp(min=0), last).long()
+        return torch.minimum(cells.clamp(min=0), self._grid - 3).long()
 
     def _reach(self, x: Tensor) -> tuple[list, list]:
         """Smallest and largest base in each axis and world; waits for the device."""
@@ -69,23 +70,27 @@ class Arrangement:
             for low, high in zip(first[axis], last[axis], strict=True)
         )
 
-    def _renew(self, x: Tensor) -> None:
-        """Sort by cell and centre the window on the particles."""
-        base, grid = self._base(x), self.model.scene.grid.shape
-        key = base[..., 0]
+    def renew(self, x: Tensor) -> None:
+        """Sort by cell and centre the window on the particles, without waiting for the device.
+
+        On the CPU, where nothing is summed in parallel, the order is that at rest, so that results never depend on what ran
+        before; the window does not change a result.
+        """
+        base = self._base(x)
+        sorted_base = base if x.device.type == "cuda" else self._base(self.model.positions.expand_as(x))
+        key = sorted_base[..., 0]
         for axis in range(1, self.model.dim):
-            key = key * grid[axis] + base[..., axis]
+            key = key * self.model.scene.grid.shape[axis] + sorted_base[..., axis]
         self.order.copy_(torch.argsort(key, dim=1, stable=True))
-        shape, grid = (torch.tensor(s, device=x.device) for s in (self.shape, grid))
-        middle = (base.amin(dim=1) + base.amax(dim=1) + 3 - shape) // 2
-        self.origin.copy_(torch.minimum(middle.clamp(min=0), grid - shape))
+        middle = (base.amin(dim=1) + base.amax(dim=1) + 3 - self._shape) // 2
+        self.origin.copy_(torch.minimum(middle.clamp(min=0), self._grid - self._shape))
         self.fresh_cells, self.stale = None, False
 
     def renewed(self, x: Tensor) -> "Arrangement":
         """Itself with a new order and place, or another one if the window is too small for these positions."""
         if not self.fits(x):
             return Arrangement(self.model, x, least=self.shape)
-        self._renew(x)
+        self.renew(x)
         return self
 
     def grown(self, x: Tensor) -> "Arrangement":
@@ -96,7 +101,8 @@ class Arrangement:
         """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""
         if self.fresh_cells is None:
             self.fresh_cells = cells
-        self.stale = near_edge or cells > STALE * self.fresh_cells
+        scattered = self.model.device.type == "cuda" and cells > STALE * self.fresh_cells
+        self.stale = near_edge or scattered
 
     def window(self, origin: Tensor):
         """Struct for the kernels."""

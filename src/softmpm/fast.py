@@ -10,6 +10,7 @@ from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid, SolidAdj
 from softmpm.horizon import Chunk
 from softmpm.kernels.types import Wanted
+from softmpm.memory import LONGEST
 from softmpm.model import Model
 from softmpm.program import Program
 from softmpm.program_adj import ProgramAdj, Scratch
@@ -70,20 +71,34 @@ class Fast:
     def __init__(self, model: Model):
         self.model = model
         self._pool: Pool | None = None
+        self._recorded = (
+            LONGEST  # substeps of the graph that is being recorded since it last renewed the order
+        )
 
     def run(self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool) -> FastRun:
-        return FastRun(self._arranged(start), chunk, start, pull, solid, keep)
+        return FastRun(self._arranged(start, chunk), chunk, start, pull, solid, keep)
 
-    def _arranged(self, start: State) -> Pool:
+    def _arranged(self, start: State, chunk: Chunk) -> Pool:
+        if recording(self.model):
+            return self._arranged_blindly(start, chunk)
+        self._recorded = LONGEST
         if self._pool is None:
-            if recording(self.model):
-                raise RuntimeError(
-                    "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work "
-                    "once first, or let softmpm.Graph do it."
-                )
             self._use(Arrangement(self.model, start.x))
-        elif self._pool.arrangement.stale and not recording(self.model):
+        elif self._pool.arrangement.stale:
             self._use(self._pool.arrangement.renewed(start.x))
+        return self._pool
+
+    def _arranged_blindly(self, start: State, chunk: Chunk) -> Pool:
+        """Inside a graph nobody can look whether the order is stale: it is renewed every so often."""
+        if self._pool is None:
+            raise RuntimeError(
+                "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work once "
+                "first, or let softmpm.Graph do it."
+            )
+        if self._recorded >= LONGEST:
+            self._pool.arrangement.renew(start.x)
+            self._recorded = 0
+        self._recorded += chunk.length
         return self._pool
 
     def _use(self, arrangement: Arrangement) -> None:

@@ -160,8 +160,18 @@ class Model:
         state = State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye)
         if self.dtype == torch.float64:
             return state
-        low = torch.from_numpy(self._exact_positions).to(self.device) - self.positions.double()
-        return state.with_low(Low(low.to(self.dtype).expand(*lead, self.dim).clone(), torch.zeros_like(eye)))
+        return state.with_low(Low(self._low.expand_as(x).clone(), torch.zeros_like(eye)))
+
+    @functools.cached_property
+    def _low(self) -> Tensor:
+        """What rounding took off the rest positions [m], shape (particle, dim)."""
+        exact = torch.from_numpy(self._exact_positions).to(self.device)
+        return (exact - self.positions.double()).to(self.dtype)
+
+    @functools.cached_property
+    def mass(self) -> Tensor:
+        """Mass [kg] as the scene gives it, shape (particle,)."""
+        return (self.params().density * self.volume).contiguous()
 
     def params(self) -> Params:
         """Material of each particle as the scene gives it, shape (particle,) each. Fresh tensors."""

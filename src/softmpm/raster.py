@@ -8,6 +8,7 @@ from softmpm.failures import raise_failure
 from softmpm.kernels.raster import raster
 from softmpm.kernels.types import types
 from softmpm.model import Model
+from softmpm.replay import note, recording
 from softmpm.state import GridField, State
 from softmpm.step import Substep
 
@@ -19,14 +20,16 @@ def _enter(model: Model, state: State):
     step, motion = Substep(model, None), Motion.empty(model)
     struct = motion.struct(model)
     step.enter(state, struct)
-    raise_failure(model, step.watch_words.tolist(), state)
+    if recording(model):
+        note(step.watch_words)
+    else:
+        raise_failure(model, step.watch_words.tolist(), state)
     return step, motion, struct
 
 
 def _arguments(model: Model, node: Tensor):
     t = types(model.spec.dim, model.spec.dtype)
-    mass = (model.params().density * model.volume).contiguous()
-    return view(mass, t.real), view(node, t.node)
+    return view(model.mass, t.real), view(node, t.node)
 
 
 def rasterize_nodes(model: Model, state: State) -> GridField:

@@ -17,6 +17,35 @@ def recording(model: Model) -> bool:
     return model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
+class Ledger:
+    """Watch words of the calls that a CUDA graph holds, to be read after each replay."""
+
+    def __init__(self):
+        self.words: list[torch.Tensor] = []
+
+
+_open: list[Ledger] = []
+"""The ledger of the graph that PyTorch is recording, which is one at a time; its backward pass runs in another thread."""
+
+
+def open_ledger() -> Ledger:
+    _open.append(Ledger())
+    return _open[-1]
+
+
+def close_ledger() -> None:
+    _open.pop()
+
+
+def note(words: torch.Tensor) -> None:
+    """Leave the reading of these words, one for each world, to whoever replays the graph that is being recorded."""
+    if not _open:
+        raise RuntimeError(
+            "softmpm cannot tell whether a simulation fails inside a CUDA graph of your own: record it with softmpm.Graph."
+        )
+    _open[-1].words.append(words)
+
+
 class Replay:
     """Calls ``launches(stream)`` once to record it.
 

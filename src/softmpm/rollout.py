@@ -15,6 +15,7 @@ from softmpm.kernels.types import Wanted
 from softmpm.memory import LONGEST, Plan, plan
 from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
+from softmpm.replay import note, recording
 from softmpm.state import State
 
 
@@ -66,6 +67,9 @@ class _Runner:
         """Run a chunk, and wait until it can be used."""
         while True:
             run = self.run(chunk, start, keep)
+            if recording(self.model):
+                note(run.words[: self.model.worlds])
+                return run
             if self.settled(run, Report(run.words)):
                 return run
 
@@ -87,6 +91,8 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     trail = Trail(chosen, horizon.chunks(chosen.longest), [], {})
     stays = schedule.kept_first(len(trail.chunks), chosen.slots) if chosen.slots else ()
     runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all
+    if recording(model):
+        return _recorded(runner, trail, start, stays, inside), trail if keep else None
     state, k, before = start, 0, None
     while k < len(trail.chunks) or before is not None:
         ahead = runner.run(trail.chunks[k], state, inside) if k < len(trail.chunks) else None
@@ -101,6 +107,18 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
         before = None if ahead is None else (ahead, report)
         state, k = (state, k) if ahead is None else (ahead.end, k + 1)
     return state, trail if keep else None
+
+
+def _recorded(runner: _Runner, trail: Trail, state: State, stays, inside: bool) -> State:
+    """:func:`rollout` while PyTorch records a graph: nothing is read back."""
+    for k, chunk in enumerate(trail.chunks):
+        if k in stays:
+            trail.states[k] = state
+        run = runner.settle(chunk, state, inside)
+        if inside:
+            trail.runs.append(run)
+        state = run.end
+    return state
 
 
 def rollout_adj(
@@ -128,7 +146,8 @@ def rollout_adj(
         adj, part = run.pull_back(adj, adj_solid, wanted)
         if adj_pull is not None:
             adj_pull[run.chunk.rows] += part
-        reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
+        if not recording(model):
+            reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
     for report, last in reports:
         words = report.read()[: model.worlds]
         raise_gradient_failure(model, words, adj_end, last, horizon.total)

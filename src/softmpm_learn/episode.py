@@ -1,7 +1,7 @@
 """Observe → act → simulate, again and again, differentiable end to end: one closed-loop simulation."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -39,13 +39,17 @@ class Episode:
     end: State
     seen: Tensor | None
     """What the observer saw, every so many control steps, shape (frame, world, ...), detached; None if it was not asked for."""
-    effort: float
-    """Root mean square of the activation [-]."""
+    effort: Tensor
+    """Mean square of the activation [-], shape (), detached."""
 
     @property
     def loss(self) -> Tensor:
         """Final loss and running cost together, shape (world,)."""
         return self.final + self.running
+
+    def detach(self) -> "Episode":
+        end = State(*(tensor.detach() for tensor in self.end))
+        return replace(self, final=self.final.detach(), running=self.running.detach(), end=end)
 
 
 def run_episode(
@@ -97,5 +101,55 @@ def run_episode(
         running=running / task.control_steps,
         end=state,
         seen=torch.stack(seen) if seen else None,
-        effort=(effort / task.control_steps).sqrt().item(),
+        effort=effort / task.control_steps,
     )
+
+
+class ClosedLoop:
+    """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one recorded graph.
+
+    Args:
+        parameters: What the gradient is taken of.
+        params: Gives the materials, see :class:`softmpm_learn.design.Design`.
+        keep_every: As in :func:`run_episode`.
+    """
+
+    def __init__(
+        self,
+        task: "Task",
+        model: Model,
+        observer: Observer,
+        policy: nn.Module,
+        params: Callable[[], Params],
+        parameters: list[nn.Parameter],
+        keep_every: int = 0,
+    ):
+        self.task, self.model, self.observer, self.policy = task, model, observer, policy
+        self.params, self.parameters, self.keep_every = params, parameters, keep_every
+        self._goal: Tensor | None = None
+        self._graph = softmpm.Graph(self._work, model.device)
+
+    def __call__(
+        self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
+    ) -> tuple[Episode, tuple[Tensor, ...]]:
+        """The episode, detached, and the gradient of its mean loss; overwritten by the next call. A film is not replayed.
+
+        Raises:
+            softmpm.UnstableError: As :func:`run_episode`.
+        """
+        if goal is not None:
+            self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
+        return self._work(on_frame) if on_frame else self._graph()
+
+    def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
+        episode = run_episode(
+            self.task,
+            self.model,
+            self.observer,
+            self.policy,
+            self.params(),
+            goal=self._goal,
+            keep_every=self.keep_every,
+            on_frame=on_frame,
+        )
+        return episode.detach(), torch.autograd.grad(episode.loss.mean(), self.parameters)

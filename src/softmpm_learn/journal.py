@@ -21,8 +21,8 @@ METRICS = [
     *("epochs", "training_loss", "validation_loss", "replay"),
 ]
 """Columns of metrics.csv; nothing in it depends on the clock."""
-TIMING = ["simulate", "backward", "learn", "save"]
-"""Columns of timing.csv [s]; ``save`` is that of the iteration before."""
+TIMING = ["episode", "learn", "save"]
+"""Columns of timing.csv [s]; ``episode`` is simulation and gradient, ``save`` is that of the iteration before."""
 
 
 class Journal:

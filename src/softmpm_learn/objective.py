@@ -1,5 +1,6 @@
 """What the robot should do: a loss of how a simulation ends, and running terms along the way. Smaller is better."""
 
+import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -10,7 +11,23 @@ from torch import Tensor
 from softmpm import State
 
 
-class Running(ABC):
+class Placed:
+    """Arrays among the fields, moved to a device once: a recorded graph cannot copy from the host."""
+
+    @functools.cached_property
+    def _placed(self) -> dict:
+        return {}
+
+    def on(self, name: str, like: Tensor) -> Tensor:
+        """The field ``name`` on the device of ``like``; real numbers in its precision."""
+        key = name, like.device, like.dtype
+        if key not in self._placed:
+            tensor = torch.as_tensor(getattr(self, name))
+            self._placed[key] = tensor.to(like.device, like.dtype if tensor.is_floating_point() else None)
+        return self._placed[key]
+
+
+class Running(Placed, ABC):
     """A term that is averaged over the control steps of an episode."""
 
     @abstractmethod
@@ -55,11 +72,11 @@ class Upright(Running):
     def __call__(self, state: State, activation: Tensor) -> Tensor:
         apart = self.rest[self.front].mean(axis=0) - self.rest[self.back].mean(axis=0)
         y = state.x[..., 1]
-        rise = y[:, self.front].mean(dim=-1) - y[:, self.back].mean(dim=-1)
+        rise = y[:, self.on("front", y)].mean(dim=-1) - y[:, self.on("back", y)].mean(dim=-1)
         return self.weight * ((rise - apart[1]) / apart[0]).square()
 
 
-class Objective(ABC):
+class Objective(Placed, ABC):
     """A final loss and running terms."""
 
     terms: tuple[Running, ...] = ()
@@ -85,7 +102,7 @@ class Progress(Objective):
 
     def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
         moved = end.x[..., self.axis] - start.x[..., self.axis]
-        return -(moved if self.particles is None else moved[:, self.particles]).mean(dim=-1)
+        return -(moved if self.particles is None else moved[:, self.on("particles", moved)]).mean(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -99,5 +116,5 @@ class Reach(Objective):
     terms: tuple[Running, ...] = ()
 
     def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
-        place = torch.as_tensor(self.target).to(end.x) if goal is None else goal
-        return (end.x[:, self.particles].mean(dim=1) - place).square().sum(dim=-1)
+        place = self.on("target", end.x) if goal is None else goal
+        return (end.x[:, self.on("particles", end.x)].mean(dim=1) - place).square().sum(dim=-1)

@@ -15,6 +15,7 @@ from softmpm import Model, Params
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
+from softmpm_learn.episode import ClosedLoop
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Centroids, Latent, Observer, Picture, clusters
 from softmpm_learn.policy import Goal, make_policy
@@ -41,6 +42,7 @@ class Run:
         generator: The only source of randomness after the first weights.
         safe: Values of policy and design in the last simulation that did not fail.
         best: The lowest loss so far and what gave it.
+        loop: Simulates and differentiates what is above as it is.
     """
 
     def __init__(self, task: "Task", model: Model, settings: Settings, out: Path, group: Group | None = None):
@@ -65,6 +67,9 @@ class Run:
         self.design = Design(settings.design, model, task.regions)
         self.optimizer = self._make_optimizer()
         self.safe: list[Tensor] = []
+        every = settings.learning.frame_every if self.learner else 0
+        parts = (task, model, self.observer, self.policy, self.params, self.parameters)
+        self.loop = ClosedLoop(*parts, keep_every=every)
 
     def _make_observer(self, out: Path) -> Observer:
         conf, model, task = self.settings.observer, self.model, self.task

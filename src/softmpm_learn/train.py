@@ -159,19 +159,9 @@ def optimise(run: Run, journal: Journal | None, seconds: dict[str, float]) -> di
 def attempt(run: Run, goal, journal: Journal | None, seconds) -> tuple[Episode, dict[str, float]]:
     """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
     film = journal.film(run.iteration) if journal and journal.due(run.iteration) else contextlib.nullcontext()
-    with _clock(seconds, "simulate"), _all_worlds(run), film as on_frame:
-        episode = run_episode(
-            run.task,
-            run.model,
-            run.observer,
-            run.policy,
-            run.params(),
-            goal=goal,
-            keep_every=run.settings.learning.frame_every if run.learner else 0,
-            on_frame=on_frame,
-        )
-    with _clock(seconds, "backward"):
-        return episode, differentiate(run, episode)
+    with _clock(seconds, "episode"), _all_worlds(run), film as on_frame:
+        episode, gradients = run.loop(goal, on_frame)
+    return episode, take_gradient(run, episode, gradients)
 
 
 @contextlib.contextmanager
@@ -189,14 +179,12 @@ def _all_worlds(run: Run) -> Iterator[None]:
             raise
 
 
-def differentiate(run: Run, episode: Episode) -> dict[str, float]:
-    """Put the gradient of the mean loss of all worlds into ``.grad`` of policy and design; gives its length and the losses.
+def take_gradient(run: Run, episode: Episode, gradients: Sequence[Tensor]) -> dict[str, float]:
+    """Put the mean gradient of all worlds into ``.grad`` of policy and design; gives its length and the losses.
 
     The encoder is left out: it learns from pictures, not from the loss.
     """
     policy, design = list(run.policy.parameters()), list(run.design.parameters())
-    with _all_worlds(run):
-        gradients = torch.autograd.grad(episode.loss.mean(), policy + design)
     gradients = run.group.average(gradients)
     for parameter, gradient in zip(policy + design, gradients, strict=True):
         parameter.grad = gradient
@@ -219,7 +207,7 @@ def differentiate(run: Run, episode: Episode) -> dict[str, float]:
 def _losses(run: Run, episode: Episode) -> dict[str, float]:
     """Means over all worlds; the effort is a root mean square."""
     means = {"loss": episode.loss.mean(), "final": episode.final.mean(), "running": episode.running.mean()}
-    *losses, square = run.group.average([*means.values(), torch.full_like(means["loss"], episode.effort**2)])
+    *losses, square = run.group.average([*means.values(), episode.effort])
     return {name: loss.item() for name, loss in zip(means, losses, strict=True)} | {
         "effort": square.sqrt().item()
     }

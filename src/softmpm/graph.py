@@ -1,0 +1,78 @@
+"""A whole closed loop, its gradient included, as one CUDA graph."""
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import torch
+
+from softmpm.replay import close_ledger, open_ledger
+from softmpm.watch import NEVER
+
+Result = TypeVar("Result")
+
+
+class Graph(Generic[Result]):
+    """Work that calls :func:`softmpm.simulate`, recorded once and replayed: no launch costs the host anything any more.
+
+    On the CPU, where simulations are replayed anyway, it calls the work each time. A replay that fails is done again by
+    calling the work, which raises what there is to raise, or takes a larger part of the grid into memory.
+
+    Args:
+        work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
+            for a number: what changes between calls is written into tensors that it reads. Gradients are taken inside it.
+        device: Where it runs.
+
+    Example:
+        >>> def work():
+        ...     loss = closed_loop(policy)
+        ...     return loss.detach(), grad(loss, list(policy.parameters()))
+        >>> graph = softmpm.Graph(work, model.device)
+        >>> loss, gradients = graph()  # overwritten by the next call
+    """
+
+    def __init__(self, work: Callable[[], Result], device: torch.device):
+        self.work, self.device = work, device
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._warm = False
+
+    def __call__(self) -> Result:
+        """What the work gives; once recorded, in the same tensors each time.
+
+        Raises:
+            UnstableError: As ``simulate`` does.
+        """
+        if self._stream is None:
+            return self.work()
+        if not self._warm:
+            self._warm = True  # the first call makes what a recording must not: kernels, buffers, an order of the particles
+            return self._run(self.work)
+        if self._graph is None:
+            self._record()
+        return self._replay()
+
+    def _run(self, work: Callable):
+        """On the stream of the recording, which knows the buffers."""
+        self._stream.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.cuda.stream(self._stream):
+            result = work()
+        torch.cuda.current_stream(self.device).wait_stream(self._stream)
+        return result
+
+    def _record(self) -> None:
+        graph, ledger = torch.cuda.CUDAGraph(), open_ledger()
+        try:
+            torch.cuda.synchronize(self.device)
+            with torch.cuda.graph(graph, stream=self._stream):
+                self._result = self.work()
+                self._failed = torch.cat([words != NEVER for words in ledger.words]).any()
+        finally:
+            close_ledger()
+        self._graph, self._ledger = graph, ledger
+
+    def _replay(self) -> Result:
+        self._graph.replay()
+        if self._failed.item():
+            self._graph = None
+            return self._run(self.work)
+        return self._result
