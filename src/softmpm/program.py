@@ -24,6 +24,9 @@ from softmpm.state import Low, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
 
+SMALL = {2: 30_000, 3: 12_000}
+"""Up to so many particles a substep is one launch on a GPU."""
+
 
 class Program:
     """One chunk on one arrangement."""
@@ -43,7 +46,8 @@ class Program:
         self.order = tensor(*self.lead, dtype=torch.int32)
         self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
         self.words = tensor(model.worlds + 2, dtype=torch.int64)
-        slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
+        self.whole = model.device.type == "cuda" and self.total <= SMALL[model.dim]
+        slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 3 if self.whole else 2)
         self.base = tensor(slots, padded, dtype=torch.int32)
         self.rows = tensor(slots, padded * t.rows)
         self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
@@ -152,32 +156,37 @@ class Program:
         return state.with_low(Low(*low)) if rounds else state
 
     def _launch_all(self, stream) -> None:
-        nodes, spec = self.node_arrays, self.model.spec
-        self.launch(fused(spec).clear, len(self.velocity), nodes[0], stream=stream, block_dim=BLOCK)
-        self._advance(-1, stream)
-        for s in range(self.chunk.length):
-            last = s + 1 == self.chunk.length
-            cleared = self.nothing if last else nodes[(s + 1) % len(nodes)]
-            arguments = (self.model.scale, self.model.walls, self.window, nodes[s % len(nodes)])
-            self.launch(
-                fused(spec).grid_velocity,
-                len(self.velocity),
-                *arguments,
-                self.velocity_array,
-                cleared,
-                stream=stream,
-                block_dim=BLOCK,
-            )
-            self._advance(s, stream)
+        nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec, self.whole)
 
-    def _advance(self, s: int, stream) -> None:
+        def grid(s: int) -> wp.array:
+            return nodes[s % len(nodes)] if 0 <= s < length else self.nothing
+
+        self.launch(kernels.clear, len(self.velocity), nodes[0], stream=stream, block_dim=BLOCK)
+        for s in range(-1, length):
+            if self.whole:
+                self._advance(s, grid(s), grid(s + 1), grid(s + 2), stream)
+                continue
+            if s >= 0:
+                arguments = (
+                    self.model.scale,
+                    self.model.walls,
+                    self.window,
+                    grid(s),
+                    self.velocity_array,
+                    grid(s + 1),
+                )
+                self.launch(
+                    kernels.grid_velocity, len(self.velocity), *arguments, stream=stream, block_dim=BLOCK
+                )
+            self._advance(s, self.velocity_array, grid(s + 1), self.nothing, stream)
+
+    def _advance(self, s: int, read: wp.array, node: wp.array, cleared: wp.array, stream) -> None:
         """G2P of substep ``s`` and P2G of the next; the P2G of the first if ``s`` is -1."""
-        model, packed, nodes = self.model, self.packed, self.node_arrays
-        last = s + 1 == self.chunk.length
+        model, packed, length = self.model, self.packed, self.chunk.length
         now, then = (max(s, 0), s + 1) if self.keep else (0, 0)
-        parameters = (model.scale, self.solid(min(s + 1, self.chunk.length - 1)), self.window, s, last)
-        sizes = (model.particle_count, self.total, self.order_flat)
-        out = (self.watch, packed[then], nodes[(s + 1) % len(nodes)])
-        kernel = fused(model.spec).advance
-        arguments = (*parameters, *sizes, self.velocity_array, packed[now], *out)
+        solid = self.solid(min(s + 1, length - 1))
+        parameters = (model.scale, model.walls, solid, self.window, s, s + 1 == length)
+        sizes = (model.particle_count, self.total, self.blocks, self.order_flat)
+        arguments = (*parameters, *sizes, read, packed[now], self.watch, packed[then], cleared, node)
+        kernel = fused(model.spec, self.whole).advance
         self.launch(kernel, self.blocks, *arguments, stream=stream, block_dim=BLOCK)

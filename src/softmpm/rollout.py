@@ -30,6 +30,11 @@ class Trail:
     states: dict[int, State]
     """Else states before some of the chunks."""
 
+    def keep(self, run: FastRun | PlainRun) -> None:
+        """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
+        run.end = None
+        self.runs.append(run)
+
 
 RUN_ONLY = Plan(LONGEST, 0, 0, 0)
 """Without a backward pass nothing is kept."""
@@ -101,7 +106,7 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
             k, state, before = k - 1, before[0].start, None  # what ran ahead of it is void
             continue
         if before is not None and inside:
-            trail.runs.append(before[0])
+            trail.keep(before[0])
         if k in stays:
             trail.states[k] = state
         before = None if ahead is None else (ahead, report)
@@ -115,9 +120,9 @@ def _recorded(runner: _Runner, trail: Trail, state: State, stays, inside: bool) 
         if k in stays:
             trail.states[k] = state
         run = runner.settle(chunk, state, inside)
-        if inside:
-            trail.runs.append(run)
         state = run.end
+        if inside:
+            trail.keep(run)
     return state
 
 

@@ -5,6 +5,10 @@ A substep is two launches. With M the nodes' momentum and mass, V their velocity
     grid      V ← (G1), (G2) of M,  next M ← 0
     advance   particles: V → (T2), (T3) → new state → (T1) → next M
 
+In small scenes, where a launch costs more than what it does, it is one: each particle finds the velocity of its nodes itself.
+
+    advance   particles: M → (G1), (G2) → V → (T2), (T3) → new state → (T1) → next M,  the M after it ← 0
+
 and backward, with a bar for adjoints and the same sums the other way round:
 
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
@@ -28,20 +32,31 @@ from softmpm.watch import Kind
 
 
 @functools.lru_cache(maxsize=None)
-def fused(spec: Spec) -> SimpleNamespace:
+def fused(spec: Spec, whole: bool = False) -> SimpleNamespace:
+    """The forward kernels; ``whole`` if ``advance`` does the grid's work too."""
     t, one = types(spec.dim, spec.dtype), particle(spec)
-    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
+    real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
     Scale, Packed, Window, Particle = t.Scale, t.Packed, t.Window, one.Particle
     Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
-    gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
+    first_node, pack_base, unpack_base = s.first_node, s.pack_base, s.unpack_base
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     affine_momentum, moved, node_velocity = one.affine_momentum, one.moved, grid(spec).node_velocity
     running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
-    module = native_module(spec.module + ".fused")
+    module = native_module(spec.module + (".fused.whole" if whole else ".fused"))
+
+    @wp.func
+    def read(scale: Scale, walls: Walls, node: wp.array(dtype=node_vec), i: int, place: ivec) -> vec:
+        """Velocity of a node."""
+        here = load_node(node, i)
+        if wp.static(whole):
+            return node_velocity(scale, walls, place, head(here), here[dim])
+        return head(here)
+
+    gather = s.gather_of(read, Walls)
 
     @wp.func
     def centre(fx: vec) -> vec:
@@ -82,23 +97,29 @@ def fused(spec: Spec) -> SimpleNamespace:
     def advance(
         # Parameters:
         scale: Scale,
+        walls: Walls,
         body: Solid,
         window: Window,
         substep: int,  # -1: only the P2G of the start
         last: bool,  # no P2G afterwards
         count: int,  # particles of one world
         total: int,  # particles of all worlds
+        threads: int,
         order: wp.array(dtype=wp.int32),
         # In:
-        velocity: wp.array(dtype=node_vec),
+        velocity: wp.array(dtype=node_vec),  # or momentum and mass, for the whole substep
         now: Packed,
         # Out:
         watch: wp.array(dtype=wp.int64),
         then: Packed,
+        cleared: wp.array(dtype=node_vec),
         # Out, added into:
         node: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
+        if wp.static(whole):
+            for n in range(i, cleared.shape[0], threads):
+                store_node(cleared, n, node_vec())
         first = int(-1)
         g = vec()
         b = vec()
@@ -114,31 +135,36 @@ def fused(spec: Spec) -> SimpleNamespace:
             at.H = load_mat(now.rows, i, row_H)
             origin = window.origin[world]
             held = world * window.count  # nodes of the worlds before
+            at.sound = True
+            at_base = at.base  # where it stood
             if substep >= 0 and running(watch, world):
                 g = centre(at.fx)
-                sums = gather(velocity, held + first_node(at.base, origin, window.shape), window.shape, g)
+                here = held + first_node(at.base, origin, window.shape)
+                sums = gather(scale, walls, velocity, here, window.shape, at.base, g)
                 B = sums.outer - wp.outer(sums.value, g)
-                new = moved(scale, body, origin, window.shape, world, p, at, sums.value, B)
-                if not new.sound:
-                    complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
-                    new.base = at.base
-                at = new
+                at = moved(scale, body, origin, window.shape, world, p, at, sums.value, B)
             else:
                 at.v = load_vec(now.rows, i, row_v)
                 at.C = load_mat(now.rows, i, row_C)
-            if substep >= 0:
-                then.base[i] = pack_base(at.base)
-                store_vec(then.rows, i, row_fx, at.fx)
-                store_vec(then.rows, i, row_low, at.low)
-                store_vec(then.rows, i, row_v, at.v)
-                store_mat(then.rows, i, row_H, at.H)
-                store_mat(then.rows, i, row_C, at.C)
+            base = at.base
+            if not at.sound:
+                base = at_base
+            # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
             if not last:
                 m = body.mass[world, p]
                 g = centre(at.fx)
                 A = affine_momentum(scale, body, world, p, at.C, at.H)
                 b = m * at.v - A * g
-                first = held + first_node(at.base, origin, window.shape)
+                first = held + first_node(base, origin, window.shape)
+            if substep >= 0:
+                then.base[i] = pack_base(base)
+                store_vec(then.rows, i, row_fx, at.fx)
+                store_vec(then.rows, i, row_low, at.low)
+                store_vec(then.rows, i, row_v, at.v)
+                store_mat(then.rows, i, row_H, at.H)
+                store_mat(then.rows, i, row_C, at.C)
+            if not at.sound:
+                complain(watch, scale.shape, world, order[i], substep, at.fx, at.base, at.H)
         if not last:
             scatter(node, window.shape, first, g, b, A, m)
 
@@ -228,6 +254,11 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             world = i / count
             p = i - world * count
             origin = window.origin[world]
+            held = world * window.count
+            old_fx = load_vec(before.rows, i, row_fx)
+            old_H = load_mat(before.rows, i, row_H)
+            if not start:
+                first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
             adj = ParticleAdj()
             adj.fx = load_vec(adj_now, i, row_fx)
             adj.H = load_mat(adj_now, i, row_H)
@@ -241,7 +272,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
                 g = centre(load_vec(now.rows, i, row_fx))
                 m = body.mass[world, p]
                 A = affine_momentum(scale, body, world, p, C, H)
-                here = world * window.count + first_node(unpack_base(now.base[i]), origin, window.shape)
+                here = held + first_node(unpack_base(now.base[i]), origin, window.shape)
                 sums = gather_adj(adj_node, here, window.shape, g, m * v - A * g, A, m)
                 B = sums.outer - wp.outer(sums.value, g)
                 more = momentum_adj(scale, body, world, p, v, C, H, sums.value, sums.mass, B, adj_body)
@@ -261,11 +292,10 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
                 store_vec(adj_now, i, row_v, adj.v)
                 store_mat(adj_now, i, row_C, adj.C)
             else:
-                g = centre(load_vec(before.rows, i, row_fx))
-                adj = moved_adj(scale, load_mat(before.rows, i, row_H), C, adj)
+                g = centre(old_fx)
+                adj = moved_adj(scale, old_H, C, adj)
                 B = adj.C
                 b = adj.v - B * g
-                first = world * window.count + first_node(unpack_base(before.base[i]), origin, window.shape)
                 sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
                 adj.fx += sums.slope - wp.transpose(B) * v
             store_vec(adj_now, i, row_fx, adj.fx)
