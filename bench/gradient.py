@@ -1,46 +1,72 @@
 """How long is a substep backward? `python bench/gradient.py [--device cuda] [--json bench/results/gradient.json]`
 
-Forward with gradient and backward of one call, divided by its substeps, recomputation included; medians after a warm-up.
-Activation and material get gradients where the scene has them.
+Forward with gradient and backward of one call, each divided by its substeps; medians after a warm-up. ``kept``: memory for
+everything inside, nothing runs twice. ``again``: memory for a fifth of it, so that the backward pass runs the substeps again;
+its time includes that. Activation gets a gradient where the scene has muscles, the materials only in the rows that say so.
 """
 
 import time
 
 import torch
-from common import arguments, cube, median_seconds, report, sync
+from common import arguments, cube, report, sync
 from step import CASES, VARIANTS
 
 import softmpm
+from softmpm.horizon import Horizon
+from softmpm.memory import plan
+
+GRADIENTS = VARIANTS | {"neo-Hookean, materials": {}}
+
+
+def substeps_of(particles: int, device: torch.device) -> int:
+    if device.type == "cpu":
+        return 50
+    return 512 if particles < 500_000 else 128 if particles < 5_000_000 else 32
+
+
+def measure(model, substeps: int, materials: bool, repeats: int) -> tuple[float, float]:
+    """Median microseconds of a substep, forward and backward."""
+    device, start = model.device, model.rest()
+    start.v.requires_grad_()
+    params = softmpm.Params(*(p.requires_grad_(materials) for p in model.params()))
+    shape = (1, model.worlds, model.muscle_count)
+    activation = torch.full(shape, 0.2, device=device, requires_grad=True) if model.muscle_count else None
+    ahead, back = [], []
+    for _ in range(repeats + 1):
+        sync(device)
+        begin = time.perf_counter()
+        end = softmpm.simulate(model, start, activation, params, substeps=substeps)
+        sync(device)
+        middle = time.perf_counter()
+        end.x.sum().backward()
+        sync(device)
+        ahead.append(middle - begin)
+        back.append(time.perf_counter() - middle)
+        del end
+    return tuple(sorted(times[1:])[repeats // 2] / substeps * 1e6 for times in (ahead, back))
 
 
 def main():
     args = arguments(__doc__)
     device, rows = torch.device(args.device), []
-    substeps = 20 if device.type == "cpu" else 100
-    for dim, particles, nodes in CASES[:-1]:
+    for dim, particles, nodes in CASES:
         if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
             continue
-        for name, features in VARIANTS.items():
-            model = softmpm.build(cube(dim, particles, nodes, **features), device=device)
-            start, params = model.rest(), softmpm.Params(*(p.requires_grad_() for p in model.params()))
-            activation = (
-                torch.full((1, 1, 1), 0.2, device=device, requires_grad=True) if model.muscle_count else None
-            )
-            forward = []
-
-            def work(model=model, start=start, activation=activation, params=params, forward=forward):
-                begin = time.perf_counter()
-                end = softmpm.simulate(model, start, activation, params, substeps=substeps)
-                sync(device)
-                forward.append(time.perf_counter() - begin)
-                end.x.sum().backward()
-
-            both = median_seconds(work, device, args.repeats)
-            ahead = sorted(forward[1:])[len(forward[1:]) // 2]
-            us = [t / substeps * 1e6 for t in (ahead, both - ahead)]
-            row = {"dim": dim, "particles": model.particle_count, "nodes": nodes, "scene": name}
-            rows.append(row | {"forward us/substep": us[0], "backward us/substep": us[1]})
-    report("Forward and backward, float32", rows, device, args.json)
+        substeps = substeps_of(particles, device)
+        for name, features in GRADIENTS.items():
+            scene = cube(dim, particles, nodes, **features)
+            row = {"dim": dim, "particles": None, "nodes": nodes, "scene": name, "substeps": substeps}
+            everything = plan(Horizon(1, substeps), softmpm.build(scene, device=device).sizes(), 2**62).kept
+            for kind, budget in (("kept", 2**62), ("again", everything // 5)):
+                model = softmpm.build(scene, device=device, memory_budget=budget)
+                row["particles"] = model.particle_count
+                figures = measure(model, substeps, "materials" in name, args.repeats)
+                row |= {f"forward, {kind}": figures[0], f"backward, {kind}": figures[1]}
+                del model
+                if device.type == "cuda":
+                    torch.cuda.empty_cache()
+            rows.append(row)
+    report("Forward and backward [us/substep], float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,11 @@ def view(tensor: Tensor, dtype) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+def passing(tensor: Tensor, dtype):
+    """As :func:`view`, for one launch: cheaper to make, and cannot be a field of a struct."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
 def clear(tensor: Tensor) -> None:
     """Set to zero; on the CPU through Warp, since PyTorch would wake its thread pool for each of many small buffers."""
     if tensor.device.type == "cpu":

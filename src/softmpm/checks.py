@@ -3,6 +3,7 @@
 Each message says what must hold, what came instead and what to do. Rules of one object stand in ``scene.py``.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
@@ -176,20 +177,36 @@ def check_substeps(substeps: int) -> None:
 @torch.no_grad()
 def check_values(state: NamedTuple, activation: Tensor | None, params: NamedTuple) -> None:
     """What only the numbers can tell: all finite, materials possible. Reads back once: a GPU has to wait."""
-    named = [(f"state.{name}", value) for name, value in _fields("state", state, ("x", "v", "C", "F"))]
-    named += [] if activation is None else [("activation", activation)]
-    rules = [(name, value, torch.isfinite(value), "finite") for name, value in named]
-    for name, value in _fields("params", params, ("young", "poisson", "density")):
-        if name == "poisson":
-            rules.append((f"params.{name}", value, (value > -1.0) & (value < 0.5), "in (-1, 0.5)"))
-        else:
-            rules.append((f"params.{name}", value, torch.isfinite(value) & (value > 0), "finite and > 0"))
-    kept = torch.stack([holds.all() for _, _, holds, _ in rules]).tolist()
-    for (name, value, holds, rule), good in zip(rules, kept, strict=True):
-        if not good:
-            index = torch.nonzero(~holds)[0].tolist()
-            place = f"[{', '.join(map(str, index))}]" if index else ""
-            raise ValueError(f"{name} must be {rule}, but {name}{place} is {value[tuple(index)].item():g}.")
+    finite = [(f"state.{name}", value) for name, value in _fields("state", state, ("x", "v", "C", "F"))]
+    finite += [] if activation is None or activation.numel() == 0 else [("activation", activation)]
+    bounded = [(f"params.{name}", value) for name, value in _fields("params", params, tuple(BOUNDS))]
+    # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
+    figures = [value.sum() for _, value in finite] + [f for _, v in bounded for f in torch.aminmax(v)]
+    read = torch.stack(figures).tolist()
+    sums, ends = read[: len(finite)], read[len(finite) :]
+    for (name, value), total in zip(finite, sums, strict=True):
+        if not math.isfinite(total):
+            _demand(name, value, torch.isfinite(value), "finite")
+    for (name, value), low, high in zip(bounded, ends[::2], ends[1::2], strict=True):
+        least, most, rule = BOUNDS[name.removeprefix("params.")]
+        if not (least < low and high < most):
+            _demand(name, value, (value > least) & (value < most), rule)
+
+
+BOUNDS = {
+    "young": (0.0, math.inf, "finite and > 0"),
+    "poisson": (-1.0, 0.5, "in (-1, 0.5)"),
+    "density": (0.0, math.inf, "finite and > 0"),
+}
+"""Limits that each material parameter lies between."""
+
+
+def _demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
+    """Raise ValueError for the first value that breaks the rule."""
+    if not bool(holds.all()):
+        index = torch.nonzero(~holds)[0].tolist()
+        place = f"[{', '.join(map(str, index))}]" if index else ""
+        raise ValueError(f"{name} must be {rule}, but {name}{place} is {value[tuple(index)].item():g}.")
 
 
 def _fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:

@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.arrangement import Arrangement
-from softmpm.buffers import Solid, view
+from softmpm.buffers import Solid, passing, view
 from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
 from softmpm.kernels.native import BLOCK
@@ -140,16 +140,16 @@ class Program:
     def packing(self):
         return packing(self.model.spec.dim, self.model.spec.dtype)
 
-    def state_arrays(self, *tensors: Tensor) -> list[wp.array]:
+    def state_arrays(self, *tensors: Tensor) -> list:
         t = self.types
-        return [view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in tensors]
+        return [passing(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in tensors]
 
     def _leave(self, stream) -> State:
         model, d, rounds = self.model, self.model.dim, self.model.dtype == torch.float32
         tails = 2 * [(d,)] + 2 * [(d, d)]
         out = [self._tensor(*self.lead, *tail) for tail in tails]
         low = [self._tensor(*(self.lead if rounds else (0, 0)), *tail) for tail in ((d,), (d, d))]
-        report = view(self.words[-2:], wp.int64)
+        report = passing(self.words[-2:], wp.int64)
         leave = (self.window, self.order_array, self.packed[-1], *self.state_arrays(*out, *low), report)
         self.launch(self.packing.leave, self.lead, model.scale, *leave, stream=stream)
         state = State(*out)

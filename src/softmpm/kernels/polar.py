@@ -22,7 +22,7 @@ import warp as wp
 
 from softmpm.kernels.types import types
 
-NEWTON_STEPS = 3  # each doubles the digits of a start that has a few; float64 has 16
+NEWTON_STEPS = {"float32": 2, "float64": 3}  # each doubles the digits of a start that has a few
 QUARTIC_STEPS = 40  # an upper bound: at F = I none is taken, elsewhere 3 to 8
 
 
@@ -67,6 +67,7 @@ def _polar3(dtype: str) -> SimpleNamespace:
     real, vec, mat = t.real, t.vec, t.mat
     quat = wp.types.vector(4, real)  # (w, x, y, z), unit
     mat4 = wp.types.matrix((4, 4), real)
+    steps = NEWTON_STEPS[dtype]
     close = 1e-3 if dtype == "float32" else 1e-6  # the eigenvalue need not be better: (R3) finishes
 
     @wp.func
@@ -138,7 +139,7 @@ def _polar3(dtype: str) -> SimpleNamespace:
     @wp.func
     def rotation(H: mat) -> mat:
         q = quaternion(wp.identity(n=3, dtype=real) + H)
-        for _step in range(NEWTON_STEPS):
+        for _step in range(steps):
             Q = minus_identity(q)
             E = H + wp.transpose(Q) + wp.transpose(Q) * H  # RᵀF − I
             w = wp.inverse(gap(wp.identity(n=3, dtype=real) + E)) * axl(E)
