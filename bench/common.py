@@ -32,9 +32,17 @@ def cube(
         bodies=[body],
         muscles=[softmpm.Muscle(particles=index, direction=up, strength=1.0)] if muscles else [],
         walls=[softmpm.Wall(normal=up, offset=float(positions[:, 1].min()), friction=0.5)] if floor else [],
-        gravity=tuple(-9.8 * u for u in up),
+        gravity=tuple(-0.5 * u for u in up),  # so weak that a thousand substeps stay on the grid
     )
     return softmpm.Scene(**scene, dt=0.3 * softmpm.stable_dt(softmpm.Scene(**scene, dt=1.0)))
+
+
+def turning(model: softmpm.Model, rate: float = 2.0) -> softmpm.State:
+    """The scene at rest but turning [rad/s], so that particles change their cells and the order they are kept in grows stale."""
+    start = model.rest()
+    arm = start.x - start.x.mean(dim=1, keepdim=True)
+    start.v[..., 0], start.v[..., 1] = -rate * arm[..., 1], rate * arm[..., 0]
+    return start
 
 
 def sync(device: torch.device) -> None:

@@ -8,7 +8,7 @@ its time includes that. Activation gets a gradient where the scene has muscles, 
 import time
 
 import torch
-from common import arguments, cube, report, sync
+from common import arguments, cube, report, sync, turning
 from step import CASES, VARIANTS
 
 import softmpm
@@ -26,7 +26,7 @@ def substeps_of(particles: int, device: torch.device) -> int:
 
 def measure(model, substeps: int, materials: bool, repeats: int) -> tuple[float, float]:
     """Median microseconds of a substep, forward and backward."""
-    device, start = model.device, model.rest()
+    device, start = model.device, turning(model)
     start.v.requires_grad_()
     params = softmpm.Params(*(p.requires_grad_(materials) for p in model.params()))
     shape = (1, model.worlds, model.muscle_count)

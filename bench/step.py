@@ -1,11 +1,11 @@
 """How long is a substep forward? `python bench/step.py [--device cuda] [--json bench/results/step.json]`
 
 One call of `simulate` without gradient, everything in it that a user gets, divided by its substeps; the particles come in random
-order. Median of repeats after a warm-up. ``call`` is what a call costs besides: that of one substep.
+order, and the cube turns. Median of repeats after a warm-up. ``call`` is what a call costs besides: that of one substep.
 """
 
 import torch
-from common import arguments, cube, median_seconds, report
+from common import arguments, cube, median_seconds, report, turning
 
 import softmpm
 
@@ -33,7 +33,7 @@ def main():
         substeps = substeps_of(particles, device)
         for name, features in VARIANTS.items():
             model = softmpm.build(cube(dim, particles, nodes, **features), device=device)
-            start, params = model.rest(), model.params()
+            start, params = turning(model), model.params()
             activation = torch.full((1, 1, 1), 0.2, device=device) if model.muscle_count else None
 
             def work(substeps, model=model, start=start, activation=activation, params=params):

@@ -9,39 +9,52 @@ with a larger window. The cost of a substep follows the window, not the grid.
 import math
 
 import torch
+import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import view
+from softmpm.buffers import passing, view
+from softmpm.kernels.packing import packing
 from softmpm.kernels.types import types
 from softmpm.memory import window_shape
 from softmpm.model import Model
+from softmpm.step import stream_of
 
-STALE = 1.3
+STALE = 1.5
 """Renew the order when going along it meets so many times more cells than when it was new."""
 
 
 class Arrangement:
-    """Order of the particles and window of the grid; moves in place, but for a window that must grow.
+    """Order of the particles and window of the grid. Both are renewed in place; only a window that grows is another one.
+
+    Args:
+        x: Positions to start from [m], shape (world, particle, dim).
+        least: Nodes that the window has at least along each axis.
 
     Attributes:
         order: Particle at each place, shape (world, particle), int32.
         origin: First node of the window, shape (world, dim), int32.
         shape: Nodes of the window along each axis.
+        version: How often it was renewed.
     """
 
     def __init__(self, model: Model, x: Tensor, least: tuple[int, ...] = ()):
-        self.model = model
-        self.fresh_cells: int | None = None
+        self.model, self.version = model, 0
+        self._fresh_cells: int | None = None
         self.stale = False
-        self._grid = torch.tensor(model.scene.grid.shape, device=model.device)
-        first, last = self._reach(x)
+
+        def integers(*size):
+            return torch.empty(*size, dtype=torch.int32, device=model.device)
+
+        self.order = integers(model.worlds, model.particle_count)
+        self.origin = integers(model.worlds, model.dim)
+        self._key = torch.empty_like(self.order)
+        self._ends = integers(2, model.worlds, model.dim)
         grid = model.scene.grid.shape
-        reach = [max(h - low for low, h in zip(*axis, strict=True)) for axis in zip(first, last, strict=True)]
-        wide = window_shape(grid, reach)
+        self._locate(x)
+        low, high = self._ends.tolist()  # waits for the device
+        apart = [[h - b for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
+        wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)])
         self.shape = tuple(min(n, max(w, k)) for n, w, k in zip(grid, wide, least or wide, strict=True))
-        self._shape = torch.tensor(self.shape, device=model.device)
-        self.order = torch.empty(model.worlds, model.particle_count, dtype=torch.int32, device=model.device)
-        self.origin = torch.empty(model.worlds, model.dim, dtype=torch.int32, device=model.device)
         self.renew(x)
 
     @property
@@ -49,49 +62,35 @@ class Arrangement:
         """Nodes of one world in memory."""
         return math.prod(self.shape)
 
-    def _base(self, x: Tensor) -> Tensor:
-        """First node of each particle's stencil, kept on the grid; shape (world, particle, dim)."""
-        cells = torch.floor(x.double() / self.model.scene.grid.spacing - 0.5).nan_to_num(0.0)
-        return torch.minimum(cells.clamp(min=0), self._grid - 3).long()
+    def _launch(self, kernel, dim, *inputs) -> None:
+        model = self.model
+        scale, stream = model.scale, stream_of(model.device)
+        wp.launch(kernel, dim, (scale, *inputs), device=model.wp_device, stream=stream, record_tape=False)
 
-    def _reach(self, x: Tensor) -> tuple[list, list]:
-        """Smallest and largest base in each axis and world; waits for the device."""
-        base = self._base(x)
-        both = torch.stack([base.amin(dim=1), base.amax(dim=1)]).tolist()
-        first, last = ([list(axis) for axis in zip(*side, strict=True)] for side in both)
-        return first, last
-
-    def fits(self, x: Tensor) -> bool:
-        """Whether the particles would fit into the window, wherever it is put."""
-        first, last = self._reach(x)
-        return all(
-            high - low + 3 <= nodes
-            for axis, nodes in enumerate(self.shape)
-            for low, high in zip(first[axis], last[axis], strict=True)
-        )
-
-    def renew(self, x: Tensor) -> None:
-        """Sort by cell and centre the window on the particles, without waiting for the device.
+    def _locate(self, x: Tensor) -> None:
+        """Cell of each particle, and the box around them in each world.
 
         On the CPU, where nothing is summed in parallel, the order is that at rest, so that results never depend on what ran
         before; the window does not change a result.
         """
-        base = self._base(x)
-        sorted_base = base if x.device.type == "cuda" else self._base(self.model.positions.expand_as(x))
-        key = sorted_base[..., 0]
-        for axis in range(1, self.model.dim):
-            key = key * self.model.scene.grid.shape[axis] + sorted_base[..., axis]
-        self.order.copy_(torch.argsort(key, dim=1, stable=True))
-        middle = (base.amin(dim=1) + base.amax(dim=1) + 3 - self._shape) // 2
-        self.origin.copy_(torch.minimum(middle.clamp(min=0), self._grid - self._shape))
-        self.fresh_cells, self.stale = None, False
+        model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
+        follow = x if model.device.type == "cuda" else model.positions.expand_as(x)
+        self._ends[0].fill_(max(model.scene.grid.shape))
+        self._ends[1].fill_(0)
+        places = [passing(place.contiguous(), t.vec) for place in (x, follow)]
+        found = [passing(found, wp.int32) for found in (self._key, *self._ends)]
+        self._launch(packing(t.dim, model.spec.dtype).locate, self.order.shape, *places, *found)
 
-    def renewed(self, x: Tensor) -> "Arrangement":
-        """Itself with a new order and place, or another one if the window is too small for these positions."""
-        if not self.fits(x):
-            return Arrangement(self.model, x, least=self.shape)
-        self.renew(x)
-        return self
+    def renew(self, x: Tensor) -> None:
+        """Sort by cell and centre the window on the particles, without waiting for the device."""
+        self._locate(x)
+        self.order.copy_(torch.sort(self._key, dim=1, stable=True).indices)
+        t = types(self.model.spec.dim, self.model.spec.dtype)
+        ends = [passing(tensor, wp.int32) for tensor in (*self._ends, self.origin)]
+        kernel = packing(t.dim, self.model.spec.dtype).centre_window
+        self._launch(kernel, self.origin.shape, t.ivec(*self.shape), *ends)
+        self._fresh_cells, self.stale = None, False
+        self.version += 1
 
     def grown(self, x: Tensor) -> "Arrangement":
         """Another one with a window half as large again."""
@@ -99,9 +98,9 @@ class Arrangement:
 
     def judge(self, cells: int, near_edge: bool) -> None:
         """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""
-        if self.fresh_cells is None:
-            self.fresh_cells = cells
-        scattered = self.model.device.type == "cuda" and cells > STALE * self.fresh_cells
+        if self._fresh_cells is None:
+            self._fresh_cells = cells
+        scattered = self.model.device.type == "cuda" and cells > STALE * self._fresh_cells
         self.stale = near_edge or scattered
 
     def window(self, origin: Tensor):

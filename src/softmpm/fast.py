@@ -85,7 +85,7 @@ class Fast:
         if self._pool is None:
             self._use(Arrangement(self.model, start.x))
         elif self._pool.arrangement.stale:
-            self._use(self._pool.arrangement.renewed(start.x))
+            self._pool.arrangement.renew(start.x)  # if they do not fit into the window, the call will say so
         return self._pool
 
     def _arranged_blindly(self, start: State, chunk: Chunk) -> Pool:
@@ -115,10 +115,9 @@ class _Local(threading.local):
         self.of_stream: dict[int, Fast] = {}
 
 
-_per_model: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
-
-
 def fast(model: Model, stream: int) -> Fast:
-    """The runner of this model in this thread on this stream."""
-    local = _per_model.setdefault(model, _Local())
-    return local.of_stream.setdefault(stream, Fast(model))
+    """The runner of this model in this thread on this stream. It lives as long as the model, which it does not hold."""
+    local = model.__dict__.setdefault("_runners", _Local())
+    if stream not in local.of_stream:
+        local.of_stream[stream] = Fast(weakref.proxy(model))
+    return local.of_stream[stream]

@@ -19,7 +19,7 @@ from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
 from softmpm.kernels.types import solid_types, types
 from softmpm.model import Model
-from softmpm.replay import Replay
+from softmpm.replay import Replay, recording
 from softmpm.state import Low, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
@@ -46,6 +46,9 @@ class Program:
         self.order = tensor(*self.lead, dtype=torch.int32)
         self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
         self.words = tensor(model.worlds + 2, dtype=torch.int64)
+        self._calm = torch.full_like(self.words, NEVER)
+        self._calm[-2:].zero_()
+        self._version = -1  # of the arrangement that order and origin were taken from
         self.whole = model.device.type == "cuda" and self.total <= SMALL[model.dim]
         slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 3 if self.whole else 2)
         self.base = tensor(slots, padded, dtype=torch.int32)
@@ -121,10 +124,11 @@ class Program:
     def run(self, start: State, pull: Tensor | None, solid: Solid) -> State:
         """All substeps from ``start``; the end in new tensors. Failures are in :attr:`words`."""
         model, stream, pack = self.model, stream_of(self.model.device), self.packing
-        self.order.copy_(self.arrangement.order)
-        self.origin.copy_(self.arrangement.origin)
-        self.words[:-2] = NEVER
-        self.words[-2:] = 0
+        if recording(model) or self._version != self.arrangement.version:
+            self.order.copy_(self.arrangement.order)
+            self.origin.copy_(self.arrangement.origin)
+            self._version = self.arrangement.version
+        self.words.copy_(self._calm)
         if self.pull is not None:
             self.pull.copy_(pull)
         low = start.low or Low(torch.zeros_like(start.x), torch.zeros_like(start.F))

@@ -19,7 +19,8 @@ from softmpm.watch import Kind
 @functools.lru_cache(maxsize=None)
 def packing(dim: int, dtype: str) -> SimpleNamespace:
     t, b, n, s = types(dim, dtype), boundary(dim, dtype), native(dim, dtype), stencil(dim, dtype)
-    real, vec, mat, Scale, Packed, Window = t.real, t.vec, t.mat, t.Scale, t.Packed, t.Window
+    real, vec, mat, ivec = t.real, t.vec, t.mat, t.ivec
+    Scale, Packed, Window = t.Scale, t.Packed, t.Window
     entered, left = b.entered, b.left
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     pack_base, unpack_base, report = s.pack_base, s.unpack_base, failure.report(dim, dtype).report
@@ -116,6 +117,49 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
                 state_of_order[1] = wp.int64(1)
 
     @wp.kernel(module=module, enable_backward=False)
+    def locate(
+        # Parameters:
+        scale: Scale,
+        # In:
+        x: wp.array2d(dtype=vec),
+        sorted_x: wp.array2d(dtype=vec),  # what the order follows
+        # Out:
+        key: wp.array2d(dtype=wp.int32),  # grows with the cell, along the last axis first
+        # Out, lowered and raised:
+        low: wp.array2d(dtype=wp.int32),
+        high: wp.array2d(dtype=wp.int32),
+    ):
+        """Where particles are: keys to sort by, and the first and last base node of each world along each axis."""
+        world, p = wp.tid()
+        cell = int(0)
+        for axis in range(dim):
+            last = scale.shape[axis] - 3
+            there = wp.float64(sorted_x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5)
+            cell = cell * scale.shape[axis] + wp.clamp(int(wp.floor(there)), 0, last)
+            here = wp.float64(x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5)
+            base = wp.clamp(int(wp.floor(here)), 0, last)
+            if base < low[world, axis]:
+                wp.atomic_min(low, world, axis, base)
+            if base > high[world, axis]:
+                wp.atomic_max(high, world, axis, base)
+        key[world, p] = cell
+
+    @wp.kernel(module=module, enable_backward=False)
+    def centre_window(
+        # Parameters:
+        scale: Scale,
+        shape: ivec,  # nodes of the window
+        # In:
+        low: wp.array2d(dtype=wp.int32),
+        high: wp.array2d(dtype=wp.int32),
+        # Out:
+        origin: wp.array2d(dtype=wp.int32),
+    ):
+        world, axis = wp.tid()
+        middle = (low[world, axis] + high[world, axis] + 3 - shape[axis]) / 2
+        origin[world, axis] = wp.clamp(middle, 0, scale.shape[axis] - shape[axis])
+
+    @wp.kernel(module=module, enable_backward=False)
     def enter_adj(
         # Parameters:
         scale: Scale,
@@ -159,4 +203,11 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         adj_F[world, p] = load_mat(adj, i, row_H)
         adj_C[world, p] = load_mat(adj, i, row_C)
 
-    return SimpleNamespace(enter=enter, leave=leave, enter_adj=enter_adj, leave_adj=leave_adj)
+    return SimpleNamespace(
+        enter=enter,
+        leave=leave,
+        locate=locate,
+        centre_window=centre_window,
+        enter_adj=enter_adj,
+        leave_adj=leave_adj,
+    )

@@ -41,7 +41,7 @@ class Wanted:
     activation: bool
 
 
-BASE_BITS = {2: 16, 3: 10}
+BASE_BITS = {2: 15, 3: 10}
 """Bits of a node's coordinate in packed particles."""
 
 

@@ -1,0 +1,282 @@
+"""Order of the particles and window of the grid: neither changes a result, whatever moves where."""
+
+import itertools
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+from helpers import LAWS, assert_relative, cotangent, dot
+
+import softmpm
+from softmpm import arrangement
+from softmpm.arrangement import STALE, Arrangement
+from softmpm.memory import MARGIN
+
+DX = 1 / 16  # a power of two: shifting by whole cells is exact
+
+
+def robot(
+    dim: int,
+    corners,
+    *,
+    grid,
+    cells=2,
+    worlds=1,
+    device="cpu",
+    dtype=torch.float64,
+    scheme="fast",
+    young=80.0,
+    **scene,
+):
+    """A model of cubes, ``cells`` wide with 2^dim particles in each, whose lower corners are given in cells."""
+    lattice = np.stack(np.meshgrid(*dim * (np.arange(2 * cells),), indexing="ij"), -1).reshape(-1, dim)
+    bodies = []
+    for corner in corners:
+        positions = (np.array(corner) + 0.25 + lattice / 2) * DX
+        particles = softmpm.Particles(positions, (DX / 2) ** dim)
+        bodies.append(softmpm.Body(particles, LAWS["neo_hookean"](density=1.0, young=young, poisson=0.3)))
+    made = softmpm.Scene(grid=softmpm.Grid(shape=grid, spacing=DX), bodies=bodies, dt=1e-3, **scene)
+    return softmpm.build(made, device=device, dtype=dtype, worlds=worlds, scheme=scheme)
+
+
+def bases(model, x) -> np.ndarray:
+    """First node of each stencil, (world, particle, dim)."""
+    return np.floor(x.double().cpu().numpy() / DX - 0.5).astype(int)
+
+
+def window(found: Arrangement) -> tuple[np.ndarray, np.ndarray]:
+    """First node in memory and the first one beyond, (world, dim) each."""
+    first = found.origin.cpu().numpy()
+    return first, first + np.array(found.shape)
+
+
+# -- order and window ---------------------------------------------------------------------------------------------
+
+
+def scattered(model, low: float, high: float, seed=0) -> torch.Tensor:
+    """Positions between two numbers of cells, in every world differently."""
+    generator = torch.Generator().manual_seed(seed)
+    lead = (model.worlds, model.particle_count, model.dim)
+    x = torch.rand(lead, generator=generator, dtype=torch.float64)
+    return (DX * (low + (high - low) * x)).to(model.device, model.dtype)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_order_is_a_stable_sort_by_cell(dim, device):
+    """Along the order cells come in the order of their nodes in memory; particles of one cell keep their own order.
+
+    On a GPU by where they are; on the CPU, so that results depend on nothing else, by where they rest.
+    """
+    model = robot(dim, [(6,) * dim, (9,) * dim], grid=(20, 18, 22)[:dim], worlds=2, device=device)
+    x = scattered(model, 3.0, 12.0)
+    found = Arrangement(model, x)
+    sorted_by = bases(model, x if device == "cuda" else model.rest().x)
+    for world in range(2):
+        keys = [sorted_by[world, :, axis] for axis in reversed(range(dim))]
+        assert (
+            found.order[world].tolist() == np.lexsort(keys).tolist()
+        )  # stable; the last key is the first to look at
+        assert not np.array_equal(found.order[world].cpu(), np.arange(model.particle_count))
+
+
+@pytest.mark.parametrize("low, high", [(8.0, 14.0), (0.6, 4.0), (24.0, 28.4), (0.6, 28.4)])
+def test_the_window_holds_every_stencil(low, high, device):
+    """With a margin on each side, but for where the grid ends; and it never reaches beyond the grid."""
+    model = robot(2, [(6, 6), (9, 9)], grid=(30, 30), worlds=2, device=device)
+    x = scattered(model, low, high)
+    found, base = Arrangement(model, x), bases(model, x)
+    first, beyond = window(found)
+    assert (first >= 0).all() and (beyond <= 30).all()
+    below, above = base.min(1) - first, beyond - (base.max(1) + 3)
+    assert ((below >= MARGIN) | (first == 0)).all(), below
+    assert ((above >= MARGIN) | (beyond == 30)).all(), above
+    assert found.fits(x) and found.node_count == math.prod(found.shape)
+
+
+def test_a_window_is_as_small_as_its_particles_allow(device):
+    """Not the grid but the reach of the widest world counts, along each axis by itself."""
+    model = robot(2, [(6, 6)], grid=(500, 400), worlds=2, device=device)
+    x = scattered(model, 100.0, 104.0)
+    x[1, :, 0] += 150 * DX
+    x[1, 0, 1] += 9 * DX
+    found = Arrangement(model, x)
+    reach = np.ptp(bases(model, x), axis=1).max(0)
+    assert (np.array(found.shape) >= reach + 3 + 2 * MARGIN).all()
+    assert (np.array(found.shape) <= reach + 3 + 2 * MARGIN + 3).all()  # rounded up to four
+    assert found.shape[1] > found.shape[0]
+
+
+def test_the_window_moves_with_the_robot(device):
+    """Renewed where the robot has gone to: the same arrangement, its origin further by as many nodes in that world."""
+    model = robot(2, [(20, 20)], grid=(80, 80), worlds=3, device=device)
+    x = model.rest().x
+    found = Arrangement(model, x)
+    before, shape = found.origin.clone(), found.shape
+    x[1, :, 0] += 30 * DX
+    x[2, :, 1] -= 9 * DX
+    assert found.renewed(x) is found and found.shape == shape
+    moved = (found.origin - before).cpu().tolist()
+    assert moved == [[0, 0], [30, 0], [0, -9]]
+
+
+def test_a_window_that_is_too_small_becomes_larger(device):
+    """``renewed`` takes one that fits; ``grown`` one half as large again; neither goes beyond the grid."""
+    model = robot(2, [(20, 20)], grid=(80, 26), device=device)
+    x = model.rest().x
+    found = Arrangement(model, x)
+    x[0, 0, 0] += 40 * DX
+    assert not found.fits(x)
+    wider = found.renewed(x)
+    assert wider is not found and wider.fits(x) and wider.shape[0] >= 43 and wider.shape[1] >= found.shape[1]
+    grown = found.grown(model.rest().x)
+    assert grown.shape == (math.ceil(1.5 * found.shape[0]), 26)
+    assert grown.fits(model.rest().x)
+
+
+def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
+    """The first report is the measure; on the CPU, where the order is fixed, only the edge counts. Renewing forgets both."""
+    model = robot(2, [(20, 20)], grid=(80, 80), device=device)
+    found = Arrangement(model, model.rest().x)
+    found.judge(100, near_edge=False)
+    assert not found.stale and found.fresh_cells == 100
+    found.judge(int(100 * STALE), near_edge=False)
+    assert not found.stale
+    found.judge(int(100 * STALE) + 1, near_edge=False)
+    assert found.stale == (device == "cuda") and found.fresh_cells == 100
+    found.judge(100, near_edge=True)
+    assert found.stale
+    found.renew(model.rest().x)
+    assert not found.stale and found.fresh_cells is None
+
+
+# -- what a window must not change --------------------------------------------------------------------------------
+
+
+class Watched(Arrangement):
+    """Notes what becomes of windows."""
+
+    made: list[tuple[int, ...]]
+    grown_from: list[tuple[int, ...]]
+    renewals: int
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        Watched.made.append(self.shape)
+
+    def grown(self, x):
+        Watched.grown_from.append(self.shape)
+        return super().grown(x)
+
+    def renewed(self, x):
+        Watched.renewals += 1
+        return super().renewed(x)
+
+
+@pytest.fixture
+def watched(monkeypatch) -> type[Watched]:
+    Watched.made, Watched.grown_from, Watched.renewals = [], [], 0
+    monkeypatch.setattr(arrangement, "Arrangement", Watched)
+    monkeypatch.setattr("softmpm.fast.Arrangement", Watched)
+    return Watched
+
+
+def end_and_gradient(model, v: torch.Tensor, substeps: int, calls: int = 1, twist: float = 0.0):
+    """End and ∂L/∂v of a flight with velocity ``v`` [m/s] of each particle, turning at ``twist`` [1/s]."""
+    state = model.rest()
+    turn = torch.zeros_like(state.C)
+    turn[..., 0, 1], turn[..., 1, 0] = -twist, twist
+    start = state._replace(v=(state.v + v.to(state.v)).requires_grad_(), C=turn)
+    end = start.with_low(state.low)
+    for _ in range(calls):
+        end = softmpm.simulate(model, end, None, model.params(), substeps=substeps)
+    weights = [w / w.abs().max() for w in cotangent(end)]
+    (gradient,) = torch.autograd.grad(dot(weights, end), start.v)
+    return [t.detach().cpu() for t in end], gradient.cpu()
+
+
+def assert_same(got, want, limit: float) -> None:
+    """C is a difference of velocities in a cell, 4/dx Σ w v rᵀ: it is as exact as 4/dx times the largest of them."""
+    fastest = want[0][1].abs().max()
+    for name, a, b in zip("xvCF", got[0], want[0], strict=True):
+        scale = 4 / DX * fastest / b.abs().max() if name == "C" else 1.0
+        assert_relative(a, b, limit * max(1.0, scale), name)
+    assert_relative(got[1], want[1], limit, "gradient")
+
+
+def test_a_particle_that_flies_through_the_window(watched, device):
+    """It crosses 40 cells in one chunk: the call starts again with larger windows, and gives what the plain scheme gives."""
+    v = torch.zeros(1, 32, 2, dtype=torch.float64)
+    v[0, :16, 0] = 25.0  # the first of two bodies: 0.4 cells a substep, over the margin after 15 of 100
+    build = {"corners": [(30, 40), (28, 20)], "grid": (100, 64), "device": device}
+    got = end_and_gradient(robot(2, **build), v, 100, twist=3.0)
+    assert len(watched.grown_from) >= 2 and watched.made[-1][0] >= 40
+    assert all(a[0] < b[0] for a, b in itertools.pairwise(watched.made))
+    assert_same(got, end_and_gradient(robot(2, **build, scheme="plain"), v, 100, twist=3.0), 1e-13)
+
+
+def test_a_window_that_must_grow_in_the_second_chunk(watched, monkeypatch, device):
+    """What ran ahead of a void chunk is void too; what ran before it stays."""
+    monkeypatch.setattr("softmpm.memory.LONGEST", 16)
+    v = torch.zeros(1, 32, 2, dtype=torch.float64)
+    v[0, :16, 0] = 14.0  # 3.6 cells in each chunk of 16
+    build = {"corners": [(30, 40), (30, 20)], "grid": (100, 64), "device": device}
+    got = end_and_gradient(robot(2, **build), v, 80, twist=3.0)
+    assert len(watched.made) >= 2 and watched.made[-1][0] > watched.made[0][0]
+    assert_same(got, end_and_gradient(robot(2, **build, scheme="plain"), v, 80, twist=3.0), 1e-13)
+
+
+def test_a_robot_that_wanders_takes_its_window_along(watched, device):
+    """Over 14 calls it goes 25 cells: the window follows, none is made larger, and the result is the plain scheme's."""
+    v = torch.tensor([4.5, 1.0], dtype=torch.float64)  # 1.8 cells in a call
+    build = {"corners": [(10, 20)], "grid": (80, 64), "device": device}
+    got = end_and_gradient(robot(2, **build), v, 25, calls=14, twist=3.0)
+    assert len(watched.made) == 1 and not watched.grown_from and 3 <= watched.renewals <= 8
+    want = end_and_gradient(robot(2, **build, scheme="plain"), v, 25, calls=14, twist=3.0)
+    assert_same(got, want, 1e-12)  # 350 substeps
+
+
+def test_worlds_far_apart_have_windows_of_their_own(watched, device):
+    """Each world's robot in another corner of a large grid, one of them fast: as the plain scheme, with few nodes in memory."""
+    starts = torch.tensor([[0.0, 0.0], [380.0, 5.0], [200.0, 260.0]], dtype=torch.float64)[:, None] * DX
+    v = torch.tensor([[1.0, 0.0], [-2.0, 1.0], [0.5, 20.0]], dtype=torch.float64)[:, None]
+    ends = []
+    for scheme in ("fast", "plain"):
+        model = robot(2, [(10, 10)], grid=(420, 300), worlds=3, device=device, scheme=scheme)
+        rest = model.rest()
+        start = rest._replace(x=rest.x + starts.to(rest.x), v=(rest.v + v.to(rest.v)).requires_grad_())
+        end = softmpm.simulate(model, start, None, model.params(), substeps=40)
+        (gradient,) = torch.autograd.grad(dot(cotangent(end), end), start.v)
+        ends.append(([t.detach().cpu() for t in end], gradient.cpu()))
+    assert math.prod(watched.made[-1]) < 0.02 * 420 * 300
+    assert len(watched.grown_from) >= 1
+    assert_same(*ends, 1e-13)
+
+
+def test_two_bodies_far_apart_share_a_window(watched, device):
+    """One window from the one to the other, as narrow as both allow; the result is the plain scheme's."""
+    v = torch.zeros(1, 32, 2, dtype=torch.float64)
+    v[0, 16:, 0] = -1.0
+    build = {"corners": [(12, 100), (150, 103)], "grid": (180, 200), "device": device}
+    got = end_and_gradient(robot(2, **build), v, 40, twist=2.0)
+    (shape,) = watched.made
+    assert shape[0] >= 140 + 3 and shape[1] <= 40
+    assert_same(got, end_and_gradient(robot(2, **build, scheme="plain"), v, 40, twist=2.0), 1e-13)
+
+
+@pytest.mark.parametrize("dtype, limit", [(torch.float64, 1e-13), (torch.float32, 2e-6)])
+def test_the_size_of_the_grid_costs_nothing(dtype, limit, watched, device):
+    """64 particles on 1024³ nodes: built and run at once, with less than a thousandth of the nodes, as in a small grid."""
+    clock, found = time.perf_counter(), []
+    for shape, corner in ((3 * (1024,), (900, 500, 40)), (3 * (24,), (10, 10, 10))):
+        model = robot(3, [corner], grid=shape, device=device, dtype=dtype, gravity=(0.0, -9.8, 0.0))
+        (x, *rest), gradient = end_and_gradient(model, torch.tensor([0.5, 0.0, 0.2]), 40, twist=3.0)
+        shift = torch.tensor(corner, dtype=torch.float64) * DX
+        found.append(([x.double() - shift, *rest], gradient))
+        assert math.prod(watched.made[-1]) == model.held_nodes < 20_000
+    assert model.node_count == 24**3 and time.perf_counter() - clock < 30
+    (large, *_), (small, *_) = found[0][0], found[1][0]
+    found[0][0][0] = small  # compared here: x in the large grid has fewer digits of a cell
+    assert (large - small).abs().max() <= limit * 1024 * DX
+    assert_same(*found, limit)

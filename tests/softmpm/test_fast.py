@@ -1,0 +1,395 @@
+"""The fast scheme: when it is chosen, that it does what the plain one does, and whose memory its programs are."""
+
+import gc
+import threading
+import weakref
+
+import numpy as np
+import pytest
+import torch
+from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
+
+import softmpm
+from softmpm import fast, memory, program, rollout
+from softmpm.horizon import Horizon
+from softmpm.kernels.types import BASE_BITS, packed_rows
+from softmpm.memory import Plan, plan
+
+SHORT = 8
+
+
+@pytest.fixture
+def short_chunks(monkeypatch):
+    """At most 8 substeps in a chunk."""
+    monkeypatch.setattr(memory, "LONGEST", SHORT)
+    monkeypatch.setattr(rollout, "RUN_ONLY", Plan(SHORT, 0, 0, 0))
+
+
+def model(dim=2, device="cpu", dtype=torch.float32, scheme="fast", **settings) -> softmpm.Model:
+    return softmpm.build(busy_scene(dim), device=device, dtype=dtype, scheme=scheme, **settings)
+
+
+def same_on(device: str) -> float:
+    """On the CPU a result never depends on what ran before; on a GPU sums are taken in any order."""
+    return 0.0 if device == "cpu" else 2e-5
+
+
+# -- choice -------------------------------------------------------------------------------------------------------
+
+
+def tiny(shape) -> softmpm.Scene:
+    body = softmpm.Body(
+        softmpm.Particles(np.full((1, len(shape)), 0.35), 1e-3),
+        softmpm.NeoHookean(density=1.0, young=10.0, poisson=0.3),
+    )
+    return softmpm.Scene(grid=softmpm.Grid(shape=shape, spacing=0.1), bodies=[body], dt=1e-3)
+
+
+def test_auto_takes_the_fast_scheme_in_single_precision():
+    """And the plain one in double precision; what is asked for is taken; ``describe`` says which and why."""
+    for asked, dtype, scheme, reason in (
+        ("auto", torch.float32, "fast", "single precision"),
+        ("auto", torch.float64, "plain", "double precision"),
+        ("fast", torch.float64, "fast", "as asked for"),
+        ("plain", torch.float32, "plain", "as asked for"),
+    ):
+        built = softmpm.build(busy_scene(2), device="cpu", dtype=dtype, scheme=asked)
+        assert built.scheme == scheme and reason in built.scheme_reason
+        (line,) = (line for line in built.describe().splitlines() if line.startswith("  scheme"))
+        assert line.split()[1] == f"{scheme}:" and reason in line and f"{built.held_nodes} nodes" in line
+    assert softmpm.build(busy_scene(2), device="cpu").scheme == "fast", "auto is what is taken unasked"
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_grid_too_large_for_packed_coordinates_takes_the_plain_scheme(dim):
+    """Said in ``describe``; an error if the fast scheme was asked for. One node fewer and it is taken."""
+    largest = 2 ** BASE_BITS[dim]
+    scene = tiny((largest + 1, *(dim - 1) * (8,)))
+    built = softmpm.build(scene, device="cpu")
+    assert built.scheme == "plain" and f"more than {largest} nodes along an axis" in built.describe()
+    with pytest.raises(
+        ValueError, match=rf"'fast' cannot hold this scene: .*{largest} nodes.*use scheme='plain'"
+    ):
+        softmpm.build(scene, device="cpu", scheme="fast")
+    assert softmpm.build(tiny((largest, *(dim - 1) * (8,))), device="cpu").scheme == "fast"
+
+
+def test_more_numbers_than_indices_reach_take_the_plain_scheme():
+    """Particles of all worlds times the numbers of each must stay below 2³¹."""
+    for worlds, scheme in (
+        (2**31 // packed_rows(2).rows + 1, "plain"),
+        (2**31 // packed_rows(2).rows, "fast"),
+    ):
+        small = softmpm.build(tiny((8, 8)), device="cpu")
+        small.worlds = worlds  # a real one would not fit into memory
+        chosen, reason = small._scheme("auto")
+        assert chosen == scheme
+        assert scheme == "fast" or "32-bit indices" in reason
+    with pytest.raises(ValueError, match="scheme must be 'auto', 'fast' or 'plain', got 'quick'"):
+        softmpm.build(tiny((8, 8)), device="cpu", scheme="quick")
+
+
+# -- the same as the plain scheme ---------------------------------------------------------------------------------
+
+
+def end_and_gradients(built, control_steps: int, substeps: int, seed=1):
+    inputs = busy_inputs(built, control_steps=control_steps, seed=seed)
+    end = run(softmpm.simulate, built, inputs, substeps)
+    weights = [w / w.abs().max() for w in cotangent(end)]
+    found = torch.autograd.grad(dot(weights, end), list(inputs.values()))
+    return dict(zip((*"xvCF", *(f"gradient of {name}" for name in inputs)), (*end, *found), strict=True))
+
+
+@pytest.mark.parametrize("control_steps, substeps", [(5, 3), (2, 20)])
+@pytest.mark.parametrize(
+    "dtype, limit, limit_adj",
+    # a gradient comes of twice as many operations, and of differences between them
+    [(torch.float32, 2e-6, 5e-6), (torch.float64, 1e-13, 1e-13)],
+)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_fast_and_plain_agree(dim, dtype, limit, limit_adj, control_steps, substeps, short_chunks, device):
+    """End and every gradient, with two worlds, over chunks of unequal length that hold several control steps or a part of one."""
+    built = [model(dim, device, dtype, scheme, worlds=2) for scheme in ("fast", "plain")]
+    lengths = {chunk.length for chunk in Horizon(control_steps, substeps).chunks(SHORT)}
+    assert len(lengths) == 2 and built[0].scheme == "fast" and built[1].scheme == "plain"
+    got, want = (end_and_gradients(m, control_steps, substeps) for m in built)
+    for name in want:
+        assert_relative(got[name], want[name], limit if name in "xvCF" else limit_adj, name)
+
+
+@pytest.mark.parametrize("scene", ["passive", "many blocks"])
+def test_fast_and_plain_agree_in(scene, device):
+    """A scene without muscles and walls; more particles than a block has threads, in worlds that share a block."""
+    changes = dict(muscles=[], walls=[], gravity=None) if scene == "passive" else dict(per_law=75)
+    built = [
+        softmpm.build(busy_scene(2, **changes), device=device, worlds=3, scheme=s, dtype=torch.float64)
+        for s in ("fast", "plain")
+    ]
+    results = []
+    for m in built:
+        inputs = busy_inputs(m)
+        if scene == "passive":
+            inputs["activation"] = inputs["activation"].detach()
+        end = run(softmpm.simulate, m, inputs, 6)
+        wanted = [name for name, tensor in inputs.items() if tensor.requires_grad]
+        found = torch.autograd.grad(dot(cotangent(end), end), [inputs[name] for name in wanted])
+        results.append(dict(zip((*"xvCF", *wanted), (*end, *found), strict=False)))
+    for name, want in results[1].items():
+        assert_relative(results[0][name], want, 1e-12, name)
+
+
+def test_each_gradient_can_be_wanted_alone(device):
+    """Whatever else is differentiated, the gradient of an input is the same: kernels are compiled for what is wanted."""
+    built = model(device=device, worlds=2)
+    every = gradients(softmpm.simulate, built, busy_inputs(built), 6)
+    for name in ("v", "activation", "young"):
+        inputs = {n: t.detach() for n, t in busy_inputs(built).items()}
+        inputs[name].requires_grad_()
+        end = run(softmpm.simulate, built, inputs, 6)
+        (alone,) = torch.autograd.grad(dot(cotangent(end), end), inputs[name])
+        assert_relative(alone, every[name], 1e-6, name)
+
+
+# -- one program, many calls --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def made(monkeypatch) -> list:
+    """Every program that is made."""
+    programs = []
+
+    class Counted(program.Program):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            programs.append((self.chunk, self.keep))
+
+    monkeypatch.setattr(fast, "Program", Counted)
+    return programs
+
+
+def calls(built, seeds, substeps=7):
+    """Ends of simulations from different starts, that wait for their backward pass: (end, inputs)."""
+    for seed in seeds:
+        inputs = busy_inputs(built, control_steps=3, seed=seed)
+        yield run(softmpm.simulate, built, inputs, substeps), inputs
+
+
+def pull(end, inputs, **options) -> dict[str, torch.Tensor]:
+    found = torch.autograd.grad(dot(cotangent(end), end), list(inputs.values()), **options)
+    return dict(zip(inputs, found, strict=True))
+
+
+def alone(seed: int, device: str, **settings) -> dict[str, torch.Tensor]:
+    """The gradient of a call that a model of its own made."""
+    return pull(*next(calls(model(device=device, **settings), [seed])))
+
+
+def assert_gradient(got, want, device) -> None:
+    for name in INPUTS:
+        assert_relative(got[name], want[name], same_on(device), name)
+
+
+@pytest.fixture(params=["kept", "run again"])
+def budget(request) -> dict:
+    """Settings with which a call keeps everything inside, and with which it keeps one state and runs chunks again."""
+    if request.param == "kept":
+        return {}
+    sizes = model().sizes()
+    settings = {"memory_budget": 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between}
+    assert not plan(Horizon(3, 7), sizes, settings["memory_budget"]).keep_all
+    return settings
+
+
+def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device):
+    """After the first call, with and without gradient, every program is one that was made before."""
+    built = model(device=device, **budget)
+
+    def both():
+        with torch.no_grad():
+            list(calls(built, [1]))
+        for end, inputs in calls(built, [2]):
+            pull(end, inputs)
+            del end, inputs
+
+    both()
+    count = len(made)
+    assert count >= 2
+    for _ in range(4):
+        both()
+    assert len(made) == count, made[count:]
+
+
+def test_outstanding_gradients_keep_their_own_states(made, short_chunks, budget, device):
+    """Five calls wait for their backward pass: each gets its gradient, in any order; five more need nothing new."""
+    built = model(device=device, **budget)
+    want = {seed: alone(seed, device) for seed in range(5)}
+    made.clear()
+    counts = []
+    for order in ((0, 1, 2, 3, 4), (3, 0, 4, 2, 1)):
+        waiting = dict(enumerate(calls(built, range(5))))
+        for seed in order:
+            got = pull(*waiting.pop(seed))
+            if not budget:
+                assert_gradient(got, want[seed], device)
+            else:  # chunks of other lengths, other rounding in between
+                for name in INPUTS:
+                    assert_relative(got[name], want[seed][name], 2e-6, name)
+        counts.append(len(made))
+    assert counts[0] == counts[1]
+
+
+def test_backward_twice(budget, device):
+    """With ``retain_graph`` the second gradient is the first, also when another call ran in between."""
+    built = model(device=device, **budget)
+    ((end, inputs),) = calls(built, [1])
+    first = pull(end, inputs, retain_graph=True)
+    second = pull(end, inputs, retain_graph=True)
+    for other, others in calls(built, [2]):
+        pull(other, others)
+    third = pull(end, inputs)
+    for again in (second, third):
+        assert_gradient(again, first, device)
+
+
+def test_interleaved_calls(budget, device):
+    """Forward A, forward B, a call without gradient, backward A, backward B: each as if it were alone."""
+    built = model(device=device, **budget)
+    a, b = calls(built, [1, 2])
+    with torch.no_grad():
+        list(calls(built, [3]))
+    got = pull(*a)
+    with torch.no_grad():
+        list(calls(built, [4]))
+    assert_gradient(got, alone(1, device, **budget), device)
+    assert_gradient(pull(*b), alone(2, device, **budget), device)
+
+
+def test_a_result_outlives_what_runs_after_it(short_chunks, device):
+    """The end of a call is not written to by later calls, with or without a gradient of its own."""
+    built = model(device=device)
+    with torch.no_grad():
+        ((bare, _),) = calls(built, [1])
+    ((end, _),) = calls(built, [1])
+    copies = [t.detach().clone() for t in (*bare, *end)]
+    with torch.no_grad():
+        list(calls(built, [2, 3]))
+    for other, others in calls(built, [2]):
+        pull(other, others)
+    for tensor, copy in zip((*bare, *end), copies, strict=True):
+        assert torch.equal(tensor, copy)
+    for one, other in zip(bare, end, strict=True):
+        assert_relative(one, other.detach(), same_on(device))
+
+
+def test_threads_share_a_model(short_chunks, device):
+    """Three threads, each with gradients and calls without, recording and replaying at once: each gets what it gets alone."""
+    built, want = model(device=device), {seed: alone(seed, device) for seed in range(3)}
+    got: dict[int, list] = {seed: [] for seed in want}
+    together, errors = threading.Barrier(len(want)), []
+
+    def work(seed):
+        try:
+            together.wait()
+            for _ in range(4):
+                for end, inputs in calls(built, [seed]):
+                    got[seed].append(pull(end, inputs))
+                with torch.no_grad():
+                    list(calls(built, [seed + 10]))
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in want]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors, errors
+    for seed, found in got.items():
+        for gradient in found:
+            assert_gradient(gradient, want[seed], device)
+
+
+# -- failures -----------------------------------------------------------------------------------------------------
+
+
+def failure(built, seed=1, **changes) -> softmpm.UnstableError:
+    inputs = {name: t.detach().clone() for name, t in busy_inputs(built, seed=seed).items()}
+    for name, edit in changes.items():
+        edit(inputs[name])
+    with pytest.raises(softmpm.UnstableError) as caught:
+        run(softmpm.simulate, built, inputs, 20)
+    return caught.value
+
+
+def assert_same_failure(one, other, built) -> None:
+    """What, where and when; worlds that did not fail end alike, and so does the particle that did.
+
+    The others of its world stop in that substep, before or after it: they run at the same time.
+    """
+    for name in ("kind", "world", "particle", "substep"):
+        assert getattr(one, name) == getattr(other, name), name
+    healthy = [world for world in range(built.worlds) if world != other.world]
+    for name in "xvCF":
+        got, want = getattr(one.state, name), getattr(other.state, name)
+        assert_relative(got[healthy], want[healthy], 2e-6, name)
+        at = other.world, other.particle
+        assert_relative(got[at], want[at], 2e-6, f"{name} of the particle")
+
+
+def test_a_failure_is_that_of_the_plain_scheme(short_chunks, device):
+    """In the second chunk, a world that moves off leaves the grid; the two others stay and go on."""
+
+    def kick(v):
+        v[1] += torch.tensor([-20.0, 3.0]).to(v)
+
+    errors = []
+    for scheme in ("fast", "plain"):
+        built = model(device=device, scheme=scheme, worlds=3)
+        errors.append(failure(built, v=kick))
+    assert errors[1].kind == "left_grid" and errors[1].world == 1 and errors[1].substep > SHORT
+    assert_same_failure(*errors, built)
+
+
+def test_a_failing_call_leaves_the_model_as_it_was(short_chunks, device):
+    """The next call is what it is on a fresh model, and one that waited for its gradient gets it."""
+
+    def kick(v):
+        v += torch.tensor([-50.0, 9.0]).to(v)
+
+    built = model(device=device)
+    ((end, inputs),) = calls(built, [1])
+    failure(built, v=kick)
+    assert_gradient(pull(end, inputs), alone(1, device), device)
+    assert_gradient(pull(*next(calls(built, [2]))), alone(2, device), device)
+
+
+def test_a_failure_in_the_start_is_reported_as_such(device):
+    """Off the grid before the first substep: the fast scheme refuses as the plain one does."""
+
+    def outside(x):
+        x[0, 7] = torch.tensor([-3.0, 0.5])
+
+    errors = [failure(model(device=device, scheme=scheme), x=outside) for scheme in ("fast", "plain")]
+    for error in errors:
+        assert (error.kind, error.particle, error.world) == ("start", 7, 0)
+    assert str(errors[0]) == str(errors[1])
+
+
+def test_a_gradient_that_failed_does_not_fail_again(device):
+    """After a loss that overflows, a finite one has its gradient."""
+    built = model(device=device)
+    ((end, inputs),) = calls(built, [1])
+    with pytest.raises(softmpm.UnstableError, match="not finite"):
+        (end.x[0, 1] * 3e38 * 10).sum().backward(retain_graph=True)
+    assert_gradient(pull(end, inputs), alone(1, device), device)
+
+
+def test_a_model_that_nobody_uses_is_freed(scheme, device):
+    """And with it its programs: building one model after the other takes no more memory than one."""
+    built = model(device=device, scheme=scheme)
+    for end, inputs in calls(built, [1]):
+        pull(end, inputs)
+    seen = weakref.ref(built)
+    del built, end, inputs
+    gc.collect()
+    assert seen() is None
