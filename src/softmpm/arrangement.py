@@ -13,10 +13,12 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.buffers import passing, view
+from softmpm.failures import Report
 from softmpm.kernels.packing import packing
 from softmpm.kernels.types import types
 from softmpm.memory import window_shape
 from softmpm.model import Model
+from softmpm.replay import recording
 from softmpm.step import stream_of
 
 STALE = 1.5
@@ -39,7 +41,7 @@ class Arrangement:
 
     def __init__(self, model: Model, x: Tensor, least: tuple[int, ...] = ()):
         self.model, self.version = model, 0
-        self._fresh_cells: int | None = None
+        self._fresh: Report | None = None  # cells met along the order when it was new
         self.stale = False
 
         def integers(*size):
@@ -84,12 +86,15 @@ class Arrangement:
     def renew(self, x: Tensor) -> None:
         """Sort by cell and centre the window on the particles, without waiting for the device."""
         self._locate(x)
-        self.order.copy_(torch.sort(self._key, dim=1, stable=True).indices)
+        key, order = torch.sort(self._key, dim=1, stable=True)
+        self.order.copy_(order)
         t = types(self.model.spec.dim, self.model.spec.dtype)
         ends = [passing(tensor, wp.int32) for tensor in (*self._ends, self.origin)]
         kernel = packing(t.dim, self.model.spec.dtype).centre_window
         self._launch(kernel, self.origin.shape, t.ivec(*self.shape), *ends)
-        self._fresh_cells, self.stale = None, False
+        if not recording(self.model):
+            self._fresh = Report(self.model.worlds + (key[:, 1:] != key[:, :-1]).sum()[None])
+        self.stale = False
         self.version += 1
 
     def grown(self, x: Tensor) -> "Arrangement":
@@ -98,9 +103,8 @@ class Arrangement:
 
     def judge(self, cells: int, near_edge: bool) -> None:
         """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""
-        if self._fresh_cells is None:
-            self._fresh_cells = cells
-        scattered = self.model.device.type == "cuda" and cells > STALE * self._fresh_cells
+        assert self._fresh is not None
+        scattered = self.model.device.type == "cuda" and cells > STALE * self._fresh.read()[0]
         self.stale = near_edge or scattered
 
     def window(self, origin: Tensor):

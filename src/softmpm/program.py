@@ -14,7 +14,7 @@ from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid, passing, view
 from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
-from softmpm.kernels.native import BLOCK
+from softmpm.kernels.native import BLOCK, FEW, WARP
 from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
 from softmpm.kernels.types import solid_types, types
@@ -23,9 +23,6 @@ from softmpm.replay import Replay, recording
 from softmpm.state import Low, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
-
-SMALL = {2: 30_000, 3: 12_000}
-"""Up to so many particles a substep is one launch on a GPU."""
 
 
 class Program:
@@ -37,7 +34,7 @@ class Program:
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
-        padded = -(-self.total // 32) * 32
+        padded = -(-self.total // WARP) * WARP
 
         def tensor(*size, dtype=model.dtype):
             return torch.empty(*size, dtype=dtype, device=model.device)
@@ -49,8 +46,7 @@ class Program:
         self._calm = torch.full_like(self.words, NEVER)
         self._calm[-2:].zero_()
         self._version = -1  # of the arrangement that order and origin were taken from
-        self.whole = model.device.type == "cuda" and self.total <= SMALL[model.dim]
-        slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 3 if self.whole else 2)
+        slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
         self.base = tensor(slots, padded, dtype=torch.int32)
         self.rows = tensor(slots, padded * t.rows)
         self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
@@ -115,9 +111,14 @@ class Program:
         )
 
     @functools.cached_property
-    def blocks(self) -> int:
-        """Threads of a launch over particles: whole warps, since they work together."""
-        return -(-self.total // BLOCK) * BLOCK if self.model.device.type == "cuda" else self.total
+    def block(self) -> int:
+        """Threads of a block over particles; a single warp if the GPU has more room than warps."""
+        return BLOCK if self.total > FEW else WARP
+
+    @functools.cached_property
+    def threads(self) -> int:
+        """Threads of a launch over particles: whole blocks on a GPU, since warps work together."""
+        return -(-self.total // self.block) * self.block if self.model.device.type == "cuda" else self.total
 
     # -- forward -------------------------------------------------------------------------------------------------
 
@@ -160,37 +161,28 @@ class Program:
         return state.with_low(Low(*low)) if rounds else state
 
     def _launch_all(self, stream) -> None:
-        nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec, self.whole)
+        nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec)
+        self._over_nodes(kernels.clear, nodes[0], stream=stream)
+        self._advance(-1, stream)
+        for s in range(length):
+            now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
+            parameters = (self.model.scale, self.model.walls, self.window)
+            self._over_nodes(
+                kernels.grid_velocity, *parameters, now, self.velocity_array, then, stream=stream
+            )
+            self._advance(s, stream)
 
-        def grid(s: int) -> wp.array:
-            return nodes[s % len(nodes)] if 0 <= s < length else self.nothing
+    def _over_nodes(self, kernel, *arguments, stream) -> None:
+        self.launch(kernel, len(self.velocity), *arguments, stream=stream, block_dim=BLOCK)
 
-        self.launch(kernels.clear, len(self.velocity), nodes[0], stream=stream, block_dim=BLOCK)
-        for s in range(-1, length):
-            if self.whole:
-                self._advance(s, grid(s), grid(s + 1), grid(s + 2), stream)
-                continue
-            if s >= 0:
-                arguments = (
-                    self.model.scale,
-                    self.model.walls,
-                    self.window,
-                    grid(s),
-                    self.velocity_array,
-                    grid(s + 1),
-                )
-                self.launch(
-                    kernels.grid_velocity, len(self.velocity), *arguments, stream=stream, block_dim=BLOCK
-                )
-            self._advance(s, self.velocity_array, grid(s + 1), self.nothing, stream)
-
-    def _advance(self, s: int, read: wp.array, node: wp.array, cleared: wp.array, stream) -> None:
+    def _advance(self, s: int, stream) -> None:
         """G2P of substep ``s`` and P2G of the next; the P2G of the first if ``s`` is -1."""
-        model, packed, length = self.model, self.packed, self.chunk.length
+        model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (max(s, 0), s + 1) if self.keep else (0, 0)
         solid = self.solid(min(s + 1, length - 1))
-        parameters = (model.scale, model.walls, solid, self.window, s, s + 1 == length)
-        sizes = (model.particle_count, self.total, self.blocks, self.order_flat)
-        arguments = (*parameters, *sizes, read, packed[now], self.watch, packed[then], cleared, node)
-        kernel = fused(model.spec, self.whole).advance
-        self.launch(kernel, self.blocks, *arguments, stream=stream, block_dim=BLOCK)
+        parameters = (model.scale, solid, self.window, s, s + 1 == length)
+        sizes = (model.particle_count, self.total, self.order_flat)
+        states = (packed[now], self.watch, packed[then])
+        arguments = (*parameters, *sizes, self.velocity_array, *states, nodes[(s + 1) % len(nodes)])
+        kernel = fused(model.spec).advance
+        self.launch(kernel, self.threads, *arguments, stream=stream, block_dim=self.block)

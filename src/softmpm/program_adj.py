@@ -114,7 +114,7 @@ class ProgramAdj:
         out = (program.watch, scratch.solid_struct, before)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
-        program.launch(kernel, program.blocks, *arguments, stream=stream, block_dim=BLOCK)
+        program.launch(kernel, program.threads, *arguments, stream=stream, block_dim=program.block)
 
     def _collect(self, s: int, stream) -> None:
         """Where a control step begins, add what the particles found for its pull."""

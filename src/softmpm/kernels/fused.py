@@ -5,10 +5,6 @@ A substep is two launches. With M the nodes' momentum and mass, V their velocity
     grid      V ← (G1), (G2) of M,  next M ← 0
     advance   particles: V → (T2), (T3) → new state → (T1) → next M
 
-In small scenes, where a launch costs more than what it does, it is one: each particle finds the velocity of its nodes itself.
-
-    advance   particles: M → (G1), (G2) → V → (T2), (T3) → new state → (T1) → next M,  the M after it ← 0
-
 and backward, with a bar for adjoints and the same sums the other way round:
 
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
@@ -32,31 +28,20 @@ from softmpm.watch import Kind
 
 
 @functools.lru_cache(maxsize=None)
-def fused(spec: Spec, whole: bool = False) -> SimpleNamespace:
-    """The forward kernels; ``whole`` if ``advance`` does the grid's work too."""
+def fused(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
-    real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
+    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
     Scale, Packed, Window, Particle = t.Scale, t.Packed, t.Window, one.Particle
     Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
-    first_node, pack_base, unpack_base = s.first_node, s.pack_base, s.unpack_base
+    gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     affine_momentum, moved, node_velocity = one.affine_momentum, one.moved, grid(spec).node_velocity
     running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
-    module = native_module(spec.module + (".fused.whole" if whole else ".fused"))
-
-    @wp.func
-    def read(scale: Scale, walls: Walls, node: wp.array(dtype=node_vec), i: int, place: ivec) -> vec:
-        """Velocity of a node."""
-        here = load_node(node, i)
-        if wp.static(whole):
-            return node_velocity(scale, walls, place, head(here), here[dim])
-        return head(here)
-
-    gather = s.gather_of(read, Walls)
+    module = native_module(spec.module + ".fused")
 
     @wp.func
     def centre(fx: vec) -> vec:
@@ -97,29 +82,23 @@ def fused(spec: Spec, whole: bool = False) -> SimpleNamespace:
     def advance(
         # Parameters:
         scale: Scale,
-        walls: Walls,
         body: Solid,
         window: Window,
         substep: int,  # -1: only the P2G of the start
         last: bool,  # no P2G afterwards
         count: int,  # particles of one world
         total: int,  # particles of all worlds
-        threads: int,
         order: wp.array(dtype=wp.int32),
         # In:
-        velocity: wp.array(dtype=node_vec),  # or momentum and mass, for the whole substep
+        velocity: wp.array(dtype=node_vec),
         now: Packed,
         # Out:
         watch: wp.array(dtype=wp.int64),
         then: Packed,
-        cleared: wp.array(dtype=node_vec),
         # Out, added into:
         node: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
-        if wp.static(whole):
-            for n in range(i, cleared.shape[0], threads):
-                store_node(cleared, n, node_vec())
         first = int(-1)
         g = vec()
         b = vec()
@@ -140,7 +119,7 @@ def fused(spec: Spec, whole: bool = False) -> SimpleNamespace:
             if substep >= 0 and running(watch, world):
                 g = centre(at.fx)
                 here = held + first_node(at.base, origin, window.shape)
-                sums = gather(scale, walls, velocity, here, window.shape, at.base, g)
+                sums = gather(velocity, here, window.shape, g)
                 B = sums.outer - wp.outer(sums.value, g)
                 at = moved(scale, body, origin, window.shape, world, p, at, sums.value, B)
             else:

@@ -12,8 +12,12 @@ import warp as wp
 from softmpm.kernels.types import types
 
 HEADER = Path(__file__).with_name("scatter.h")
+WARP = 32
+"""Threads that work together, and particles of a block of packed rows."""
 BLOCK = 128
-"""Threads of a block; scatter.h reserves shared memory for so many particles."""
+"""Threads of a block."""
+FEW = 20_000
+"""Up to so many particles a block is one warp."""
 
 
 def native_module(name: str) -> str:

@@ -20,7 +20,7 @@ from softmpm.kernels.types import types
 @functools.lru_cache(maxsize=None)
 def stencil(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
-    real, vec, mat, ivec, node_vec, Scale = t.real, t.vec, t.mat, t.ivec, t.aligned, t.Scale
+    real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
     triple = wp.types.vector(3, real)
     load_node = native(dim, dtype).load_node
 
@@ -67,43 +67,30 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         def aligned(v: vec, m: real) -> node_vec:
             return node_vec(v[0], v[1], m, real(0.0))
 
-        def gather_of(read, Walls):
-            """Sums Σ w v and Σ w v oᵀ of v = read(scale, walls, nodes, index of the node, its coordinates)."""
-
-            @wp.func
-            def gather(
-                scale: Scale,
-                walls: Walls,
-                node: wp.array(dtype=node_vec),
-                first: int,
-                shape: ivec,
-                base: ivec,
-                g: vec,
-            ) -> Sums:
-                wx = weights(g[0])
-                wy = weights(g[1])
-                value = vec()
-                along_x = vec()
-                along_y = vec()
-                for i in range(3):
-                    at = first + i * shape[1]
-                    a = read(scale, walls, node, at, base + ivec(i, 0))
-                    b = read(scale, walls, node, at + 1, base + ivec(i, 1))
-                    c = read(scale, walls, node, at + 2, base + ivec(i, 2))
-                    row = wy[0] * a + wy[1] * b + wy[2] * c
-                    value += wx[i] * row
-                    along_y += wx[i] * (wy[2] * c - wy[0] * a)
-                    if i == 0:
-                        along_x -= wx[0] * row
-                    if i == 2:
-                        along_x += wx[2] * row
-                sums = Sums()
-                sums.value = value
-                sums.outer = wp.matrix_from_cols(along_x, along_y)
-                return sums
-
-            return gather
-
+        @wp.func
+        def gather(node: wp.array(dtype=node_vec), first: int, shape: ivec, g: vec) -> Sums:
+            """Σ w v and Σ w v oᵀ."""
+            wx = weights(g[0])
+            wy = weights(g[1])
+            value = vec()
+            along_x = vec()
+            along_y = vec()
+            for i in range(3):
+                at = first + i * shape[1]
+                a = head(load_node(node, at))
+                b = head(load_node(node, at + 1))
+                c = head(load_node(node, at + 2))
+                row = wy[0] * a + wy[1] * b + wy[2] * c
+                value += wx[i] * row
+                along_y += wx[i] * (wy[2] * c - wy[0] * a)
+                if i == 0:
+                    along_x -= wx[0] * row
+                if i == 2:
+                    along_x += wx[2] * row
+            sums = Sums()
+            sums.value = value
+            sums.outer = wp.matrix_from_cols(along_x, along_y)
+            return sums
     else:
 
         @wp.func
@@ -130,55 +117,43 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         def aligned(v: vec, m: real) -> node_vec:
             return node_vec(v[0], v[1], v[2], m)
 
-        def gather_of(read, Walls):
-            """Sums Σ w v and Σ w v oᵀ of v = read(scale, walls, nodes, index of the node, its coordinates)."""
-
-            @wp.func
-            def gather(
-                scale: Scale,
-                walls: Walls,
-                node: wp.array(dtype=node_vec),
-                first: int,
-                shape: ivec,
-                base: ivec,
-                g: vec,
-            ) -> Sums:
-                wx = weights(g[0])
-                wy = weights(g[1])
-                wz = weights(g[2])
-                value = vec()
-                along_x = vec()
-                along_y = vec()
-                along_z = vec()
-                for i in range(3):
-                    plane = vec()
-                    plane_y = vec()
-                    plane_z = vec()
-                    for j in range(3):
-                        at = first + (i * shape[1] + j) * shape[2]
-                        a = read(scale, walls, node, at, base + ivec(i, j, 0))
-                        b = read(scale, walls, node, at + 1, base + ivec(i, j, 1))
-                        c = read(scale, walls, node, at + 2, base + ivec(i, j, 2))
-                        row = wz[0] * a + wz[1] * b + wz[2] * c
-                        plane += wy[j] * row
-                        plane_z += wy[j] * (wz[2] * c - wz[0] * a)
-                        if j == 0:
-                            plane_y -= wy[0] * row
-                        if j == 2:
-                            plane_y += wy[2] * row
-                    value += wx[i] * plane
-                    along_y += wx[i] * plane_y
-                    along_z += wx[i] * plane_z
-                    if i == 0:
-                        along_x -= wx[0] * plane
-                    if i == 2:
-                        along_x += wx[2] * plane
-                sums = Sums()
-                sums.value = value
-                sums.outer = wp.matrix_from_cols(along_x, along_y, along_z)
-                return sums
-
-            return gather
+        @wp.func
+        def gather(node: wp.array(dtype=node_vec), first: int, shape: ivec, g: vec) -> Sums:
+            """Σ w v and Σ w v oᵀ."""
+            wx = weights(g[0])
+            wy = weights(g[1])
+            wz = weights(g[2])
+            value = vec()
+            along_x = vec()
+            along_y = vec()
+            along_z = vec()
+            for i in range(3):
+                plane = vec()
+                plane_y = vec()
+                plane_z = vec()
+                for j in range(3):
+                    at = first + (i * shape[1] + j) * shape[2]
+                    a = head(load_node(node, at))
+                    b = head(load_node(node, at + 1))
+                    c = head(load_node(node, at + 2))
+                    row = wz[0] * a + wz[1] * b + wz[2] * c
+                    plane += wy[j] * row
+                    plane_z += wy[j] * (wz[2] * c - wz[0] * a)
+                    if j == 0:
+                        plane_y -= wy[0] * row
+                    if j == 2:
+                        plane_y += wy[2] * row
+                value += wx[i] * plane
+                along_y += wx[i] * plane_y
+                along_z += wx[i] * plane_z
+                if i == 0:
+                    along_x -= wx[0] * plane
+                if i == 2:
+                    along_x += wx[2] * plane
+            sums = Sums()
+            sums.value = value
+            sums.outer = wp.matrix_from_cols(along_x, along_y, along_z)
+            return sums
 
     @functools.lru_cache(maxsize=None)
     def gather_adj(everything: bool):
@@ -308,7 +283,7 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         unpack_base=unpack_base,
         aligned=aligned,
         head=head,
-        gather_of=gather_of,
+        gather=gather,
         gather_adj=gather_adj(everything=True),
         slope_adj=gather_adj(everything=False),
     )
