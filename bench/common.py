@@ -14,12 +14,26 @@ import softmpm
 
 
 def cube(
-    dim: int, particles: int, nodes: int, *, law=softmpm.NeoHookean, muscles=False, floor=False, seed=0
+    dim: int,
+    particles: int,
+    nodes: int,
+    *,
+    law=softmpm.NeoHookean,
+    muscles=False,
+    floor=False,
+    seed=0,
+    domain=None,
+    **scene_settings,
 ) -> softmpm.Scene:
-    """An elastic cube with 2^dim particles per cell in the middle of the grid, particles in random order."""
+    """An elastic cube with 2^dim particles per cell in the middle of the grid, particles in random order.
+
+    Args:
+        nodes: Nodes along an axis of a grid one metre wide; they decide the spacing.
+        domain: Nodes along an axis of a larger grid, most of it empty.
+    """
     dx = 1.0 / nodes
     side = round(particles ** (1 / dim))
-    axis = (np.arange(side) - (side - 1) / 2) * dx / 2 + 0.5
+    axis = (np.arange(side) - (side - 1) / 2) * dx / 2 + 0.5 * (domain or nodes) * dx
     positions = np.stack(np.meshgrid(*[axis] * dim, indexing="ij"), -1).reshape(-1, dim)
     np.random.default_rng(seed).shuffle(positions)
     body = softmpm.Body(
@@ -28,12 +42,13 @@ def cube(
     up = (0.0, 1.0) + (0.0,) * (dim - 2)
     index = np.arange(len(positions))
     scene = dict(
-        grid=softmpm.Grid(shape=(nodes,) * dim, spacing=dx),
+        grid=softmpm.Grid(shape=(domain or nodes,) * dim, spacing=dx),
         bodies=[body],
         muscles=[softmpm.Muscle(particles=index, direction=up, strength=1.0)] if muscles else [],
         walls=[softmpm.Wall(normal=up, offset=float(positions[:, 1].min()), friction=0.5)] if floor else [],
         gravity=tuple(-0.5 * u for u in up),  # so weak that a thousand substeps stay on the grid
     )
+    scene |= scene_settings
     return softmpm.Scene(**scene, dt=0.3 * softmpm.stable_dt(softmpm.Scene(**scene, dt=1.0)))
 
 

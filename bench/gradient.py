@@ -2,7 +2,8 @@
 
 Forward with gradient and backward of one call, each divided by its substeps; medians after a warm-up. ``kept``: memory for
 everything inside, nothing runs twice. ``again``: memory for a fifth of it, so that the backward pass runs the substeps again;
-its time includes that. Activation gets a gradient where the scene has muscles, the materials only in the rows that say so.
+its time includes that. The cube falls; activation gets a
+gradient where the scene has muscles, the materials only in the rows that say so.
 """
 
 import time
@@ -15,18 +16,20 @@ import softmpm
 from softmpm.horizon import Horizon
 from softmpm.memory import plan
 
-GRADIENTS = VARIANTS | {"neo-Hookean, materials": {}}
+GRADIENTS = VARIANTS | {"neo-Hookean, materials": {}, "neo-Hookean, turning": {}}
 
 
 def substeps_of(particles: int, device: torch.device) -> int:
     if device.type == "cpu":
         return 50
-    return 512 if particles < 500_000 else 128 if particles < 5_000_000 else 32
+    return 512 if particles < 500_000 else 64 if particles < 5_000_000 else 32
 
 
-def measure(model, substeps: int, materials: bool, repeats: int) -> tuple[float, float]:
+def measure(
+    model, substeps: int, repeats: int, *, materials: bool = False, turns: bool = False
+) -> tuple[float, float]:
     """Median microseconds of a substep, forward and backward."""
-    device, start = model.device, turning(model)
+    device, start = model.device, turning(model) if turns else model.rest()
     start.v.requires_grad_()
     params = softmpm.Params(*(p.requires_grad_(materials) for p in model.params()))
     shape = (1, model.worlds, model.muscle_count)
@@ -60,7 +63,9 @@ def main():
             for kind, budget in (("kept", 2**62), ("again", everything // 5)):
                 model = softmpm.build(scene, device=device, memory_budget=budget)
                 row["particles"] = model.particle_count
-                figures = measure(model, substeps, "materials" in name, args.repeats)
+                figures = measure(
+                    model, substeps, args.repeats, materials="materials" in name, turns="turning" in name
+                )
                 row |= {f"forward, {kind}": figures[0], f"backward, {kind}": figures[1]}
                 del model
                 if device.type == "cuda":

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from softmpm.buffers import passing, view
 from softmpm.failures import Report
+from softmpm.kernels.native import FEW
 from softmpm.kernels.packing import packing
 from softmpm.kernels.types import types
 from softmpm.memory import window_shape
@@ -21,8 +22,8 @@ from softmpm.model import Model
 from softmpm.replay import recording
 from softmpm.step import stream_of
 
-STALE = 1.5
-"""Renew the order when going along it meets so many times more cells than when it was new."""
+STALE, STALE_FEW = 1.5, 3.0
+"""Renew the order when going along it meets so many times more cells than when it was new; with few particles it matters less."""
 
 
 class Arrangement:
@@ -104,7 +105,8 @@ class Arrangement:
     def judge(self, cells: int, near_edge: bool) -> None:
         """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""
         assert self._fresh is not None
-        scattered = self.model.device.type == "cuda" and cells > STALE * self._fresh.read()[0]
+        limit = STALE_FEW if self.order.numel() <= FEW else STALE
+        scattered = self.model.device.type == "cuda" and cells > limit * self._fresh.read()[0]
         self.stale = near_edge or scattered
 
     def window(self, origin: Tensor):

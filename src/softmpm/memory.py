@@ -16,6 +16,8 @@ from softmpm.schedule import recomputed
 
 LONGEST = 128
 """Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
+MANY, LONGEST_OF_MANY = 200_000, 64
+"""From so many particles on the host has time enough, and sorting in time is worth more."""
 CPU_BUDGET = 64 * 2**20
 """Without a budget, what a call on the CPU may keep; on a GPU it is a sixteenth of its memory."""
 
@@ -35,6 +37,11 @@ def window_shape(grid: Sequence[int], reach: Sequence[int]) -> tuple[int, ...]:
     return tuple(min(nodes, 4 * math.ceil(w / 4)) for nodes, w in zip(grid, wide, strict=True))
 
 
+def longest_chunk(particles: int) -> int:
+    """Substeps of a chunk, at most, for so many particles in all worlds."""
+    return LONGEST if particles < MANY else LONGEST_OF_MANY
+
+
 class Sizes(NamedTuple):
     """Bytes of what a call may keep."""
 
@@ -44,6 +51,8 @@ class Sizes(NamedTuple):
     """What is kept of the nodes of all worlds for each substep."""
     between: int
     """State of all worlds between chunks."""
+    longest: int
+    """Substeps of a chunk, at most."""
 
 
 class Plan(NamedTuple):
@@ -72,12 +81,12 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     Raises:
         ValueError: Not even one substep at a time fits.
     """
-    chunks = len(horizon.chunks(LONGEST))
+    chunks = len(horizon.chunks(sizes.longest))
     everything = horizon.total * (sizes.inside + sizes.nodes) + chunks * sizes.inside
     if everything <= budget or horizon.total == 0:
-        return Plan(LONGEST, 0, everything, 0)
+        return Plan(sizes.longest, 0, everything, 0)
     best, least = None, math.inf
-    for longest in (2**k for k in range(LONGEST.bit_length() - 1, -1, -1)):
+    for longest in (2**k for k in range(sizes.longest.bit_length() - 1, -1, -1)):
         chunks = horizon.chunks(longest)
         length = max(chunk.length for chunk in chunks)
         inside = (length + 1) * sizes.inside + length * sizes.nodes

@@ -12,7 +12,7 @@ from torch import Tensor
 from softmpm.checks import check_scene
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import CPU_BUDGET, Sizes, memory, window_shape
+from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, memory, window_shape
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
 from softmpm.stability import stable_dt, warn_unstable
 from softmpm.state import Low, Params, State
@@ -225,9 +225,10 @@ class Model:
         between = round(particles * real * low * (2 * d + 2 * d * d))
         if self.scheme == "fast":
             inside = particles * (4 + real * packed_rows(d).rows)
-            return Sizes(inside, self.worlds * self.held_nodes * 4 * real, between)
+            nodes = self.worlds * self.held_nodes * 4 * real
+            return Sizes(inside, nodes, between, longest_chunk(particles))
         inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-        return Sizes(inside, 0, between)
+        return Sizes(inside, 0, between, longest_chunk(particles))
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""

@@ -12,7 +12,7 @@ from softmpm.failures import Report, outgrown, raise_failure, raise_gradient_fai
 from softmpm.fast import Fast, FastRun, fast
 from softmpm.horizon import Chunk, Horizon
 from softmpm.kernels.types import Wanted
-from softmpm.memory import LONGEST, Plan, plan
+from softmpm.memory import Plan, plan
 from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
 from softmpm.replay import note, recording
@@ -34,10 +34,6 @@ class Trail:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
         run.end = None
         self.runs.append(run)
-
-
-RUN_ONLY = Plan(LONGEST, 0, 0, 0)
-"""Without a backward pass nothing is kept."""
 
 
 class _Runner:
@@ -92,7 +88,8 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     Raises:
         UnstableError: A world failed.
     """
-    chosen = plan(horizon, model.sizes(), model.budget) if keep else RUN_ONLY
+    sizes = model.sizes()
+    chosen = plan(horizon, sizes, model.budget) if keep else Plan(sizes.longest, 0, 0, 0)
     trail = Trail(chosen, horizon.chunks(chosen.longest), [], {})
     stays = schedule.kept_first(len(trail.chunks), chosen.slots) if chosen.slots else ()
     runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all

@@ -135,23 +135,25 @@ def test_a_grown_window_is_half_as_large_again(device):
 
 
 def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
-    """The first report is the measure; on the CPU, where the order is fixed, only the edge counts. Renewing forgets both."""
-    model = robot(2, [(20, 20)], grid=(80, 80), device=device)
-    found, most = Arrangement(model, model.rest().x), int(100 * STALE)
-    found.judge(100, near_edge=False)
+    """Measured by the cells it met when it was new; on the CPU, where the order is fixed, only the edge counts."""
+    model = robot(2, [(20, 20)], grid=(80, 80), worlds=2, device=device)
+    x = model.rest().x
+    found = Arrangement(model, x)
+    for apart in (1.0, 3.0):  # further apart in a renewed order: other cells, another measure
+        x = x.mean(1, keepdim=True) + apart * (x - x.mean(1, keepdim=True))
+        found.renew(x)
+        followed = x if device == "cuda" else model.rest().x
+        cells = sum(len(np.unique(base, axis=0)) for base in bases(model, followed))
+        for met, near_edge, stale in (
+            (cells, False, False),
+            (int(STALE * cells), False, False),
+            (int(STALE * cells) + 1, False, device == "cuda"),
+            (cells, True, True),
+        ):
+            found.judge(met, near_edge)
+            assert found.stale == stale, (apart, met, near_edge)
+    found.renew(x)
     assert not found.stale
-    found.judge(most, near_edge=False)
-    assert not found.stale
-    found.judge(most + 1, near_edge=False)
-    assert found.stale == (device == "cuda")
-    found.judge(100, near_edge=True)
-    assert found.stale
-    found.renew(model.rest().x)
-    assert not found.stale
-    found.judge(most + 1, near_edge=False)
-    assert not found.stale, "the first report after that is the new measure"
-    found.judge(int(STALE * (most + 1)) + 1, near_edge=False)
-    assert found.stale == (device == "cuda")
 
 
 # -- what a window must not change --------------------------------------------------------------------------------
@@ -239,6 +241,21 @@ def test_a_robot_that_wanders_takes_its_window_along(sign, watched, device):
     assert len(watched.made) == 1 and not watched.grown_from and 4 <= watched.renewals <= 9
     want = end_and_gradient(robot(2, **build, scheme="plain"), v, 25, calls=14, twist=3.0)
     assert_same(got, want, 1e-12)  # 350 substeps
+
+
+def test_programs_that_are_used_again_see_where_the_window_went(watched, device):
+    """Without gradients every call takes the same program: it follows the robot without growing, as the plain scheme does."""
+    ends = []
+    for scheme in ("fast", "plain"):
+        model = robot(2, [(15, 27)], grid=(80, 64), device=device, scheme=scheme)
+        state, v = model.rest(), torch.tensor([4.5, 1.0], dtype=torch.float64)
+        state = state._replace(v=state.v + v.to(state.v))
+        for _ in range(14):
+            state = softmpm.simulate(model, state, None, model.params(), substeps=25)
+        ends.append(state)
+    assert len(watched.made) == 1 and not watched.grown_from and watched.renewals >= 4
+    for name, got, want in zip("xv", *(end[:2] for end in ends), strict=True):
+        assert_relative(got, want, 1e-12, name)
 
 
 def test_worlds_far_apart_have_windows_of_their_own(watched, device):

@@ -83,7 +83,7 @@ def test_what_a_scene_lacks_is_not_stored():
     passive = softmpm.build(plain_scene(), device="cpu")
     assert passive.muscle_slots.numel() == 0 and passive.sizes().inside == 12 * (4 + 4 * (2 + 2 + 2 + 8))
     plain = softmpm.build(plain_scene(), device="cpu", scheme="plain")
-    assert plain.sizes() == (12 * (4 * 2 + 4 * (2 + 4 + 8)), 0, 12 * 4 * 12 * 1.5)
+    assert plain.sizes()[:3] == (12 * (4 * 2 + 4 * (2 + 4 + 8)), 0, 12 * 4 * 12 * 1.5)
 
 
 def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):

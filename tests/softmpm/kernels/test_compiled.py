@@ -35,7 +35,7 @@ def kernel(dim: int, law: str, which: str):
     )
     if which == "adjoint":
         return fused_adj(spec, Wanted(material=True, activation=True)).advance_adj
-    return fused(spec, whole=which == "whole").advance
+    return fused(spec).advance
 
 
 def compiled(kernel) -> tuple[str, cubin.Kernel]:
@@ -49,13 +49,13 @@ def compiled(kernel) -> tuple[str, cubin.Kernel]:
     return code, facts
 
 
-@pytest.mark.parametrize("which", ["forward", "whole", "adjoint"])
+@pytest.mark.parametrize("which", ["forward", "adjoint"])
 @pytest.mark.parametrize("dim, law", CASES)
 def test_machine_code(dim, law, which):
     """Nodes are read and added 16 bytes at a time, never number by number, and no register is spilled.
 
     Local memory is what the source itself declares: nothing, but for the 4 x 4 matrix of the rotation in 3D (polar.py), which
-    the forward kernels hold once and the adjoint twice.
+    the forward kernel holds once and the adjoint twice.
     """
     code, facts = compiled(kernel(dim, law, which))
     print(f"\n{dim}D {law} {which}: {facts}")

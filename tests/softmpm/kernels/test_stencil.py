@@ -20,36 +20,24 @@ LIMIT = 1e-13
 def kernels(dim: int, dtype: str) -> SimpleNamespace:
     """One kernel for each function that is tested."""
     t, s, n = types(dim, dtype), stencil(dim, dtype), native(dim, dtype)
-    real, vec, mat, ivec, node_vec, Scale = t.real, t.vec, t.mat, t.ivec, t.aligned, t.Scale
-    gather_adj, slope_adj, scatter = s.gather_adj, s.slope_adj, n.scatter
+    real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
+    gather, gather_adj, slope_adj, scatter = s.gather, s.gather_adj, s.slope_adj, n.scatter
     first_node, coordinates, pack_base, unpack_base = s.first_node, s.coordinates, s.pack_base, s.unpack_base
     load_node, store_node, aligned, head = n.load_node, n.store_node, s.aligned, s.head
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     module = native_module(f"test_stencil.d{dim}.{dtype}")
 
-    @wp.func
-    def read(scale: Scale, walls: Scale, node: wp.array(dtype=node_vec), i: int, place: ivec) -> vec:
-        """A value that depends on where the node is said to be."""
-        stretch = scale.spacing
-        for axis in range(dim):
-            stretch += walls.gravity[axis] * real(place[axis])
-        return stretch * head(load_node(node, i))
-
-    gather = s.gather_of(read, Scale)
-
     @wp.kernel(module=module, enable_backward=False)
     def sums(
-        scale: Scale,
         node: wp.array(dtype=node_vec),
         first: wp.array(dtype=int),
         shape: ivec,
-        base: wp.array(dtype=ivec),
         g: wp.array(dtype=vec),
         value: wp.array(dtype=vec),
         outer: wp.array(dtype=mat),
     ):
         i = wp.tid()
-        found = gather(scale, scale, node, first[i], shape, base[i], g[i])
+        found = gather(node, first[i], shape, g[i])
         value[i] = found.value
         outer[i] = found.outer
 
@@ -202,18 +190,16 @@ def bench(request, device):
 
 
 def test_gather(bench):
-    """Σ w v and Σ w v oᵀ (A4), of a velocity that depends on the node's coordinates as a wall's does."""
-    scale, away = bench.t.Scale(), np.array((0.1, 0.2, -0.3)[: bench.dim])
-    scale.spacing, scale.gravity = 1.0, bench.t.vec(*away)
+    """Σ w v and Σ w v oᵀ (A4)."""
     value, outer = np.zeros((COUNT, bench.dim)), np.zeros((COUNT, bench.dim, bench.dim))
     for p, o, index, w, _ in bench.neighbours():
-        v = (1.0 + away @ (bench.base[p] + o + 1)) * bench.node[index, : bench.dim]
+        v = bench.node[index, : bench.dim]
         value[p] += w * v
         outer[p] += w * np.outer(v, o)
     got = bench.empty(bench.dim), bench.empty(bench.dim, bench.dim)
     first, shape = bench.array(bench.first, wp.int32), bench.t.ivec(*bench.shape)
-    node, base = bench.array(bench.node, bench.t.aligned), bench.array(bench.base, bench.t.ivec)
-    bench.launch(bench.kernels.sums, COUNT, scale, node, first, shape, base, bench.particles()[0], *got)
+    node = bench.array(bench.node, bench.t.aligned)
+    bench.launch(bench.kernels.sums, COUNT, node, first, shape, bench.particles()[0], *got)
     close(got[0], value)
     close(got[1], outer)
 

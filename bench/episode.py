@@ -1,0 +1,76 @@
+"""How long is an iteration of learning in closed loop, and how much of it is physics?
+
+    python bench/episode.py [--device cuda] [--json bench/results/episode.json]
+
+The biped looks, decides and moves, and the loss is differentiated with respect to policy and materials. ``iteration`` is that,
+as training runs it; ``physics`` is its calls of `simulate` alone, forward and backward, recorded in the same way; ``eager`` is
+the iteration without the graph. Medians after a warm-up.
+"""
+
+import enum
+import tempfile
+from pathlib import Path
+
+import torch
+from common import arguments, median_seconds, report
+
+import softmpm
+from softmpm_learn.run import Run
+from softmpm_learn.settings import Settings
+from softmpm_learn.tasks.biped import BipedConf, biped
+
+CASES = [(128, 0.0125, 2000), (264, 0.0125, 2000), (264, 0.004, 2000)]
+"""Cells per metre, seconds between two decisions, substeps of an episode."""
+
+
+def task_of(cells: int, period: float, substeps: int):
+    resolution = enum.Enum("Cells", {"bench": cells}).bench
+    conf = BipedConf(resolution=resolution, control_period=period, seconds=period)
+    steps = round(substeps / biped(conf).substeps)
+    return biped(BipedConf(resolution=resolution, control_period=period, seconds=steps * period))
+
+
+def physics(run: Run):
+    """The simulations of an episode and their gradient, without anything around them."""
+    model, task = run.model, run.task
+    activation = torch.zeros(
+        task.control_steps, 1, model.worlds, model.muscle_count, device=model.device
+    ).requires_grad_()
+    params = softmpm.Params(*(p.detach().clone().requires_grad_() for p in run.params()))
+
+    def work():
+        state = model.rest()
+        for row in activation:
+            state = softmpm.simulate(model, state, row, params, substeps=task.substeps)
+        return torch.autograd.grad(state.x.sum(), [activation, *params])
+
+    return softmpm.Graph(work, model.device)
+
+
+def main():
+    args = arguments(__doc__)
+    device, rows = torch.device(args.device), []
+    for cells, period, substeps in CASES if device.type == "cuda" else [(80, 0.0125, 100)]:
+        task = task_of(cells, period, substeps)
+        model = softmpm.build(task.scene, device=device)
+        with tempfile.TemporaryDirectory() as folder:
+            run = Run(task, model, Settings(), Path(folder))
+            whole = median_seconds(lambda run=run: run.loop(None), device, args.repeats + 1)
+            alone = median_seconds(physics(run), device, args.repeats + 1)
+            eager = median_seconds(run.loop._work, device, 2)
+        rows.append(
+            {
+                "particles": model.particle_count,
+                "control steps": task.control_steps,
+                "substeps": task.control_steps * task.substeps,
+                "iteration ms": 1e3 * whole,
+                "physics ms": 1e3 * alone,
+                "physics share": alone / whole,
+                "eager ms": 1e3 * eager,
+            }
+        )
+    report("An iteration of learning in closed loop, float32", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""What does each feature of a scene cost when it is there? `python bench/features.py [--device cuda] [--json FILE]`
+
+Microseconds of a substep, forward and backward with everything kept, and their ratio to the scene with nothing but a neo-Hookean
+cube. What a scene lacks is not compiled (tests/softmpm/test_model.py), so the first row is also what each absence costs. The last
+rows hold the same cube in grids that are mostly empty.
+"""
+
+import torch
+from common import arguments, cube, report
+from gradient import measure
+
+import softmpm
+
+BARE = {"gravity": None}
+FLOOR = {"normal": (0.0, 1.0, 0.0), "offset": 0.3}
+FEATURES = {
+    "nothing": BARE,
+    "gravity": {},
+    "damping": BARE | {"damping": 0.1},
+    "wall": BARE | {"walls": [softmpm.Wall(**FLOOR, contact="slip")]},
+    "wall with friction": BARE | {"walls": [softmpm.Wall(**FLOOR, friction=0.5)]},
+    "six walls with friction": BARE
+    | {
+        "walls": [
+            softmpm.Wall(normal=tuple(s * (a == axis) for a in range(3)), offset=s * 0.5 - 0.4, friction=0.5)
+            for axis in range(3)
+            for s in (1.0, -1.0)
+        ]
+    },
+    "muscle": BARE | {"muscles": True},
+    "fixed corotated": BARE | {"law": softmpm.FixedCorotated},
+    "grid of 256³": BARE | {"domain": 256},
+    "grid of 1024³": BARE | {"domain": 1024},
+}
+
+
+def main():
+    args = arguments(__doc__)
+    device, rows = torch.device(args.device), []
+    gpu = device.type == "cuda"
+    particles, nodes, substeps = (64_000, 48, 128) if gpu else (1_000, 16, 20)
+    for name, features in FEATURES.items():
+        model = softmpm.build(
+            cube(3, particles, nodes, **features), device=device, memory_budget=2**62 if gpu else None
+        )
+        ahead, back = measure(model, substeps, args.repeats)
+        row = {"scene": name, "forward us": ahead, "backward us": back}
+        first = rows[0] if rows else row
+        for way in ("forward", "backward"):
+            row[f"{way} ratio"] = row[f"{way} us"] / first[f"{way} us"]
+        rows.append(row)
+        del model
+        if gpu:
+            torch.cuda.empty_cache()
+    report(f"Features, 3D, {particles} particles, float32", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()

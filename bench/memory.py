@@ -1,0 +1,60 @@
+"""What does a gradient through a thousand substeps cost with little memory? `python bench/memory.py [--device cuda] [--json FILE]`
+
+Peak memory of one call and its backward pass, and the time of both, against memory for everything where that fits.
+"""
+
+import time
+
+import torch
+from common import arguments, cube, report, sync, turning
+
+import softmpm
+from softmpm.horizon import Horizon
+from softmpm.memory import plan
+
+GIB = 2**30
+
+
+def main():
+    args = arguments(__doc__)
+    device, rows = torch.device(args.device), []
+    cases = [(64_000, 48, [32, 4, 1, 0.25]), (1_000_000, 96, [60, 6])]
+    substeps = 1000
+    if device.type == "cpu":
+        cases, substeps = [(1_000, 16, [1, 0.01])], 100
+    for particles, nodes, budgets in cases:
+        for budget in budgets:
+            model = softmpm.build(cube(3, particles, nodes), device=device, memory_budget=round(budget * GIB))
+            chosen = plan(Horizon(1, substeps), model.sizes(), model.budget)
+            start, params, seconds = turning(model), model.params(), []
+            start.v.requires_grad_()
+            for _ in range(2):  # the first compiles
+                if device.type == "cuda":
+                    torch.cuda.reset_peak_memory_stats()
+                sync(device)
+                begin = time.perf_counter()
+                end = softmpm.simulate(model, start, None, params, substeps=substeps)
+                torch.autograd.grad(end.x.sum(), start.v)
+                sync(device)
+                seconds.append(time.perf_counter() - begin)
+                del end
+            peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else 0
+            rows.append(
+                {
+                    "particles": model.particle_count,
+                    "substeps": substeps,
+                    "budget GiB": budget,
+                    "chunk": chosen.longest,
+                    "states kept": chosen.slots or "all",
+                    "peak GiB": peak / GIB,
+                    "forward and backward s": seconds[-1],
+                }
+            )
+            del model, start, params
+            if device.type == "cuda":
+                torch.cuda.empty_cache()
+    report("Gradient with little memory, float32", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()

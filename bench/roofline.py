@@ -1,0 +1,64 @@
+"""How far from the memory's speed is a substep? `python bench/roofline.py [--device cuda] [--json bench/results/roofline.json]`
+
+The copy bandwidth of the device, measured here, against the bytes that a forward substep of the cases of bench/step.py must move
+at least: every state read and written once, the material of a particle read once (16 B: volume, mass, μ, λ), the grid once.
+The reads of the grid by 3^dim nodes a particle, and all atomic additions, are taken to cost nothing. `floor us` is the time of these
+bytes at copy speed, `times floor` how often it fits into the measured substep. A scene that fits into the caches may beat its floor.
+"""
+
+import torch
+from common import arguments, cube, median_seconds, report
+from step import CASES, VARIANTS
+
+import softmpm
+
+MATERIAL_BYTES = 16
+"""Volume, mass, μ and λ of a particle in float32 [B]."""
+
+
+def copy_bandwidth(device: torch.device, repeats: int) -> float:
+    """Bytes read and written per second by a copy far larger than any cache."""
+    size = 2**31 if device.type == "cuda" else 2**28
+    source = torch.zeros(size, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    return 2 * size / median_seconds(lambda: target.copy_(source), device, max(repeats, 5))
+
+
+def least_bytes(model: softmpm.Model) -> int:
+    """What a forward substep has to move [B]."""
+    particles = model.worlds * model.particle_count
+    return 2 * model.state_bytes() + MATERIAL_BYTES * particles + model.node_bytes()
+
+
+def seconds(model: softmpm.Model, substeps: int, repeats: int) -> float:
+    """Of one forward substep, checks on."""
+    start, params, device = model.rest(), model.params(), model.device
+    activation = torch.full((1, 1, 1), 0.2, device=device) if model.muscle_count else None
+
+    def work():
+        with torch.no_grad():
+            softmpm.simulate(model, start, activation, params, substeps=substeps)
+
+    return median_seconds(work, device, repeats) / substeps
+
+
+def main():
+    args = arguments(__doc__)
+    device, rows = torch.device(args.device), []
+    bandwidth = copy_bandwidth(device, args.repeats)
+    substeps = 20 if device.type == "cpu" else 100
+    for dim, particles, nodes in CASES:
+        if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
+            continue
+        for name, features in VARIANTS.items():
+            model = softmpm.build(cube(dim, particles, nodes, **features), device=device)
+            least = least_bytes(model)
+            floor, taken = least / bandwidth, seconds(model, substeps, args.repeats)
+            row = {"dim": dim, "particles": model.particle_count, "nodes": nodes, "scene": name}
+            row |= {"MB": least / 1e6, "floor us": floor * 1e6, "us/substep": taken * 1e6}
+            rows.append(row | {"copy GB/s": bandwidth / 1e9, "times floor": taken / floor})
+    report(f"Forward against a copy at {bandwidth / 1e9:.0f} GB/s, float32", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()

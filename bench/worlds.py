@@ -1,0 +1,39 @@
+"""Do many small robots in one launch run as fast as one large one? `python bench/worlds.py [--device cuda] [--json FILE]`
+
+Millions of particles and substeps per second, forward and backward, everything kept; ``share`` is the throughput over that of the
+last row, one scene with as many particles as 64 worlds.
+"""
+
+import torch
+from common import arguments, cube, report
+from gradient import measure
+
+import softmpm
+
+
+def main():
+    args = arguments(__doc__)
+    device, rows = torch.device(args.device), []
+    gpu = device.type == "cuda"
+    small, large = (8_000, 512_000) if gpu else (1_000, 8_000)
+    cases = [(n, small, 32) for n in ((1, 8, 64, 256) if gpu else (1, 8))] + [(1, large, 96 if gpu else 32)]
+    substeps = 64 if gpu else 10
+    for worlds, particles, nodes in cases:
+        model = softmpm.build(
+            cube(3, particles, nodes), device=device, worlds=worlds, memory_budget=2**62 if gpu else None
+        )
+        total = worlds * model.particle_count
+        ahead, back = measure(model, substeps, args.repeats)
+        speed = {"forward M/s": total / ahead, "backward M/s": total / back}
+        rows.append({"worlds": worlds, "particles": model.particle_count} | speed)
+        del model
+        if gpu:
+            torch.cuda.empty_cache()
+    for row in rows:
+        for way in ("forward", "backward"):
+            row[f"{way} share"] = row[f"{way} M/s"] / rows[-1][f"{way} M/s"]
+    report("Worlds in one launch, 3D neo-Hookean, float32", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()
