@@ -49,7 +49,9 @@ def main():
             row["substeps"] = substeps
             for motion, start in (("falling us", model.rest()), ("turning us", turning(model))):
                 call = median_seconds(lambda s=start, m=model: run(m, s, 1), device, args.repeats)
-                whole = median_seconds(lambda s=start, m=model: run(m, s, substeps), device, args.repeats)
+                whole = median_seconds(
+                    lambda s=start, m=model, n=substeps: run(m, s, n), device, args.repeats
+                )
                 row[motion], row["call us"] = (whole - call) / (substeps - 1) * 1e6, call * 1e6
             rows.append(row)
             del model, start

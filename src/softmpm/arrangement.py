@@ -55,7 +55,7 @@ class Arrangement:
         grid = model.scene.grid.shape
         self._locate(x)
         low, high = self._ends.tolist()  # waits for the device
-        apart = [[h - b for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
+        apart = [[max(0, h - b) for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
         wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)])
         self.shape = tuple(min(n, max(w, k)) for n, w, k in zip(grid, wide, least or wide, strict=True))
         self.renew(x)

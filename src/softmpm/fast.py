@@ -47,13 +47,14 @@ class FastRun:
     """One chunk that ran; as long as it lives, its program keeps what is inside.
 
     Attributes:
-        start, end: State before and after it.
+        renewed: Whether the arrangement was made for its start.
+        start, end: State before and after it; the end is handed over once the run is kept.
         words: What the kernels reported, see watch.py; then cells met along the order of the particles, and whether one is
             near the window's edge; shape (world + 2,).
     """
 
-    def __init__(self, pool: Pool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
-        self.pool, self.chunk, self.start = pool, chunk, start
+    def __init__(self, pool: Pool, renewed: bool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
+        self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
         self.program = program = pool.take(chunk, keep)
         self.end = program.run(start, pull, solid)
         self.words = program.words
@@ -76,38 +77,48 @@ class Fast:
         )
 
     def run(self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool) -> FastRun:
-        return FastRun(self._arranged(start, chunk), chunk, start, pull, solid, keep)
+        renewed = self._arrange(start, chunk)
+        assert self._pool is not None
+        return FastRun(self._pool, renewed, chunk, start, pull, solid, keep)
 
-    def _arranged(self, start: State, chunk: Chunk) -> Pool:
+    def _arrange(self, start: State, chunk: Chunk) -> bool:
+        """See to it that there is an arrangement fit for use; whether it was made for this start."""
         if recording(self.model):
-            return self._arranged_blindly(start, chunk)
+            return self._arrange_blindly(start, chunk)
         self._recorded = LONGEST
         if self._pool is None:
             self._use(Arrangement(self.model, start.x))
         elif self._pool.arrangement.stale:
             self._pool.arrangement.renew(start.x)  # if they do not fit into the window, the call will say so
-        return self._pool
+        else:
+            return False
+        return True
 
-    def _arranged_blindly(self, start: State, chunk: Chunk) -> Pool:
+    def _arrange_blindly(self, start: State, chunk: Chunk) -> bool:
         """Inside a graph nobody can look whether the order is stale: it is renewed every so often."""
         if self._pool is None:
             raise RuntimeError(
                 "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work once "
                 "first, or let softmpm.Graph do it."
             )
-        if self._recorded >= LONGEST:
+        renew = self._recorded >= LONGEST
+        if renew:
             self._pool.arrangement.renew(start.x)
             self._recorded = 0
         self._recorded += chunk.length
-        return self._pool
+        return renew
 
     def _use(self, arrangement: Arrangement) -> None:
         if self._pool is None or arrangement is not self._pool.arrangement:
             self._pool = Pool(self.model, arrangement)
 
-    def grow(self, run: FastRun) -> None:
-        """A particle left the window during ``run``: take a larger one from now on."""
-        self._use(run.pool.arrangement.grown(run.start.x))
+    def widen(self, run: FastRun) -> None:
+        """A particle left the window during ``run``: put it around the start, or take a larger one if that was done before."""
+        arrangement = run.pool.arrangement
+        if run.renewed:
+            self._use(arrangement.grown(run.start.x))
+        else:
+            arrangement.renew(run.start.x)
 
 
 class _Local(threading.local):

@@ -46,33 +46,29 @@ class Graph(Generic[Result]):
             return self.work()
         if not self._warm:
             self._warm = True  # the first call makes what a recording must not: kernels, buffers, an order of the particles
-            return self._run(self.work)
-        if self._graph is None:
-            self._record()
-        return self._replay()
-
-    def _run(self, work: Callable):
-        """On the stream of the recording, which knows the buffers."""
-        self._stream.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.cuda.stream(self._stream):
-            result = work()
-        torch.cuda.current_stream(self.device).wait_stream(self._stream)
-        return result
-
-    def _record(self) -> None:
-        graph, ledger = torch.cuda.CUDAGraph(), open_ledger()
-        try:
-            torch.cuda.synchronize(self.device)
-            with torch.cuda.graph(graph, stream=self._stream):
-                self._result = self.work()
-                self._failed = torch.cat([words != NEVER for words in ledger.words]).any()
-        finally:
-            close_ledger()
-        self._graph, self._ledger = graph, ledger
-
-    def _replay(self) -> Result:
-        self._graph.replay()
+            return self._run(self._stream)
+        graph = self._graph = self._graph or self._record(self._stream)
+        graph.replay()
         if self._failed.item():
             self._graph = None
-            return self._run(self.work)
+            return self._run(self._stream)
         return self._result
+
+    def _run(self, stream: torch.cuda.Stream) -> Result:
+        """The work itself, on the stream of the recording, which knows the buffers."""
+        stream.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.cuda.stream(stream):
+            result = self.work()
+        torch.cuda.current_stream(self.device).wait_stream(stream)
+        return result
+
+    def _record(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
+        graph, self._ledger = torch.cuda.CUDAGraph(), open_ledger()
+        try:
+            torch.cuda.synchronize(self.device)
+            with torch.cuda.graph(graph, stream=stream):
+                self._result = self.work()
+                self._failed = torch.cat([words != NEVER for words in self._ledger.words]).any()
+        finally:
+            close_ledger()
+        return graph

@@ -9,13 +9,14 @@ from softmpm.kernels.types import Wanted
 from softmpm.model import Model
 from softmpm.state import State
 from softmpm.step import Substep
+from softmpm.watch import NEVER
 
 
 class PlainRun:
     """One chunk that ran.
 
     Attributes:
-        start, end: State before and after it.
+        start, end: State before and after it; the end is handed over once the run is kept.
         words: What the kernels reported, see watch.py; shape (world,).
     """
 
@@ -44,6 +45,7 @@ class PlainRun:
     def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
         model, chunk, step = self.model, self.chunk, self.step
+        step.watch_words.fill_(NEVER)
         adj_pull = torch.zeros_like(self.pull) if wanted.activation and self.pull is not None else None
         adjoints = MotionAdj.zeros(model), MotionAdj.zeros(model)
         structs, adj_struct = [adj.struct(model) for adj in adjoints], adj_solid.struct(model)

@@ -19,7 +19,7 @@ from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
 from softmpm.kernels.types import solid_types, types
 from softmpm.model import Model
-from softmpm.replay import Replay, recording
+from softmpm.replay import Launcher, Replay, recording
 from softmpm.state import Low, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
@@ -92,23 +92,13 @@ class Program:
                 solid.pull = view(row, t.real)
             self.solids.append(solid)
 
+    def calm(self) -> None:
+        """Forget what the kernels reported."""
+        self.words.copy_(self._calm)
+
     def solid(self, s: int):
         """Material and pull of substep ``s``."""
         return self.solids[self.chunk.row(s) if self.pull is not None else 0]
-
-    # -- launches ------------------------------------------------------------------------------------------------
-
-    def launch(self, kernel, dim, *inputs, stream=None, block_dim=256) -> None:
-        device = self.model.wp_device
-        wp.launch(
-            kernel,
-            dim=dim,
-            inputs=inputs,
-            device=device,
-            stream=stream,
-            block_dim=block_dim,
-            record_tape=False,
-        )
 
     @functools.cached_property
     def block(self) -> int:
@@ -120,26 +110,25 @@ class Program:
         """Threads of a launch over particles: whole blocks on a GPU, since warps work together."""
         return -(-self.total // self.block) * self.block if self.model.device.type == "cuda" else self.total
 
-    # -- forward -------------------------------------------------------------------------------------------------
-
     def run(self, start: State, pull: Tensor | None, solid: Solid) -> State:
         """All substeps from ``start``; the end in new tensors. Failures are in :attr:`words`."""
         model, stream, pack = self.model, stream_of(self.model.device), self.packing
+        launch = Launcher(model, stream)
         if recording(model) or self._version != self.arrangement.version:
             self.order.copy_(self.arrangement.order)
             self.origin.copy_(self.arrangement.origin)
             self._version = self.arrangement.version
-        self.words.copy_(self._calm)
-        if self.pull is not None:
+        self.calm()
+        if self.pull is not None and pull is not None:
             self.pull.copy_(pull)
         low = start.low or Low(torch.zeros_like(start.x), torch.zeros_like(start.F))
         arrays = self.state_arrays(*start, *low)
         given = Solid(solid.mass, solid.mu, solid.lam, None).struct(model)
-        self.launch(sorted_solid(model.spec), self.lead, self.order_array, given, self._solid, stream=stream)
+        launch(sorted_solid(model.spec), self.lead, self.order_array, given, self._solid)
         enter = (model.scale, self.window, self.order_array, *arrays, self.watch, self.packed[0])
-        self.launch(pack.enter, self.lead, *enter, stream=stream)
+        launch(pack.enter, self.lead, *enter)
         self._forward.run(stream)
-        return self._leave(stream)
+        return self._leave(launch)
 
     @property
     def packing(self):
@@ -149,33 +138,29 @@ class Program:
         t = self.types
         return [passing(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in tensors]
 
-    def _leave(self, stream) -> State:
+    def _leave(self, launch: Launcher) -> State:
         model, d, rounds = self.model, self.model.dim, self.model.dtype == torch.float32
         tails = 2 * [(d,)] + 2 * [(d, d)]
         out = [self._tensor(*self.lead, *tail) for tail in tails]
         low = [self._tensor(*(self.lead if rounds else (0, 0)), *tail) for tail in ((d,), (d, d))]
         report = passing(self.words[-2:], wp.int64)
         leave = (self.window, self.order_array, self.packed[-1], *self.state_arrays(*out, *low), report)
-        self.launch(self.packing.leave, self.lead, model.scale, *leave, stream=stream)
+        launch(self.packing.leave, self.lead, model.scale, *leave)
         state = State(*out)
         return state.with_low(Low(*low)) if rounds else state
 
-    def _launch_all(self, stream) -> None:
+    def _launch_all(self, launch: Launcher) -> None:
         nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec)
-        self._over_nodes(kernels.clear, nodes[0], stream=stream)
-        self._advance(-1, stream)
+        held = len(self.velocity)
+        launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
+        self._advance(-1, launch)
         for s in range(length):
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
-            parameters = (self.model.scale, self.model.walls, self.window)
-            self._over_nodes(
-                kernels.grid_velocity, *parameters, now, self.velocity_array, then, stream=stream
-            )
-            self._advance(s, stream)
+            arguments = (self.model.scale, self.model.walls, self.window, now, self.velocity_array, then)
+            launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
+            self._advance(s, launch)
 
-    def _over_nodes(self, kernel, *arguments, stream) -> None:
-        self.launch(kernel, len(self.velocity), *arguments, stream=stream, block_dim=BLOCK)
-
-    def _advance(self, s: int, stream) -> None:
+    def _advance(self, s: int, launch: Launcher) -> None:
         """G2P of substep ``s`` and P2G of the next; the P2G of the first if ``s`` is -1."""
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (max(s, 0), s + 1) if self.keep else (0, 0)
@@ -184,5 +169,4 @@ class Program:
         sizes = (model.particle_count, self.total, self.order_flat)
         states = (packed[now], self.watch, packed[then])
         arguments = (*parameters, *sizes, self.velocity_array, *states, nodes[(s + 1) % len(nodes)])
-        kernel = fused(model.spec).advance
-        self.launch(kernel, self.threads, *arguments, stream=stream, block_dim=self.block)
+        launch(fused(model.spec).advance, self.threads, *arguments, block_dim=self.block)

@@ -10,7 +10,7 @@ from softmpm.kernels.native import BLOCK
 from softmpm.kernels.solid import collect_pull, sorted_solid_adj
 from softmpm.kernels.types import Wanted
 from softmpm.program import Program
-from softmpm.replay import Replay
+from softmpm.replay import Launcher, Replay
 from softmpm.state import State
 from softmpm.step import stream_of
 
@@ -52,57 +52,45 @@ class ProgramAdj:
         """Adjoint of the start in new tensors, and of the pull (control step, world, muscle); adds into ``adj_solid``."""
         program, scratch = self.program, self.scratch
         model, stream, pack = program.model, stream_of(program.model.device), program.packing
+        launch = Launcher(model, stream)
         for tensor in scratch.tensors:
             clear(tensor)
         if self.adj_pull is not None:
             clear(self.adj_pull)
+        program.calm()
         order, arrays = program.order_array, program.state_arrays(*adj_end)
-        program.launch(
-            pack.enter_adj, program.lead, model.scale, order, *arrays, scratch.adj_array, stream=stream
-        )
+        launch(pack.enter_adj, program.lead, model.scale, order, *arrays, scratch.adj_array)
         self._backward.run(stream)
         start = State(*(torch.empty_like(adj) for adj in adj_end))
         arrays = program.state_arrays(*start)
-        program.launch(
-            pack.leave_adj, program.lead, model.scale, order, scratch.adj_array, *arrays, stream=stream
-        )
+        launch(pack.leave_adj, program.lead, model.scale, order, scratch.adj_array, *arrays)
         if self.wanted.material:
-            kernel = sorted_solid_adj(model.spec, self.wanted)
             structs = scratch.solid_struct, adj_solid.struct(model)
-            program.launch(kernel, program.lead, order, *structs, stream=stream)
+            launch(sorted_solid_adj(model.spec, self.wanted), program.lead, order, *structs)
         return start, None if self.adj_pull is None else self.adj_pull.clone()
 
-    def _launch_all(self, stream) -> None:
+    def _launch_all(self, launch: Launcher) -> None:
         for s in range(self.program.chunk.length, -1, -1):
-            self._grid(s, stream)
-            self._particles(s, stream)
+            self._grid(s, launch)
+            self._particles(s, launch)
             if self.adj_pull is not None and s < self.program.chunk.length:
-                self._collect(s, stream)
+                self._collect(s, launch)
 
-    def _grid(self, s: int, stream) -> None:
+    def _grid(self, s: int, launch: Launcher) -> None:
         """Adjoint of the nodes of substep ``s``, velocity of the nodes of the substep before."""
         program, nothing, (here, before) = self.program, self.program.nothing, self._adj_nodes(s)
-        model, nodes = program.model, program.node_arrays
+        model, nodes, velocity = program.model, program.node_arrays, self.scratch.velocity_array
         last, first = s == program.chunk.length, s == 0
-        if last and first:
-            return
         now, then = nothing if last else nodes[s], nothing if first else nodes[s - 1]
-        arguments = (model.scale, model.walls, program.window, now, then, here)
-        program.launch(
-            fused_adj(model.spec, self.wanted).grid_velocity_adj,
-            len(self.scratch.velocity),
-            *arguments,
-            self.scratch.velocity_array,
-            before,
-            stream=stream,
-            block_dim=BLOCK,
-        )
+        arguments = (model.scale, model.walls, program.window, now, then, here, velocity, before)
+        kernel = fused_adj(model.spec, self.wanted).grid_velocity_adj
+        launch(kernel, len(self.scratch.velocity), *arguments, block_dim=BLOCK)
 
     def _adj_nodes(self, s: int) -> tuple[wp.array, wp.array]:
         """Adjoint grids of substep ``s`` and of the one before."""
         return self.scratch.node_arrays[s % 2], self.scratch.node_arrays[(s + 1) % 2]
 
-    def _particles(self, s: int, stream) -> None:
+    def _particles(self, s: int, launch: Launcher) -> None:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
         model, length = program.model, program.chunk.length
@@ -114,12 +102,12 @@ class ProgramAdj:
         out = (program.watch, scratch.solid_struct, before)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
-        program.launch(kernel, program.threads, *arguments, stream=stream, block_dim=program.block)
+        launch(kernel, program.threads, *arguments, block_dim=program.block)
 
-    def _collect(self, s: int, stream) -> None:
+    def _collect(self, s: int, launch: Launcher) -> None:
         """Where a control step begins, add what the particles found for its pull."""
         program, chunk = self.program, self.program.chunk
-        if s == 0 or chunk.row(s - 1) != chunk.row(s):
-            slot = self.scratch.solid.slot
+        slot = self.scratch.solid.slot
+        if slot is not None and (s == 0 or chunk.row(s - 1) != chunk.row(s)):
             arrays = program.muscle_array, view(slot, program.types.real), self._adj_rows[chunk.row(s)]
-            program.launch(collect_pull(program.model.spec), tuple(slot.shape), *arrays, stream=stream)
+            launch(collect_pull(program.model.spec), tuple(slot.shape), *arrays)

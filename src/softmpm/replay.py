@@ -1,15 +1,11 @@
 """A fixed list of launches, recorded as a graph when it first runs and replayed afterwards, on a GPU and on the CPU."""
 
-import threading
 from collections.abc import Callable
 
 import torch
 import warp as wp
 
 from softmpm.model import Model
-
-_recording = threading.Lock()
-"""Warp records one CPU graph at a time."""
 
 
 def recording(model: Model) -> bool:
@@ -46,30 +42,60 @@ def note(words: torch.Tensor) -> None:
     _open[-1].words.append(words)
 
 
-class Replay:
-    """Calls ``launches(stream)`` once to record it.
+class Launcher:
+    """Launches kernels on one stream, or collects the launches to be repeated later."""
 
-    While PyTorch itself records a CUDA graph, the launches become part of that one.
+    def __init__(self, model: Model, stream: wp.Stream | None, collected: list | None = None):
+        self.device, self.stream, self.collected = model.wp_device, stream, collected
+
+    def __call__(self, kernel, dim, *inputs, block_dim: int = 256) -> None:
+        collect = self.collected is not None
+        launch = wp.launch(
+            kernel,
+            dim,
+            inputs,
+            device=self.device,
+            stream=self.stream,
+            block_dim=block_dim,
+            record_tape=False,
+            record_cmd=collect,
+        )
+        if self.collected is not None:
+            self.collected.append(launch)
+
+
+class Replay:
+    """Runs ``launches(launcher)`` the first time to record it, as a CUDA graph or, on the CPU, as a list of launches.
+
+    While PyTorch itself records a CUDA graph, the launches become part of that one. Warp's CPU graphs would be faster still, but
+    take up what other threads launch meanwhile.
     """
 
-    def __init__(self, model: Model, launches: Callable[[wp.Stream | None], None]):
+    def __init__(self, model: Model, launches: Callable[[Launcher], None]):
         self.model, self.launches = model, launches
         self._graph: wp.Graph | None = None
+        self._list: list | None = None
 
     def run(self, stream: wp.Stream | None) -> None:
-        if recording(self.model):
-            self.launches(stream)
-            return
-        if self._graph is None:
-            self._graph = self._record()
-        wp.capture_launch(self._graph, stream=stream)
+        if stream is None:
+            self._run_list()
+        elif recording(self.model):
+            self.launches(Launcher(self.model, stream))
+        else:
+            if self._graph is None:
+                self._graph = self._record()
+            wp.capture_launch(self._graph, stream=stream)
+
+    def _run_list(self) -> None:
+        if self._list is None:
+            self._list = []
+            self.launches(Launcher(self.model, None, self._list))
+        for launch in self._list:
+            launch.launch()
 
     def _record(self) -> wp.Graph:
-        if self.model.device.type == "cpu":
-            with _recording, wp.ScopedCapture(device=self.model.wp_device) as capture:
-                self.launches(None)
-            return capture.graph
         stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
         with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-            self.launches(stream)
+            self.launches(Launcher(self.model, stream))
+        assert capture.graph is not None
         return capture.graph

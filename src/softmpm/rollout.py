@@ -32,7 +32,7 @@ class Trail:
 
     def keep(self, run: FastRun | PlainRun) -> None:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
-        run.end = None
+        del run.end
         self.runs.append(run)
 
 
@@ -58,7 +58,7 @@ class _Runner:
         if isinstance(run, FastRun) and isinstance(self.scheme, Fast):
             *words, cells, near_edge = words
             if outgrown(words):
-                self.scheme.grow(run)
+                self.scheme.widen(run)
                 return False
             run.pool.arrangement.judge(cells, bool(near_edge))
         raise_failure(self.model, words, run.end, run.chunk.first)
@@ -69,7 +69,7 @@ class _Runner:
         while True:
             run = self.run(chunk, start, keep)
             if recording(self.model):
-                note(run.words[: self.model.worlds])
+                note(run.words[: self.model.worlds].clone())  # the backward pass uses them anew
                 return run
             if self.settled(run, Report(run.words)):
                 return run
@@ -97,8 +97,10 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
         return _recorded(runner, trail, start, stays, inside), trail if keep else None
     state, k, before = start, 0, None
     while k < len(trail.chunks) or before is not None:
-        ahead = runner.run(trail.chunks[k], state, inside) if k < len(trail.chunks) else None
-        report = Report(ahead.words) if ahead is not None else None
+        ahead = None
+        if k < len(trail.chunks):
+            run = runner.run(trail.chunks[k], state, inside)
+            ahead = run, Report(run.words)
         if before is not None and not runner.settled(*before):
             k, state, before = k - 1, before[0].start, None  # what ran ahead of it is void
             continue
@@ -106,8 +108,9 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
             trail.keep(before[0])
         if k in stays:
             trail.states[k] = state
-        before = None if ahead is None else (ahead, report)
-        state, k = (state, k) if ahead is None else (ahead.end, k + 1)
+        if ahead is not None:
+            state, k = ahead[0].end, k + 1
+        before = ahead
     return state, trail if keep else None
 
 
@@ -146,9 +149,11 @@ def rollout_adj(
     reports = []
     for run in _inside_out(trail, _Runner(model, pull, solid)):
         adj, part = run.pull_back(adj, adj_solid, wanted)
-        if adj_pull is not None:
+        if adj_pull is not None and part is not None:
             adj_pull[run.chunk.rows] += part
-        if not recording(model):
+        if recording(model):
+            note(run.words[: model.worlds])
+        else:
             reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
     for report, last in reports:
         words = report.read()[: model.worlds]

@@ -235,7 +235,6 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             origin = window.origin[world]
             held = world * window.count
             old_fx = load_vec(before.rows, i, row_fx)
-            old_H = load_mat(before.rows, i, row_H)
             if not start:
                 first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
             adj = ParticleAdj()
@@ -272,7 +271,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
                 store_mat(adj_now, i, row_C, adj.C)
             else:
                 g = centre(old_fx)
-                adj = moved_adj(scale, old_H, C, adj)
+                adj = moved_adj(scale, load_mat(before.rows, i, row_H), C, adj)
                 B = adj.C
                 b = adj.v - B * g
                 sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))

@@ -136,16 +136,22 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         """Where particles are: keys to sort by, and the first and last base node of each world along each axis."""
         world, p = wp.tid()
         cell = int(0)
+        base = ivec()
+        on_grid = bool(True)
         for axis in range(dim):
             last = scale.shape[axis] - 3
             there = wp.float64(sorted_x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5)
             cell = cell * scale.shape[axis] + wp.clamp(int(wp.floor(there)), 0, last)
-            here = wp.float64(x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5)
-            base = wp.clamp(int(wp.floor(here)), 0, last)
-            if base < low[world, axis]:
-                wp.atomic_min(low, world, axis, base)
-            if base > high[world, axis]:
-                wp.atomic_max(high, world, axis, base)
+            here = wp.floor(wp.float64(x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5))
+            if here >= wp.float64(0.0) and here <= wp.float64(last):
+                base[axis] = int(here)
+            else:
+                on_grid = False  # it will be refused; no memory is taken for it
+        for axis in range(dim):
+            if on_grid and base[axis] < low[world, axis]:
+                wp.atomic_min(low, world, axis, base[axis])
+            if on_grid and base[axis] > high[world, axis]:
+                wp.atomic_max(high, world, axis, base[axis])
         key[world, p] = cell
 
     @wp.kernel(module=module, enable_backward=False)

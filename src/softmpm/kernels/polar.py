@@ -114,11 +114,15 @@ def _polar3(dtype: str) -> SimpleNamespace:
             z[2], F[0, 2] + F[2, 0], F[1, 2] + F[2, 1], real(2.0) * F[2, 2] - s,
         )  # fmt: skip
         X = wp.inverse(M)  # ≈ −q qᵀ / (close ℓ)
-        column = int(0)
+        least = X[0, 0]
+        column = quat(X[0, 0], X[1, 0], X[2, 0], X[3, 0])
         for i in range(1, 4):
-            if X[i, i] < X[column, column]:
-                column = i
-        q = X * quat(X[0, column], X[1, column], X[2, column], X[3, column])
+            if X[i, i] < least:
+                least = X[i, i]
+                column = quat(
+                    X[0, i], X[1, i], X[2, i], X[3, i]
+                )  # a column by its number would be kept in memory
+        q = X * column
         length = wp.length(q)
         if not length > real(0.0):
             return quat(real(1.0), real(0.0), real(0.0), real(0.0))  # F = 0: every rotation is a maximiser
