@@ -5,6 +5,7 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.buffers import SolidAdj, clear, view
+from softmpm.exact import Exact
 from softmpm.kernels.fused import fused_adj
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.solid import collect_pull, sorted_solid_adj
@@ -31,6 +32,9 @@ class Scratch:
         self.adj_array = view(self.adj, t.real)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_array = view(self.velocity, t.aligned)
+        self.exact = None
+        if model.spec.deterministic:
+            self.exact = Exact(model, self.adj_array, self.node_arrays)
         self.solid_struct = self.solid.struct(model)
         self.tensors = [
             v for v in (self.solid.mass, self.solid.mu, self.solid.lam, self.solid.slot) if v is not None
@@ -54,6 +58,8 @@ class ProgramAdj:
         model, stream, pack = program.model, stream_of(program.model.device), program.packing
         for tensor in scratch.tensors:
             clear(tensor)
+        if scratch.exact is not None:
+            scratch.exact.begin(None)
         if self.adj_pull is not None:
             clear(self.adj_pull)
         order, arrays = program.order_array, program.state_arrays(*adj_end)
@@ -82,7 +88,9 @@ class ProgramAdj:
     def _grid(self, s: int, stream) -> None:
         """Adjoint of the nodes of substep ``s``, velocity of the nodes of the substep before."""
         program, nothing, (here, before) = self.program, self.program.nothing, self._adj_nodes(s)
-        model, nodes = program.model, program.node_arrays
+        model, nodes, exact = program.model, program.node_arrays, self.scratch.exact
+        if exact is not None:
+            here, before = exact.sums(s), nothing
         last, first = s == program.chunk.length, s == 0
         if last and first:
             return
@@ -105,16 +113,19 @@ class ProgramAdj:
     def _particles(self, s: int, stream) -> None:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
-        model, length = program.model, program.chunk.length
+        model, length, exact = program.model, program.chunk.length, scratch.exact
+        sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
         parameters = (model.scale, solid, program.window, length - 1 - s, start, end)
         sizes = (model.particle_count, program.total, program.order_flat)
         states = (program.packed[max(s - 1, 0)], program.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
-        out = (program.watch, scratch.solid_struct, before)
+        out = (program.watch, scratch.solid_struct, sink)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
         program.launch(kernel, program.threads, *arguments, stream=stream, block_dim=program.block)
+        if exact is not None and not start:
+            exact.push(program, s - 1, states[0], None, stream)
 
     def _collect(self, s: int, stream) -> None:
         """Where a control step begins, add what the particles found for its pull."""
