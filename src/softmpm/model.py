@@ -276,7 +276,6 @@ class Model:
         ]
         return "\n".join(lines)
 
-
     def _sums(self) -> str:
         if self.spec.deterministic:
             return "in fixed point: deterministic, the same bits from run to run"

@@ -8,7 +8,7 @@ from softmpm.buffers import SolidAdj, clear, view
 from softmpm.exact import Exact
 from softmpm.kernels.fused import fused_adj
 from softmpm.kernels.native import BLOCK
-from softmpm.kernels.solid import collect_pull, sorted_solid_adj
+from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, sorted_solid_adj
 from softmpm.kernels.types import Wanted
 from softmpm.program import Program
 from softmpm.replay import Replay
@@ -50,6 +50,10 @@ class ProgramAdj:
         if wanted.activation and program.pull is not None:
             self.adj_pull = torch.zeros_like(program.pull)
             self._adj_rows = [view(row, program.types.real) for row in self.adj_pull]
+            if program.model.spec.deterministic:
+                self._parts = view(
+                    self.adj_pull.new_empty(*self.adj_pull.shape[1:], PARTS), program.types.real
+                )
         self._backward = Replay(program.model, self._launch_all)
 
     def run(self, adj_end: State, adj_solid: SolidAdj) -> tuple[State, Tensor | None]:
@@ -130,7 +134,13 @@ class ProgramAdj:
     def _collect(self, s: int, stream) -> None:
         """Where a control step begins, add what the particles found for its pull."""
         program, chunk = self.program, self.program.chunk
-        if s == 0 or chunk.row(s - 1) != chunk.row(s):
-            slot = self.scratch.solid.slot
-            arrays = program.muscle_array, view(slot, program.types.real), self._adj_rows[chunk.row(s)]
-            program.launch(collect_pull(program.model.spec), tuple(slot.shape), *arrays, stream=stream)
+        if s != 0 and chunk.row(s - 1) == chunk.row(s):
+            return
+        spec, real, slot = program.model.spec, program.types.real, self.scratch.solid.slot
+        found, row = (program.muscle_array, view(slot, real)), self._adj_rows[chunk.row(s)]
+        if spec.deterministic:
+            in_order = collect_pull_in_order(spec)
+            program.launch(in_order.parts, self._parts.shape, *found, self._parts, stream=stream)
+            program.launch(in_order.total, row.shape, self._parts, row, stream=stream)
+        else:
+            program.launch(collect_pull(spec), tuple(slot.shape), *found, row, stream=stream)
