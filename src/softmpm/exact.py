@@ -21,7 +21,7 @@ class Exact:
 
     def __init__(self, model: Model, rows: wp.array, nodes: Sequence[wp.array]):
         f, device = fixed(model.dim), model.device
-        self.model = model
+        self.model, self.rows = model, rows
         self.fixed = torch.zeros(len(nodes[0]), 4, dtype=torch.int64, device=device)
         self.largest = torch.zeros(2, model.worlds, 2, device=device)
         self._none = view(torch.empty(0, 0, device=device), wp.float32)

@@ -49,11 +49,11 @@ def _sums(model: Model, step: Substep, motion: Motion, now) -> Tensor:
         step.launch(kernels.splat, step.particles, model.scale, mass, now, nodes)
         return node
     node = torch.zeros(shape, dtype=torch.int64, device=model.device)
-    weights = (model.params().density * model.volume).contiguous()
-    units = _units(model, weights, motion)
-    arguments = (view(weights, types(model.dim, model.spec.dtype).real), view(units, wp.float64), now)
+    units = _units(model, model.mass, motion)
+    arguments = (view(model.mass, types(model.dim, model.spec.dtype).real), view(units, wp.float64), now)
     step.launch(kernels.splat_fixed, step.particles, model.scale, *arguments, view(node, wp.int64))
-    return (node * units[:, None, [0] * model.dim + [1]]).to(model.dtype)
+    momentum, mass = (unit[:, None, None] for unit in units.unbind(1))
+    return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
 
 
 def rasterize_nodes(model: Model, state: State) -> GridField:

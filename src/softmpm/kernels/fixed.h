@@ -116,13 +116,16 @@ template <unsigned DIM> CUDA_CALLABLE inline wp::vec_t<4, float> take_fixed(cons
     Power momentum(-b), mass(-m);
     if (b == NOT_FINITE || m == NOT_FINITE)
         momentum.a = mass.a = real_of(0x7fc00000);
-    long long* p = f.at + 4 * (long long)i;
-    long long sum[4] = { p[0], p[1], p[2], p[3] };
-    if (sum[0] | sum[1] | sum[2] | sum[3])
-        p[0] = p[1] = p[2] = p[3] = 0;
+    struct alignas(16) Pair {
+        long long a, b;
+    };
+    Pair* p = reinterpret_cast<Pair*>(f.at + 4 * (long long)i);
+    Pair xy = p[0], zm = p[1];
+    if (xy.a | xy.b | zm.a | zm.b)  // most nodes are empty
+        p[0] = p[1] = { 0, 0 };
     return wp::vec_t<4, float>(
-        momentum(float(sum[0])), momentum(float(sum[1])), DIM == 2 ? mass(float(sum[2])) : momentum(float(sum[2])),
-        DIM == 2 ? 0.0f : mass(float(sum[3])));
+        momentum(float(xy.a)), momentum(float(xy.b)), DIM == 2 ? mass(float(zm.a)) : momentum(float(zm.a)),
+        DIM == 2 ? 0.0f : mass(float(zm.b)));
 }
 
 // Raise largest[slot] to the value, to infinity if it is not finite. The whole warp must come here together: those that
