@@ -88,7 +88,9 @@ class Fast:
         self._recorded = LONGEST
         if self._pool is None:
             self._use(Arrangement(self.model, start.x))
-        elif self._pool.arrangement.stale:
+        elif (
+            self._pool.arrangement.stale or self.model.deterministic
+        ):  # else the order would tell what ran before
             self._pool.arrangement.renew(start.x)  # if they do not fit into the window, the call will say so
         else:
             return False
@@ -101,7 +103,7 @@ class Fast:
                 "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work once "
                 "first, or let softmpm.Graph do it."
             )
-        renew = self._recorded >= LONGEST
+        renew = self._recorded >= LONGEST or self.model.deterministic
         if renew:
             self._pool.arrangement.renew(start.x)
             self._recorded = 0

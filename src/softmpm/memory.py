@@ -126,6 +126,10 @@ def memory(model, horizon) -> Memory:
         sizes.inside * (1 if model.scheme == "fast" else 2) + 3 * sizes.nodes + 2 * material + state + low
     )
     adjoints = 2 * state + 2 * material + pull + 3 * sizes.nodes + sizes.inside
-    return Memory(
-        forward, chosen.kept + 2 * material, chosen.kept + chosen.recomputed + 2 * material + state + adjoints
-    )
+    kept = chosen.kept
+    if model.spec.deterministic:  # each program adds up in fixed point, and so does the backward pass
+        own = sizes.inside + 2 * sizes.nodes
+        forward += own
+        kept += own * (len(horizon.chunks(chosen.longest)) if chosen.keep_all else 1)
+        adjoints += 2 * sizes.nodes
+    return Memory(forward, kept + 2 * material, kept + chosen.recomputed + 2 * material + state + adjoints)

@@ -29,6 +29,7 @@ def build(
     worlds: int = 1,
     memory_budget: int | None = None,
     scheme: str = "auto",
+    deterministic: bool = False,
 ) -> "Model":
     """Make a scene ready to run.
 
@@ -41,6 +42,8 @@ def build(
             see docs/memory.md.
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
+        deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
+            scheme. The CPU adds in one order anyway. See docs/conventions.md.
 
     Returns:
         The model: immutable, shared by any number of simulations.
@@ -58,7 +61,7 @@ def build(
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     warn_unstable(scene)
-    return Model(scene, _device(device), dtype, worlds, memory_budget, scheme)
+    return Model(scene, _device(device), dtype, worlds, memory_budget, scheme, deterministic)
 
 
 def _device(device: str | torch.device | None) -> torch.device:
@@ -86,6 +89,7 @@ class Model:
         volume: Rest volumes V⁰ [m³], shape (particle,).
         body: Index of each particle's body, shape (particle,).
         spec: What the kernels are specialised for.
+        deterministic: Whether results are the same bits from run to run.
     """
 
     def __init__(
@@ -96,6 +100,7 @@ class Model:
         worlds: int,
         memory_budget: int | None,
         scheme: str,
+        deterministic: bool = False,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
         self.memory_budget = memory_budget
@@ -109,7 +114,9 @@ class Model:
         self.positions = self._tensor(self._exact_positions)
         self.volume = self._tensor(np.concatenate([body.particles.volume for body in scene.bodies]))
         slots = _muscle_slots(scene, self.particle_count)
-        self.spec = _spec(scene, dtype, slots.shape[1])
+        self.scheme, self.scheme_reason = self._scheme(scheme)
+        self.deterministic = deterministic
+        self.spec = _spec(scene, dtype, slots.shape[1], deterministic and self._in_fixed_point())
         self.muscle_slots = torch.from_numpy(slots).to(device)
         self.fibre = self._tensor([m.direction for m in scene.muscles]).reshape(-1, self.dim)
         self.strength = self._tensor([m.strength for m in scene.muscles])
@@ -118,7 +125,6 @@ class Model:
         wp.init()
         self.wp_device = wp.device_from_torch(device)
         self.scale, self.walls = self._scale(), self._walls()
-        self.scheme, self.scheme_reason = self._scheme(scheme)
 
     def _tensor(self, values) -> Tensor:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
@@ -201,6 +207,18 @@ class Model:
             return "plain", "double precision gains nothing from 16-byte reductions"
         return "fast", "single precision"
 
+    def _in_fixed_point(self) -> bool:
+        """Whether a deterministic model has to sum in fixed point; an error if it cannot."""
+        if self.scheme == "fast" and self.dtype == torch.float32:
+            return True
+        if self.device.type == "cpu":
+            return False
+        raise ValueError(
+            "deterministic=True needs torch.float32 and the fast scheme on a GPU, because only its sums are in fixed point; "
+            f"got {self.dtype} and scheme {self.scheme!r} ({self.scheme_reason}). Change these, or use device='cpu', which adds "
+            "in one order, or build without it."
+        )
+
     @property
     def budget(self) -> int:
         """Bytes that one call may keep for its backward pass."""
@@ -253,10 +271,18 @@ class Model:
             "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
             f"  dt         {self.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
             f"  scheme     {self.scheme}: {self.scheme_reason}; {self.held_nodes} nodes of each world in memory",
+            f"  sums       {self._sums()}",
             f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, "
             f"{mib['backward']} at the peak",
         ]
         return "\n".join(lines)
+
+    def _sums(self) -> str:
+        if self.spec.deterministic:
+            return "in fixed point: deterministic, the same bits from run to run"
+        if self.device.type == "cpu":
+            return "in floating point, in one order: the same bits from run to run"
+        return "in floating point, in any order: the last bits vary; deterministic=True makes them repeat"
 
 
 def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
@@ -272,7 +298,7 @@ def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
     return slots
 
 
-def _spec(scene: Scene, dtype: torch.dtype, slots: int) -> Spec:
+def _spec(scene: Scene, dtype: torch.dtype, slots: int, fixed_point: bool) -> Spec:
     laws = {LAWS[type(body.material)] for body in scene.bodies}
     contacts = {wall.contact for wall in scene.walls}
     return Spec(
@@ -284,4 +310,5 @@ def _spec(scene: Scene, dtype: torch.dtype, slots: int) -> Spec:
         friction=any(wall.friction > 0 for wall in scene.walls),
         gravity=any(g != 0 for g in scene.gravity or ()),
         damping=scene.damping > 0,
+        deterministic=fixed_point,
     )

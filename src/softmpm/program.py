@@ -12,6 +12,7 @@ from torch import Tensor
 
 from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid, passing, view
+from softmpm.exact import Exact
 from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
 from softmpm.kernels.native import BLOCK, FEW, WARP
@@ -54,6 +55,9 @@ class Program:
         rows = chunk.row(chunk.length - 1) + 1
         self.pull = tensor(rows, model.worlds, model.muscle_count) if model.muscle_count else None
         self._structs()
+        self.exact = None
+        if model.spec.deterministic:
+            self.exact = Exact(model, view(tensor(padded * t.rows), t.real), self.node_arrays)
         self._forward = Replay(model, self._launch_all)
 
     def _structs(self) -> None:
@@ -127,6 +131,8 @@ class Program:
         launch(sorted_solid(model.spec), self.lead, self.order_array, given, self._solid)
         enter = (model.scale, self.window, self.order_array, *arrays, self.watch, self.packed[0])
         launch(pack.enter, self.lead, *enter)
+        if self.exact is not None:
+            self.exact.begin(solid.mass)
         self._forward.run(stream)
         return self._leave(launch)
 
@@ -152,10 +158,13 @@ class Program:
     def _launch_all(self, launch: Launcher) -> None:
         nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec)
         held = len(self.velocity)
-        launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
+        if self.exact is None:
+            launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
         self._advance(-1, launch)
         for s in range(length):
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
+            if self.exact is not None:
+                now, then = self.exact.sums(s), self.nothing
             arguments = (self.model.scale, self.model.walls, self.window, now, self.velocity_array, then)
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
@@ -168,5 +177,8 @@ class Program:
         parameters = (model.scale, solid, self.window, s, s + 1 == length)
         sizes = (model.particle_count, self.total, self.order_flat)
         states = (packed[now], self.watch, packed[then])
-        arguments = (*parameters, *sizes, self.velocity_array, *states, nodes[(s + 1) % len(nodes)])
+        sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
+        arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
         launch(fused(model.spec).advance, self.threads, *arguments, block_dim=self.block)
+        if self.exact is not None and s + 1 < length:
+            self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

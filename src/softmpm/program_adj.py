@@ -5,9 +5,10 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.buffers import SolidAdj, clear, view
+from softmpm.exact import Exact
 from softmpm.kernels.fused import fused_adj
 from softmpm.kernels.native import BLOCK
-from softmpm.kernels.solid import collect_pull, sorted_solid_adj
+from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, sorted_solid_adj
 from softmpm.kernels.types import Wanted
 from softmpm.program import Program
 from softmpm.replay import Launcher, Replay
@@ -31,6 +32,9 @@ class Scratch:
         self.adj_array = view(self.adj, t.real)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_array = view(self.velocity, t.aligned)
+        self.exact = None
+        if model.spec.deterministic:
+            self.exact = Exact(model, self.adj_array, self.node_arrays)
         self.solid_struct = self.solid.struct(model)
         self.tensors = [
             v for v in (self.solid.mass, self.solid.mu, self.solid.lam, self.solid.slot) if v is not None
@@ -46,6 +50,10 @@ class ProgramAdj:
         if wanted.activation and program.pull is not None:
             self.adj_pull = torch.zeros_like(program.pull)
             self._adj_rows = [view(row, program.types.real) for row in self.adj_pull]
+            if program.model.spec.deterministic:
+                self._parts = view(
+                    self.adj_pull.new_empty(*self.adj_pull.shape[1:], PARTS), program.types.real
+                )
         self._backward = Replay(program.model, self._launch_all)
 
     def run(self, adj_end: State, adj_solid: SolidAdj) -> tuple[State, Tensor | None]:
@@ -55,6 +63,8 @@ class ProgramAdj:
         launch = Launcher(model, stream)
         for tensor in scratch.tensors:
             clear(tensor)
+        if scratch.exact is not None:
+            scratch.exact.begin(None)
         if self.adj_pull is not None:
             clear(self.adj_pull)
         program.calm()
@@ -80,6 +90,8 @@ class ProgramAdj:
         """Adjoint of the nodes of substep ``s``, velocity of the nodes of the substep before."""
         program, nothing, (here, before) = self.program, self.program.nothing, self._adj_nodes(s)
         model, nodes, velocity = program.model, program.node_arrays, self.scratch.velocity_array
+        if self.scratch.exact is not None:
+            here, before = self.scratch.exact.sums(s), nothing
         last, first = s == program.chunk.length, s == 0
         now, then = nothing if last else nodes[s], nothing if first else nodes[s - 1]
         arguments = (model.scale, model.walls, program.window, now, then, here, velocity, before)
@@ -93,21 +105,31 @@ class ProgramAdj:
     def _particles(self, s: int, launch: Launcher) -> None:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
-        model, length = program.model, program.chunk.length
+        model, length, exact = program.model, program.chunk.length, scratch.exact
+        sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
         parameters = (model.scale, solid, program.window, length - 1 - s, start, end)
         sizes = (model.particle_count, program.total, program.order_flat)
         states = (program.packed[max(s - 1, 0)], program.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
-        out = (program.watch, scratch.solid_struct, before)
+        out = (program.watch, scratch.solid_struct, sink)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
         launch(kernel, program.threads, *arguments, block_dim=program.block)
+        if exact is not None and not start:
+            exact.push(program, s - 1, states[0], None, launch)
 
     def _collect(self, s: int, launch: Launcher) -> None:
         """Where a control step begins, add what the particles found for its pull."""
         program, chunk = self.program, self.program.chunk
         slot = self.scratch.solid.slot
-        if slot is not None and (s == 0 or chunk.row(s - 1) != chunk.row(s)):
-            arrays = program.muscle_array, view(slot, program.types.real), self._adj_rows[chunk.row(s)]
-            launch(collect_pull(program.model.spec), tuple(slot.shape), *arrays)
+        if slot is None or (s != 0 and chunk.row(s - 1) == chunk.row(s)):
+            return
+        spec, row = program.model.spec, self._adj_rows[chunk.row(s)]
+        found = program.muscle_array, view(slot, program.types.real)
+        if spec.deterministic:
+            in_order = collect_pull_in_order(spec)
+            launch(in_order.parts, self._parts.shape, *found, self._parts)
+            launch(in_order.total, row.shape, self._parts, row)
+        else:
+            launch(collect_pull(spec), tuple(slot.shape), *found, row)

@@ -1,6 +1,7 @@
 """Particles to grid for an observer, on tensors: launches of kernels/raster.py."""
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from softmpm.buffers import Motion, MotionAdj, view
@@ -32,13 +33,33 @@ def _arguments(model: Model, node: Tensor):
     return view(model.mass, t.real), view(node, t.node)
 
 
+def _units(model: Model, mass: Tensor, motion: Motion) -> Tensor:
+    """Units of momentum and mass in which no sum over a world's particles overflows 62 bits, powers of two, (world, 2)."""
+    speed = motion.v.abs().amax(-1) + 2 * model.scene.grid.spacing * motion.C.abs().sum(-1).amax(-1)
+    largest = torch.stack([(mass * speed).amax(1), mass.amax().expand(model.worlds)], 1).double()
+    return torch.frexp(largest * model.particle_count / 2.0**62).exponent.double().exp2()
+
+
+def _sums(model: Model, step: Substep, motion: Motion, now) -> Tensor:
+    """Momentum and mass of the nodes, (world, node, dim + 1)."""
+    kernels, shape = raster(model.dim, model.spec.dtype), (*step.nodes, model.dim + 1)
+    if not model.deterministic:
+        node = torch.zeros(shape, dtype=model.dtype, device=model.device)
+        mass, nodes = _arguments(model, node)
+        step.launch(kernels.splat, step.particles, model.scale, mass, now, nodes)
+        return node
+    node = torch.zeros(shape, dtype=torch.int64, device=model.device)
+    units = _units(model, model.mass, motion)
+    arguments = (view(model.mass, types(model.dim, model.spec.dtype).real), view(units, wp.float64), now)
+    step.launch(kernels.splat_fixed, step.particles, model.scale, *arguments, view(node, wp.int64))
+    momentum, mass = (unit[:, None, None] for unit in units.unbind(1))
+    return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
+
+
 def rasterize_nodes(model: Model, state: State) -> GridField:
     """Mass (world, *nodes) and velocity (world, *nodes, dim) of what :func:`softmpm.rasterize` sees."""
-    step, _motion, now = _enter(model, state)
-    node = torch.zeros(*step.nodes, model.dim + 1, dtype=model.dtype, device=model.device)
-    mass, nodes = _arguments(model, node)
-    step.launch(raster(model.dim, model.spec.dtype).splat, step.particles, model.scale, mass, now, nodes)
-    node = node.view(model.worlds, *model.scene.grid.shape, model.dim + 1)
+    step, motion, now = _enter(model, state)
+    node = _sums(model, step, motion, now).view(model.worlds, *model.scene.grid.shape, model.dim + 1)
     mass = node[..., -1].clone()
     return GridField(mass, node[..., :-1] / torch.where(mass > 0, mass, 1)[..., None])
 

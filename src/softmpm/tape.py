@@ -162,11 +162,17 @@ def step(
         tape: Where the adjoint is recorded. It adds into ``.grad`` of ``state_in`` and ``solid``; ``tape.zero()`` clears.
 
     Raises:
-        ValueError: The two states are the same, or a tape is given and an array carries no gradient.
+        ValueError: The two states are the same, a tape is given and an array carries no gradient, or the model is
+            deterministic and on a GPU.
     """
     if state_in is state_out:
         raise ValueError(
             "state_in and state_out must be two different states; make another with softmpm.warp_state."
+        )
+    if model.deterministic and model.device.type == "cuda":
+        raise ValueError(
+            "step adds in floating point, in any order, but the model was built with deterministic=True; use softmpm.simulate, "
+            "or a model built without it."
         )
     solid.work.stream = stream_of(model.device)
     solid.work.advance(state_in.struct(model), state_out.struct(model), substep)

@@ -10,10 +10,10 @@ import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 import softmpm
-from softmpm import fast, memory, program, rollout
+from softmpm import fast, memory, program
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import BASE_BITS, packed_rows
-from softmpm.memory import Plan, plan
+from softmpm.memory import plan
 
 SHORT = 8
 
@@ -22,7 +22,6 @@ SHORT = 8
 def short_chunks(monkeypatch):
     """At most 8 substeps in a chunk."""
     monkeypatch.setattr(memory, "LONGEST", SHORT)
-    monkeypatch.setattr(rollout, "RUN_ONLY", Plan(SHORT, 0, 0, 0))
 
 
 def model(dim=2, device="cpu", dtype=torch.float32, scheme="fast", **settings) -> softmpm.Model:

@@ -10,6 +10,8 @@ and backward, with a bar for adjoints and the same sums the other way round:
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
     advance_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
 
+A deterministic model adds up in a launch more, ``push`` of fixed.py, between advance and grid and between their twins.
+
 All that is particle- or node-wise is shared with the plain scheme: particle.py, grid.py, failure.py.
 """
 
@@ -19,6 +21,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels import failure
+from softmpm.kernels.fixed import fixed
 from softmpm.kernels.grid import grid
 from softmpm.kernels.native import native, native_module
 from softmpm.kernels.particle import particle, particle_adj
@@ -41,6 +44,9 @@ def fused(spec: Spec) -> SimpleNamespace:
     affine_momentum, moved, node_velocity = one.affine_momentum, one.moved, grid(spec).node_velocity
     running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
+    exact, give, take, not_finite = spec.deterministic, fixed(dim).give, fixed(dim).take, int(Kind.NOT_FINITE)
+    Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
+    report = failure.report(spec.dim, spec.dtype).report
     module = native_module(spec.module + ".fused")
 
     @wp.func
@@ -62,13 +68,18 @@ def fused(spec: Spec) -> SimpleNamespace:
         walls: Walls,
         window: Window,
         # In:
-        node: wp.array(dtype=node_vec),
+        node: Sums,
         # Out:
         velocity: wp.array(dtype=node_vec),
         cleared: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
-        here = load_node(node, i)
+        here = node_vec()
+        if wp.static(exact):
+            here = take(node, i)
+            store_node(node.node, i, here)
+        else:
+            here = load_node(node, i)
         v = vec()
         if here[dim] > real(0.0):
             world = i / window.count
@@ -96,7 +107,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         watch: wp.array(dtype=wp.int64),
         then: Packed,
         # Out, added into:
-        node: wp.array(dtype=node_vec),
+        node: Shares,
     ):
         i = wp.tid()
         first = int(-1)
@@ -145,7 +156,11 @@ def fused(spec: Spec) -> SimpleNamespace:
             if not at.sound:
                 complain(watch, scale.shape, world, order[i], substep, at.fx, at.base, at.H)
         if not last:
-            scatter(node, window.shape, first, g, b, A, m)
+            if wp.static(exact):
+                if not give(node, i, count, total, b, A):
+                    report(watch, i / count, substep + 1, not_finite, order[i])
+            else:
+                scatter(node, window.shape, first, g, b, A, m)
 
     return SimpleNamespace(clear=clear, grid_velocity=grid_velocity, advance=advance, centre=centre)
 
@@ -169,6 +184,8 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
     report, bad_gradient = failure.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
     row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
+    exact, give, take = spec.deterministic, fixed(dim).give, fixed(dim).take
+    Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     module = native_module(adj_module(spec, wanted) + ".fused")
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -181,7 +198,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         node: wp.array(dtype=node_vec),  # of this substep; empty after the last
         node_before: wp.array(dtype=node_vec),  # of the substep before; empty in the first
         # In and out:
-        adj: wp.array(dtype=node_vec),  # adjoint of the velocity, then of momentum and mass
+        adj: Sums,  # adjoint of the velocity, then of momentum and mass
         # Out:
         velocity: wp.array(dtype=node_vec),  # of the substep before
         cleared: wp.array(dtype=node_vec),
@@ -191,13 +208,18 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         place = coordinates(i - world * window.count, window.shape) + window.origin[world]
         if i < node.shape[0]:
             here = load_node(node, i)
-            back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(load_node(adj, i)))
-            store_node(adj, i, aligned(back.p, back.m))
+            if wp.static(exact):
+                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(take(adj, i)))
+                store_node(adj.node, i, aligned(back.p, back.m))
+            else:
+                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(load_node(adj, i)))
+                store_node(adj, i, aligned(back.p, back.m))
         if i < node_before.shape[0]:
             there = load_node(node_before, i)
             v = node_velocity(scale, walls, place, head(there), there[dim])
             store_node(velocity, i, aligned(v, real(0.0)))
-            store_node(cleared, i, node_vec())
+            if wp.static(not exact):
+                store_node(cleared, i, node_vec())
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def advance_adj(
@@ -222,7 +244,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         watch: wp.array(dtype=wp.int64),
         # Out, added into:
         adj_body: SolidAdj,
-        adj_velocity: wp.array(dtype=node_vec),  # of the substep before
+        adj_velocity: Shares,  # of the substep before
     ):
         i = wp.tid()
         first = int(-1)
@@ -279,6 +301,9 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             store_vec(adj_now, i, row_fx, adj.fx)
             store_mat(adj_now, i, row_H, adj.H)
         if not start:
-            scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
+            if wp.static(exact):
+                give(adj_velocity, i, count, total, b, B)
+            else:
+                scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
 
     return SimpleNamespace(grid_velocity_adj=grid_velocity_adj, advance_adj=advance_adj)

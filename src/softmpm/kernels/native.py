@@ -1,4 +1,4 @@
-"""What Warp's language cannot say: 16-byte loads and reductions, and the sum over a warp. The code is in scatter.h.
+"""What Warp's language cannot say: 16-byte loads and reductions, and the sum over a warp. The code is in scatter.h and fixed.h.
 
 Everything has a plain form as well, for the CPU, for double precision and for GPUs before sm_90, chosen when it is compiled.
 """
@@ -11,7 +11,7 @@ import warp as wp
 
 from softmpm.kernels.types import types
 
-HEADER = Path(__file__).with_name("scatter.h")
+HEADERS = [Path(__file__).with_name(name) for name in ("scatter.h", "fixed.h")]
 WARP = 32
 """Threads that work together, and particles of a block of packed rows."""
 BLOCK = 128
@@ -25,7 +25,7 @@ def native_module(name: str) -> str:
 
     Machine code of the very GPU ("cubin"): PTX would be that of the oldest GPU in the machine, without 16-byte reductions.
     """
-    source = HEADER.read_text()
+    source = "".join(header.read_text() for header in HEADERS)
     build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)
     options = {"extra_build_options": build, "cuda_output": "cubin", "enable_backward": False}
     wp.set_module_options(options, module=wp.get_module(name))

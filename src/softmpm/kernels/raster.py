@@ -63,6 +63,35 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
             )
 
     @wp.kernel(module=module, enable_backward=False)
+    def splat_fixed(
+        # Parameters:
+        scale: Scale,
+        mass: wp.array(dtype=real),
+        unit: wp.array2d(dtype=wp.float64),  # of momentum and mass, (world, 2)
+        # In:
+        now: Motion,
+        # Out, added into:
+        node: wp.array3d(dtype=wp.int64),  # (world, node, dim + 1), in these units
+    ):
+        """As ``splat``, into integers, whose sum does not depend on the order."""
+        world, p = wp.tid()
+        base = now.base[world, p]
+        fx = now.fx[world, p]
+        v = now.v[world, p]
+        C = scale.spacing * now.C[world, p]
+        m = mass[p]
+        w = weights(fx)
+        for n in range(s.count):
+            o = offset(n)
+            i = node_index(base, o, scale.shape)
+            share = m * weight(w, o)
+            value = share * (v + C * (position(o) - fx))
+            for axis in range(dim):
+                whole = wp.rint(wp.float64(value[axis]) / unit[world, 0])
+                wp.atomic_add(node, world, i, axis, wp.int64(whole))
+            wp.atomic_add(node, world, i, dim, wp.int64(wp.rint(wp.float64(share) / unit[world, 1])))
+
+    @wp.kernel(module=module, enable_backward=False)
     def splat_adj(
         # Parameters:
         scale: Scale,
@@ -99,4 +128,4 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         adj_now.v[world, p] = adj_now.v[world, p] + m * adj_v
         adj_now.C[world, p] = adj_now.C[world, p] + (m * scale.spacing) * B
 
-    return SimpleNamespace(splat=splat, splat_adj=splat_adj)
+    return SimpleNamespace(splat=splat, splat_fixed=splat_fixed, splat_adj=splat_adj)

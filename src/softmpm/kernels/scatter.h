@@ -13,6 +13,9 @@ namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 
+// Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed.h.
+template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
+
 #if defined(__CUDA_ARCH__)
 
 template <typename T> struct Node {
@@ -57,8 +60,9 @@ struct Weight {
 };
 
 // Three dimensions: a lane owns a column of three nodes along z, and hands it on when the next cell is the one above.
+template <class Sink>
 CUDA_CALLABLE inline void add_warp(
-    float* node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, float>& g, const wp::vec_t<3, float>& b,
+    Sink node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, float>& g, const wp::vec_t<3, float>& b,
     const wp::mat_t<3, 3, float>& A, float m)
 {
     constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
@@ -81,7 +85,7 @@ CUDA_CALLABLE inline void add_warp(
     int begin = group * 11, end = min(begin + 11, LANES);
     if (group == 3)
         begin = end;  // lanes 27 to 31 own nothing
-    float* origin = node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]);
+    Sink origin = node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]);
     float4 below = make_float4(0.0f, 0.0f, 0.0f, 0.0f), middle = below, above = below;
     const float4 zero = below;
     int current = -1;
@@ -93,7 +97,7 @@ CUDA_CALLABLE inline void add_warp(
             break;  // the last particle was the one before
         if (next != current) {
             if (current >= 0) {
-                float* at = origin + 4 * (long long)current;
+                auto at = cell(origin, current);
                 add(at, below.x, below.y, below.z, below.w);
                 if (next == current + 1) {
                     below = middle;
@@ -125,7 +129,7 @@ CUDA_CALLABLE inline void add_warp(
         above.w += w2 * q0.w;
     }
     if (current >= 0) {
-        float* at = origin + 4 * (long long)current;
+        auto at = cell(origin, current);
         add(at, below.x, below.y, below.z, below.w);
         add(at + 4, middle.x, middle.y, middle.z, middle.w);
         add(at + 8, above.x, above.y, above.z, above.w);
@@ -134,8 +138,9 @@ CUDA_CALLABLE inline void add_warp(
 }
 
 // Two dimensions: a lane owns one node. The node is (x, y, m, 0).
+template <class Sink>
 CUDA_CALLABLE inline void add_warp(
-    float* node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, float>& g, const wp::vec_t<2, float>& b,
+    Sink node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, float>& g, const wp::vec_t<2, float>& b,
     const wp::mat_t<2, 2, float>& A, float m)
 {
     constexpr int WIDTH = 3;
@@ -155,7 +160,7 @@ CUDA_CALLABLE inline void add_warp(
     int begin = group * 11, end = min(begin + 11, LANES);
     if (group == 3)
         begin = end;
-    float* origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
+    Sink origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
     float x = 0.0f, y = 0.0f, mass = 0.0f;
     int current = -1;
     for (int p = begin; p < end; ++p) {
@@ -166,7 +171,7 @@ CUDA_CALLABLE inline void add_warp(
             break;
         if (next != current) {
             if (current >= 0)
-                add(origin + 4 * (long long)current, x, y, mass, 0.0f);
+                add(cell(origin, current), x, y, mass, 0.0f);
             x = y = mass = 0.0f;
             current = next;
         }
@@ -177,7 +182,7 @@ CUDA_CALLABLE inline void add_warp(
         mass += w * q0.z;
     }
     if (current >= 0)
-        add(origin + 4 * (long long)current, x, y, mass, 0.0f);
+        add(cell(origin, current), x, y, mass, 0.0f);
     __syncwarp();
 }
 
@@ -206,9 +211,9 @@ template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
     w[2] = T(0.5) * high * high;
 }
 
-template <typename T>
+template <class Sink, typename T>
 CUDA_CALLABLE inline void add_each(
-    T* node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, T>& g, const wp::vec_t<3, T>& b,
+    Sink node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, T>& g, const wp::vec_t<3, T>& b,
     const wp::mat_t<3, 3, T>& A, T m)
 {
     if (first < 0)
@@ -221,7 +226,7 @@ CUDA_CALLABLE inline void add_each(
             T wij = w[0][i] * w[1][j], x[3];
             for (int a = 0; a < 3; ++a)
                 x[a] = b[a] + A.data[a][0] * T(i - 1) + A.data[a][1] * T(j - 1) - A.data[a][2];
-            T* at = node + 4 * (long long)(first + (i * shape[1] + j) * shape[2]);
+            auto at = cell(node, first + (i * shape[1] + j) * shape[2]);
             for (int k = 0; k < 3; ++k) {
                 T share = wij * w[2][k];
                 add(at + 4 * k, share * x[0], share * x[1], share * x[2], share * m);
@@ -231,9 +236,9 @@ CUDA_CALLABLE inline void add_each(
         }
 }
 
-template <typename T>
+template <class Sink, typename T>
 CUDA_CALLABLE inline void add_each(
-    T* node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, T>& g, const wp::vec_t<2, T>& b,
+    Sink node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, T>& g, const wp::vec_t<2, T>& b,
     const wp::mat_t<2, 2, T>& A, T m)
 {
     if (first < 0)
@@ -244,7 +249,7 @@ CUDA_CALLABLE inline void add_each(
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) {
             T share = w[0][i] * w[1][j], x = T(i - 1), y = T(j - 1);
-            T* at = node + 4 * (long long)(first + i * shape[1] + j);
+            auto at = cell(node, first + i * shape[1] + j);
             add(at, share * (b[0] + A.data[0][0] * x + A.data[0][1] * y),
                 share * (b[1] + A.data[1][0] * x + A.data[1][1] * y), share * m, T(0));
         }

@@ -22,11 +22,14 @@ class Spec:
     friction: bool
     gravity: bool
     damping: bool
+    deterministic: bool = False  # sums over particles in fixed point
 
     @property
     def module(self) -> str:
         """Name of the Warp module that holds every kernel of this specialisation."""
-        features = [name for name in ("friction", "gravity", "damping") if getattr(self, name)]
+        features = [
+            name for name in ("friction", "gravity", "damping", "deterministic") if getattr(self, name)
+        ]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
         return ".".join(
             ["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *self.contacts, *features]
