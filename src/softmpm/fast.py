@@ -72,6 +72,7 @@ class Fast:
     def __init__(self, model: Model):
         self.model = model
         self._pool: Pool | None = None
+        self._widened = False  # the window was just put around the start of the chunk that comes next
         self._recorded = (
             LONGEST  # substeps of the graph that is being recorded since it last renewed the order
         )
@@ -88,12 +89,12 @@ class Fast:
         self._recorded = LONGEST
         if self._pool is None:
             self._use(Arrangement(self.model, start.x))
-        elif (
-            self._pool.arrangement.stale or self.model.deterministic
-        ):  # else the order would tell what ran before
+        elif self._pool.arrangement.stale or self.model.deterministic:  # else it would tell what ran before
             self._pool.arrangement.renew(start.x)  # if they do not fit into the window, the call will say so
         else:
-            return False
+            renewed, self._widened = self._widened, False
+            return renewed
+        self._widened = False
         return True
 
     def _arrange_blindly(self, start: State, chunk: Chunk) -> bool:
@@ -121,6 +122,7 @@ class Fast:
             self._use(arrangement.grown(run.start.x))
         else:
             arrangement.renew(run.start.x)
+            self._widened = True
 
 
 class _Local(threading.local):
