@@ -15,13 +15,10 @@ class Chunk:
     """Substeps of a control step."""
 
     @property
-    def offset(self) -> int:
-        """Which substep of its control step the first one is."""
-        return self.first % self.substeps
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return self.length, self.substeps, self.offset
+    def shape(self) -> tuple[int, tuple[int, ...]]:
+        """Its length, and where in it control steps begin."""
+        begins = range(-self.first % self.substeps, self.length, self.substeps)
+        return self.length, tuple(s for s in begins if s > 0)
 
     @property
     def rows(self) -> slice:
@@ -31,7 +28,7 @@ class Chunk:
 
     def row(self, s: int) -> int:
         """Which of these its substep ``s`` belongs to."""
-        return (self.offset + s) // self.substeps
+        return (self.first % self.substeps + s) // self.substeps
 
 
 @dataclass(frozen=True)

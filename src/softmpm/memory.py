@@ -22,8 +22,8 @@ CPU_BUDGET = 64 * 2**20
 """Without a budget, what a call on the CPU may keep; on a GPU it is a sixteenth of its memory."""
 
 
-MARGIN = 6
-"""Nodes of a window around the particles' stencils, on each side."""
+MARGIN = {2: 6, 3: 3}
+"""Nodes of a window around the particles' stencils, on each side, in 2D and 3D."""
 
 
 def window_shape(grid: Sequence[int], reach: Sequence[int]) -> tuple[int, ...]:
@@ -33,7 +33,7 @@ def window_shape(grid: Sequence[int], reach: Sequence[int]) -> tuple[int, ...]:
         grid: Nodes of the whole grid.
         reach: How far the particles' base nodes lie apart.
     """
-    wide = (apart + 3 + 2 * MARGIN for apart in reach)
+    wide = (apart + 3 + 2 * MARGIN[len(grid)] for apart in reach)
     return tuple(min(nodes, 4 * math.ceil(w / 4)) for nodes, w in zip(grid, wide, strict=True))
 
 

@@ -155,6 +155,7 @@ def rollout_adj(
             note(run.words[: model.worlds])
         else:
             reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
+        del run  # or it would keep its memory while the one before runs again
     for report, last in reports:
         words = report.read()[: model.worlds]
         raise_gradient_failure(model, words, adj_end, last, horizon.total)

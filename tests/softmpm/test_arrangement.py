@@ -90,8 +90,8 @@ def test_the_window_holds_every_stencil(low, high, device):
     first, beyond = window(found)
     assert (first >= 0).all() and (beyond <= 30).all()
     below, above = base.min(1) - first, beyond - (base.max(1) + 3)
-    assert ((below >= MARGIN) | (first == 0)).all(), below
-    assert ((above >= MARGIN) | (beyond == 30)).all(), above
+    assert ((below >= MARGIN[2]) | (first == 0)).all(), below
+    assert ((above >= MARGIN[2]) | (beyond == 30)).all(), above
     assert found.node_count == math.prod(found.shape)
 
 
@@ -103,8 +103,8 @@ def test_a_window_is_as_small_as_its_particles_allow(device):
     x[1, 0, 1] += 9 * DX
     found = Arrangement(model, x)
     reach = np.ptp(bases(model, x), axis=1).max(0)
-    assert (np.array(found.shape) >= reach + 3 + 2 * MARGIN).all()
-    assert (np.array(found.shape) <= reach + 3 + 2 * MARGIN + 3).all()  # rounded up to four
+    assert (np.array(found.shape) >= reach + 3 + 2 * MARGIN[2]).all()
+    assert (np.array(found.shape) <= reach + 3 + 2 * MARGIN[2] + 3).all()  # rounded up to four
     assert found.shape[1] > found.shape[0]
 
 
@@ -130,7 +130,7 @@ def test_a_grown_window_is_half_as_large_again(device):
     grown = found.grown(x)
     assert grown.shape == (math.ceil(1.5 * before[0]), 26) and found.shape == before
     x[0, 0, 0] += 40 * DX
-    assert found.grown(x).shape[0] >= 40 + 3 + 2 * MARGIN
+    assert found.grown(x).shape[0] >= 40 + 3 + 2 * MARGIN[2]
     assert found.grown(x).grown(x).shape == (80, 26)
 
 

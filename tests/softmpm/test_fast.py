@@ -218,6 +218,15 @@ def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device)
     assert len(made) == count, made[count:]
 
 
+def test_chunks_of_a_long_control_step_share_programs(made, short_chunks, device):
+    """Wherever in the control step they lie: two at a time forward, since one is launched ahead, and one kept going back."""
+    sizes = model().sizes()
+    built = model(device=device, memory_budget=9 * (sizes.inside + sizes.nodes) + 20 * sizes.between)
+    inputs = busy_inputs(built, control_steps=1, seed=1)
+    pull(run(softmpm.simulate, built, inputs, 8 * SHORT), inputs)
+    assert [keep for _, keep in made].count(False) <= 2 and [keep for _, keep in made].count(True) == 1, made
+
+
 def test_outstanding_gradients_keep_their_own_states(made, short_chunks, budget, device):
     """Five calls wait for their backward pass: each gets its gradient, in any order; five more need nothing new."""
     built = model(device=device, **budget)
