@@ -41,7 +41,9 @@ def main():
     axes.set_yscale("log")
     axes.set_xticks(range(len(SIZES)), list(SIZES))
     axes.set_ylabel("µs per substep")
-    axes.set_title("Elastic cube, neo-Hookean, float32, one H200 (plain: falling, fast: turning)", fontsize=10)
+    axes.set_title(
+        "Elastic cube, neo-Hookean, float32, one H200 (plain: falling, fast: turning)", fontsize=10
+    )
     axes.legend(frameon=False, ncols=2, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(HERE.parent / "docs" / "images" / "performance.png", dpi=150)
