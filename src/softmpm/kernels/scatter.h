@@ -246,15 +246,13 @@ CUDA_CALLABLE inline void add_each(
     T w[2][3];
     for (int a = 0; a < 2; ++a)
         weights(g[a], w[a]);
-    for (int i = 0; i < 3; ++i) {
-        T x = b[0] + A.data[0][0] * T(i - 1) - A.data[0][1], y = b[1] + A.data[1][0] * T(i - 1) - A.data[1][1];
+    for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) {
-            T share = w[0][i] * w[1][j];
-            add(cell(node, first + i * shape[1] + j), share * x, share * y, share * m, T(0));
-            x += A.data[0][1];
-            y += A.data[1][1];
+            T share = w[0][i] * w[1][j], x = T(i - 1), y = T(j - 1);
+            auto at = cell(node, first + i * shape[1] + j);
+            add(at, share * (b[0] + A.data[0][0] * x + A.data[0][1] * y),
+                share * (b[1] + A.data[1][0] * x + A.data[1][1] * y), share * m, T(0));
         }
-    }
 }
 
 // The whole warp must come here together: particles beyond the last one with first = -1.
