@@ -1,7 +1,8 @@
 """How far from the memory's speed is a substep? `python bench/roofline.py [--device cuda] [--json bench/results/roofline.json]`
 
 The copy bandwidth of the device, measured here, against the bytes that a forward substep of the cases of bench/step.py must move
-at least: every state read and written once, the material of a particle read once (16 B: volume, mass, μ, λ), the grid once.
+at least: every state read and written once, the material of a particle read once (16 B: volume, mass, μ, λ), momentum and velocity of
+the nodes in memory once.
 The reads of the grid by 3^dim nodes a particle, and all atomic additions, are taken to cost nothing. `floor us` is the time of these
 bytes at copy speed, `times floor` how often it fits into the measured substep. A scene that fits into the caches may beat its floor.
 """
@@ -26,8 +27,8 @@ def copy_bandwidth(device: torch.device, repeats: int) -> float:
 
 def least_bytes(model: softmpm.Model) -> int:
     """What a forward substep has to move [B]."""
-    particles = model.worlds * model.particle_count
-    return 2 * model.state_bytes() + MATERIAL_BYTES * particles + model.node_bytes()
+    particles, sizes = model.worlds * model.particle_count, model.sizes()
+    return 2 * sizes.inside + MATERIAL_BYTES * particles + 2 * sizes.nodes
 
 
 def seconds(model: softmpm.Model, substeps: int, repeats: int) -> float:

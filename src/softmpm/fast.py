@@ -73,9 +73,8 @@ class Fast:
         self.model = model
         self._pool: Pool | None = None
         self._widened = False  # the window was just put around the start of the chunk that comes next
-        self._recorded = (
-            LONGEST  # substeps of the graph that is being recorded since it last renewed the order
-        )
+        # Substeps of the graph that is being recorded since it last renewed the order:
+        self._recorded = LONGEST
 
     def run(self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool) -> FastRun:
         renewed = self._arrange(start, chunk)

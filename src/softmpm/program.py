@@ -40,16 +40,15 @@ class Program:
         def tensor(*size, dtype=model.dtype):
             return torch.empty(*size, dtype=dtype, device=model.device)
 
-        self._tensor, self._padded = tensor, padded
+        self._tensor = tensor
         self.order = tensor(*self.lead, dtype=torch.int32)
         self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
         self.words = tensor(model.worlds + 2, dtype=torch.int64)
         self._calm = torch.full_like(self.words, NEVER)
         self._calm[-2:].zero_()
         self._version = -1  # of the arrangement that order and origin were taken from
-        self._given: tuple[
-            Tensor, ...
-        ] = ()  # what the sorted material was taken from, if it needs no gradient
+        # What the sorted material was taken from, if it needs no gradient:
+        self._given: tuple[Tensor, ...] = ()
         slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
         self.base = tensor(slots, padded, dtype=torch.int32)
         self.rows = tensor(slots, padded * t.rows)
@@ -131,7 +130,7 @@ class Program:
             self.pull.copy_(pull)
         low = start.low or Low(torch.zeros_like(start.x), torch.zeros_like(start.F))
         arrays = self.state_arrays(*start, *low)
-        if moved or not self._has(solid):
+        if not self._has(solid) or moved:
             given = Solid(solid.mass, solid.mu, solid.lam, None).struct(model)
             launch(sorted_solid(model.spec), self.lead, self.order_array, given, self._solid)
         enter = (model.scale, self.window, self.order_array, *arrays, self.watch, self.packed[0])
@@ -142,9 +141,9 @@ class Program:
         return self._leave(launch)
 
     def _has(self, solid: Solid) -> bool:
-        """Whether the material is the one of the run before: the very tensors, which nothing else writes to."""
+        """Whether the material is the one of the run before: the very tensors, which nothing else writes to. Takes note of it."""
         given = (solid.mass, solid.mu, solid.lam)
-        same = all(a is b for a, b in zip(given, self._given, strict=False)) and bool(self._given)
+        same = bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
         self._given = () if any(tensor.requires_grad for tensor in given) else given
         return same
 

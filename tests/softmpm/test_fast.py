@@ -10,8 +10,9 @@ import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 import softmpm
-from softmpm import fast, memory, program
-from softmpm.horizon import Horizon
+from softmpm import autograd, fast, memory, program
+from softmpm.buffers import Solid
+from softmpm.horizon import Chunk, Horizon
 from softmpm.kernels.types import BASE_BITS, packed_rows
 from softmpm.memory import plan
 
@@ -225,6 +226,33 @@ def test_chunks_of_a_long_control_step_share_programs(made, short_chunks, device
     inputs = busy_inputs(built, control_steps=1, seed=1)
     pull(run(softmpm.simulate, built, inputs, 8 * SHORT), inputs)
     assert [keep for _, keep in made].count(False) <= 2 and [keep for _, keep in made].count(True) == 1, made
+
+
+def test_material_is_not_mixed_up_when_the_order_is_renewed(device):
+    """One material, another while the order is new, the first again: the same tensors, and the result they gave at first."""
+    built = model(device=device)
+    start, soft = built.rest(), built.params()
+    stiff = soft._replace(young=3.0 * soft.young)
+    start.v.add_(0.3)
+
+    def speed(params):
+        with torch.no_grad():
+            return softmpm.simulate(built, start, None, params, substeps=5).v
+
+    masses = [autograd._material(built, params) for params in (soft, stiff)]
+    runner, chunk = fast.Fast(built), Chunk(0, 5, 5)
+
+    def chunk_of(k):
+        pull = torch.zeros(1, 1, built.muscle_count, device=device)
+        mu, lam, mass = masses[k]
+        return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end.v
+
+    first = chunk_of(0)
+    runner._pool.arrangement.renew(start.x)
+    other, again = chunk_of(1), chunk_of(0)
+    assert_relative(again, first, same_on(device))
+    assert not torch.allclose(other, first)
+    assert_relative(speed(soft), first, same_on(device))
 
 
 def test_outstanding_gradients_keep_their_own_states(made, short_chunks, budget, device):
