@@ -5,6 +5,7 @@ Everything is written in H = F − I, so that small strains keep their digits in
     neo-Hookean:      τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                        (E1)
     fixed corotated:  τ = 2μ (H − Q) Fᵀ + λ j (1 + j) I                                             (E2)
 
+Both take Q, which ``rotation`` of the law gives; a neo-Hookean solid needs none. Forward and adjoint of a particle share it.
 Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012. The twins take τ̄ and return (F̄, μ̄, λ̄):
 
     (E1): F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
@@ -73,11 +74,15 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         return wp.log(u) * (j / (u - real(1.0)))
 
     @wp.func
-    def neo_hookean(H: mat, mu: real, lam: real) -> mat:
+    def no_rotation(H: mat) -> mat:
+        return mat()
+
+    @wp.func
+    def neo_hookean(H: mat, Q: mat, mu: real, lam: real) -> mat:
         return mu * (H + wp.transpose(H) + H * wp.transpose(H)) + lam * log1p(volume_change(H)) * identity()
 
     @wp.func
-    def neo_hookean_adj(H: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
+    def neo_hookean_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
         F = identity() + H
         j = volume_change(H)
         trace = wp.trace(adj_tau)
@@ -88,15 +93,14 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         return adj
 
     @wp.func
-    def fixed_corotated(H: mat, mu: real, lam: real) -> mat:
+    def fixed_corotated(H: mat, Q: mat, mu: real, lam: real) -> mat:
         j = volume_change(H)
         F = identity() + H
-        return real(2.0) * mu * (H - rotation(H)) * wp.transpose(F) + lam * j * (real(1.0) + j) * identity()
+        return real(2.0) * mu * (H - Q) * wp.transpose(F) + lam * j * (real(1.0) + j) * identity()
 
     @wp.func
-    def fixed_corotated_adj(H: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
+    def fixed_corotated_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
         F = identity() + H
-        Q = rotation(H)
         j = volume_change(H)
         trace = wp.trace(adj_tau)
         two_mu = real(2.0) * mu
@@ -113,6 +117,7 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         Adj=ElasticAdj,
         identity=identity,
         volume_change=volume_change,
+        rotation={"neo_hookean": no_rotation, "fixed_corotated": rotation},
         stress={"neo_hookean": neo_hookean, "fixed_corotated": fixed_corotated},
         stress_adj={"neo_hookean": neo_hookean_adj, "fixed_corotated": fixed_corotated_adj},
     )

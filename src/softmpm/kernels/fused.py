@@ -41,7 +41,8 @@ def fused(spec: Spec) -> SimpleNamespace:
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
-    affine_momentum, moved, node_velocity = one.affine_momentum, one.moved, grid(spec).node_velocity
+    rotation, affine_momentum, moved = one.rotation, one.affine_momentum, one.moved
+    node_velocity = grid(spec).node_velocity
     running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     exact, give, take, not_finite = spec.deterministic, fixed(dim).give, fixed(dim).take, int(Kind.NOT_FINITE)
@@ -143,7 +144,7 @@ def fused(spec: Spec) -> SimpleNamespace:
             if not last:
                 m = body.mass[world, p]
                 g = centre(at.fx)
-                A = affine_momentum(scale, body, world, p, at.C, at.H)
+                A = affine_momentum(scale, body, world, p, at.C, at.H, rotation(body, world, p, at.H))
                 b = m * at.v - A * g
                 first = held + first_node(base, origin, window.shape)
             if substep >= 0:
@@ -180,7 +181,8 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     aligned, head, coordinates, centre = s.aligned, s.head, s.coordinates, fused(spec).centre
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
-    affine_momentum, momentum_adj, moved_adj = one.affine_momentum, twin.momentum_adj, twin.moved_adj
+    rotation, affine_momentum = one.rotation, one.affine_momentum
+    momentum_adj, moved_adj = twin.momentum_adj, twin.moved_adj
     node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
     report, bad_gradient = failure.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
     row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
@@ -271,11 +273,12 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
                 H = load_mat(now.rows, i, row_H)
                 g = centre(load_vec(now.rows, i, row_fx))
                 m = body.mass[world, p]
-                A = affine_momentum(scale, body, world, p, C, H)
+                Q = rotation(body, world, p, H)
+                A = affine_momentum(scale, body, world, p, C, H, Q)
                 here = held + first_node(unpack_base(now.base[i]), origin, window.shape)
                 sums = gather_adj(adj_node, here, window.shape, g, m * v - A * g, A, m)
                 B = sums.outer - wp.outer(sums.value, g)
-                more = momentum_adj(scale, body, world, p, v, C, H, sums.value, sums.mass, B, adj_body)
+                more = momentum_adj(scale, body, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_body)
                 adj.fx += sums.slope - wp.transpose(A) * sums.value
                 adj.v = more.v
                 adj.C = more.C

@@ -25,7 +25,7 @@ from softmpm.kernels.types import Spec, Wanted, solid_adj_type, solid_types, typ
 def particle(spec: Spec) -> SimpleNamespace:
     t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
     real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
-    Solid, stress = solid_types(spec).Solid, solid(spec).stress
+    Solid, rotation, stress = solid_types(spec).Solid, solid(spec).rotation, solid(spec).stress
     sound, dim, rounds = failure.check(spec).sound, spec.dim, spec.dtype == "float32"
 
     @wp.struct
@@ -44,10 +44,10 @@ def particle(spec: Spec) -> SimpleNamespace:
         return real(4.0) * scale.dt * body.volume[world, p] / (scale.spacing * scale.spacing)
 
     @wp.func
-    def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat) -> mat:
+    def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat, Q: mat) -> mat:
         """A per cell [kg m/s] (T1)."""
         return scale.spacing * (
-            body.mass[world, p] * C - impulse(scale, body, world, p) * stress(body, world, p, H)
+            body.mass[world, p] * C - impulse(scale, body, world, p) * stress(body, world, p, H, Q)
         )
 
     @wp.func
@@ -85,6 +85,7 @@ def particle(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(
         Particle=Particle,
         impulse=impulse,
+        rotation=rotation,
         affine_momentum=affine_momentum,
         moved=moved,
         identity=laws.identity,
@@ -114,6 +115,7 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         v: vec,
         C: mat,
         H: mat,
+        Q: mat,
         adj_mv: vec,
         adj_m: real,
         B: mat,
@@ -125,7 +127,7 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         adj = ParticleAdj()
         adj.v = m * adj_mv
         adj.C = m * adj_A
-        adj.H = stress_adj(body, world, p, H, -impulse(scale, body, world, p) * adj_A, adj_body)
+        adj.H = stress_adj(body, world, p, H, Q, -impulse(scale, body, world, p) * adj_A, adj_body)
         if wp.static(wanted.material):
             adj_body.mass[world, p] = adj_body.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
         return adj

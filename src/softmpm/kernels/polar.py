@@ -6,7 +6,7 @@ Functions take H = F − I and give Q = R − I, so that a small deformation kee
 2D, with a = F₀₀ + F₁₁, b = F₁₀ − F₀₁, r = √(a² + b²):  cos = a/r, sin = b/r                       (R1)
 3D: the unit quaternion q of R is the eigenvector of the largest eigenvalue ℓ = tr S of Davenport's K(F),
     ℓ⁴ − 2 |F|² ℓ² − 8 det(F) ℓ + |F|⁴ − 4 |cof F|² = 0,                                           (R2)
-    found by inverse iteration, then by Newton steps on the rotations:
+    found by inverse iteration to a few digits, then by Newton steps on the rotations:
     R ← R exp[ω],  (tr(S) I − S) ω = axl(RᵀF)                                                      (R3)
     with axl(M) = (M₂₁ − M₁₂, M₀₂ − M₂₀, M₁₀ − M₀₁).
 Adjoint: F̄ += R [y],  (tr(S) I − S) y = axl(RᵀR̄)                                                    (R3.F)
@@ -24,6 +24,7 @@ from softmpm.kernels.types import types
 
 NEWTON_STEPS = {"float32": 2, "float64": 3}  # each doubles the digits of a start that has a few
 QUARTIC_STEPS = 40  # an upper bound: at F = I none is taken, elsewhere 3 to 8
+INVERSE_STEPS = 5  # where two singular values nearly cancel each takes the error down by little
 
 
 @functools.lru_cache(maxsize=None)
@@ -66,9 +67,9 @@ def _polar3(dtype: str) -> SimpleNamespace:
     t = types(3, dtype)
     real, vec, mat = t.real, t.vec, t.mat
     quat = wp.types.vector(4, real)  # (w, x, y, z), unit
-    mat4 = wp.types.matrix((4, 4), real)
     steps = NEWTON_STEPS[dtype]
     close = 1e-3 if dtype == "float32" else 1e-6  # the eigenvalue need not be better: (R3) finishes
+    above = 1.0 + close
 
     @wp.func
     def axl(M: mat) -> vec:
@@ -103,42 +104,75 @@ def _polar3(dtype: str) -> SimpleNamespace:
 
     @wp.func
     def quaternion(F: mat) -> quat:
-        """Unit eigenvector of K(F) for ℓ, to a few digits."""
+        """Unit eigenvector of K(F) for ℓ, to a few digits: inverse iteration with (1 + close) ℓ I − K = L D Lᵀ.
+
+        That matrix is positive definite, so it needs no pivots. The start is at a right angle to no rotation about the axes by
+        quarter turns, and what rounding adds is enough elsewhere.
+        """
+        s = largest_eigenvalue(F) * real(above)
         trace = F[0, 0] + F[1, 1] + F[2, 2]
         z = axl(F)
-        s = trace + largest_eigenvalue(F) * real(1.0 + close)
-        M = mat4(
-            real(2.0) * trace - s, z[0], z[1], z[2],
-            z[0], real(2.0) * F[0, 0] - s, F[0, 1] + F[1, 0], F[0, 2] + F[2, 0],
-            z[1], F[0, 1] + F[1, 0], real(2.0) * F[1, 1] - s, F[1, 2] + F[2, 1],
-            z[2], F[0, 2] + F[2, 0], F[1, 2] + F[2, 1], real(2.0) * F[2, 2] - s,
-        )  # fmt: skip
-        X = wp.inverse(M)  # ≈ −q qᵀ / (close ℓ)
-        least = X[0, 0]
-        column = quat(X[0, 0], X[1, 0], X[2, 0], X[3, 0])
-        for i in range(1, 4):
-            if X[i, i] < least:
-                least = X[i, i]
-                column = quat(
-                    X[0, i], X[1, i], X[2, i], X[3, i]
-                )  # a column by its number would be kept in memory
-        q = X * column
+        xy = -(F[0, 1] + F[1, 0])
+        xz = -(F[0, 2] + F[2, 0])
+        yz = -(F[1, 2] + F[2, 1])
+        r0 = real(1.0) / (s - trace)
+        b = -r0 * z  # the column below the pivot, over it
+        r1 = real(1.0) / (s + trace - real(2.0) * F[0, 0] + b[0] * z[0])
+        xy += b[0] * z[1]
+        xz += b[0] * z[2]
+        yz += b[1] * z[2]
+        c = r1 * xy
+        d = r1 * xz
+        r2 = real(1.0) / (s + trace - real(2.0) * F[1, 1] + b[1] * z[1] - c * xy)
+        yz -= c * xz
+        e = r2 * yz
+        r3 = real(1.0) / (s + trace - real(2.0) * F[2, 2] + b[2] * z[2] - d * xz - e * yz)
+        unit = real(close) * s  # keeps the length: the smallest eigenvalue is about that
+        q = quat(real(0.8), real(0.45), real(0.3), real(0.2))
+        for _step in range(INVERSE_STEPS):
+            x = q[1] - b[0] * q[0]
+            y = q[2] - b[1] * q[0] - c * x
+            w = unit * r3 * (q[3] - b[2] * q[0] - d * x - e * y)
+            y = unit * r2 * y - e * w
+            x = unit * r1 * x - c * y - d * w
+            q = quat(unit * r0 * q[0] - b[0] * x - b[1] * y - b[2] * w, x, y, w)
         length = wp.length(q)
         if not length > real(0.0):
             return quat(real(1.0), real(0.0), real(0.0), real(0.0))  # F = 0: every rotation is a maximiser
-        return q / length
+        return (real(1.0) / length) * q
 
     @wp.func
     def minus_identity(q: quat) -> mat:
         """Q = R(q) − I without forming R."""
-        w = q[0]
-        u = vec(q[1], q[2], q[3])
-        return real(2.0) * (w * wp.skew(u) + wp.outer(u, u) - wp.dot(u, u) * wp.identity(n=3, dtype=real))
+        w = real(2.0) * q[0]
+        x = real(2.0) * q[1]
+        y = real(2.0) * q[2]
+        z = real(2.0) * q[3]
+        xx = x * q[1]
+        yy = y * q[2]
+        zz = z * q[3]
+        return mat(
+            -yy - zz, x * q[2] - w * q[3], x * q[3] + w * q[2],
+            x * q[2] + w * q[3], -xx - zz, y * q[3] - w * q[1],
+            x * q[3] - w * q[2], y * q[3] + w * q[1], -xx - yy,
+        )  # fmt: skip
 
     @wp.func
-    def gap(S: mat) -> mat:
-        """tr(S) I − S, symmetrised."""
-        return wp.trace(S) * wp.identity(n=3, dtype=real) - real(0.5) * (S + wp.transpose(S))
+    def turn(E: mat, z: vec) -> vec:
+        """ω with (tr(S) I − S) ω = z for S = I + E, symmetrised; not finite where there is none."""
+        a = real(2.0) + E[1, 1] + E[2, 2]
+        b = real(2.0) + E[0, 0] + E[2, 2]
+        c = real(2.0) + E[0, 0] + E[1, 1]
+        d = real(-0.5) * (E[1, 2] + E[2, 1])
+        e = real(-0.5) * (E[0, 2] + E[2, 0])
+        f = real(-0.5) * (E[0, 1] + E[1, 0])
+        first = vec(b * c - d * d, d * e - f * c, d * f - e * b)
+        yy = a * c - e * e
+        yz = e * f - d * a
+        zz = a * b - f * f
+        rest = vec(first[1] * z[0] + yy * z[1] + yz * z[2], first[2] * z[0] + yz * z[1] + zz * z[2], real(0.0))
+        over = real(1.0) / (a * first[0] + f * first[1] + e * first[2])
+        return over * vec(wp.dot(first, z), rest[0], rest[1])
 
     @wp.func
     def rotation(H: mat) -> mat:
@@ -146,8 +180,7 @@ def _polar3(dtype: str) -> SimpleNamespace:
         for _step in range(steps):
             Q = minus_identity(q)
             E = H + wp.transpose(Q) + wp.transpose(Q) * H  # RᵀF − I
-            w = wp.inverse(gap(wp.identity(n=3, dtype=real) + E)) * axl(E)
-            half = real(0.5) * w
+            half = real(0.5) * turn(E, axl(E))
             u = vec(q[1], q[2], q[3])
             v = q[0] * half + u + wp.cross(u, half)
             q = wp.normalize(quat(q[0] - wp.dot(u, half), v[0], v[1], v[2]))  # (R3)
@@ -157,13 +190,7 @@ def _polar3(dtype: str) -> SimpleNamespace:
     def rotation_adj(H: mat, Q: mat, adj_R: mat) -> mat:
         """∂L/∂F (R3.F)."""
         R = wp.identity(n=3, dtype=real) + Q
-        S = wp.transpose(R) * (wp.identity(n=3, dtype=real) + H)
-        A = gap(S)
-        y = (
-            wp.inverse(A)
-            * axl(wp.transpose(R) * adj_R)
-            / wp.where(wp.determinant(A) == real(0.0), real(0.0), real(1.0))
-        )
+        y = turn(H + wp.transpose(Q) + wp.transpose(Q) * H, axl(wp.transpose(R) * adj_R))
         return R * wp.skew(y)
 
     return SimpleNamespace(rotation=rotation, rotation_adj=rotation_adj)

@@ -16,20 +16,34 @@ def solid(spec: Spec) -> SimpleNamespace:
     mat, Solid = t.mat, solid_types(spec).Solid
     laws = elasticity(spec.dim, spec.dtype)
     first, last = laws.stress[spec.laws[0]], laws.stress[spec.laws[-1]]
+    first_rotation, last_rotation = laws.rotation[spec.laws[0]], laws.rotation[spec.laws[-1]]
     muscle_stress = muscle(spec.dim, spec.dtype).muscle_stress
     mixed, slots = len(spec.laws) > 1, spec.muscle_slots
 
     @wp.func
-    def stress(body: Solid, world: int, p: int, H: mat) -> mat:
+    def rotation(body: Solid, world: int, p: int, H: mat) -> mat:
+        """Q of F, if the law of this particle asks for it."""
+        Q = mat()
+        if wp.static(mixed):
+            if body.law[world, p] == 0:
+                Q = first_rotation(H)
+            else:
+                Q = last_rotation(H)
+        else:
+            Q = first_rotation(H)
+        return Q
+
+    @wp.func
+    def stress(body: Solid, world: int, p: int, H: mat, Q: mat) -> mat:
         """Kirchhoff stress τ [Pa]."""
         tau = mat()
         if wp.static(mixed):
             if body.law[world, p] == 0:
-                tau = first(H, body.mu[world, p], body.lam[world, p])
+                tau = first(H, Q, body.mu[world, p], body.lam[world, p])
             else:
-                tau = last(H, body.mu[world, p], body.lam[world, p])
+                tau = last(H, Q, body.mu[world, p], body.lam[world, p])
         else:
-            tau = first(H, body.mu[world, p], body.lam[world, p])
+            tau = first(H, Q, body.mu[world, p], body.lam[world, p])
         if wp.static(slots > 0):
             for slot in range(slots):
                 k = body.muscle[world, p, slot]
@@ -37,7 +51,7 @@ def solid(spec: Spec) -> SimpleNamespace:
                     tau += muscle_stress(H, body.fibre[k], body.pull[world, k])
         return tau
 
-    return SimpleNamespace(stress=stress)
+    return SimpleNamespace(rotation=rotation, stress=stress)
 
 
 @functools.lru_cache(maxsize=None)
@@ -50,16 +64,16 @@ def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     mixed, slots = len(spec.laws) > 1, spec.muscle_slots
 
     @wp.func
-    def stress_adj(body: Solid, world: int, p: int, H: mat, adj_tau: mat, adj_body: SolidAdj) -> mat:
+    def stress_adj(body: Solid, world: int, p: int, H: mat, Q: mat, adj_tau: mat, adj_body: SolidAdj) -> mat:
         """∂L/∂F; adds what is wanted of the material and of the muscles' pull into ``adj_body``."""
         adj = ElasticAdj()
         if wp.static(mixed):
             if body.law[world, p] == 0:
-                adj = first_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
+                adj = first_adj(H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
             else:
-                adj = last_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
+                adj = last_adj(H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
         else:
-            adj = first_adj(H, body.mu[world, p], body.lam[world, p], adj_tau)
+            adj = first_adj(H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
         adj_F = adj.F
         if wp.static(wanted.material):
             adj_body.mu[world, p] = adj_body.mu[world, p] + adj.mu

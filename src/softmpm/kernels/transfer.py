@@ -36,7 +36,8 @@ def transfer(spec: Spec) -> SimpleNamespace:
     vec, mat, node_vec, Scale, Motion, ivec = t.vec, t.mat, t.node, t.Scale, t.Motion, t.ivec
     Solid, s, one = solid_types(spec).Solid, spline(spec.dim, spec.dtype), particle(spec)
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
-    pack, Particle, affine_momentum, moved = s.pack, one.Particle, one.affine_momentum, one.moved
+    pack, Particle, moved = s.pack, one.Particle, one.moved
+    rotation, affine_momentum = one.rotation, one.affine_momentum
     running, rounds = failure.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
     complain = failure.check(spec).complain
 
@@ -55,7 +56,8 @@ def transfer(spec: Spec) -> SimpleNamespace:
         fx = now.fx[world, p]
         m = body.mass[world, p]
         mv = m * now.v[world, p]
-        A = affine_momentum(scale, body, world, p, now.C[world, p], now.H[world, p])
+        H = now.H[world, p]
+        A = affine_momentum(scale, body, world, p, now.C[world, p], H, rotation(body, world, p, H))
         w = weights(fx)
         for n in range(s.count):
             o = offset(n)
@@ -123,8 +125,8 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index, momentum = s.weight, s.weight_slope, s.node_index, s.momentum
     ParticleAdj, momentum_adj, moved_adj = one.ParticleAdj, one.momentum_adj, one.moved_adj
-    affine_momentum, report = particle(spec).affine_momentum, failure.report(spec.dim, spec.dtype).report
-    bad_gradient = int(Kind.GRADIENT)
+    rotation, affine_momentum = particle(spec).rotation, particle(spec).affine_momentum
+    report, bad_gradient = failure.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
 
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
     def p2g_adj(
@@ -147,7 +149,8 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         C = now.C[world, p]
         H = now.H[world, p]
         m = body.mass[world, p]
-        A = affine_momentum(scale, body, world, p, C, H)
+        Q = rotation(body, world, p, H)
+        A = affine_momentum(scale, body, world, p, C, H, Q)
         w = weights(fx)
         slope = slopes(fx)
         adj_mv = vec()
@@ -165,7 +168,7 @@ def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             adj_mv += share * adj_p
             adj_m += share * adj_i[dim]
             B += wp.outer(share * adj_p, r)
-        adj = momentum_adj(scale, body, world, p, v, C, H, adj_mv, adj_m, B, adj_body)
+        adj = momentum_adj(scale, body, world, p, v, C, H, Q, adj_mv, adj_m, B, adj_body)
         adj.fx = adj_fx + adj_now.fx[world, p]
         adj.v += adj_now.v[world, p]
         adj.C += adj_now.C[world, p]

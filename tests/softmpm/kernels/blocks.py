@@ -8,9 +8,8 @@ import warp as wp
 
 @functools.lru_cache(maxsize=None)
 def _map(function, count: int, out, *arguments):
-    """A kernel out[i] = function(a[i], b[i], ...), for two to four arguments."""
-    a, b, c, d = (*arguments, *(None,) * (4 - count))
-    A, B, C, D = (t or wp.float32 for t in (a, b, c, d))
+    """A kernel out[i] = function(a[i], b[i], ...), for up to five arguments."""
+    A, B, C, D, E = (*arguments, *(wp.float32,) * (5 - count))
 
     if count == 1:
 
@@ -32,7 +31,7 @@ def _map(function, count: int, out, *arguments):
         ):
             i = wp.tid()
             result[i] = function(x[i], y[i], z[i])
-    else:
+    elif count == 4:
 
         @wp.kernel(module="unique", enable_backward=False)
         def kernel(
@@ -44,6 +43,19 @@ def _map(function, count: int, out, *arguments):
         ):
             i = wp.tid()
             result[i] = function(x[i], y[i], z[i], u[i])
+    else:
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def kernel(
+            x: wp.array(dtype=A),
+            y: wp.array(dtype=B),
+            z: wp.array(dtype=C),
+            u: wp.array(dtype=D),
+            v: wp.array(dtype=E),
+            result: wp.array(dtype=out),
+        ):
+            i = wp.tid()
+            result[i] = function(x[i], y[i], z[i], u[i], v[i])
 
     return kernel
 

@@ -28,10 +28,12 @@ def points(dim: int, law: str) -> dict[str, torch.Tensor]:
     return {name: F for name, F in found.items() if law == "fixed_corotated" or torch.linalg.det(F) > 0}
 
 
-def arguments(dim: int, dtype: str, H: torch.Tensor):
+def arguments(law: str, dim: int, dtype: str, H: torch.Tensor):
+    """H, and what else the blocks of the law take: its rotation, μ and λ."""
     t, real = types(dim, dtype), getattr(torch, dtype)
+    Q = apply(elasticity(dim, dtype).rotation[law], t.mat, (dim, dim), (H.to(real), t.mat))
     mu, lam = (torch.full((len(H),), value, dtype=real, device=H.device) for value in (MU, LAM))
-    return (H.to(real), t.mat), (mu, t.real), (lam, t.real)
+    return (H.to(real), t.mat), (Q, t.mat), (mu, t.real), (lam, t.real)
 
 
 LAWS = ["neo_hookean", "fixed_corotated"]
@@ -44,7 +46,7 @@ def test_stress_is_the_law(law, dim, dtype, limit, device):
     """τ of (E1) and (E2), at every special point."""
     given, mat = points(dim, law), types(dim, dtype).mat
     H = torch.stack(list(given.values())).to(device) - torch.eye(dim, dtype=torch.float64, device=device)
-    got = apply(elasticity(dim, dtype).stress[law], mat, (dim, dim), *arguments(dim, dtype, H)).cpu().double()
+    got = apply(elasticity(dim, dtype).stress[law], mat, (dim, dim), *arguments(law, dim, dtype, H)).cpu().double()
     for (name, F), tau in zip(given.items(), got, strict=True):
         want = numpy_stress(law, F.numpy())
         assert np.abs(tau.numpy() - want).max() <= limit * max(1.0, float((F**2).sum())) * 10, name
@@ -57,7 +59,7 @@ def test_small_strain_keeps_its_digits_in_float32(law, dim):
     H = 1e-6 * torch.randn(10, dim, dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     mat = types(dim, "float32").mat
     got = apply(
-        elasticity(dim, "float32").stress[law], mat, (dim, dim), *arguments(dim, "float32", H)
+        elasticity(dim, "float32").stress[law], mat, (dim, dim), *arguments(law, dim, "float32", H)
     ).double()
     trace = H.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     hooke = MU * (H + H.mT) + LAM * trace * torch.eye(dim, dtype=torch.float64)
@@ -75,8 +77,8 @@ def test_stress_adj_is_the_finite_difference(law, dim, device):
     twin, flat = blocks.stress_adj[law], wp.types.vector(dim * dim + 2, wp.float64)
 
     @wp.func
-    def flattened(H: t.mat, mu: t.real, lam: t.real, adj_tau: t.mat) -> flat:
-        adj = twin(H, mu, lam, adj_tau)
+    def flattened(H: t.mat, Q: t.mat, mu: t.real, lam: t.real, adj_tau: t.mat) -> flat:
+        adj = twin(H, Q, mu, lam, adj_tau)
         out = flat()
         for i in range(dim):
             for j in range(dim):
@@ -86,7 +88,7 @@ def test_stress_adj_is_the_finite_difference(law, dim, device):
         return out
 
     got = apply(
-        flattened, flat, (dim * dim + 2,), *arguments(dim, "float64", H.to(device)), (W.to(device), t.mat)
+        flattened, flat, (dim * dim + 2,), *arguments(law, dim, "float64", H.to(device)), (W.to(device), t.mat)
     ).cpu()
     for n, (name, F) in enumerate(given.items()):
         F, w = F.numpy(), W[n].numpy()

@@ -14,9 +14,9 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 def svd_rotation(F: np.ndarray) -> np.ndarray:
     """The proper rotation nearest to F: U diag(1, …, det UVᵀ) Vᵀ."""
     U, _, Vt = np.linalg.svd(F)
-    sign = np.ones(len(F))
-    sign[-1] = np.sign(np.linalg.det(U @ Vt))
-    return (U * sign) @ Vt
+    sign = np.ones(F.shape[:-1])
+    sign[..., -1] = np.sign(np.linalg.det(U @ Vt))
+    return (U * sign[..., None, :]) @ Vt
 
 
 def rotation(dim, dtype, H):
@@ -34,6 +34,24 @@ def test_rotation_is_that_of_the_svd(dim, dtype, limit, device):
     for (name, F), R in zip(points.items(), got, strict=True):
         scale = 1 if dtype == "float64" else max(1.0, F.norm().item())
         assert np.abs(R.numpy() - svd_rotation(F.numpy())).max() < limit * scale * 10, name
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype, limit", [("float64", 1e-13), ("float32", 2e-5)])
+def test_rotation_of_many(dim, dtype, limit, device):
+    """Stretches of 1 : 3000 and turned inside out, down to where two of them cancel to a hundredth; the error over their sum."""
+    generator = torch.Generator().manual_seed(4)
+    turn = torch.linalg.qr(torch.randn(2, 20_000, dim, dim, generator=generator, dtype=torch.float64))[0]
+    stretch = torch.exp(4 * torch.rand(20_000, dim, generator=generator, dtype=torch.float64)).sort(1, True)[0]
+    U, V = (Q * torch.linalg.det(Q)[:, None, None].sign() if dim == 3 else Q for Q in turn)
+    stretch[::2, -1] *= -1
+    F = (U * stretch[:, None, :]) @ V
+    sums = (stretch[:, -2] + torch.linalg.det(U @ V).sign() * stretch[:, -1]) / stretch[:, 0]
+    F, sums = F[sums > 0.01], sums[sums > 0.01]
+    H = (F - torch.eye(dim)).to(DTYPES[dtype]).double()
+    R = rotation(dim, dtype, H.to(device)).cpu() + torch.eye(dim)
+    error = (R - torch.from_numpy(svd_rotation((H + torch.eye(dim)).numpy()))).abs().amax((1, 2))
+    assert (error * sums).max() < limit
 
 
 @pytest.mark.parametrize("dim", [2, 3])
