@@ -27,6 +27,7 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat
     rotation, rotation_adj = polar(dim, dtype).rotation, polar(dim, dtype).rotation_adj
+    divide = types(dim, dtype).divide
 
     @wp.struct
     class ElasticAdj:
@@ -71,7 +72,7 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         u = real(1.0) + j
         if u == real(1.0):
             return j
-        return wp.log(u) * (j / (u - real(1.0)))
+        return wp.log(u) * divide(j, u - real(1.0))
 
     @wp.func
     def no_rotation(H: mat) -> mat:
@@ -87,7 +88,7 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         j = volume_change(H)
         trace = wp.trace(adj_tau)
         adj = ElasticAdj()
-        adj.F = mu * (adj_tau + wp.transpose(adj_tau)) * F + (lam * trace / (real(1.0) + j)) * cofactor(F)
+        adj.F = mu * (adj_tau + wp.transpose(adj_tau)) * F + divide(lam * trace, real(1.0) + j) * cofactor(F)
         adj.mu = wp.ddot(adj_tau, H + wp.transpose(H) + H * wp.transpose(H))
         adj.lam = trace * log1p(j)
         return adj

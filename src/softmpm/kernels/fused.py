@@ -23,7 +23,7 @@ import warp as wp
 from softmpm.kernels import failure
 from softmpm.kernels.fixed import fixed
 from softmpm.kernels.grid import grid
-from softmpm.kernels.native import native, native_module
+from softmpm.kernels.native import BLOCK, native, native_module
 from softmpm.kernels.particle import particle, particle_adj
 from softmpm.kernels.stencil import stencil
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
@@ -223,7 +223,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             if wp.static(not exact):
                 store_node(cleared, i, node_vec())
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 3))
     def advance_adj(
         # Parameters:
         scale: Scale,

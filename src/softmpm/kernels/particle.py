@@ -24,7 +24,7 @@ from softmpm.kernels.types import Spec, Wanted, solid_adj_type, solid_types, typ
 @functools.lru_cache(maxsize=None)
 def particle(spec: Spec) -> SimpleNamespace:
     t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
-    real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
+    real, vec, mat, ivec, Scale, divide = t.real, t.vec, t.mat, t.ivec, t.Scale, t.divide
     Solid, rotation, stress = solid_types(spec).Solid, solid(spec).rotation, solid(spec).stress
     sound, dim, rounds = failure.check(spec).sound, spec.dim, spec.dtype == "float32"
 
@@ -41,7 +41,7 @@ def particle(spec: Spec) -> SimpleNamespace:
     @wp.func
     def impulse(scale: Scale, body: Solid, world: int, p: int) -> real:
         """Δt V⁰ / D [m s]."""
-        return real(4.0) * scale.dt * body.volume[world, p] / (scale.spacing * scale.spacing)
+        return divide(real(4.0) * scale.dt * body.volume[world, p], scale.spacing * scale.spacing)
 
     @wp.func
     def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat, Q: mat) -> mat:
@@ -65,9 +65,9 @@ def particle(spec: Spec) -> SimpleNamespace:
         """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not sound keeps its base."""
         new = Particle()
         new.v = v
-        new.C = (real(4.0) / scale.spacing) * B
+        new.C = divide(real(4.0), scale.spacing) * B
         new.H = old.H + scale.dt * (new.C + new.C * old.H)
-        step = (scale.dt / scale.spacing) * v
+        step = divide(scale.dt, scale.spacing) * v
         if wp.static(rounds):
             step += old.low
             new.low = step - ((old.fx + step) - old.fx)
@@ -95,7 +95,7 @@ def particle(spec: Spec) -> SimpleNamespace:
 @functools.lru_cache(maxsize=None)
 def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
-    real, vec, mat, Scale = t.real, t.vec, t.mat, t.Scale
+    real, vec, mat, Scale, divide = t.real, t.vec, t.mat, t.Scale, t.divide
     Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
     stress_adj, impulse, identity = solid_adj(spec, wanted).stress_adj, one.impulse, one.identity
 
@@ -137,8 +137,8 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         """(T3.adj): adjoints of x and H before, and in ``v`` and ``C`` those of v' and B."""
         adj = ParticleAdj()
         adj.fx = adj_new.fx
-        adj.v = adj_new.v + (scale.dt / scale.spacing) * adj_new.fx
-        adj.C = (real(4.0) / scale.spacing) * (
+        adj.v = adj_new.v + divide(scale.dt, scale.spacing) * adj_new.fx
+        adj.C = divide(real(4.0), scale.spacing) * (
             adj_new.C + scale.dt * (adj_new.H * wp.transpose(identity() + H))
         )
         adj.H = adj_new.H + scale.dt * (wp.transpose(new_C) * adj_new.H)

@@ -65,7 +65,7 @@ def _polar2(dtype: str) -> SimpleNamespace:
 
 def _polar3(dtype: str) -> SimpleNamespace:
     t = types(3, dtype)
-    real, vec, mat = t.real, t.vec, t.mat
+    real, vec, mat, divide = t.real, t.vec, t.mat, t.divide
     quat = wp.types.vector(4, real)  # (w, x, y, z), unit
     steps = NEWTON_STEPS[dtype]
     close = 1e-3 if dtype == "float32" else 1e-6  # the eigenvalue need not be better: (R3) finishes
@@ -74,6 +74,10 @@ def _polar3(dtype: str) -> SimpleNamespace:
     @wp.func
     def axl(M: mat) -> vec:
         return vec(M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1])
+
+    @wp.func
+    def normalized(q: quat) -> quat:
+        return divide(real(1.0), wp.length(q)) * q
 
     @wp.func
     def cofactor(F: mat) -> mat:
@@ -96,7 +100,7 @@ def _polar3(dtype: str) -> SimpleNamespace:
         for _step in range(QUARTIC_STEPS):
             value = ((x * x - real(2.0) * square) * x - real(8.0) * J) * x + last
             slope = real(4.0) * (x * x - square) * x - real(8.0) * J
-            change = value / slope
+            change = divide(value, slope)
             if not change > real(0.1 * close) * x:  # also ends on 0/0, where F = 0
                 break
             x = x - change
@@ -115,31 +119,30 @@ def _polar3(dtype: str) -> SimpleNamespace:
         xy = -(F[0, 1] + F[1, 0])
         xz = -(F[0, 2] + F[2, 0])
         yz = -(F[1, 2] + F[2, 1])
-        r0 = real(1.0) / (s - trace)
+        r0 = divide(real(1.0), s - trace)
         b = -r0 * z  # the column below the pivot, over it
-        r1 = real(1.0) / (s + trace - real(2.0) * F[0, 0] + b[0] * z[0])
+        r1 = divide(real(1.0), s + trace - real(2.0) * F[0, 0] + b[0] * z[0])
         xy += b[0] * z[1]
         xz += b[0] * z[2]
         yz += b[1] * z[2]
         c = r1 * xy
         d = r1 * xz
-        r2 = real(1.0) / (s + trace - real(2.0) * F[1, 1] + b[1] * z[1] - c * xy)
+        r2 = divide(real(1.0), s + trace - real(2.0) * F[1, 1] + b[1] * z[1] - c * xy)
         yz -= c * xz
         e = r2 * yz
-        r3 = real(1.0) / (s + trace - real(2.0) * F[2, 2] + b[2] * z[2] - d * xz - e * yz)
-        unit = real(close) * s  # keeps the length: the smallest eigenvalue is about that
+        r3 = divide(real(1.0), s + trace - real(2.0) * F[2, 2] + b[2] * z[2] - d * xz - e * yz)
+        small = real(close) * s  # keeps the length: the smallest eigenvalue is about that
         q = quat(real(0.8), real(0.45), real(0.3), real(0.2))
         for _step in range(INVERSE_STEPS):
             x = q[1] - b[0] * q[0]
             y = q[2] - b[1] * q[0] - c * x
-            w = unit * r3 * (q[3] - b[2] * q[0] - d * x - e * y)
-            y = unit * r2 * y - e * w
-            x = unit * r1 * x - c * y - d * w
-            q = quat(unit * r0 * q[0] - b[0] * x - b[1] * y - b[2] * w, x, y, w)
-        length = wp.length(q)
-        if not length > real(0.0):
+            w = small * r3 * (q[3] - b[2] * q[0] - d * x - e * y)
+            y = small * r2 * y - e * w
+            x = small * r1 * x - c * y - d * w
+            q = quat(small * r0 * q[0] - b[0] * x - b[1] * y - b[2] * w, x, y, w)
+        if not wp.dot(q, q) > real(0.0):
             return quat(real(1.0), real(0.0), real(0.0), real(0.0))  # F = 0: every rotation is a maximiser
-        return (real(1.0) / length) * q
+        return normalized(q)
 
     @wp.func
     def minus_identity(q: quat) -> mat:
@@ -170,8 +173,10 @@ def _polar3(dtype: str) -> SimpleNamespace:
         yy = a * c - e * e
         yz = e * f - d * a
         zz = a * b - f * f
-        rest = vec(first[1] * z[0] + yy * z[1] + yz * z[2], first[2] * z[0] + yz * z[1] + zz * z[2], real(0.0))
-        over = real(1.0) / (a * first[0] + f * first[1] + e * first[2])
+        rest = vec(
+            first[1] * z[0] + yy * z[1] + yz * z[2], first[2] * z[0] + yz * z[1] + zz * z[2], real(0.0)
+        )
+        over = divide(real(1.0), a * first[0] + f * first[1] + e * first[2])
         return over * vec(wp.dot(first, z), rest[0], rest[1])
 
     @wp.func
@@ -181,9 +186,11 @@ def _polar3(dtype: str) -> SimpleNamespace:
             Q = minus_identity(q)
             E = H + wp.transpose(Q) + wp.transpose(Q) * H  # RᵀF − I
             half = real(0.5) * turn(E, axl(E))
+            if not wp.isfinite(wp.dot(half, half)):
+                half = vec()  # R is not unique; q is one of them
             u = vec(q[1], q[2], q[3])
             v = q[0] * half + u + wp.cross(u, half)
-            q = wp.normalize(quat(q[0] - wp.dot(u, half), v[0], v[1], v[2]))  # (R3)
+            q = normalized(quat(q[0] - wp.dot(u, half), v[0], v[1], v[2]))  # (R3)
         return minus_identity(q)
 
     @wp.func

@@ -89,9 +89,12 @@ CUDA_CALLABLE inline void add_warp(
     float4 below = make_float4(0.0f, 0.0f, 0.0f, 0.0f), middle = below, above = below;
     const float4 zero = below;
     int current = -1;
+    const float4* q = all + min(begin, LANES - 1) * WIDTH;
+    float4 n0 = q[0], n1 = q[1], n2 = q[2], n3 = q[3], n4 = q[4];  // the particle after this one: read before it is waited for
     for (int p = begin; p < end; ++p) {
-        const float4* q = all + p * WIDTH;
-        float4 q4 = q[4];
+        float4 q0 = n0, q1 = n1, q2 = n2, q3 = n3, q4 = n4;
+        q = all + min(p + 1, LANES - 1) * WIDTH;
+        n0 = q[0], n1 = q[1], n2 = q[2], n3 = q[3], n4 = q[4];
         int next = __float_as_int(q4.z);
         if (next < 0)
             break;  // the last particle was the one before
@@ -111,7 +114,6 @@ CUDA_CALLABLE inline void add_warp(
             }
             current = next;
         }
-        float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
         float w = wx(q1.w) * wy(q2.w);
         float x = q0.x + q1.x * fx + q2.x * fy, y = q0.y + q1.y * fx + q2.y * fy, z = q0.z + q1.z * fx + q2.z * fy;
         float w0 = w * q3.w, w1 = w * q4.x, w2 = w * q4.y;
@@ -163,9 +165,12 @@ CUDA_CALLABLE inline void add_warp(
     Sink origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
     float x = 0.0f, y = 0.0f, mass = 0.0f;
     int current = -1;
+    const float4* q = all + min(begin, LANES - 1) * WIDTH;
+    float4 n0 = q[0], n1 = q[1], n2 = q[2];
     for (int p = begin; p < end; ++p) {
-        const float4* q = all + p * WIDTH;
-        float4 q0 = q[0];
+        float4 q0 = n0, q1 = n1, q2 = n2;
+        q = all + min(p + 1, LANES - 1) * WIDTH;
+        n0 = q[0], n1 = q[1], n2 = q[2];
         int next = __float_as_int(q0.w);
         if (next < 0)
             break;
@@ -175,7 +180,6 @@ CUDA_CALLABLE inline void add_warp(
             x = y = mass = 0.0f;
             current = next;
         }
-        float4 q1 = q[1], q2 = q[2];
         float w = wx(q2.x) * wy(q2.y);
         x += w * (q0.x + q1.x * fx + q1.z * fy);
         y += w * (q0.y + q1.y * fx + q1.w * fy);

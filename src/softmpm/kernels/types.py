@@ -73,6 +73,18 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
     aligned = wp.types.vector(4, real)  # the same in the fast scheme: 16 bytes in float32, padded in 2D
     ivec = wp.types.vector(dim, wp.int32)
 
+    if dtype == "float32":
+
+        @wp.func
+        def divide(a: real, b: real) -> real:
+            """a / b to two units in the last place, without branches."""
+            return wp.div_approx(a, b)
+    else:
+
+        @wp.func
+        def divide(a: real, b: real) -> real:
+            return a / b
+
     class Scale:
         shape: ivec  # nodes along each axis
         dt: real  # Δt [s]
@@ -127,6 +139,7 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         node=node,
         aligned=aligned,
         c_name={"float32": "float", "float64": "double"}[dtype],
+        divide=divide,
         Packed=struct(Packed),
         Window=struct(Window),
         **packed_rows(dim)._asdict(),

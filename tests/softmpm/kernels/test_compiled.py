@@ -62,7 +62,9 @@ def test_machine_code(dim, law, which):
     declared = cubin.arrays(code)
     assert facts.frame == facts.stack == declared, f"{facts.frame - declared} bytes of registers are spilled"
     assert declared == 0
-    assert not re.findall(r"^\s+[a-z]+\.\S*f64\b.*", code, re.MULTILINE), "double precision where float32 is meant"
+    assert not re.findall(r"^\s+[a-z]+\.\S*f64\b.*", code, re.MULTILINE), (
+        "double precision where float32 is meant"
+    )
 
 
 def test_spilled_registers_would_be_seen():

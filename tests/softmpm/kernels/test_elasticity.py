@@ -46,7 +46,11 @@ def test_stress_is_the_law(law, dim, dtype, limit, device):
     """τ of (E1) and (E2), at every special point."""
     given, mat = points(dim, law), types(dim, dtype).mat
     H = torch.stack(list(given.values())).to(device) - torch.eye(dim, dtype=torch.float64, device=device)
-    got = apply(elasticity(dim, dtype).stress[law], mat, (dim, dim), *arguments(law, dim, dtype, H)).cpu().double()
+    got = (
+        apply(elasticity(dim, dtype).stress[law], mat, (dim, dim), *arguments(law, dim, dtype, H))
+        .cpu()
+        .double()
+    )
     for (name, F), tau in zip(given.items(), got, strict=True):
         want = numpy_stress(law, F.numpy())
         assert np.abs(tau.numpy() - want).max() <= limit * max(1.0, float((F**2).sum())) * 10, name
@@ -88,7 +92,11 @@ def test_stress_adj_is_the_finite_difference(law, dim, device):
         return out
 
     got = apply(
-        flattened, flat, (dim * dim + 2,), *arguments(law, dim, "float64", H.to(device)), (W.to(device), t.mat)
+        flattened,
+        flat,
+        (dim * dim + 2,),
+        *arguments(law, dim, "float64", H.to(device)),
+        (W.to(device), t.mat),
     ).cpu()
     for n, (name, F) in enumerate(given.items()):
         F, w = F.numpy(), W[n].numpy()

@@ -42,7 +42,9 @@ def test_rotation_of_many(dim, dtype, limit, device):
     """Stretches of 1 : 3000 and turned inside out, down to where two of them cancel to a hundredth; the error over their sum."""
     generator = torch.Generator().manual_seed(4)
     turn = torch.linalg.qr(torch.randn(2, 20_000, dim, dim, generator=generator, dtype=torch.float64))[0]
-    stretch = torch.exp(4 * torch.rand(20_000, dim, generator=generator, dtype=torch.float64)).sort(1, True)[0]
+    stretch = torch.exp(4 * torch.rand(20_000, dim, generator=generator, dtype=torch.float64)).sort(1, True)[
+        0
+    ]
     U, V = (Q * torch.linalg.det(Q)[:, None, None].sign() if dim == 3 else Q for Q in turn)
     stretch[::2, -1] *= -1
     F = (U * stretch[:, None, :]) @ V
