@@ -93,16 +93,30 @@ def machine(device: torch.device) -> str:
     return f"CPU, {torch.get_num_threads()} PyTorch thread(s), {platform.machine()}"
 
 
-def report(title: str, rows: list[dict], device: torch.device, path: Path | None) -> None:
-    """Print a table; write it as JSON if asked."""
-    print(f"{title} ({machine(device)})")
-    names = list(rows[0])
-    cells = [[f"{row[n]:.4g}" if isinstance(row[n], float) else str(row[n]) for n in names] for row in rows]
-    widths = [max(len(c) for c in column) for column in zip(names, *cells, strict=True)]
-    for line in (names, *cells):
-        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
-    if path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(
-            json.dumps({"title": title, "machine": machine(device), "rows": rows}, indent=1) + "\n"
+class Table:
+    """What a benchmark measured. A row is printed, and in the JSON file if one is asked for, as soon as it is there."""
+
+    def __init__(self, title: str, device: torch.device, path: Path | None):
+        self.title, self.machine, self.path, self.rows = title, machine(device), path, []
+
+    def add(self, row: dict) -> None:
+        if not self.rows:
+            print(f"{self.title} ({self.machine})")
+            print(self._line({name: name for name in row}, row))
+        self.rows.append(row)
+        print(self._line(row, self.rows[0]), flush=True)
+        if self.path:
+            content = {"title": self.title, "machine": self.machine, "rows": self.rows}
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.write_text(json.dumps(content, indent=1) + "\n")
+
+    @staticmethod
+    def _line(row: dict, like: dict) -> str:
+        texts = {
+            name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in row.items()
+        }
+        words = (
+            text.ljust(25) if isinstance(like[n], str) else text.rjust(max(9, len(n)))
+            for n, text in texts.items()
         )
+        return "  ".join(words)

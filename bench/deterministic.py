@@ -4,7 +4,7 @@ Microseconds of a substep, forward and backward with everything kept, of an ordi
 """
 
 import torch
-from common import arguments, cube, report
+from common import Table, arguments, cube
 from gradient import measure
 from step import CASES
 
@@ -13,7 +13,8 @@ import softmpm
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("Determinism, neo-Hookean, float32", device, args.json)
     gpu = device.type == "cuda"
     for dim, particles, nodes in CASES[:-1]:
         if particles > (args.largest or (particles if gpu else 8_000)):
@@ -29,8 +30,7 @@ def main():
                 torch.cuda.empty_cache()
         for way in ("forward", "backward"):
             row[f"{way} ratio"] = row[f"deterministic {way}"] / row[f"ordinary {way}"]
-        rows.append(row)
-    report("Determinism, neo-Hookean, float32", rows, device, args.json)
+        table.add(row)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 import torch
-from common import arguments, median_seconds, report
+from common import Table, arguments, median_seconds
 
 import softmpm
 from softmpm_learn.run import Run
@@ -49,7 +49,8 @@ def physics(run: Run):
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("An iteration of learning in closed loop, float32", device, args.json)
     for cells, period, substeps in CASES if device.type == "cuda" else [(80, 0.0125, 100)]:
         task = task_of(cells, period, substeps)
         model = softmpm.build(task.scene, device=device)
@@ -58,7 +59,7 @@ def main():
             whole = median_seconds(lambda run=run: run.loop(None), device, args.repeats + 1)
             alone = median_seconds(physics(run), device, args.repeats + 1)
             eager = median_seconds(run.loop._work, device, 2)
-        rows.append(
+        table.add(
             {
                 "particles": model.particle_count,
                 "control steps": task.control_steps,
@@ -69,7 +70,6 @@ def main():
                 "eager ms": 1e3 * eager,
             }
         )
-    report("An iteration of learning in closed loop, float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

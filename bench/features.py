@@ -6,7 +6,7 @@ rows hold the same cube in grids that are mostly empty.
 """
 
 import torch
-from common import arguments, cube, report
+from common import Table, arguments, cube
 from gradient import measure
 
 import softmpm
@@ -36,23 +36,23 @@ FEATURES = {
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
     gpu = device.type == "cuda"
     particles, nodes, substeps = (64_000, 48, 128) if gpu else (1_000, 16, 20)
+    table = Table(f"Features, 3D, {particles} particles, float32", device, args.json)
     for name, features in FEATURES.items():
         model = softmpm.build(
             cube(3, particles, nodes, **features), device=device, memory_budget=2**62 if gpu else None
         )
         ahead, back = measure(model, substeps, args.repeats)
         row = {"scene": name, "forward us": ahead, "backward us": back}
-        first = rows[0] if rows else row
+        first = table.rows[0] if table.rows else row
         for way in ("forward", "backward"):
             row[f"{way} ratio"] = row[f"{way} us"] / first[f"{way} us"]
-        rows.append(row)
+        table.add(row)
         del model
         if gpu:
             torch.cuda.empty_cache()
-    report(f"Features, 3D, {particles} particles, float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ gradient where the scene has muscles, the materials only in the rows that say so
 import time
 
 import torch
-from common import arguments, cube, report, sync, turning
+from common import Table, arguments, cube, sync, turning
 from step import CASES, VARIANTS
 
 import softmpm
@@ -51,7 +51,8 @@ def measure(
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("Forward and backward [us/substep], float32", device, args.json)
     for dim, particles, nodes in CASES:
         if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
             continue
@@ -70,8 +71,7 @@ def main():
                 del model
                 if device.type == "cuda":
                     torch.cuda.empty_cache()
-            rows.append(row)
-    report("Forward and backward [us/substep], float32", rows, device, args.json)
+            table.add(row)
 
 
 if __name__ == "__main__":

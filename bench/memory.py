@@ -6,7 +6,7 @@ Peak memory of one call and its backward pass, and the time of both, against mem
 import time
 
 import torch
-from common import arguments, cube, report, sync, turning
+from common import Table, arguments, cube, sync, turning
 
 import softmpm
 from softmpm.horizon import Horizon
@@ -17,7 +17,8 @@ GIB = 2**30
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("Gradient with little memory, float32", device, args.json)
     cases = [(64_000, 48, [32, 4, 1, 0.25]), (1_000_000, 96, [60, 6])]
     substeps = 1000
     if device.type == "cpu":
@@ -39,7 +40,7 @@ def main():
                 seconds.append(time.perf_counter() - begin)
                 del end
             peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else 0
-            rows.append(
+            table.add(
                 {
                     "particles": model.particle_count,
                     "substeps": substeps,
@@ -53,7 +54,6 @@ def main():
             del model, start, params
             if device.type == "cuda":
                 torch.cuda.empty_cache()
-    report("Gradient with little memory, float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

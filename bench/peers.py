@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from common import arguments, cube, median_seconds, report, sync
+from common import Table, arguments, cube, median_seconds, sync
 from naive_warp import NaiveWarp
 
 import softmpm
@@ -148,8 +148,9 @@ class Cube(NamedTuple):
 
 
 def cube_in_orders(dim: int, particles: int, nodes: int, device: torch.device) -> Cube:
-    most = 20 if device.type == "cpu" else 100
-    substeps = 32 if particles > 100_000 else 100  # the peers keep all states, 3 GB of them at most
+    most = 20 if device.type == "cpu" else 1000
+    # The peers keep all states, some gigabytes of them.
+    substeps = 1000 if particles < 10_000 else 200 if particles < 100_000 else 32
     scenes = [ordered(cube(dim, particles, nodes), order) for order in ORDERS]
     return Cube(dim, nodes, min(most, substeps), scenes, [case_of(scene) for scene in scenes])
 
@@ -212,9 +213,8 @@ def row(name: str, found: dict | None, ours: dict, substeps: int, dx: float) -> 
     }
 
 
-def contest(one: Cube, others: list[dict] | None, device: torch.device, repeats: int) -> list[dict]:
+def contest(one: Cube, others: list[dict] | None, device: torch.device, repeats: int, table: Table) -> None:
     """All contenders on one cube, its particles in either order; Taichi's results are given."""
-    rows = []
     others = others or [None] * len(ORDERS)
     for order, scene, case, other in zip(ORDERS, one.scenes, one.cases, others, strict=True):
 
@@ -229,22 +229,20 @@ def contest(one: Cube, others: list[dict] | None, device: torch.device, repeats:
         found = {name: result(make, one.substeps, device, repeats) for name, make in makes.items()}
         label = {"dim": one.dim, "particles": len(case["x"]), "nodes": one.nodes, "order": order}
         for name, theirs in (found | {"Taichi": other}).items():
-            rows.append(label | row(name, theirs, found["softmpm"], one.substeps, scene.grid.spacing))
-            print(*rows[-1].values(), flush=True)
+            table.add(label | row(name, theirs, found["softmpm"], one.substeps, scene.grid.spacing))
         if device.type == "cuda":
             torch.cuda.empty_cache()
-    return rows
 
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("softmpm and peers, us/substep, float32", device, args.json)
     most = args.largest or (8_000 if device.type == "cpu" else max(case[1] for case in CASES))
     cubes = [cube_in_orders(*case, device) for case in CASES if case[1] <= most]
     for one, others in zip(cubes, taichi(cubes, device, args.repeats), strict=True):
-        rows += contest(one, others, device, args.repeats)
-    report("softmpm and peers, us/substep, float32", rows, device, args.json)
-    ran = [r for r in rows if r["apart [dx]"] != "-"]
+        contest(one, others, device, args.repeats, table)
+    ran = [r for r in table.rows if r["apart [dx]"] != "-"]
     wrong = [r for r in ran if not (r["apart [dx]"] < APART and r["gradient apart"] < GRADIENT_APART)]
     if wrong:
         sys.exit(f"{len(wrong)} results differ by more than {APART} dx or {GRADIENT_APART} of the gradient.")

@@ -8,7 +8,7 @@ bytes at copy speed, `times floor` how often it fits into the measured substep. 
 """
 
 import torch
-from common import arguments, cube, median_seconds, report
+from common import Table, arguments, cube, median_seconds
 from step import CASES, VARIANTS
 
 import softmpm
@@ -45,8 +45,9 @@ def seconds(model: softmpm.Model, substeps: int, repeats: int) -> float:
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
     bandwidth = copy_bandwidth(device, args.repeats)
+    table = Table(f"Forward against a copy at {bandwidth / 1e9:.0f} GB/s, float32", device, args.json)
     substeps = 20 if device.type == "cpu" else 100
     for dim, particles, nodes in CASES:
         if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
@@ -57,8 +58,7 @@ def main():
             floor, taken = least / bandwidth, seconds(model, substeps, args.repeats)
             row = {"dim": dim, "particles": model.particle_count, "nodes": nodes, "scene": name}
             row |= {"MB": least / 1e6, "floor us": floor * 1e6, "us/substep": taken * 1e6}
-            rows.append(row | {"copy GB/s": bandwidth / 1e9, "times floor": taken / floor})
-    report(f"Forward against a copy at {bandwidth / 1e9:.0f} GB/s, float32", rows, device, args.json)
+            table.add(row | {"copy GB/s": bandwidth / 1e9, "times floor": taken / floor})
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ calling. Medians of repeats after a warm-up.
 """
 
 import torch
-from common import arguments, cube, median_seconds, report, turning
+from common import Table, arguments, cube, median_seconds, turning
 
 import softmpm
 
@@ -38,7 +38,8 @@ def run(model: softmpm.Model, start: softmpm.State, substeps: int) -> None:
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("Forward, float32", device, args.json)
     for dim, particles, nodes in CASES:
         if particles > (args.largest or (64_000 if device.type == "cpu" else particles)):
             continue
@@ -53,9 +54,8 @@ def main():
                     lambda s=start, m=model, n=substeps: run(m, s, n), device, args.repeats
                 )
                 row[motion], row["call us"] = (whole - call) / (substeps - 1) * 1e6, call * 1e6
-            rows.append(row)
+            table.add(row)
             del model, start
-    report("Forward, float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

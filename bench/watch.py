@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
-from common import arguments, cube, median_seconds, report
+from common import Table, arguments, cube, median_seconds
 from step import CASES
 
 import softmpm
@@ -48,7 +48,8 @@ def unchecked(model: softmpm.Model):
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("Cost of watching for failures, float32", device, args.json)
     substeps = 20 if device.type == "cpu" else 200
     for dim, particles, nodes in CASES[:-1]:
         if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
@@ -72,7 +73,7 @@ def main():
                 seconds[k].append(median_seconds(work, device, 3))
         with_watch, without = (statistics.median(s) / substeps * 1e6 for s in seconds)
         ratio = statistics.median(a / b for a, b in zip(*seconds, strict=True))
-        rows.append(
+        table.add(
             {
                 "dim": dim,
                 "particles": particles,
@@ -81,7 +82,6 @@ def main():
                 "ratio": ratio,
             }
         )
-    report("Cost of watching for failures, float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Do many small robots in one launch run as fast as one large one? `python bench/worlds.py [--device cuda] [--json FILE]`
 
 Millions of particles and substeps per second, forward and backward, everything kept; ``share`` is the throughput over that of the
-last row, one scene with as many particles as 64 worlds.
+first row, one scene with as many particles as 64 worlds.
 """
 
 import torch
-from common import arguments, cube, report
+from common import Table, arguments, cube
 from gradient import measure
 
 import softmpm
@@ -13,10 +13,11 @@ import softmpm
 
 def main():
     args = arguments(__doc__)
-    device, rows = torch.device(args.device), []
+    device = torch.device(args.device)
+    table = Table("Worlds in one launch, 3D neo-Hookean, float32", device, args.json)
     gpu = device.type == "cuda"
     small, large = (8_000, 512_000) if gpu else (1_000, 8_000)
-    cases = [(n, small, 32) for n in ((1, 8, 64, 256) if gpu else (1, 8))] + [(1, large, 96 if gpu else 32)]
+    cases = [(1, large, 96 if gpu else 32)] + [(n, small, 32) for n in ((1, 8, 64, 256) if gpu else (1, 8))]
     substeps = 64 if gpu else 10
     for worlds, particles, nodes in cases:
         model = softmpm.build(
@@ -25,14 +26,12 @@ def main():
         total = worlds * model.particle_count
         ahead, back = measure(model, substeps, args.repeats)
         speed = {"forward M/s": total / ahead, "backward M/s": total / back}
-        rows.append({"worlds": worlds, "particles": model.particle_count} | speed)
+        first = table.rows[0] if table.rows else speed
+        share = {f"{way} share": speed[f"{way} M/s"] / first[f"{way} M/s"] for way in ("forward", "backward")}
+        table.add({"worlds": worlds, "particles": model.particle_count} | speed | share)
         del model
         if gpu:
             torch.cuda.empty_cache()
-    for row in rows:
-        for way in ("forward", "backward"):
-            row[f"{way} share"] = row[f"{way} M/s"] / rows[-1][f"{way} M/s"]
-    report("Worlds in one launch, 3D neo-Hookean, float32", rows, device, args.json)
 
 
 if __name__ == "__main__":

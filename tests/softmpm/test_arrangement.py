@@ -11,7 +11,7 @@ from helpers import LAWS, assert_relative, cotangent, dot
 
 import softmpm
 from softmpm import arrangement
-from softmpm.arrangement import STALE, Arrangement
+from softmpm.arrangement import STALE_FEW, Arrangement
 from softmpm.memory import MARGIN
 
 DX = 1 / 16  # a power of two: shifting by whole cells is exact
@@ -146,8 +146,8 @@ def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
         cells = sum(len(np.unique(base, axis=0)) for base in bases(model, followed))
         for met, near_edge, stale in (
             (cells, False, False),
-            (int(STALE * cells), False, False),
-            (int(STALE * cells) + 1, False, device == "cuda"),
+            (int(STALE_FEW * cells), False, False),
+            (int(STALE_FEW * cells) + 1, False, device == "cuda"),
             (cells, True, True),
         ):
             found.judge(met, near_edge)
