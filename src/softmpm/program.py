@@ -112,6 +112,19 @@ class Program:
         return BLOCK if self.total > FEW else WARP
 
     @functools.cached_property
+    def crew(self) -> int:
+        """Particles of a warp: fewer than its threads while the GPU has more room than warps, so that each walks a shorter way."""
+        if self.model.device.type != "cuda" or self.exact is not None:
+            return WARP
+        return WARP if self.total > FEW else WARP // 2
+
+    @property
+    def crews(self) -> int:
+        """Threads of a launch in which each warp has a crew of particles."""
+        warps = -(-self.total // self.crew)
+        return -(-warps * WARP // self.block) * self.block if self.model.device.type == "cuda" else self.total
+
+    @functools.cached_property
     def threads(self) -> int:
         """Threads of a launch over particles: whole blocks on a GPU, since warps work together."""
         return -(-self.total // self.block) * self.block if self.model.device.type == "cuda" else self.total
@@ -185,11 +198,11 @@ class Program:
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (max(s, 0), s + 1) if self.keep else (0, 0)
         solid = self.solid(min(s + 1, length - 1))
-        parameters = (model.scale, solid, self.window, s, s + 1 == length)
+        parameters = (model.scale, solid, self.window, s, s + 1 == length, self.crew)
         sizes = (model.particle_count, self.total, self.order_flat)
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(fused(model.spec).advance, self.threads, *arguments, block_dim=self.block)
+        launch(fused(model.spec).advance, self.crews, *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
             self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

@@ -108,14 +108,14 @@ class ProgramAdj:
         model, length, exact = program.model, program.chunk.length, scratch.exact
         sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
-        parameters = (model.scale, solid, program.window, length - 1 - s, start, end)
+        parameters = (model.scale, solid, program.window, length - 1 - s, start, end, program.crew)
         sizes = (model.particle_count, program.total, program.order_flat)
         states = (program.packed[max(s - 1, 0)], program.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
         out = (program.watch, scratch.solid_struct, sink)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
-        launch(kernel, program.threads, *arguments, block_dim=program.block)
+        launch(kernel, program.crews, *arguments, block_dim=program.block)
         if exact is not None and not start:
             exact.push(program, s - 1, states[0], None, launch)
 

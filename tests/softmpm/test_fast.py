@@ -369,7 +369,9 @@ def assert_same_failure(one, other, built) -> None:
         got, want = getattr(one.state, name), getattr(other.state, name)
         assert_relative(got[healthy], want[healthy], 2e-6, name)
         at = other.world, other.particle
-        if name == "C":  # a difference of velocities over a cell: their rounding, not its own size, is the measure
+        if (
+            name == "C"
+        ):  # a difference of velocities over a cell: their rounding, not its own size, is the measure
             rounding = other.state.v[at].norm() / built.scene.grid.spacing
             assert (got[at] - want[at]).norm() <= 2e-6 * rounding
         else:

@@ -38,7 +38,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
-    aligned, head, coordinates = s.aligned, s.head, s.coordinates
+    aligned, head, coordinates, particle_of = s.aligned, s.head, s.coordinates, s.particle_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum, moved = one.rotation, one.affine_momentum, one.moved
@@ -98,6 +98,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         window: Window,
         substep: int,  # -1: only the P2G of the start
         last: bool,  # no P2G afterwards
+        crew: int,  # particles of a warp
         count: int,  # particles of one world
         total: int,  # particles of all worlds
         order: wp.array(dtype=wp.int32),
@@ -110,7 +111,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         # Out, added into:
         node: Shares,
     ):
-        i = wp.tid()
+        i = particle_of(wp.tid(), crew, total)
         first = int(-1)
         g = vec()
         b = vec()
@@ -161,7 +162,7 @@ def fused(spec: Spec) -> SimpleNamespace:
                 if not give(node, i, count, total, b, A):
                     report(watch, i / count, substep + 1, not_finite, order[i])
             else:
-                scatter(node, window.shape, first, g, b, A, m)
+                scatter(node, window.shape, crew, first, g, b, A, m)
 
     return SimpleNamespace(clear=clear, grid_velocity=grid_velocity, advance=advance, centre=centre)
 
@@ -178,7 +179,8 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     )
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     gather_adj, slope_adj, first_node, unpack_base = s.gather_adj, s.slope_adj, s.first_node, s.unpack_base
-    aligned, head, coordinates, centre = s.aligned, s.head, s.coordinates, fused(spec).centre
+    aligned, head, coordinates = s.aligned, s.head, s.coordinates
+    centre, particle_of = fused(spec).centre, s.particle_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum = one.rotation, one.affine_momentum
@@ -232,6 +234,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         back: int,  # substeps from the end
         start: bool,  # nothing before
         end: bool,  # nothing after
+        crew: int,
         count: int,
         total: int,
         order: wp.array(dtype=wp.int32),
@@ -248,7 +251,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         adj_body: SolidAdj,
         adj_velocity: Shares,  # of the substep before
     ):
-        i = wp.tid()
+        i = particle_of(wp.tid(), crew, total)
         first = int(-1)
         g = vec()
         b = vec()
@@ -307,6 +310,6 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             if wp.static(exact):
                 give(adj_velocity, i, count, total, b, B)
             else:
-                scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
+                scatter(adj_velocity, window.shape, crew, first, g, b, B, real(0.0))
 
     return SimpleNamespace(grid_velocity_adj=grid_velocity_adj, advance_adj=advance_adj)

@@ -8,7 +8,7 @@
 // forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
 // share their nodes. The warp therefore turns the sum around: it writes its particles' (b, A, m, g) to shared memory, then
 // three groups of nine lanes own the nodes, walk through a third of the particles each, add up in registers while the cell
-// stays the same, and send one 16-byte reduction per node and cell.
+// stays the same, and send one 16-byte reduction per node and cell. Its first lanes have particles, the ``crew``.
 namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
@@ -62,8 +62,8 @@ struct Weight {
 // Three dimensions: a lane owns a column of three nodes along z, and hands it on when the next cell is the one above.
 template <class Sink>
 CUDA_CALLABLE inline void add_warp(
-    Sink node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, float>& g, const wp::vec_t<3, float>& b,
-    const wp::mat_t<3, 3, float>& A, float m)
+    Sink node, const wp::vec_t<3, int>& shape, int crew, int first, const wp::vec_t<3, float>& g,
+    const wp::vec_t<3, float>& b, const wp::mat_t<3, 3, float>& A, float m)
 {
     constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
@@ -82,7 +82,7 @@ CUDA_CALLABLE inline void add_warp(
     int ox = column / 3 - 1, oy = column % 3 - 1;
     Weight wx(ox), wy(oy);
     float fx = float(ox), fy = float(oy);
-    int begin = group * 11, end = min(begin + 11, LANES);
+    int share = (crew + 2) / 3, begin = group * share, end = min(begin + share, crew);
     if (group == 3)
         begin = end;  // lanes 27 to 31 own nothing
     Sink origin = node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]);
@@ -142,8 +142,8 @@ CUDA_CALLABLE inline void add_warp(
 // Two dimensions: a lane owns one node. The node is (x, y, m, 0).
 template <class Sink>
 CUDA_CALLABLE inline void add_warp(
-    Sink node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, float>& g, const wp::vec_t<2, float>& b,
-    const wp::mat_t<2, 2, float>& A, float m)
+    Sink node, const wp::vec_t<2, int>& shape, int crew, int first, const wp::vec_t<2, float>& g,
+    const wp::vec_t<2, float>& b, const wp::mat_t<2, 2, float>& A, float m)
 {
     constexpr int WIDTH = 3;
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
@@ -159,7 +159,7 @@ CUDA_CALLABLE inline void add_warp(
     int ox = own / 3 - 1, oy = own % 3 - 1;
     Weight wx(ox), wy(oy);
     float fx = float(ox), fy = float(oy);
-    int begin = group * 11, end = min(begin + 11, LANES);
+    int share = (crew + 2) / 3, begin = group * share, end = min(begin + share, crew);
     if (group == 3)
         begin = end;
     Sink origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
@@ -259,15 +259,15 @@ CUDA_CALLABLE inline void add_each(
         }
 }
 
-// The whole warp must come here together: particles beyond the last one with first = -1.
+// The whole warp must come here together: lanes without a particle with first = -1.
 template <unsigned DIM, typename T>
 CUDA_CALLABLE inline void scatter(
-    wp::vec_t<4, T>* node, const wp::vec_t<DIM, int>& shape, int first, const wp::vec_t<DIM, T>& g,
+    wp::vec_t<4, T>* node, const wp::vec_t<DIM, int>& shape, int crew, int first, const wp::vec_t<DIM, T>& g,
     const wp::vec_t<DIM, T>& b, const wp::mat_t<DIM, DIM, T>& A, T m)
 {
 #if defined(__CUDA_ARCH__)
     if constexpr (sizeof(T) == 4) {
-        add_warp(reinterpret_cast<T*>(node), shape, first, g, b, A, m);
+        add_warp(reinterpret_cast<T*>(node), shape, crew, first, g, b, A, m);
         return;
     }
 #endif

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.native import native
+from softmpm.kernels.native import WARP, native
 from softmpm.kernels.types import types
 
 
@@ -40,6 +40,15 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func
     def slopes(g: real) -> triple:
         return triple(g - real(0.5), real(-2.0) * g, g + real(0.5))
+
+    @wp.func
+    def particle_of(thread: int, crew: int, total: int) -> int:
+        """Place of the particle that a thread has. The first ``crew`` lanes of a warp have one; to have none is ``total``."""
+        lane = thread % WARP
+        place = thread / WARP * crew + lane
+        if lane >= crew or place > total:
+            place = total
+        return place
 
     if dim == 2:
 
@@ -277,6 +286,7 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         return sums_adj
 
     return SimpleNamespace(
+        particle_of=particle_of,
         first_node=first_node,
         coordinates=coordinates,
         pack_base=pack_base,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmpm.kernels.native import BLOCK, native, native_module
+from softmpm.kernels.native import BLOCK, WARP, native, native_module
 from softmpm.kernels.stencil import stencil
 from softmpm.kernels.types import BASE_BITS, packed_rows, types
 
@@ -22,7 +22,8 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
     t, s, n = types(dim, dtype), stencil(dim, dtype), native(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
     gather, gather_adj, slope_adj, scatter = s.gather, s.gather_adj, s.slope_adj, n.scatter
-    first_node, coordinates, pack_base, unpack_base = s.first_node, s.coordinates, s.pack_base, s.unpack_base
+    first_node, coordinates, particle_of = s.first_node, s.coordinates, s.particle_of
+    pack_base, unpack_base = s.pack_base, s.unpack_base
     load_node, store_node, aligned, head = n.load_node, n.store_node, s.aligned, s.head
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     module = native_module(f"test_stencil.d{dim}.{dtype}")
@@ -69,6 +70,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
     def spread(
         node: wp.array(dtype=node_vec),
         shape: ivec,
+        crew: int,
         count: int,
         first: wp.array(dtype=int),
         g: wp.array(dtype=vec),
@@ -76,10 +78,10 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         A: wp.array(dtype=mat),
         m: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = particle_of(wp.tid(), crew, count)
         p = wp.min(i, count - 1)
         at = wp.where(i < count, first[p], -1)
-        scatter(node, shape, at, g[p], b[p], A[p], m[p])
+        scatter(node, shape, crew, at, g[p], b[p], A[p], m[p])
 
     @wp.kernel(module=module, enable_backward=False)
     def bases(base: wp.array(dtype=ivec), packed: wp.array(dtype=int), back: wp.array(dtype=ivec)):
@@ -236,9 +238,10 @@ def spread(bench) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dtype, limit", [("float64", LIMIT), ("float32", 1e-6)])
+@pytest.mark.parametrize("crew", [WARP, 16, 7])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_scatter(dim, dtype, limit, device):
-    """w (b + A o, m) of every particle on each of its nodes (A1), added to what is there; places without a particle give none."""
+def test_scatter(dim, crew, dtype, limit, device):
+    """w (b + A o, m) of every particle on each of its nodes (A1), added to what is there; lanes without a particle give none."""
     bench = Bench(dim, device, dtype)
     if dtype == "float32":  # what is compared is what was given
         for name in ("g", "b", "A", "m"):
@@ -246,7 +249,8 @@ def test_scatter(dim, dtype, limit, device):
     there = np.arange(bench.node.size).reshape(bench.node.shape) / bench.node.size
     node, t = bench.array(there, bench.t.aligned), bench.t
     first, shape = bench.array(bench.first, wp.int32), t.ivec(*bench.shape)
-    bench.launch(bench.kernels.spread, BLOCK, node, shape, COUNT, first, *bench.particles())
+    threads = -(-COUNT // crew) * WARP
+    bench.launch(bench.kernels.spread, threads, node, shape, crew, COUNT, first, *bench.particles())
     close(node, there + spread(bench), limit)
 
 
@@ -256,7 +260,7 @@ def test_scatter_keeps_mass_and_momentum(dim, device):
     bench = Bench(dim, device)
     node, t = bench.array(0 * bench.node, bench.t.aligned), bench.t
     first, shape = bench.array(bench.first, wp.int32), t.ivec(*bench.shape)
-    bench.launch(bench.kernels.spread, BLOCK, node, shape, COUNT, first, *bench.particles())
+    bench.launch(bench.kernels.spread, BLOCK, node, shape, WARP, COUNT, first, *bench.particles())
     total = node.numpy().sum(0)
     np.testing.assert_allclose(total[dim], bench.m.sum(), rtol=0, atol=LIMIT * COUNT)
     momentum = (bench.b + np.einsum("pij,pj->pi", bench.A, bench.g)).sum(0)
