@@ -68,7 +68,7 @@ class Graph(Generic[Result]):
             torch.cuda.synchronize(self.device)
             with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
-                self._failed = torch.cat([words != NEVER for words in self._ledger.words]).any()
+                self._failed = (torch.cat(self._ledger.words) != NEVER).any()
         finally:
             close_ledger()
         return graph

@@ -4,77 +4,81 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import Motion, MotionAdj, view
+from softmpm.buffers import passing
 from softmpm.failures import raise_failure
 from softmpm.kernels.raster import raster
 from softmpm.kernels.types import types
 from softmpm.model import Model
-from softmpm.replay import note, recording
+from softmpm.replay import Launcher, note, recording
 from softmpm.state import GridField, State
-from softmpm.step import Substep
+from softmpm.step import stream_of
+from softmpm.watch import NEVER
 
 
-def _enter(model: Model, state: State):
-    """The state as kernels hold it, checked; F does not enter and is taken as I."""
-    eye = torch.eye(model.dim, dtype=model.dtype, device=model.device)
-    state = state._replace(F=eye.expand_as(state.C))
-    step, motion = Substep(model, None), Motion.empty(model)
-    struct = motion.struct(model)
-    step.enter(state, struct)
-    if recording(model):
-        note(step.watch_words)
-    else:
-        raise_failure(model, step.watch_words.tolist(), state)
-    return step, motion, struct
+def _particles(model: Model, *tensors: Tensor) -> list:
+    """Vectors and matrices of the particles as the kernels take them."""
+    t = types(model.dim, model.spec.dtype)
+    return [passing(tensor, t.vec if tensor.ndim == 3 else t.mat) for tensor in tensors]
 
 
-def _arguments(model: Model, node: Tensor):
-    t = types(model.spec.dim, model.spec.dtype)
-    return view(model.mass, t.real), view(node, t.node)
+def _nodes(model: Model, *tensors: Tensor) -> list:
+    """Numbers of the nodes as the kernels take them, the axes of the grid as one."""
+    return [
+        passing(tensor.flatten(1, model.dim), types(model.dim, model.spec.dtype).real) for tensor in tensors
+    ]
 
 
-def _units(model: Model, mass: Tensor, motion: Motion) -> Tensor:
+def _units(model: Model, mass: Tensor, state: State) -> Tensor:
     """Units of momentum and mass in which no sum over a world's particles overflows 62 bits, powers of two, (world, 2)."""
-    speed = motion.v.abs().amax(-1) + 2 * model.scene.grid.spacing * motion.C.abs().sum(-1).amax(-1)
+    speed = state.v.abs().amax(-1) + 2 * model.scene.grid.spacing * state.C.abs().sum(-1).amax(-1)
     largest = torch.stack([(mass * speed).amax(1), mass.amax().expand(model.worlds)], 1).double()
     return torch.frexp(largest * model.particle_count / 2.0**62).exponent.double().exp2()
 
 
-def _sums(model: Model, step: Substep, motion: Motion, now) -> Tensor:
+def _sums(model: Model, state: State, watch: Tensor) -> Tensor:
     """Momentum and mass of the nodes, (world, node, dim + 1)."""
-    kernels, shape = raster(model.dim, model.spec.dtype), (*step.nodes, model.dim + 1)
+    launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.particle_count)
+    mass, words = passing(model.mass, t.real), passing(watch, wp.int64)
+    moving = _particles(model, *(tensor.contiguous() for tensor in (state.x, state.v, state.C)))
+    shape = (model.worlds, model.node_count, model.dim + 1)
     if not model.deterministic:
         node = torch.zeros(shape, dtype=model.dtype, device=model.device)
-        mass, nodes = _arguments(model, node)
-        step.launch(kernels.splat, step.particles, model.scale, mass, now, nodes)
+        launch(kernels.splat, lead, model.scale, mass, *moving, words, passing(node, t.node))
         return node
-    node = torch.zeros(shape, dtype=torch.int64, device=model.device)
-    units = _units(model, model.mass, motion)
-    arguments = (view(model.mass, types(model.dim, model.spec.dtype).real), view(units, wp.float64), now)
-    step.launch(kernels.splat_fixed, step.particles, model.scale, *arguments, view(node, wp.int64))
+    node, units = torch.zeros(shape, dtype=torch.int64, device=model.device), _units(model, model.mass, state)
+    inputs = (mass, passing(units, wp.float64), *moving)
+    launch(kernels.splat_fixed, lead, model.scale, *inputs, words, passing(node, wp.int64))
     momentum, mass = (unit[:, None, None] for unit in units.unbind(1))
     return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
 
 
 def rasterize_nodes(model: Model, state: State) -> GridField:
     """Mass (world, *nodes) and velocity (world, *nodes, dim) of what :func:`softmpm.rasterize` sees."""
-    step, motion, now = _enter(model, state)
-    node = _sums(model, step, motion, now).view(model.worlds, *model.scene.grid.shape, model.dim + 1)
-    mass = node[..., -1].clone()
-    return GridField(mass, node[..., :-1] / torch.where(mass > 0, mass, 1)[..., None])
+    watch = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+    node = _sums(model, state, watch)
+    if recording(model):
+        note(watch)
+    else:
+        raise_failure(model, watch.tolist(), state)
+    grid = model.scene.grid.shape
+    velocity = node.new_empty(model.worlds, model.dim, *grid).movedim(1, -1)  # in memory as in a picture
+    field = GridField(node.new_empty(model.worlds, *grid), velocity)
+    launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    nodes = passing(node, types(model.dim, model.spec.dtype).node)
+    launch(kernels.divide, (model.worlds, model.node_count), nodes, *_nodes(model, *field))
+    return field
 
 
 def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridField) -> State:
-    """Adjoint of :func:`rasterize_nodes`, of x, v and C: p̄ = v̄/m, m̄ −= p̄·v, never a 1/m² that underflows; then (O1.adj)."""
-    present = field.mass > 0
-    adj_p = adj.velocity / torch.where(present, field.mass, 1)[..., None] * present[..., None]
-    adj_m = adj.mass - (adj_p * field.velocity).sum(-1)
-    adj_node = torch.cat([adj_p, adj_m[..., None]], -1).view(model.worlds, model.node_count, model.dim + 1)
-    step, _motion, now = _enter(model, state)
-    adj_state = MotionAdj.zeros(model)
-    mass, nodes = _arguments(model, adj_node)
-    kernel = raster(model.dim, model.spec.dtype).splat_adj
-    step.launch(kernel, step.particles, model.scale, mass, now, nodes, adj_state.struct(model))
-    return State(
-        adj_state.fx / model.scene.grid.spacing, adj_state.v, adj_state.C, F=torch.zeros_like(adj_state.C)
-    )
+    """Adjoint of :func:`rasterize_nodes`, of x, v and C."""
+    launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.node_count)
+    adj_node = passing(field.mass.new_empty(*lead, model.dim + 1), t.node)
+    launch(kernels.divide_adj, lead, *_nodes(model, *field, *adj), adj_node)
+    moving = [tensor.contiguous() for tensor in (state.x, state.v, state.C)]
+    adj_moving = [torch.empty_like(tensor) for tensor in moving]
+    inputs = (passing(model.mass, t.real), *_particles(model, *moving), adj_node)
+    lead = (model.worlds, model.particle_count)
+    launch(kernels.splat_adj, lead, model.scale, *inputs, *_particles(model, *adj_moving))
+    return State(*adj_moving, F=torch.empty(0))  # nothing: F does not enter

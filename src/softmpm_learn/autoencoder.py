@@ -54,16 +54,20 @@ class Encoder(nn.Module):
         self.register_buffer("centre", torch.zeros(latent_size))
         self.register_buffer("spread", torch.ones(latent_size))
 
-    def moments(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log variance of the latent, each (picture, latent_size), of velocities [m/s] (picture, dim, *nodes)."""
+    def _convolved(self, picture: Tensor) -> Tensor:
         h = picture / self.scale
         for conv in self.convs:
             h = functional.silu(conv(h))
-        return self.head(h.flatten(start_dim=1)).chunk(2, dim=-1)
+        return h.flatten(start_dim=1)
+
+    def moments(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log variance of the latent, each (picture, latent_size), of velocities [m/s] (picture, dim, *nodes)."""
+        return self.head(self._convolved(picture)).chunk(2, dim=-1)
 
     def forward(self, picture: Tensor) -> Tensor:
-        """Standardised latent, shape (picture, latent_size)."""
-        return (self.moments(picture)[0] - self.centre) / self.spread
+        """Standardised mean of the latent, shape (picture, latent_size)."""
+        weight, bias = (part.chunk(2)[0] for part in (self.head.weight, self.head.bias))
+        return (functional.linear(self._convolved(picture), weight, bias) - self.centre) / self.spread
 
 
 class Decoder(nn.Module):

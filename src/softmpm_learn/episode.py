@@ -1,7 +1,7 @@
 """Observe → act → simulate, again and again, differentiable end to end: one closed-loop simulation."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -41,6 +41,7 @@ class Episode:
     """What the observer saw, every so many control steps, shape (frame, world, ...), detached; None if it was not asked for."""
     effort: Tensor
     """Mean square of the activation [-], shape (), detached."""
+    decisions: "Decisions"
 
     @property
     def loss(self) -> Tensor:
@@ -48,8 +49,20 @@ class Episode:
         return self.final + self.running
 
     def detach(self) -> "Episode":
+        """Without anything that a gradient needs, the decisions included."""
         end = State(*(tensor.detach() for tensor in self.end))
-        return replace(self, final=self.final.detach(), running=self.running.detach(), end=end)
+        final, running = self.final.detach(), self.running.detach()
+        return replace(self, final=final, running=running, end=end, decisions=Decisions())
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """What the policy decided on and how, one tensor for each control step."""
+
+    features: list[Tensor] = field(default_factory=list)
+    """Features that it saw, shape (world, size) each."""
+    activations: list[Tensor] = field(default_factory=list)
+    """Its answer [-], shape (world, muscle) each. Differentiable."""
 
 
 def run_episode(
@@ -75,14 +88,14 @@ def run_episode(
         softmpm.UnstableError: With a note that names the control step.
     """
     start = state = model.rest()
-    period = task.substeps * model.scene.dt
-    running, effort, seen = state.x.new_zeros(model.worlds), state.x.new_zeros(()), []
+    period, times = task.control_period, _times(task, model)
+    made, path, seen = Decisions(), [], []
     for step in range(task.control_steps):
         look = observer.look(model, state)
         if keep_every and step % keep_every == 0:
             seen.append(look.detach())
         features = observer.encode(look)
-        activation = policy(features, step * period, goal)
+        activation = policy(features, times[step], goal)
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
         try:
@@ -91,26 +104,34 @@ def run_episode(
             when = f"which began at {step * period:.4g} s"
             error.add_note(f"In control step {step} of {task.control_steps}, {when}.")
             raise
-        running = running + task.objective.running(state, activation)
-        effort += activation.detach().square().mean()
+        made.features.append(features)
+        made.activations.append(activation)
+        path.append(state.x)
     if on_frame:
         with torch.no_grad():
             on_frame(Frame(task.control_steps * period, state, observer(model, state), None))
+    activations = torch.stack(made.activations)
     return Episode(
         final=task.objective.final(start, state, goal),
-        running=running / task.control_steps,
+        running=task.objective.running(torch.stack(path), activations).mean(dim=0),
         end=state,
         seen=torch.stack(seen) if seen else None,
-        effort=effort / task.control_steps,
+        effort=activations.detach().square().mean(),
+        decisions=made,
     )
+
+
+def _times(task: "Task", model: Model) -> Tensor:
+    """When each control step begins [s], shape (step,)."""
+    return task.control_period * torch.arange(task.control_steps, dtype=model.dtype, device=model.device)
 
 
 class ClosedLoop:
     """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one recorded graph.
 
     Args:
-        parameters: What the gradient is taken of.
         params: Gives the materials, see :class:`softmpm_learn.design.Design`.
+        free: What the materials are made of.
         keep_every: As in :func:`run_episode`.
     """
 
@@ -121,18 +142,19 @@ class ClosedLoop:
         observer: Observer,
         policy: nn.Module,
         params: Callable[[], Params],
-        parameters: list[nn.Parameter],
+        free: list[nn.Parameter],
         keep_every: int = 0,
     ):
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
-        self.params, self.parameters, self.keep_every = params, parameters, keep_every
+        self.params, self.free, self.keep_every = params, free, keep_every
         self._goal: Tensor | None = None
         self._graph = softmpm.Graph(self._work, model.device)
 
     def __call__(
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
     ) -> tuple[Episode, tuple[Tensor, ...]]:
-        """The episode, detached, and the gradient of its mean loss; overwritten by the next call. A film is not replayed.
+        """The episode, detached, and the gradient of its mean loss with respect to the parameters of the policy, then to
+        ``free``; overwritten by the next call. A film is not replayed.
 
         Raises:
             softmpm.UnstableError: As :func:`run_episode`.
@@ -152,4 +174,13 @@ class ClosedLoop:
             keep_every=self.keep_every,
             on_frame=on_frame,
         )
-        return episode.detach(), torch.autograd.grad(episode.loss.mean(), self.parameters)
+        activations = episode.decisions.activations
+        adj = torch.autograd.grad(episode.loss.mean(), [*activations, *self.free])
+        adj_activations, adj_free = adj[: len(activations)], adj[len(activations) :]
+        return episode.detach(), (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
+
+    def _policy_gradient(self, decisions: Decisions, adj_activations: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Of all decisions at once: layer by layer and step by step it would be many small sums."""
+        seen, times = torch.stack(decisions.features).detach(), _times(self.task, self.model)[:, None]
+        again = self.policy(seen, times, self._goal)
+        return torch.autograd.grad(again, list(self.policy.parameters()), torch.stack(list(adj_activations)))

@@ -31,8 +31,9 @@ class Running(Placed, ABC):
     """A term that is averaged over the control steps of an episode."""
 
     @abstractmethod
-    def __call__(self, state: State, activation: Tensor) -> Tensor:
-        """Cost of one control step, shape (world,), from the state after it and the activation (world, muscle) during it."""
+    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
+        """Cost of control steps, shape (..., world), from the positions [m] after them, (..., world, particle, dim), and the
+        activations during them, (..., world, muscle)."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Effort(Running):
 
     weight: float
 
-    def __call__(self, state: State, activation: Tensor) -> Tensor:
+    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
         return self.weight * activation.square().mean(dim=-1)
 
 
@@ -54,8 +55,8 @@ class Height(Running):
     axis: int = 1
     """Which axis is up."""
 
-    def __call__(self, state: State, activation: Tensor) -> Tensor:
-        return self.weight * (self.lowest - state.x[..., self.axis].mean(dim=-1)).clamp(min=0.0).square()
+    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
+        return self.weight * (self.lowest - x[..., self.axis].mean(dim=-1)).clamp(min=0.0).square()
 
 
 @dataclass(frozen=True)
@@ -69,11 +70,17 @@ class Upright(Running):
     rest: np.ndarray
     """Rest positions of all particles [m], shape (particle, dim)."""
 
-    def __call__(self, state: State, activation: Tensor) -> Tensor:
-        apart = self.rest[self.front].mean(axis=0) - self.rest[self.back].mean(axis=0)
-        y = state.x[..., 1]
-        rise = y[:, self.on("front", y)].mean(dim=-1) - y[:, self.on("back", y)].mean(dim=-1)
-        return self.weight * ((rise - apart[1]) / apart[0]).square()
+    @functools.cached_property
+    def lever(self) -> np.ndarray:
+        """What each particle's height counts for in the slope [1/m], shape (particle,)."""
+        share = np.zeros(len(self.rest))
+        share[self.front] += 1 / len(self.front)
+        share[self.back] -= 1 / len(self.back)
+        return share / (share @ self.rest[:, 0])
+
+    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
+        slope = x[..., 1] @ self.on("lever", x)
+        return self.weight * (slope - float(self.lever @ self.rest[:, 1])).square()
 
 
 class Objective(Placed, ABC):
@@ -85,10 +92,10 @@ class Objective(Placed, ABC):
     def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
         """Loss of each world, shape (world,). ``goal`` [m] of shape (world, dim) if the episode has one of its own."""
 
-    def running(self, state: State, activation: Tensor) -> Tensor:
-        """Cost of one control step, shape (world,)."""
-        nothing = activation.new_zeros(activation.shape[0])
-        return sum((term(state, activation) for term in self.terms), nothing)
+    def running(self, x: Tensor, activation: Tensor) -> Tensor:
+        """Cost of control steps, shape (..., world); arguments as of :class:`Running`."""
+        nothing = activation.new_zeros(activation.shape[:-1])
+        return sum((term(x, activation) for term in self.terms), nothing)
 
 
 @dataclass(frozen=True)

@@ -108,18 +108,17 @@ class Picture:
         last = torch.tensor(grid.shape, dtype=model.dtype, device=model.device) - 1
         self._low, self._high = torch.full_like(last, grid.spacing), (last - 1) * grid.spacing
         self._middle = last * grid.spacing / 2
-        spare = [n * self.block - full for n, full in zip(self.shape, grid.shape, strict=True)]
-        self._pad = [side for count in reversed(spare) for side in (0, count)]
 
     def __call__(self, model: Model, state: State) -> Tensor:
         """Velocity [m/s], shape (world, dim, *shape)."""
         if self.follow:
             x = state.x + (self._middle - state.x.mean(dim=1, keepdim=True))
-            state = state._replace(x=torch.minimum(torch.maximum(x, self._low), self._high))
+            state = state._replace(x=x.clamp(self._low, self._high))
         field = softmpm.rasterize(model, state)
         velocity = field.velocity * (field.mass / (field.mass + self._thin))[..., None]
-        pool = functional.avg_pool2d if model.dim == 2 else functional.avg_pool3d
-        return pool(functional.pad(velocity.movedim(-1, 1), self._pad), self.block)
+        pool, size = functional.avg_pool2d if model.dim == 2 else functional.avg_pool3d, self.block
+        # The blocks at the far ends reach beyond the grid, where there is nothing:
+        return pool(velocity.movedim(-1, 1), size, ceil_mode=True, divisor_override=size**model.dim)
 
 
 class Latent(Observer):

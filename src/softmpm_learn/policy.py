@@ -16,15 +16,19 @@ class Clock(nn.Module):
     """sin and cos of 2π h t / period for h = 1 … harmonics."""
 
     rate: Tensor
+    phase: Tensor
 
     def __init__(self, period: float, harmonics: int):
         super().__init__()
-        self.register_buffer("rate", 2 * math.pi / period * torch.arange(1, harmonics + 1), persistent=False)
+        rate = 2 * math.pi / period * torch.arange(1, harmonics + 1)
+        self.register_buffer("rate", rate.repeat(2), persistent=False)
+        phase = torch.tensor([0.0, math.pi / 2]).repeat_interleave(harmonics)  # cos a = sin(a + π/2)
+        self.register_buffer("phase", phase, persistent=False)
         self.size = 2 * harmonics
 
-    def forward(self, time: float) -> Tensor:
-        """Shape (size,)."""
-        return torch.cat([torch.sin(self.rate * time), torch.cos(self.rate * time)])
+    def forward(self, time: Tensor) -> Tensor:
+        """Shape (*time.shape, size)."""
+        return torch.addcmul(self.phase, self.rate, time[..., None]).sin()
 
 
 class Goal(nn.Module):
@@ -67,13 +71,16 @@ class Feedback(nn.Module):
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
 
-    def forward(self, z: Tensor, time: float, goal: Tensor | None = None) -> Tensor:
-        """Activation (world, muscle) in (-1, 1) from features (world, size), time [s] and goals (world, dim) [m]."""
-        inputs = [z]
+    def forward(self, z: Tensor, time: Tensor, goal: Tensor | None = None) -> Tensor:
+        """Activation (..., world, muscle) in (-1, 1) from features (..., world, size), time [s] and goals (world, dim) [m].
+
+        Of one control step with a time of shape (), or of many at once with times of shape (step, 1).
+        """
+        lead, inputs = z.shape[:-1], [z]
         if self.clock:
-            inputs.append(self.clock(time).expand(len(z), -1))
+            inputs.append(self.clock(time).expand(*lead, -1))
         if self.goal:
-            inputs.append(self.goal(goal))
+            inputs.append(self.goal(goal).expand(*lead, -1))
         return torch.tanh(self.layers(torch.cat(inputs, dim=-1)))
 
 
@@ -86,23 +93,24 @@ class Sinusoids(nn.Module):
         nn.init.normal_(self.wave.weight, std=gain / math.sqrt(clock.size))
         nn.init.zeros_(self.wave.bias)
 
-    def forward(self, z: Tensor, time: float, goal: Tensor | None = None) -> Tensor:
-        return torch.tanh(self.wave(self.clock(time))).expand(len(z), -1)
+    def forward(self, z: Tensor, time: Tensor, goal: Tensor | None = None) -> Tensor:
+        return torch.tanh(self.wave(self.clock(time))).expand(*z.shape[:-1], -1)
 
 
 class Knots(nn.Module):
     """Open loop: tanh of values at evenly spaced times, joined by straight lines; constant after the last."""
 
+    number: Tensor
+
     def __init__(self, muscles: int, gain: float, knots: int, seconds: float):
         super().__init__()
         self.seconds, self.values = seconds, nn.Parameter(gain * torch.randn(knots, muscles))
+        self.register_buffer("number", torch.arange(float(knots)), persistent=False)
 
-    def forward(self, z: Tensor, time: float, goal: Tensor | None = None) -> Tensor:
-        last = len(self.values) - 1
-        place = min(max(time / self.seconds, 0.0), 1.0) * last
-        left = min(int(place), last - 1)
-        value = torch.lerp(self.values[left], self.values[left + 1], place - left)
-        return torch.tanh(value).expand(len(z), -1)
+    def forward(self, z: Tensor, time: Tensor, goal: Tensor | None = None) -> Tensor:
+        place = (time / self.seconds).clamp(0.0, 1.0) * (len(self.values) - 1)
+        share = (1.0 - (place[..., None] - self.number).abs()).clamp(min=0.0)  # of each knot: a hat
+        return torch.tanh(share @ self.values).expand(*z.shape[:-1], -1)
 
 
 def make_policy(

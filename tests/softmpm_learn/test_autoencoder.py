@@ -40,6 +40,16 @@ def test_scale_makes_units_vanish():
     assert autoencoder.encoder.scale.item() == scale
 
 
+def test_what_the_policy_sees_is_the_standardised_mean():
+    """Of pictures that it was standardised on, mean 0 and deviation 1; of any, the mean of the moments so moved."""
+    autoencoder, pictures = make(), 100 * waves(8)
+    autoencoder.standardise(pictures)
+    encoder, z = autoencoder.encoder, autoencoder.encoder(pictures)
+    torch.testing.assert_close(z, (encoder.moments(pictures)[0] - encoder.centre) / encoder.spread)
+    torch.testing.assert_close(z.mean(dim=0), torch.zeros(2), rtol=0, atol=1e-5)
+    torch.testing.assert_close(z.std(dim=0, correction=0), torch.ones(2))
+
+
 def test_kullback_leibler_term():
     """(A1): the variational loss exceeds the plain one by β times the divergence from the unit normal, computed by torch."""
     autoencoder, pictures = make(), waves(5)

@@ -7,7 +7,7 @@ from torch import nn
 
 import softmpm
 from softmpm_learn.design import Design
-from softmpm_learn.episode import run_episode
+from softmpm_learn.episode import ClosedLoop, run_episode
 from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.observe import Centroids, Latent, Picture
 from softmpm_learn.policy import make_policy
@@ -72,6 +72,21 @@ def test_gradient_of_policy_and_design(task):
         got = sum((g * d).sum() for g, d in zip(gradient[part], direction[part], strict=True))
         assert abs(want) > 1e-8  # not a difference of nothing
         torch.testing.assert_close(got, want, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("name", ["mlp", "knots"])
+def test_the_loop_gives_the_gradient_of_all_parameters(task, model, name):
+    """The policy's, taken of all decisions at once, and the design's are those of autograd through the episode."""
+    observer = Centroids(model, list(task.regions.values()), task.body_length)
+    policy = make_policy(PolicyConf(name=name), observer.size, 2, 0.1, seed=0)
+    design = Design(DesignConf(), model, task.regions)
+    free = list(design.parameters())
+    episode, got = ClosedLoop(task, model, observer, policy, design, free)(None)
+    assert not episode.loss.requires_grad and not episode.decisions.activations
+    loss = run_episode(task, model, observer, policy, design()).loss.mean()
+    want = torch.autograd.grad(loss, [*policy.parameters(), *free])
+    for a, b in zip(got, want, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())
 
 
 def test_frames_and_pictures(task, model):
