@@ -6,7 +6,14 @@ import torch
 from torch import Tensor
 
 from softmpm.buffers import Solid, lame
-from softmpm.checks import check_activation, check_params, check_state, check_substeps, check_values
+from softmpm.checks import (
+    check_activation,
+    check_bounds,
+    check_finite,
+    check_params,
+    check_state,
+    check_substeps,
+)
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
@@ -14,6 +21,7 @@ from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.replay import recording
 from softmpm.rollout import Trail, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
+from softmpm.watch import UnstableError
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
@@ -53,13 +61,13 @@ def simulate(
 
 @_opaque
 def _simulate(model: Model, start: State, activation: Tensor | None, params: Params, substeps: int) -> State:
+    if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
+        with torch.inference_mode(False), torch.no_grad():
+            return _simulate(model, start, activation, params, substeps)
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
-    check_params(model, params)
     check_substeps(substeps)
-    if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
-        check_values(start, activation, params)
     mu, lam, mass = _material(model, params)
     pull, control_steps = None, 1
     if activation is not None:
@@ -72,27 +80,38 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     inputs = (pull, mu, lam, mass, *start)
     needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     keep = _Kept() if needed else None
-    end = _Simulate.apply(model, Horizon(control_steps, substeps), keep, *inputs, *low)
+    try:
+        end = _Simulate.apply(model, Horizon(control_steps, substeps), keep, *inputs, *low)
+    except UnstableError:
+        check_finite(start, activation)  # raises if it came in like that
+        raise
     state = State(*end[:4])
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
 
 
 def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
-    """μ, λ [Pa] and mass [kg], (world, particle) each; those of the call before if nothing changed and nothing needs a gradient."""
-    fixed = all(type(p) is Tensor and not p.requires_grad for p in params) and not recording(model)
-    last = model.__dict__.get("_last_material")
-    if (
-        fixed
-        and last is not None
-        and all(p is q and p._version == v for p, (q, v) in zip(params, last[0], strict=True))
-    ):
+    """μ, λ [Pa] and mass [kg], (world, particle) each, of ``params`` that were checked.
+
+    Those of the call before if nothing changed and nothing needs a gradient.
+    """
+    fixed = isinstance(params, Params) and all(map(_counts_writes, params)) and not recording(model)
+    last = model.__dict__.get("_last_material") if fixed else None
+    if last and all(p is q and p._version == v for p, (q, v) in zip(params, last[0], strict=True)):
         return last[1]
+    check_params(model, params)
+    if not recording(model):  # else nothing can be read back
+        check_bounds(params)
     lead = (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead).contiguous() for term in lame(Params(*(p.expand(lead) for p in params))))
     found = mu, lam, (params.density * model.volume).expand(lead).contiguous()
     if fixed:
         model.__dict__["_last_material"] = [(p, p._version) for p in params], found
     return found
+
+
+def _counts_writes(tensor: Any) -> bool:
+    """Whether it is a plain tensor without gradient, of which PyTorch counts how often it was written to."""
+    return type(tensor) is Tensor and not tensor.requires_grad and not tensor.is_inference()
 
 
 def rasterize(model: Model, state: State) -> GridField:

@@ -179,3 +179,47 @@ def test_material_changed_in_place_is_seen(scheme):
         changed = run(softmpm.simulate, model, inputs, 5)
         assert torch.equal(changed.v, fresh.v) and not torch.equal(changed.v, first.v), name
         first = changed
+
+
+@pytest.mark.parametrize("name, bad", [("young", -1.0), ("poisson", 0.5), ("density", float("nan"))])
+def test_material_that_turns_impossible_is_refused(name, bad, scheme, device):
+    """Numbers are not read again for tensors that nobody wrote to; a write is seen, also through a view."""
+    model = softmpm.build(busy_scene(2), device=device, scheme=scheme)
+    params = softmpm.Params(*(p.clone() for p in model.params()))
+    for _ in range(2):
+        softmpm.simulate(model, model.rest(), None, params, substeps=2)
+    getattr(params, name)[3:5].select(0, 1).fill_(bad)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=rf"params.{name} must be .*\[4\]"):
+            softmpm.simulate(model, model.rest(), None, params, substeps=2)
+
+
+def test_material_that_is_learned_is_checked_each_time(model):
+    """Also after a step by hand through ``.data``, which PyTorch does not count."""
+    young = torch.full((), 80.0, dtype=torch.float64, requires_grad=True)
+    params = model.params()._replace(young=young)
+    softmpm.simulate(model, model.rest(), None, params, substeps=2)
+    young.data.sub_(100.0)
+    with pytest.raises(ValueError, match=r"params.young must be finite and > 0, but params.young is -20"):
+        softmpm.simulate(model, model.rest(), None, params, substeps=2)
+
+
+def test_it_works_in_inference_mode(scheme):
+    """Whose tensors do not count their writes; what a model keeps from there serves calls with gradient too."""
+    model, other = (softmpm.build(busy_scene(2), device="cpu", scheme=scheme) for _ in range(2))
+    outside = model.params()
+    with torch.inference_mode():
+        params = softmpm.Params(*(p.clone() for p in outside))
+        first = softmpm.simulate(model, model.rest(), None, params, substeps=3)
+        params.young.mul_(2.0)
+        stiff = softmpm.simulate(model, model.rest(), None, params, substeps=3)
+        softmpm.simulate(model, model.rest(), None, outside, substeps=3)
+    want = softmpm.simulate(other, other.rest(), None, other.params(), substeps=3)
+    assert torch.equal(first.v, want.v) and not torch.equal(stiff.v, want.v)
+    found = []
+    for built, material in ((model, outside), (other, other.params())):
+        start = built.rest()
+        start.v.requires_grad_()
+        end = softmpm.simulate(built, start, None, material, substeps=3)
+        found += torch.autograd.grad(dot(cotangent(end), end), start.v)
+    assert torch.equal(*found)
