@@ -102,7 +102,7 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     if not recording(model):  # else nothing can be read back
         check_bounds(params)
     lead = (model.worlds, model.particle_count)
-    mu, lam = (term.expand(lead).contiguous() for term in lame(Params(*(p.expand(lead) for p in params))))
+    mu, lam = (term.expand(lead).contiguous() for term in lame(params))
     found = mu, lam, (params.density * model.volume).expand(lead).contiguous()
     if fixed:
         model.__dict__["_last_material"] = [(p, p._version) for p in params], found
@@ -155,7 +155,9 @@ class _Kept:
 
 class _Simulate(torch.autograd.Function):
     @staticmethod
-    def forward(*inputs):  # PyTorch binds arguments to the signature at each call: a short one takes 50 us less
+    def forward(
+        *inputs,
+    ):  # PyTorch binds arguments to the signature at each call: a short one takes 50 us less
         model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
         start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
         end, trail = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep is not None)

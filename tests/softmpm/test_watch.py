@@ -103,9 +103,7 @@ def test_bad_numbers_that_come_in_are_refused(dtype, scheme, device):
 def test_a_bad_activation_is_refused_at_whatever_control_step(scheme, device):
     """In the last row, in one muscle of one world of a deterministic model: the simulation runs up to there, and tells."""
     deterministic = scheme == "fast"
-    model = softmpm.build(
-        busy_scene(2), device=device, worlds=2, scheme=scheme, deterministic=deterministic
-    )
+    model = softmpm.build(busy_scene(2), device=device, worlds=2, scheme=scheme, deterministic=deterministic)
     inputs = {k: t.detach().clone() for k, t in busy_inputs(model, control_steps=3).items()}
     inputs["activation"][2, 1, 0] = float("nan")
     with pytest.raises(ValueError, match=r"activation must be finite, but activation\[2, 1, 0\] is nan"):
