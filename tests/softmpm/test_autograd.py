@@ -5,6 +5,7 @@ import warnings
 import pytest
 import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
+from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 import softmpm
@@ -141,6 +142,34 @@ def test_it_works_under_func_grad_checkpoint_autocast_and_compile(model):
         (again,) = torch.autograd.grad(loss(half), half)
     assert again.dtype == torch.bfloat16
     assert_relative(again.double(), want, 0.05)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # by PyTorch itself, for forward mode
+@pytest.mark.parametrize("name", ["x", "activation", "young"])
+def test_no_other_derivative_is_lost(name, scheme):
+    """Forward mode and vmap are not there: they raise, also where no gradient is needed and none could be asked for."""
+    model = softmpm.build(busy_scene(2, per_law=6), device="cpu", scheme=scheme)
+    inputs = {key: tensor.detach() for key, tensor in busy_inputs(model).items()}
+
+    def end(tensor):
+        return run(softmpm.simulate, model, inputs | {name: tensor}, 2).v
+
+    for _ in range(2):
+        with torch.no_grad(), forward_ad.dual_level(), pytest.raises(NotImplementedError, match="jvp"):
+            end(forward_ad.make_dual(inputs[name], torch.ones_like(inputs[name])))
+        with torch.no_grad(), pytest.raises(RuntimeError):
+            torch.vmap(end)(torch.stack([inputs[name]] * 2))
+        with pytest.raises(NotImplementedError, match="jvp"):
+            torch.func.jvp(end, (inputs[name],), (torch.ones_like(inputs[name]),))
+        end(inputs[name])
+
+    def weighted(tensor):
+        with torch.no_grad():
+            found = end(tensor)
+        return (found.sum() * tensor).sum()
+
+    got = torch.func.grad(weighted)(inputs[name])
+    assert_relative(got, end(inputs[name]).sum().expand_as(got), 1e-6)
 
 
 def test_no_grad_keeps_nothing(model):
