@@ -27,13 +27,13 @@ def substeps_of(particles: int, device: torch.device) -> int:
 
 
 @torch.no_grad()
-def run(model: softmpm.Model, start: softmpm.State, substeps: int) -> None:
+def run(model: softmpm.Model, start: softmpm.State, params: softmpm.Params, substeps: int) -> None:
     activation = (
         torch.full((1, model.worlds, model.muscle_count), 0.2, device=model.device)
         if model.muscle_count
         else None
     )
-    softmpm.simulate(model, start, activation, model.params(), substeps=substeps)
+    softmpm.simulate(model, start, activation, params, substeps=substeps)
 
 
 def main():
@@ -46,16 +46,16 @@ def main():
         substeps = substeps_of(particles, device)
         for name, features in VARIANTS.items():
             model = softmpm.build(cube(dim, particles, nodes, **features), device=device)
+            params = model.params()
             row = {"dim": dim, "particles": model.particle_count, "nodes": nodes, "scene": name}
             row["substeps"] = substeps
             for motion, start in (("falling us", model.rest()), ("turning us", turning(model))):
-                call = median_seconds(lambda s=start, m=model: run(m, s, 1), device, args.repeats)
-                whole = median_seconds(
-                    lambda s=start, m=model, n=substeps: run(m, s, n), device, args.repeats
-                )
+                given = model, start, params
+                call = median_seconds(lambda g=given: run(*g, 1), device, args.repeats)
+                whole = median_seconds(lambda g=given, n=substeps: run(*g, n), device, args.repeats)
                 row[motion], row["call us"] = (whole - call) / (substeps - 1) * 1e6, call * 1e6
             table.add(row)
-            del model, start
+            del model, start, params, given
 
 
 if __name__ == "__main__":

@@ -1,12 +1,21 @@
 """The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from softmpm.buffers import Solid, lame
-from softmpm.checks import check_activation, check_params, check_state, check_substeps, check_values
+from softmpm.checks import (
+    check_activation,
+    check_bounds,
+    check_finite,
+    check_params,
+    check_state,
+    check_substeps,
+)
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
@@ -14,6 +23,7 @@ from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.replay import recording
 from softmpm.rollout import Trail, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
+from softmpm.watch import UnstableError
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
@@ -38,7 +48,8 @@ def simulate(
         activation: Muscle activation [-], shape (control_step, world, muscle); None is one control step without
             activation. Differentiable.
         params: Material of each particle: ``young`` [Pa], ``poisson`` [-], ``density`` [kg/m³], shapes that broadcast
-            to (world, particle). Differentiable.
+            to (world, particle). Differentiable. Tensors without gradient that come again are taken as unchanged unless
+            PyTorch counted a write, which it does not through ``.data``, NumPy or Warp: hand over others then.
         substeps: Substeps of ``model.scene.dt`` [s] for each row of ``activation``.
 
     Returns:
@@ -53,13 +64,13 @@ def simulate(
 
 @_opaque
 def _simulate(model: Model, start: State, activation: Tensor | None, params: Params, substeps: int) -> State:
+    if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
+        with torch.inference_mode(False), torch.no_grad():
+            return _simulate(model, start, activation, params, substeps)
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
-    check_params(model, params)
     check_substeps(substeps)
-    if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
-        check_values(start, activation, params)
     mu, lam, mass = _material(model, params)
     pull, control_steps = None, 1
     if activation is not None:
@@ -72,27 +83,49 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     inputs = (pull, mu, lam, mass, *start)
     needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     keep = _Kept() if needed else None
-    end = _Simulate.apply(model, Horizon(control_steps, substeps), keep, *inputs, *low)
+    simulated: Any = _Simulate.apply if needed or _followed(inputs) else _Simulate.forward
+    try:
+        end = simulated(model, Horizon(control_steps, substeps), keep, *inputs, *low)
+    except UnstableError:
+        check_finite(start, activation)  # raises if it came in like that
+        raise
     state = State(*end[:4])
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
 
 
+def _followed(tensors: Iterable[Tensor | None]) -> bool:
+    """Whether PyTorch would look into a function of these without asking for its gradient: torch.func, or forward mode.
+
+    If not, and no gradient is needed, what the function runs is called directly, without 40 us of preparations.
+    """
+    return torch._C._are_functorch_transforms_active() or any(
+        t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
+    )
+
+
 def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
-    """μ, λ [Pa] and mass [kg], (world, particle) each; those of the call before if nothing changed and nothing needs a gradient."""
-    fixed = all(type(p) is Tensor and not p.requires_grad for p in params) and not recording(model)
-    last = model.__dict__.get("_last_material")
-    if (
-        fixed
-        and last is not None
-        and all(p is q and p._version == v for p, (q, v) in zip(params, last[0], strict=True))
-    ):
+    """μ, λ [Pa] and mass [kg], (world, particle) each, of ``params`` that were checked.
+
+    Those of the call before if nothing changed and nothing needs a gradient.
+    """
+    fixed = isinstance(params, Params) and all(map(_counts_writes, params)) and not recording(model)
+    last = model.__dict__.get("_last_material") if fixed else None
+    if last and all(p is q and p._version == v for p, (q, v) in zip(params, last[0], strict=True)):
         return last[1]
+    check_params(model, params)
+    if not recording(model):  # else nothing can be read back
+        check_bounds(params)
     lead = (model.worlds, model.particle_count)
-    mu, lam = (term.expand(lead).contiguous() for term in lame(Params(*(p.expand(lead) for p in params))))
+    mu, lam = (term.expand(lead).contiguous() for term in lame(params))
     found = mu, lam, (params.density * model.volume).expand(lead).contiguous()
     if fixed:
         model.__dict__["_last_material"] = [(p, p._version) for p in params], found
     return found
+
+
+def _counts_writes(tensor: Any) -> bool:
+    """Whether it is a plain tensor without gradient, of which PyTorch counts how often it was written to."""
+    return type(tensor) is Tensor and not tensor.requires_grad and not tensor.is_inference()
 
 
 def rasterize(model: Model, state: State) -> GridField:
@@ -136,7 +169,10 @@ class _Kept:
 
 class _Simulate(torch.autograd.Function):
     @staticmethod
-    def forward(model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F):
+    def forward(
+        *inputs,
+    ):  # PyTorch binds arguments to the signature at each call: a short one takes 50 us less
+        model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
         start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
         end, trail = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep is not None)
         if keep is not None:
@@ -155,7 +191,9 @@ class _Simulate(torch.autograd.Function):
     def backward(ctx, *adj_end):
         wanted = Wanted(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
         about = ctx.model, ctx.horizon, ctx.trail, wanted
-        adj = _SimulateBackward.apply(*about, *ctx.saved_tensors, *adj_end[:4])
+        inputs = *about, *ctx.saved_tensors, *adj_end[:4]
+        again = torch.is_grad_enabled() or _followed(inputs[4:])  # it may be differentiated once more
+        adj = (_SimulateBackward.apply if again else _SimulateBackward.forward)(*inputs)
         return None, None, None, *adj, None, None
 
 
@@ -163,9 +201,10 @@ class _SimulateBackward(torch.autograd.Function):
     """A function of its own, so that a second derivative raises instead of silently losing this term."""
 
     @staticmethod
-    def forward(model, horizon, trail, wanted, pull, mu, lam, mass, *tensors):
+    def forward(*inputs):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
-        adj_end = tensors[-4:]
+        model, horizon, trail, wanted, pull, mu, lam, mass, *_start = inputs[:-4]
+        adj_end = inputs[-4:]
         shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
         shapes += 2 * ((*shapes[0], model.dim),)
         adj_end = State(

@@ -1,5 +1,6 @@
 """What the kernels work on, as tensors that PyTorch owns and the Warp structs that see them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -19,6 +20,20 @@ def view(tensor: Tensor, dtype) -> wp.array:
 def passing(tensor: Tensor, dtype):
     """As :func:`view`, for one launch: cheaper to make, and cannot be a field of a struct."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def slot(model: Model, dtype):
+    """As :func:`passing`, for contiguous tensors (world, particle, ...) that come later, see :class:`softmpm.replay.Command`."""
+    shape = (model.worlds, model.particle_count, *getattr(dtype, "_shape_", ()))
+    return passing(torch.empty(shape, dtype=model.dtype, device="meta"), dtype)
+
+
+def slots_in(struct, names: Sequence[str], model: Model, dtype) -> list:
+    """Make fields of a struct slots."""
+    held = struct.__ctype__()
+    for name in names:
+        setattr(held, name, slot(model, dtype))
+    return [getattr(held, name) for name in names]  # they lie in the struct's own memory
 
 
 def clear(tensor: Tensor) -> None:
@@ -115,9 +130,17 @@ class Solid:
     pull: Tensor | None
 
     def struct(self, model: Model):
-        t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
+        t, solid = types(model.spec.dim, model.spec.dtype), Solid.fixed(model)
         for name in ("mass", "mu", "lam"):
             setattr(solid, name, view(getattr(self, name), t.real))
+        if self.pull is not None:
+            solid.pull = view(self.pull, t.real)
+        return solid
+
+    @staticmethod
+    def fixed(model: Model):
+        """The struct with what the scene alone decides; μ, λ, mass and pull are open."""
+        t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
         lead = (model.worlds, model.particle_count)
         solid.volume = view(model.volume.expand(lead), t.real)
         if len(model.spec.laws) > 1:
@@ -125,16 +148,18 @@ class Solid:
         if model.spec.muscle_slots:
             solid.muscle = view(model.muscle_slots.expand(*lead, -1), wp.int32)
             solid.fibre = view(model.fibre, t.vec)
-        if self.pull is not None:
-            solid.pull = view(self.pull, t.real)
         return solid
 
 
 @dataclass
 class SolidAdj:
-    """Adjoint of a :class:`Solid`; what is not wanted is None. ``slot`` is the pull's, of each particle and slot."""
+    """Adjoint of a :class:`Solid`; what is not wanted is None. ``slot`` is the pull's, of each particle and slot.
+
+    Those of the material lie in one tensor, ``material``, so that they are cleared at once.
+    """
 
     wanted: Wanted
+    material: Tensor | None = None
     mass: Tensor | None = None
     mu: Tensor | None = None
     lam: Tensor | None = None
@@ -142,16 +167,13 @@ class SolidAdj:
 
     @staticmethod
     def zeros(model: Model, wanted: Wanted) -> "SolidAdj":
-        def tensor(*tail):
-            return torch.zeros(
-                model.worlds, model.particle_count, *tail, dtype=model.dtype, device=model.device
-            )
-
+        lead, kind = (model.worlds, model.particle_count), {"dtype": model.dtype, "device": model.device}
         adj = SolidAdj(wanted)
         if wanted.material:
-            adj.mass, adj.mu, adj.lam = tensor(), tensor(), tensor()
+            adj.material = torch.zeros(3, *lead, **kind)
+            adj.mass, adj.mu, adj.lam = adj.material
         if wanted.activation:
-            adj.slot = tensor(model.spec.muscle_slots)
+            adj.slot = torch.zeros(*lead, model.spec.muscle_slots, **kind)
         return adj
 
     def struct(self, model: Model):

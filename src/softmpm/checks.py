@@ -127,16 +127,14 @@ class Sizes(Protocol):
 
 
 def check_state(model: Sizes, state: NamedTuple) -> None:
-    """Shape, dtype and device of x, v, C and F."""
-    particles, dim = (model.worlds, model.particle_count), model.dim
-    shapes = {"x": (dim,), "v": (dim,), "C": (dim, dim), "F": (dim, dim)}
+    """Shape, dtype and device of x, v, C and F, and of the low-order parts if there are any."""
+    lead, d = (model.worlds, model.particle_count), model.dim
+    shapes = {"x": (*lead, d), "v": (*lead, d), "C": (*lead, d, d), "F": (*lead, d, d)}
     for name, value in _fields("state", state, tuple(shapes)):
-        _check_tensor(model, f"state.{name}", value)
-        need(
-            tuple(value.shape) == particles + shapes[name],
-            f"state.{name} must have shape {particles + shapes[name]} (world, particle, axes), "
-            f"got {tuple(value.shape)}; start from model.rest().",
-        )
+        _check_tensor(model, f"state.{name}", value, shapes[name])
+    low = getattr(state, "low", None)
+    for name in () if low is None else ("x", "F"):
+        _check_tensor(model, f"state.low.{name}", getattr(low, name), shapes[name])
 
 
 def check_activation(model: Sizes, activation: Tensor | None) -> None:
@@ -145,11 +143,11 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
         return
     _check_tensor(model, "activation", activation)
     want = (model.worlds, model.muscle_count)
-    need(
-        activation.ndim == 3 and tuple(activation.shape[1:]) == want,
-        f"activation must have shape (control_step, world, muscle) = (any, {want[0]}, {want[1]}), "
-        f"got {tuple(activation.shape)}; one control step is activation[None].",
-    )
+    if activation.ndim != 3 or activation.shape[1:] != want:
+        raise ValueError(
+            f"activation must have shape (control_step, world, muscle) = (any, {want[0]}, {want[1]}), "
+            f"got {tuple(activation.shape)}; one control step is activation[None]."
+        )
     need(
         len(activation) > 0, "activation needs at least one control step, got none; pass None to move freely."
     )
@@ -158,39 +156,41 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
 def check_params(model: Sizes, params: NamedTuple) -> None:
     """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
     want = (model.worlds, model.particle_count)
-    for name, value in _fields("params", params, ("young", "poisson", "density")):
+    for name, value in _fields("params", params, tuple(BOUNDS)):
         _check_tensor(model, f"params.{name}", value)
         shape = tuple(value.shape)
         fits = all(n in (1, full) for n, full in zip(reversed(shape), reversed(want), strict=False))
-        need(
-            fits and len(shape) <= 2,
-            f"params.{name} must broadcast to (world, particle) = {want}, got shape {shape}; "
-            "one value for each world needs shape (world, 1).",
-        )
+        if not fits or len(shape) > 2:
+            raise ValueError(
+                f"params.{name} must broadcast to (world, particle) = {want}, got shape {shape}; "
+                "one value for each world needs shape (world, 1)."
+            )
 
 
 def check_substeps(substeps: int) -> None:
     whole = isinstance(substeps, (int, np.integer)) and not isinstance(substeps, bool)
-    need(whole and substeps >= 1, f"substeps must be a whole number of at least 1, got {substeps!r}.")
+    if not whole or substeps < 1:
+        raise ValueError(f"substeps must be a whole number of at least 1, got {substeps!r}.")
 
 
 @torch.no_grad()
-def check_values(state: NamedTuple, activation: Tensor | None, params: NamedTuple) -> None:
-    """What only the numbers can tell: all finite, materials possible. Reads back once: a GPU has to wait."""
-    finite = [(f"state.{name}", value) for name, value in _fields("state", state, ("x", "v", "C", "F"))]
-    finite += [] if activation is None or activation.numel() == 0 else [("activation", activation)]
-    bounded = [(f"params.{name}", value) for name, value in _fields("params", params, tuple(BOUNDS))]
-    # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
-    figures = [value.sum() for _, value in finite] + [f for _, v in bounded for f in torch.aminmax(v)]
-    read = torch.stack(figures).tolist()
-    sums, ends = read[: len(finite)], read[len(finite) :]
-    for (name, value), total in zip(finite, sums, strict=True):
-        if not math.isfinite(total):
-            _demand(name, value, torch.isfinite(value), "finite")
-    for (name, value), low, high in zip(bounded, ends[::2], ends[1::2], strict=True):
-        least, most, rule = BOUNDS[name.removeprefix("params.")]
+def check_bounds(params: NamedTuple) -> None:
+    """Whether a material can exist. Reads back once: a GPU has to wait."""
+    given = list(_fields("params", params, tuple(BOUNDS)))
+    ends = torch.stack([end for _, value in given for end in torch.aminmax(value)]).tolist()
+    for (name, value), low, high in zip(given, ends[::2], ends[1::2], strict=True):
+        least, most, rule = BOUNDS[name]
         if not (least < low and high < most):
-            _demand(name, value, (value > least) & (value < most), rule)
+            _demand(f"params.{name}", value, (value > least) & (value < most), rule)
+
+
+@torch.no_grad()
+def check_finite(state: NamedTuple, activation: Tensor | None) -> None:
+    """All numbers that move are finite. Asked only after the kernels met one that is not: they look at each anyway."""
+    for name, value in _fields("state", state, ("x", "v", "C", "F")):
+        _demand(f"state.{name}", value, torch.isfinite(value), "finite")
+    if activation is not None:
+        _demand("activation", activation, torch.isfinite(activation), "finite")
 
 
 BOUNDS = {
@@ -216,15 +216,20 @@ def _fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[t
         yield name, getattr(record, name)
 
 
-def _check_tensor(model: Sizes, name: str, value: Tensor) -> None:
+def _check_tensor(model: Sizes, name: str, value: Tensor, shape: tuple[int, ...] | None = None) -> None:
+    """Precision and device are the model's; and the shape, if it is one of particles. Texts are made only when needed."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
-    need(
-        value.dtype == model.dtype,
-        f"{name} must be {model.dtype} like the model, got {value.dtype}; use .to({model.dtype}), "
-        "or build the model with another dtype.",
-    )
-    need(
-        value.device == model.device,
-        f"{name} must be on {model.device} like the model, got {value.device}; use .to('{model.device}').",
-    )
+    if value.dtype != model.dtype:
+        raise ValueError(
+            f"{name} must be {model.dtype} like the model, got {value.dtype}; use .to({model.dtype}), "
+            "or build the model with another dtype."
+        )
+    if value.device != model.device:
+        raise ValueError(
+            f"{name} must be on {model.device} like the model, got {value.device}; use .to('{model.device}')."
+        )
+    if shape is not None and value.shape != shape:
+        raise ValueError(
+            f"{name} must have shape {shape} (world, particle, axes), got {tuple(value.shape)}; start from model.rest()."
+        )

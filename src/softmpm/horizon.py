@@ -1,5 +1,6 @@
 """How the substeps of a call are cut into chunks; a chunk runs, and is pulled back, as one."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -14,13 +15,13 @@ class Chunk:
     substeps: int
     """Substeps of a control step."""
 
-    @property
+    @functools.cached_property
     def shape(self) -> tuple[int, tuple[int, ...]]:
         """Its length, and where in it control steps begin."""
         begins = range(-self.first % self.substeps, self.length, self.substeps)
         return self.length, tuple(s for s in begins if s > 0)
 
-    @property
+    @functools.cached_property
     def rows(self) -> slice:
         """Control steps that it touches."""
         first = self.first // self.substeps
@@ -42,15 +43,16 @@ class Horizon:
     def total(self) -> int:
         return self.control_steps * self.substeps
 
-    def chunks(self, longest: int) -> list[Chunk]:
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - keeps numbers, not what is simulated
+    def chunks(self, longest: int) -> tuple[Chunk, ...]:
         """Whole control steps as far as they fit, or equal parts of one: few shapes, so that few programs are made."""
         if self.substeps <= longest:
             length = self.substeps * (longest // self.substeps)
             starts = range(0, self.total, length)
-            return [Chunk(first, min(length, self.total - first), self.substeps) for first in starts]
+            return tuple(Chunk(first, min(length, self.total - first), self.substeps) for first in starts)
         length = math.ceil(self.substeps / math.ceil(self.substeps / longest))
-        return [
+        return tuple(
             Chunk(step * self.substeps + first, min(length, self.substeps - first), self.substeps)
             for step in range(self.control_steps)
             for first in range(0, self.substeps, length)
-        ]
+        )

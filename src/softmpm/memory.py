@@ -8,6 +8,7 @@ nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes a
                and the others are found by running chunks again, as few as possible (schedule.py)
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -72,6 +73,7 @@ class Plan(NamedTuple):
         return self.slots == 0
 
 
+@functools.lru_cache(maxsize=256)
 def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     """The plan that runs least again within the budget [B].
 

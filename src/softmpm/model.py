@@ -177,10 +177,14 @@ class Model:
     @functools.cached_property
     def mass(self) -> Tensor:
         """Mass [kg] as the scene gives it, shape (particle,)."""
-        return (self.params().density * self.volume).contiguous()
+        return (self._params.density * self.volume).contiguous()
 
     def params(self) -> Params:
         """Material of each particle as the scene gives it, shape (particle,) each. Fresh tensors."""
+        return Params(*(tensor.clone() for tensor in self._params))
+
+    @functools.cached_property
+    def _params(self) -> Params:
         materials = [body.material for body in self.scene.bodies]
         return Params(
             *(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields)

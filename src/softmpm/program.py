@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.arrangement import Arrangement
-from softmpm.buffers import Solid, passing, view
+from softmpm.buffers import Solid, passing, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
@@ -20,7 +20,7 @@ from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
 from softmpm.kernels.types import solid_types, types
 from softmpm.model import Model
-from softmpm.replay import Launcher, Replay, recording
+from softmpm.replay import Command, Launcher, Replay, recording
 from softmpm.state import Low, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
@@ -61,6 +61,7 @@ class Program:
         if model.spec.deterministic:
             self.exact = Exact(model, view(tensor(padded * t.rows), t.real), self.node_arrays)
         self._forward = Replay(model, self._launch_all)
+        self._commands()
 
     def _structs(self) -> None:
         """What the kernels see of the buffers."""
@@ -98,6 +99,30 @@ class Program:
                 solid.pull = view(row, t.real)
             self.solids.append(solid)
 
+    def _commands(self) -> None:
+        """The launches between what users hold and the buffers."""
+        model, t, pack, lead = self.model, self.types, self.packing, self.lead
+        at, low = (model.scale, self.window, self.order_array), (t.vec, t.mat)
+        state = (t.vec, t.vec, t.mat, t.mat)
+        zero = torch.zeros(t.dim, t.dim, dtype=model.dtype, device=model.device)
+        none = passing(zero[0].expand(*lead, -1), t.vec), passing(zero.expand(*lead, -1, -1), t.mat)
+
+        def enter(*dtypes, low=()) -> Command:
+            slots = [slot(model, dtype) for dtype in dtypes]
+            inputs = (*at, *slots, *low, self.watch, self.packed[0])
+            return Command(model, pack.enter, lead, inputs, slots)
+
+        self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
+        out = state + low if model.dtype == torch.float32 else state
+        self._out = [(*lead, *dtype._shape_) for dtype in out]
+        slots = [slot(model, dtype) for dtype in out]
+        inputs = (*at, self.packed[-1], *slots, *(6 - len(out)) * (None,), view(self.words[-2:], wp.int64))
+        self._leave = Command(model, pack.leave, lead, inputs, slots)
+        given = Solid.fixed(model)
+        slots = slots_in(given, ("mass", "mu", "lam"), model, t.real)
+        inputs = (self.order_array, given, self._solid)
+        self._sort = Command(model, sorted_solid(model.spec), lead, inputs, slots)
+
     def calm(self) -> None:
         """Forget what the kernels reported."""
         self.words.copy_(self._calm)
@@ -131,9 +156,8 @@ class Program:
 
     def run(self, start: State, pull: Tensor | None, solid: Solid) -> State:
         """All substeps from ``start``; the end in new tensors. Failures are in :attr:`words`."""
-        model, stream, pack = self.model, stream_of(self.model.device), self.packing
-        launch = Launcher(model, stream)
-        moved = recording(model) or self._version != self.arrangement.version
+        stream = stream_of(self.model.device)
+        moved = recording(self.model) or self._version != self.arrangement.version
         if moved:
             self.order.copy_(self.arrangement.order)
             self.origin.copy_(self.arrangement.origin)
@@ -141,17 +165,16 @@ class Program:
         self.calm()
         if self.pull is not None and pull is not None:
             self.pull.copy_(pull)
-        low = start.low or Low(torch.zeros_like(start.x), torch.zeros_like(start.F))
-        arrays = self.state_arrays(*start, *low)
         if not self._has(solid) or moved:
-            given = Solid(solid.mass, solid.mu, solid.lam, None).struct(model)
-            launch(sorted_solid(model.spec), self.lead, self.order_array, given, self._solid)
-        enter = (model.scale, self.window, self.order_array, *arrays, self.watch, self.packed[0])
-        launch(pack.enter, self.lead, *enter)
+            self._sort(stream, solid.mass, solid.mu, solid.lam)
+        given = [tensor.contiguous() for tensor in (*start, *(start.low or ()))]  # kept until it is launched
+        self._enter[start.low is not None](stream, *given)
         if self.exact is not None:
             self.exact.begin(solid.mass)
         self._forward.run(stream)
-        return self._leave(launch)
+        x, v, C, F, *low = (self._tensor(*shape) for shape in self._out)
+        self._leave(stream, x, v, C, F, *low)
+        return State(x, v, C, F).with_low(Low(*low) if low else None)
 
     def _has(self, solid: Solid) -> bool:
         """Whether the material is the one of the run before: the very tensors, which nothing else writes to. Takes note of it."""
@@ -163,21 +186,6 @@ class Program:
     @property
     def packing(self):
         return packing(self.model.spec.dim, self.model.spec.dtype)
-
-    def state_arrays(self, *tensors: Tensor) -> list:
-        t = self.types
-        return [passing(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in tensors]
-
-    def _leave(self, launch: Launcher) -> State:
-        model, d, rounds = self.model, self.model.dim, self.model.dtype == torch.float32
-        tails = 2 * [(d,)] + 2 * [(d, d)]
-        out = [self._tensor(*self.lead, *tail) for tail in tails]
-        low = [self._tensor(*(self.lead if rounds else (0, 0)), *tail) for tail in ((d,), (d, d))]
-        report = passing(self.words[-2:], wp.int64)
-        leave = (self.window, self.order_array, self.packed[-1], *self.state_arrays(*out, *low), report)
-        launch(self.packing.leave, self.lead, model.scale, *leave)
-        state = State(*out)
-        return state.with_low(Low(*low)) if rounds else state
 
     def _launch_all(self, launch: Launcher) -> None:
         nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec)

@@ -4,14 +4,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import SolidAdj, clear, view
+from softmpm.buffers import SolidAdj, clear, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.kernels.fused import fused_adj
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, sorted_solid_adj
-from softmpm.kernels.types import Wanted
+from softmpm.kernels.types import Wanted, solid_adj_type
 from softmpm.program import Program
-from softmpm.replay import Launcher, Replay
+from softmpm.replay import Command, Launcher, Replay
 from softmpm.state import State
 from softmpm.step import stream_of
 
@@ -36,9 +36,7 @@ class Scratch:
         if model.spec.deterministic:
             self.exact = Exact(model, self.adj_array, self.node_arrays)
         self.solid_struct = self.solid.struct(model)
-        self.tensors = [
-            v for v in (self.solid.mass, self.solid.mu, self.solid.lam, self.solid.slot) if v is not None
-        ]
+        self.tensors = [part for part in (self.solid.material, self.solid.slot) if part is not None]
 
 
 class ProgramAdj:
@@ -55,12 +53,25 @@ class ProgramAdj:
                     self.adj_pull.new_empty(*self.adj_pull.shape[1:], PARTS), program.types.real
                 )
         self._backward = Replay(program.model, self._launch_all)
+        self._commands()
+
+    def _commands(self) -> None:
+        """The twins of those of the program."""
+        program, t, model = self.program, self.program.types, self.program.model
+        pack, lead, adj, at = program.packing, program.lead, self.scratch.adj_array, program.order_array
+        end, start = ([slot(model, dtype) for dtype in (t.vec, t.vec, t.mat, t.mat)] for _ in range(2))
+        self._enter = Command(model, pack.enter_adj, lead, (model.scale, at, *end, adj), end)
+        self._leave = Command(model, pack.leave_adj, lead, (model.scale, at, adj, *start), start)
+        if self.wanted.material:
+            found = solid_adj_type(model.spec, self.wanted)()
+            slots = slots_in(found, ("mass", "mu", "lam"), model, t.real)
+            kernel = sorted_solid_adj(model.spec, self.wanted)
+            self._sort = Command(model, kernel, lead, (at, self.scratch.solid_struct, found), slots)
 
     def run(self, adj_end: State, adj_solid: SolidAdj) -> tuple[State, Tensor | None]:
         """Adjoint of the start in new tensors, and of the pull (control step, world, muscle); adds into ``adj_solid``."""
         program, scratch = self.program, self.scratch
-        model, stream, pack = program.model, stream_of(program.model.device), program.packing
-        launch = Launcher(model, stream)
+        stream = stream_of(program.model.device)
         for tensor in scratch.tensors:
             clear(tensor)
         if scratch.exact is not None:
@@ -68,15 +79,12 @@ class ProgramAdj:
         if self.adj_pull is not None:
             clear(self.adj_pull)
         program.calm()
-        order, arrays = program.order_array, program.state_arrays(*adj_end)
-        launch(pack.enter_adj, program.lead, model.scale, order, *arrays, scratch.adj_array)
+        self._enter(stream, *adj_end)
         self._backward.run(stream)
         start = State(*(torch.empty_like(adj) for adj in adj_end))
-        arrays = program.state_arrays(*start)
-        launch(pack.leave_adj, program.lead, model.scale, order, scratch.adj_array, *arrays)
-        if self.wanted.material:
-            structs = scratch.solid_struct, adj_solid.struct(model)
-            launch(sorted_solid_adj(model.spec, self.wanted), program.lead, order, *structs)
+        self._leave(stream, *start)
+        if adj_solid.mass is not None and adj_solid.mu is not None and adj_solid.lam is not None:
+            self._sort(stream, adj_solid.mass, adj_solid.mu, adj_solid.lam)
         return start, None if self.adj_pull is None else self.adj_pull.clone()
 
     def _launch_all(self, launch: Launcher) -> None:

@@ -1,6 +1,6 @@
-"""A fixed list of launches, recorded as a graph when it first runs and replayed afterwards, on a GPU and on the CPU."""
+"""Launches that are made once and then repeated: one on other tensors each time, or a list on fixed ones as a graph."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 import warp as wp
@@ -62,6 +62,28 @@ class Launcher:
         )
         if self.collected is not None:
             self.collected.append(launch)
+
+
+class Command:
+    """A launch on other tensors each time: only their addresses are put in.
+
+    Args:
+        inputs: Of the kernel, some of which are slots, or structs that hold slots.
+        slots: These, from :func:`softmpm.buffers.slot`; each is filled in place, so they belong to this command alone.
+    """
+
+    def __init__(self, model: Model, kernel, dim, inputs: Sequence, slots: Sequence):
+        self._slots = slots
+        launch = wp.launch(kernel, dim, inputs, device=model.wp_device, record_tape=False, record_cmd=True)
+        assert launch is not None
+        self._launch = launch
+
+    def __call__(self, stream: wp.Stream | None, *tensors: torch.Tensor) -> None:
+        """Launch it on contiguous tensors of the slots' shapes and precision."""
+        for slot, tensor in zip(self._slots, tensors, strict=True):
+            assert tensor.is_contiguous()
+            slot.data = tensor.data_ptr()
+        self._launch.launch(stream)
 
 
 class Replay:

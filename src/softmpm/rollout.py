@@ -24,7 +24,7 @@ class Trail:
     """What a call keeps for its backward pass."""
 
     plan: Plan
-    chunks: list[Chunk]
+    chunks: tuple[Chunk, ...]
     runs: list[FastRun | PlainRun]
     """Every chunk, if everything is kept."""
     states: dict[int, State]

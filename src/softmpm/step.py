@@ -4,7 +4,7 @@ Nothing here decides how many substeps there are or what is kept: that is ``roll
 stream and are never recorded on a ``wp.Tape`` by themselves: :func:`softmpm.step` records the explicit adjoint.
 """
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 import warp as wp
@@ -23,7 +23,15 @@ from softmpm.watch import NEVER
 
 def stream_of(device: torch.device) -> wp.Stream | None:
     """PyTorch's current stream as Warp sees it; None on the CPU."""
-    return wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    if device.type != "cuda":
+        return None
+    return _known_stream(device, torch.cuda.current_stream(device).cuda_stream)
+
+
+@lru_cache(maxsize=None)
+def _known_stream(device: torch.device, handle: int) -> wp.Stream:
+    """Made once for each: Warp registers a stream when it is made, and takes it off when it goes."""
+    return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
 
 class Substep:

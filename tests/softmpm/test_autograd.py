@@ -5,6 +5,7 @@ import warnings
 import pytest
 import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
+from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 import softmpm
@@ -143,6 +144,34 @@ def test_it_works_under_func_grad_checkpoint_autocast_and_compile(model):
     assert_relative(again.double(), want, 0.05)
 
 
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # by PyTorch itself, for forward mode
+@pytest.mark.parametrize("name", ["x", "activation", "young"])
+def test_no_other_derivative_is_lost(name, scheme):
+    """Forward mode and vmap are not there: they raise, also where no gradient is needed and none could be asked for."""
+    model = softmpm.build(busy_scene(2, per_law=6), device="cpu", scheme=scheme)
+    inputs = {key: tensor.detach() for key, tensor in busy_inputs(model).items()}
+
+    def end(tensor):
+        return run(softmpm.simulate, model, inputs | {name: tensor}, 2).v
+
+    for _ in range(2):
+        with torch.no_grad(), forward_ad.dual_level(), pytest.raises(NotImplementedError, match="jvp"):
+            end(forward_ad.make_dual(inputs[name], torch.ones_like(inputs[name])))
+        with torch.no_grad(), pytest.raises(RuntimeError):
+            torch.vmap(end)(torch.stack([inputs[name]] * 2))
+        with pytest.raises(NotImplementedError, match="jvp"):
+            torch.func.jvp(end, (inputs[name],), (torch.ones_like(inputs[name]),))
+        end(inputs[name])
+
+    def weighted(tensor):
+        with torch.no_grad():
+            found = end(tensor)
+        return (found.sum() * tensor).sum()
+
+    got = torch.func.grad(weighted)(inputs[name])
+    assert_relative(got, end(inputs[name]).sum().expand_as(got), 1e-6)
+
+
 def test_no_grad_keeps_nothing(model):
     """Under no_grad the end has no history."""
     with torch.no_grad():
@@ -179,3 +208,47 @@ def test_material_changed_in_place_is_seen(scheme):
         changed = run(softmpm.simulate, model, inputs, 5)
         assert torch.equal(changed.v, fresh.v) and not torch.equal(changed.v, first.v), name
         first = changed
+
+
+@pytest.mark.parametrize("name, bad", [("young", -1.0), ("poisson", 0.5), ("density", float("nan"))])
+def test_material_that_turns_impossible_is_refused(name, bad, scheme, device):
+    """Numbers are not read again for tensors that nobody wrote to; a write is seen, also through a view."""
+    model = softmpm.build(busy_scene(2), device=device, scheme=scheme)
+    params = softmpm.Params(*(p.clone() for p in model.params()))
+    for _ in range(2):
+        softmpm.simulate(model, model.rest(), None, params, substeps=2)
+    getattr(params, name)[3:5].select(0, 1).fill_(bad)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=rf"params.{name} must be .*\[4\]"):
+            softmpm.simulate(model, model.rest(), None, params, substeps=2)
+
+
+def test_material_that_is_learned_is_checked_each_time(model):
+    """Also after a step by hand through ``.data``, which PyTorch does not count."""
+    young = torch.full((), 80.0, dtype=torch.float64, requires_grad=True)
+    params = model.params()._replace(young=young)
+    softmpm.simulate(model, model.rest(), None, params, substeps=2)
+    young.data.sub_(100.0)
+    with pytest.raises(ValueError, match=r"params.young must be finite and > 0, but params.young is -20"):
+        softmpm.simulate(model, model.rest(), None, params, substeps=2)
+
+
+def test_it_works_in_inference_mode(scheme):
+    """Whose tensors do not count their writes; what a model keeps from there serves calls with gradient too."""
+    model, other = (softmpm.build(busy_scene(2), device="cpu", scheme=scheme) for _ in range(2))
+    outside = model.params()
+    with torch.inference_mode():
+        params = softmpm.Params(*(p.clone() for p in outside))
+        first = softmpm.simulate(model, model.rest(), None, params, substeps=3)
+        params.young.mul_(2.0)
+        stiff = softmpm.simulate(model, model.rest(), None, params, substeps=3)
+        softmpm.simulate(model, model.rest(), None, outside, substeps=3)
+    want = softmpm.simulate(other, other.rest(), None, other.params(), substeps=3)
+    assert torch.equal(first.v, want.v) and not torch.equal(stiff.v, want.v)
+    found = []
+    for built, material in ((model, outside), (other, other.params())):
+        start = built.rest()
+        start.v.requires_grad_()
+        end = softmpm.simulate(built, start, None, material, substeps=3)
+        found += torch.autograd.grad(dot(cotangent(end), end), start.v)
+    assert torch.equal(*found)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,16 +10,18 @@ import pytest
 import torch
 
 from softmpm.checks import (
+    BOUNDS,
     check_activation,
+    check_bounds,
+    check_finite,
     check_params,
     check_scene,
     check_state,
     check_substeps,
-    check_values,
 )
 from softmpm.scene import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
 from softmpm.shapes import box
-from softmpm.state import Params, State
+from softmpm.state import Low, Params, State
 
 SOFT = NeoHookean(density=1.0, young=10.0)
 DX = 0.125  # a power of two, so that places between nodes are exact
@@ -168,8 +171,10 @@ def test_good_tensors_pass():
         check_params(MODEL, params(young=torch.ones(shape)))
     check_substeps(1)
     check_substeps(np.int64(20))
-    check_values(state(), torch.zeros(1, 2, 4), params())
-    check_values(state(), None, params())
+    check_bounds(params())
+    check_finite(state(), torch.zeros(1, 2, 4))
+    check_finite(state(), None)
+    check_state(MODEL, state().with_low(Low(state().v, state().C)))
 
 
 @pytest.mark.parametrize("name", ["x", "v", "C", "F"])
@@ -180,6 +185,16 @@ def test_state_shape(name):
     for bad in (good[0], good[:1], good[:, :2], good[..., :1]):
         with pytest.raises(ValueError, match=want + ".*" + re.escape(f"got {tuple(bad.shape)}")):
             check_state(MODEL, state(**{name: bad}))
+
+
+def test_low_order_parts():
+    """The kernels read them as they read x and F: another shape or precision is refused."""
+    good = Low(state().v, state().C)
+    for bad in (good._replace(x=good.x[:1]), good._replace(F=good.F[..., :1])):
+        with pytest.raises(ValueError, match=r"state.low.(x|F) must have shape"):
+            check_state(MODEL, state().with_low(bad))
+    with pytest.raises(ValueError, match=r"state.low.F must be torch.float32"):
+        check_state(MODEL, state().with_low(good._replace(F=good.F.double())))
 
 
 def test_activation_shape():
@@ -241,14 +256,14 @@ def test_not_finite(name, bad):
     tensors = {key: value.clone() for key, value in tensors.items()}
     tensors[name].view(-1)[-1] = bad
     index = ", ".join(str(n - 1) for n in tensors[name].shape)
+    start, material = (cls(*(tensors[key] for key in cls._fields)) for cls in (State, Params))
+    check = partial(check_bounds, material)
+    if name not in BOUNDS:
+        check = partial(check_finite, start, tensors["activation"])
     with pytest.raises(
         ValueError, match=re.escape(f"{name}[{index}] is {bad:g}" if index else f"{name} is {bad:g}")
     ):
-        check_values(
-            State(*(tensors[key] for key in State._fields)),
-            tensors["activation"],
-            Params(*(tensors[key] for key in Params._fields)),
-        )
+        check()
 
 
 @pytest.mark.parametrize(
@@ -258,4 +273,4 @@ def test_impossible_materials(name, bad):
     """A material outside its bounds is refused, also where it requires gradients."""
     tensors = params(**{name: torch.tensor([0.3, 0.3, bad], requires_grad=True)})
     with pytest.raises(ValueError, match=rf"params.{name} must be .*{name}\[2\] is {bad:g}"):
-        check_values(state(), None, tensors)
+        check_bounds(tensors)

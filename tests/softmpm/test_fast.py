@@ -228,6 +228,56 @@ def test_chunks_of_a_long_control_step_share_programs(made, short_chunks, device
     assert [keep for _, keep in made].count(False) <= 2 and [keep for _, keep in made].count(True) == 1, made
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_starts_of_any_layout(dtype, device):
+    """Transposed, spread out or broadcast in memory, with low-order parts or without, one after the other: as its copy."""
+    built = model(device=device, dtype=dtype, worlds=2)
+    inputs = {name: tensor.detach() for name, tensor in busy_inputs(built).items()}
+    params = softmpm.Params(*(inputs[name] for name in softmpm.Params._fields))
+    copy = softmpm.State(*(inputs[name] for name in "xvCF"))
+    layouts = {
+        "transposed": lambda t: t.transpose(0, -1).contiguous().transpose(0, -1),
+        "spread out": lambda t: torch.stack((t, torch.full_like(t, torch.nan)), -1)[..., 0],
+        "as it is": lambda t: t,
+    }
+    low = built.rest().low
+    for parts in (None, None if low is None else softmpm.Low(low.x + 1e-8, low.F + 1e-8)):
+        fresh = model(device=device, dtype=dtype, worlds=2)
+        want = softmpm.simulate(fresh, copy.with_low(parts), inputs["activation"], params, substeps=3)
+        for name, laid in layouts.items():
+            given = softmpm.State(*map(laid, copy)).with_low(parts and softmpm.Low(*map(laid, parts)))
+            got = softmpm.simulate(built, given, laid(inputs["activation"]), params, substeps=3)
+            for field, a, b in zip("xvCF", got, want, strict=True):
+                assert_relative(a, b, same_on(device), f"{field}, {name}")
+    one = copy._replace(v=copy.v[:, :1].expand_as(copy.v))  # no memory of its own
+    got, want = (
+        softmpm.simulate(m, start, None, params, substeps=3)
+        for m, start in (
+            (built, one),
+            (model(device=device, dtype=dtype, worlds=2), one._replace(v=one.v.clone())),
+        )
+    )
+    assert_relative(got.v, want.v, same_on(device))
+
+
+def test_gradients_of_any_layout(device):
+    """Cotangents that are transposed or broadcast, as PyTorch hands them on, give the gradient of their copies."""
+    built = model(device=device, worlds=2)
+    weights = [w.transpose(0, 1).contiguous().transpose(0, 1) for w in cotangent(built.rest())]
+    found = []
+    for given in (weights, [w.contiguous() for w in weights]):
+        ((end, inputs),) = calls(built, [1])
+        found.append(torch.autograd.grad(end, list(inputs.values()), given))
+    ((end, inputs),) = calls(built, [1])
+    for one, other in zip(*found, strict=True):
+        assert_relative(one, other, same_on(device))
+    total = sum(t.sum() for t in end)
+    ones = torch.autograd.grad(total, list(inputs.values()), retain_graph=True)
+    want = torch.autograd.grad(end, list(inputs.values()), [torch.ones_like(t) for t in end])
+    for one, other in zip(ones, want, strict=True):
+        assert_relative(one, other, same_on(device))
+
+
 def test_material_is_not_mixed_up_when_the_order_is_renewed(device):
     """One material, another while the order is new, the first again: the same tensors, and the result they gave at first."""
     built = model(device=device)
