@@ -44,7 +44,7 @@ def test_what_a_scene_lacks_is_not_compiled(tmp_path):
     """The source of the kernels holds the words of a feature only if the scene has it."""
     words = {
         "log": "neo_hookean",
-        "rotation": "fixed_corotated",
+        "_polar2": "fixed_corotated",
         "muscle_stress": "muscles",
         "slide": "walls",
     }
