@@ -192,7 +192,7 @@ class Program:
         held = len(self.velocity)
         if self.exact is None:
             launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
-        self._advance(-1, launch)
+        self._begin(launch)
         for s in range(length):
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
             if self.exact is not None:
@@ -201,10 +201,19 @@ class Program:
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
 
+    def _begin(self, launch: Launcher) -> None:
+        """P2G of the first substep."""
+        model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
+        sizes = (self.crew, model.particle_count, self.total, self.order_flat)
+        arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
+        launch(fused(model.spec).begin, self.crews, *arguments, block_dim=self.block)
+        if self.exact is not None:
+            self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
+
     def _advance(self, s: int, launch: Launcher) -> None:
-        """G2P of substep ``s`` and P2G of the next; the P2G of the first if ``s`` is -1."""
+        """G2P of substep ``s`` and P2G of the next."""
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
-        now, then = (max(s, 0), s + 1) if self.keep else (0, 0)
+        now, then = (s, s + 1) if self.keep else (0, 0)
         solid = self.solid(min(s + 1, length - 1))
         parameters = (model.scale, solid, self.window, s, s + 1 == length, self.crew)
         sizes = (model.particle_count, self.total, self.order_flat)

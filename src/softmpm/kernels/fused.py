@@ -2,6 +2,7 @@
 
 A substep is two launches. With M the nodes' momentum and mass, V their velocity:
 
+    begin     particles: (T1) → the first M
     grid      V ← (G1), (G2) of M,  next M ← 0
     advance   particles: V → (T2), (T3) → new state → (T1) → next M
 
@@ -90,17 +91,86 @@ def fused(spec: Spec) -> SimpleNamespace:
         if i < cleared.shape[0]:
             store_node(cleared, i, node_vec())
 
+    @wp.func
+    def hand_on(
+        watch: wp.array(dtype=wp.int64),
+        window: Window,
+        crew: int,
+        place: int,
+        count: int,
+        total: int,
+        order: wp.array(dtype=wp.int32),
+        substep: int,
+        first: int,
+        g: vec,
+        b: vec,
+        A: mat,
+        m: real,
+        node: Shares,
+    ):
+        """(T1) of one particle, added to the nodes from ``first`` on. The whole warp comes here together."""
+        if wp.static(exact):
+            if not give(node, place, count, total, b, A):
+                report(watch, place / count, substep, not_finite, order[place])
+        else:
+            scatter(node, window.shape, crew, first, g, b, A, m)
+
+    @wp.func
+    def stay(i: int, now: Packed, then: Packed):
+        """A particle of a world that failed."""
+        then.base[i] = now.base[i]
+        store_vec(then.rows, i, row_fx, load_vec(now.rows, i, row_fx))
+        store_vec(then.rows, i, row_low, load_vec(now.rows, i, row_low))
+        store_vec(then.rows, i, row_v, load_vec(now.rows, i, row_v))
+        store_mat(then.rows, i, row_H, load_mat(now.rows, i, row_H))
+        store_mat(then.rows, i, row_C, load_mat(now.rows, i, row_C))
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def begin(
+        # Parameters:
+        scale: Scale,
+        body: Solid,
+        window: Window,
+        crew: int,  # particles of a warp
+        count: int,  # particles of one world
+        total: int,  # particles of all worlds
+        order: wp.array(dtype=wp.int32),
+        # In:
+        start: Packed,
+        # Out:
+        watch: wp.array(dtype=wp.int64),
+        # Out, added into:
+        node: Shares,
+    ):
+        """The first P2G of a chunk."""
+        place = particle_of(wp.tid(), crew, total)
+        i = wp.min(place, total - 1)
+        world = i / count
+        p = i - world * count
+        H = load_mat(start.rows, i, row_H)
+        g = centre(load_vec(start.rows, i, row_fx))
+        v = load_vec(start.rows, i, row_v)
+        C = load_mat(start.rows, i, row_C)
+        m = body.mass[world, p]
+        A = affine_momentum(scale, body, world, p, C, H, rotation(body, world, p, H))
+        first = world * window.count + first_node(
+            unpack_base(start.base[i]), window.origin[world], window.shape
+        )
+        if place == total:
+            first = -1
+        hand_on(watch, window, crew, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
+
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def advance(
         # Parameters:
         scale: Scale,
         body: Solid,
         window: Window,
-        substep: int,  # -1: only the P2G of the start
+        substep: int,
         last: bool,  # no P2G afterwards
-        crew: int,  # particles of a warp
-        count: int,  # particles of one world
-        total: int,  # particles of all worlds
+        crew: int,
+        count: int,
+        total: int,
         order: wp.array(dtype=wp.int32),
         # In:
         velocity: wp.array(dtype=node_vec),
@@ -111,60 +181,51 @@ def fused(spec: Spec) -> SimpleNamespace:
         # Out, added into:
         node: Shares,
     ):
-        i = particle_of(wp.tid(), crew, total)
-        first = int(-1)
-        g = vec()
-        b = vec()
-        A = mat()
-        m = real(0.0)
-        if i < total:
-            world = i / count
-            p = i - world * count
-            at = Particle()
-            at.base = unpack_base(now.base[i])
-            at.fx = load_vec(now.rows, i, row_fx)
-            at.low = load_vec(now.rows, i, row_low)
-            at.H = load_mat(now.rows, i, row_H)
-            origin = window.origin[world]
-            held = world * window.count  # nodes of the worlds before
-            at.sound = True
-            at_base = at.base  # where it stood
-            if substep >= 0 and running(watch, world):
-                g = centre(at.fx)
-                here = held + first_node(at.base, origin, window.shape)
-                sums = gather(velocity, here, window.shape, g)
-                B = sums.outer - wp.outer(sums.value, g)
-                at = moved(scale, body, origin, window.shape, world, p, at, sums.value, B)
-            else:
-                at.v = load_vec(now.rows, i, row_v)
-                at.C = load_mat(now.rows, i, row_C)
-            base = at.base
-            if not at.sound:
-                base = at_base
-            # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
-            if not last:
-                m = body.mass[world, p]
-                g = centre(at.fx)
-                A = affine_momentum(scale, body, world, p, at.C, at.H, rotation(body, world, p, at.H))
-                b = m * at.v - A * g
-                first = held + first_node(base, origin, window.shape)
-            if substep >= 0:
-                then.base[i] = pack_base(base)
-                store_vec(then.rows, i, row_fx, at.fx)
-                store_vec(then.rows, i, row_low, at.low)
-                store_vec(then.rows, i, row_v, at.v)
-                store_mat(then.rows, i, row_H, at.H)
-                store_mat(then.rows, i, row_C, at.C)
-            if not at.sound:
-                complain(watch, scale.shape, world, order[i], substep, at.fx, at.base, at.H)
+        # A lane without a particle follows the last one and leaves nothing behind: no branch around all that.
+        place = particle_of(wp.tid(), crew, total)
+        i = wp.min(place, total - 1)
+        world = i / count
+        p = i - world * count
+        alive = running(watch, world)
+        origin = window.origin[world]
+        held = world * window.count  # nodes of the worlds before
+        old = Particle()
+        old.base = unpack_base(now.base[i])
+        old.fx = load_vec(now.rows, i, row_fx)
+        g = centre(old.fx)
+        sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
+        B = sums.outer - wp.outer(sums.value, g)
+        if not alive:
+            stay(i, now, then)
+        old.low = load_vec(now.rows, i, row_low)
+        old.H = load_mat(now.rows, i, row_H)
+        new = moved(scale, body, origin, window.shape, world, p, old, sums.value, B)
+        base = old.base
+        if new.sound:
+            base = new.base
+        m = body.mass[world, p]
+        g = centre(new.fx)
+        A = affine_momentum(scale, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
+        b = m * new.v - A * g
+        first = held + first_node(base, origin, window.shape)
+        # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
+        if alive and place < total:
+            then.base[i] = pack_base(base)
+            store_vec(then.rows, i, row_fx, new.fx)
+            store_vec(then.rows, i, row_low, new.low)
+            store_vec(then.rows, i, row_v, new.v)
+            store_mat(then.rows, i, row_H, new.H)
+            store_mat(then.rows, i, row_C, new.C)
+            if not new.sound:
+                complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
+        else:
+            first = -1
         if not last:
-            if wp.static(exact):
-                if not give(node, i, count, total, b, A):
-                    report(watch, i / count, substep + 1, not_finite, order[i])
-            else:
-                scatter(node, window.shape, crew, first, g, b, A, m)
+            hand_on(watch, window, crew, place, count, total, order, substep + 1, first, g, b, A, m, node)
 
-    return SimpleNamespace(clear=clear, grid_velocity=grid_velocity, advance=advance, centre=centre)
+    return SimpleNamespace(
+        clear=clear, grid_velocity=grid_velocity, begin=begin, advance=advance, centre=centre
+    )
 
 
 @functools.lru_cache(maxsize=None)
