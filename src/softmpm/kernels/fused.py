@@ -39,7 +39,8 @@ def fused(spec: Spec) -> SimpleNamespace:
     Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
-    aligned, head, coordinates, particle_of = s.aligned, s.head, s.coordinates, s.particle_of
+    aligned, head, coordinates = s.aligned, s.head, s.coordinates
+    particle_of, world_of = s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum, moved = one.rotation, one.affine_momentum, one.moved
@@ -145,7 +146,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         """The first P2G of a chunk."""
         place = particle_of(wp.tid(), crew, total)
         i = wp.min(place, total - 1)
-        world = i / count
+        world = world_of(i, count, total)
         p = i - world * count
         H = load_mat(start.rows, i, row_H)
         g = centre(load_vec(start.rows, i, row_fx))
@@ -184,7 +185,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         # A lane without a particle follows the last one and leaves nothing behind: no branch around all that.
         place = particle_of(wp.tid(), crew, total)
         i = wp.min(place, total - 1)
-        world = i / count
+        world = world_of(i, count, total)
         p = i - world * count
         alive = running(watch, world)
         origin = window.origin[world]
@@ -241,7 +242,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     gather_adj, slope_adj, first_node, unpack_base = s.gather_adj, s.slope_adj, s.first_node, s.unpack_base
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
-    centre, particle_of = fused(spec).centre, s.particle_of
+    centre, particle_of, world_of = fused(spec).centre, s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum = one.rotation, one.affine_momentum
@@ -318,7 +319,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         b = vec()
         B = mat()
         if i < total:
-            world = i / count
+            world = world_of(i, count, total)
             p = i - world * count
             origin = window.origin[world]
             held = world * window.count

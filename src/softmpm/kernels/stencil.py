@@ -50,6 +50,13 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
             place = total
         return place
 
+    @wp.func
+    def world_of(place: int, count: int, total: int) -> int:
+        """World of a particle, ``count`` in each; one world is worth asking for, since a GPU divides slowly."""
+        if count == total:
+            return 0
+        return place / count
+
     if dim == 2:
 
         @wp.func
@@ -287,6 +294,7 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
 
     return SimpleNamespace(
         particle_of=particle_of,
+        world_of=world_of,
         first_node=first_node,
         coordinates=coordinates,
         pack_base=pack_base,

@@ -26,7 +26,9 @@ def warp(tmp_path_factory):
     return ctypes.CDLL(str(library))
 
 
-@pytest.mark.parametrize("crew, count", [(32, 32), (32, 27), (32, 1), (32, 0), (16, 16), (16, 11), (7, 7), (7, 2)])
+@pytest.mark.parametrize(
+    "crew, count", [(32, 32), (32, 27), (32, 1), (32, 0), (16, 16), (16, 11), (7, 7), (7, 2)]
+)
 @pytest.mark.parametrize("order", ["sorted", "shuffled"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_sum_over_a_warp(warp, dim, order, crew, count):
@@ -40,7 +42,9 @@ def test_sum_over_a_warp(warp, dim, order, crew, count):
     A, m = random.normal(size=(WARP, dim, dim)), random.uniform(1, 2, WARP)
     given = [np.ascontiguousarray(values, dtype=np.float32) for values in (g, b, A, m)]
     node, want = np.zeros((shape.prod(), 4), np.float32), np.zeros((shape.prod(), 4))
-    pointers = [values.ctypes.data_as(ctypes.c_void_p) for values in (shape.astype(np.int32), first, *given, node)]
+    pointers = [
+        values.ctypes.data_as(ctypes.c_void_p) for values in (shape.astype(np.int32), first, *given, node)
+    ]
     sent = getattr(warp, f"add{dim}")(pointers[-1], pointers[0], crew, *pointers[1:-1])
     for p, o in itertools.product(range(count), itertools.product((-1, 0, 1), repeat=dim)):
         d = np.abs(np.array(o) - given[0][p].astype(float))
