@@ -48,6 +48,8 @@ class Arrangement:
         def integers(*size):
             return torch.empty(*size, dtype=torch.int32, device=model.device)
 
+        pull = model.scene.gravity or (0.0,)
+        self._up = max(range(len(pull)), key=lambda axis: abs(pull[axis]))
         self.order = integers(model.worlds, model.particle_count)
         self.origin = integers(model.worlds, model.dim)
         self._key = torch.empty_like(self.order)
@@ -73,6 +75,7 @@ class Arrangement:
     def _locate(self, x: Tensor) -> None:
         """Cell of each particle, and the box around them in each world.
 
+        In a cell the lower half comes first: when a body falls, that is what leaves it, and it stays together.
         On the CPU, where nothing is summed in parallel, the order is that at rest, so that results never depend on what ran
         before; the window does not change a result.
         """
@@ -82,7 +85,7 @@ class Arrangement:
         self._ends[1].fill_(0)
         places = [passing(place.contiguous(), t.vec) for place in (x, follow)]
         found = [passing(found, wp.int32) for found in (self._key, *self._ends)]
-        self._launch(packing(t.dim, model.spec.dtype).locate, self.order.shape, *places, *found)
+        self._launch(packing(t.dim, model.spec.dtype).locate, self.order.shape, self._up, *places, *found)
 
     def renew(self, x: Tensor) -> None:
         """Sort by cell and centre the window on the particles, without waiting for the device."""
@@ -94,7 +97,8 @@ class Arrangement:
         kernel = packing(t.dim, self.model.spec.dtype).centre_window
         self._launch(kernel, self.origin.shape, t.ivec(*self.shape), *ends)
         if not recording(self.model):
-            self._fresh = Report(self.model.worlds + (key[:, 1:] != key[:, :-1]).sum()[None])
+            cell = key // 2
+            self._fresh = Report(self.model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])
         self.stale = False
         self.version += 1
 

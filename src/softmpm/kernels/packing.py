@@ -124,11 +124,14 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     def locate(
         # Parameters:
         scale: Scale,
+        up: int,  # the axis along which bodies fall
         # In:
         x: wp.array2d(dtype=vec),
         sorted_x: wp.array2d(dtype=vec),  # what the order follows
         # Out:
-        key: wp.array2d(dtype=wp.int32),  # grows with the cell, along the last axis first
+        key: wp.array2d(
+            dtype=wp.int32
+        ),  # grows with the cell, along the last axis first; odd in its upper half
         # Out, lowered and raised:
         low: wp.array2d(dtype=wp.int32),
         high: wp.array2d(dtype=wp.int32),
@@ -136,12 +139,15 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         """Where particles are: keys to sort by, and the first and last base node of each world along each axis."""
         world, p = wp.tid()
         cell = int(0)
+        half = int(0)
         base = ivec()
         on_grid = bool(True)
         for axis in range(dim):
             last = scale.shape[axis] - 3
             there = wp.float64(sorted_x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5)
             cell = cell * scale.shape[axis] + wp.clamp(int(wp.floor(there)), 0, last)
+            if axis == up and there - wp.floor(there) >= wp.float64(0.5):
+                half = 1
             here = wp.floor(wp.float64(x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5))
             if here >= wp.float64(0.0) and here <= wp.float64(last):
                 base[axis] = int(here)
@@ -152,7 +158,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
                 wp.atomic_min(low, world, axis, base[axis])
             if on_grid and base[axis] > high[world, axis]:
                 wp.atomic_max(high, world, axis, base[axis])
-        key[world, p] = cell
+        key[world, p] = 2 * cell + half
 
     @wp.kernel(module=module, enable_backward=False)
     def centre_window(
