@@ -22,7 +22,9 @@ METRICS = [
 ]
 """Columns of metrics.csv; nothing in it depends on the clock."""
 TIMING = ["episode", "learn", "save"]
-"""Columns of timing.csv [s]; ``episode`` is simulation and gradient, ``save`` is that of the iteration before."""
+"""Columns of timing.csv [s]: ``episode`` is simulation, gradient and its mean over the processes, ``learn`` keeps pictures as well,
+``save`` is that of the iteration before.
+"""
 
 
 class Journal:

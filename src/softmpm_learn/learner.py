@@ -34,9 +34,11 @@ class Learner:
         return [self.autoencoder] if self.target is None else [self.autoencoder, self.target]
 
     def watch(self, first: int, seen: Tensor) -> None:
-        """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on."""
-        for world, pictures in enumerate(seen.unbind(dim=1)):
-            self.replay.add(first + world, pictures)
+        """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on; where there are more
+        than the buffer holds, only the last are written.
+        """
+        for world in range(seen.shape[1])[-self.replay.simulations :]:
+            self.replay.add(first + world, seen[:, world])
 
     def learn(self, generator: torch.Generator) -> dict[str, float]:
         """One learning phase; its figures for metrics.csv."""

@@ -114,7 +114,9 @@ def _loop(run: Run, journal: Journal | None, progress, stop) -> Result:
     group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
     while run.iteration < last and not group.any(stop()):
         k = run.iteration
-        row = optimise(run, journal, seconds) | learn(run, seconds)
+        row, seen = optimise(run, journal, seconds)
+        with _clock(seconds, "learn"):
+            row |= learn(run, seen)
         with group.together():
             if journal:
                 journal.add(k, row, seconds)
@@ -129,8 +131,10 @@ def _loop(run: Run, journal: Journal | None, progress, stop) -> Result:
     return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"])
 
 
-def optimise(run: Run, journal: Journal | None, seconds: dict[str, float]) -> dict[str, float]:
-    """One optimisation step: simulate, differentiate, move policy and design. Gives figures for metrics.csv."""
+def optimise(
+    run: Run, journal: Journal | None, seconds: dict[str, float]
+) -> tuple[dict[str, float], Tensor | None]:
+    """One optimisation step: simulate, differentiate, move policy and design. Gives figures for metrics.csv and what was seen."""
     goal, retries = run.draw_goals(), 0
     while True:
         try:
@@ -148,20 +152,16 @@ def optimise(run: Run, journal: Journal | None, seconds: dict[str, float]) -> di
         run.best = {"loss": row["loss"], "iteration": run.iteration, **run.actor()}
     run.keep_safe()
     run.optimizer.step()
-    if run.learner and episode.seen is not None:
-        seen = run.group.gather(episode.seen, dim=1)
-        with run.group.together():
-            if seen is not None:
-                run.learner.watch(run.iteration * run.settings.train.worlds, seen)
-    return row | {"retries": retries, "best": run.best["loss"]}
+    return row | {"retries": retries, "best": run.best["loss"]}, episode.seen
 
 
 def attempt(run: Run, goal, journal: Journal | None, seconds) -> tuple[Episode, dict[str, float]]:
     """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
     film = journal.film(run.iteration) if journal and journal.due(run.iteration) else contextlib.nullcontext()
-    with _clock(seconds, "episode"), _all_worlds(run), film as on_frame:
-        episode, gradients = run.loop(goal, on_frame)
-    return episode, take_gradient(run, episode, gradients)
+    with _clock(seconds, "episode"):
+        with _all_worlds(run), film as on_frame:
+            episode, gradients = run.loop(goal, on_frame)
+        return episode, take_gradient(run, episode, gradients)
 
 
 @contextlib.contextmanager
@@ -217,17 +217,21 @@ def _length(gradients: Sequence[Tensor]) -> float:
     return math.sqrt(sum(g.double().square().sum().item() for g in gradients))
 
 
-def learn(run: Run, seconds: dict[str, float]) -> dict[str, float]:
-    """The learning phase, where one is due. Gives figures for metrics.csv; in the first process, which alone learns."""
-    seconds["learn"] = 0.0
-    if run.learner is None:
+def learn(run: Run, seen: Tensor | None) -> dict[str, float]:
+    """Remember what was seen; the learning phase, where one is due. Gives figures for metrics.csv in the first process, which alone
+    does both.
+    """
+    if run.learner is None or seen is None:
         return {}
+    pictures = run.group.gather(seen, dim=1)
+    with run.group.together():
+        if pictures is not None:
+            run.learner.watch(run.iteration * run.settings.train.worlds, pictures)
     row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
-        with _clock(seconds, "learn"):
-            row |= run.group.once(run.learner.learn, run.generator) or {}
-            run.group.copy_first(t for network in run.learner.networks for t in network.state_dict().values())
-            run.generator.set_state(run.group.tell(run.generator.get_state()))
+        row |= run.group.once(run.learner.learn, run.generator) or {}
+        run.group.copy_first(t for network in run.learner.networks for t in network.state_dict().values())
+        run.generator.set_state(run.group.tell(run.generator.get_state()))
     return row
 
 

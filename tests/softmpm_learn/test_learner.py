@@ -63,6 +63,14 @@ def test_without_replay_the_past_is_forgotten(tmp_path):
     assert taught(tmp_path / "with")[0].replay.ids == [0, 1, 2, 3]
 
 
+def test_what_cannot_be_kept_is_not_written(tmp_path):
+    """Of more worlds than the buffer holds simulations, the last are kept, and no file is made of the others."""
+    subject, pictures = learner(tmp_path), torch.cat([seen(number) for number in range(10)], dim=1)
+    subject.watch(20, pictures)
+    assert subject.replay.ids == list(range(22, 30)) and len(list(tmp_path.iterdir())) == 8
+    torch.testing.assert_close(torch.cat(subject.replay.split("training")[:1]), pictures[:, 2])
+
+
 def test_goes_on_from_its_state(tmp_path):
     """A learner restored from a state learns on exactly as the one that was saved."""
     subject, _ = taught(tmp_path)

@@ -1,0 +1,88 @@
+"""How much faster is a run on several GPUs? `python bench/scale.py [--device cuda] [--json bench/results/scale.json]`
+
+An arm reaches for a goal of its own in each world. The same run is started by torchrun with 1, 2, 4 and 8 processes that share its
+worlds, as far as there are GPUs (1 and 2 on a CPU). Seconds of an iteration, from timing.csv without its first rows:
+
+    episode     simulation, gradient and its mean over the processes, which is the work they share; the median
+    alone       `learn` and `save`, for which all wait for the first process: pictures, autoencoder, checkpoint; the mean, since one
+                iteration in five has a learning phase. With `centroids` there are neither pictures nor autoencoder
+
+``shared`` is the speed-up of the episode over one process, ``speed-up`` and ``efficiency`` those of both columns together. Nothing is
+recorded. ``loss apart`` is the largest relative difference of an iteration's loss from that of one process: on a CPU, in float64, it
+must be rounding; on a GPU, in float32, it shows that the same is learned, though sums differ from run to run.
+"""
+
+import csv
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+from common import Table, arguments
+
+from softmpm_learn.tasks.arm import ArmConf, arm
+from softmpm_learn.tasks.task import Resolution
+
+CASES = [("centroids", 64), ("latent", 64), ("centroids", 256)]
+"""Observer and worlds."""
+WARM, ITERATIONS = 3, 13
+"""Iterations left out, which compile and record, and all of them; the ten that count have two learning phases."""
+SAME = 1e-5
+
+
+def main():
+    args = arguments(__doc__)
+    device = torch.device(args.device)
+    gpu = device.type == "cuda"
+    precision, most = ("float32", torch.cuda.device_count()) if gpu else ("float64", 2)
+    table = Table(f"Learning on several processes, {precision}", device, args.json)
+    resolution, seconds = (Resolution.fine, 0.5) if gpu else (Resolution.draft, 0.025)
+    size = len(arm(ArmConf(resolution=resolution)).scene.bodies[0].particles.positions)
+    for observer, worlds in CASES if gpu else [("centroids", 16), ("latent", 16)]:
+        if worlds * size > (args.largest or worlds * size):
+            continue
+        words = [
+            *("task=arm", f"task.resolution={resolution.name}", f"task.seconds={seconds}"),
+            *(f"observer={observer}", f"train.worlds={worlds}", "train.goal_spread=[0.05,0.05]"),
+            *(f"train.iterations={ITERATIONS}", "train.record_every=0"),
+            *(f"device.name={device.type}", f"device.dtype={precision}"),
+        ]
+        first = None
+        for processes in (1, 2, 4, 8)[: most.bit_length()]:
+            losses, episode, alone = run(words, processes)
+            first = first or (losses, episode, alone)
+            faster = (first[1] + first[2]) / (episode + alone)
+            apart = max(abs(now - then) / abs(then) for now, then in zip(losses, first[0], strict=True))
+            row = {"observer": observer, "processes": processes, "worlds": worlds, "particles": worlds * size}
+            times = {"episode s": episode, "alone s": alone, "shared": first[1] / episode}
+            table.add(
+                row | times | {"speed-up": faster, "efficiency": faster / processes, "loss apart": apart}
+            )
+            if not gpu and not apart <= SAME:
+                sys.exit(f"{processes} processes learn something else than one: {apart:.2g} > {SAME:g}.")
+
+
+def run(words: list[str], processes: int) -> tuple[list[float], float, float]:
+    """Train in so many processes; gives the loss of each iteration, and seconds of its episode and of the first process alone."""
+    torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    with tempfile.TemporaryDirectory() as folder:
+        program = ["-m", "softmpm_learn", *words, f"hydra.run.dir={folder}"]
+        done = subprocess.run([sys.executable, *torchrun, *program], capture_output=True, text=True)
+        if done.returncode:
+            last = (done.stdout + done.stderr).splitlines()[-60:]  # torchrun adds some forty of its own
+            sys.exit("\n".join([*last, f"The run in {processes} process(es) failed."]))
+        timing, metrics = (read(Path(folder) / name) for name in ("timing.csv", "metrics.csv"))
+    episode = statistics.median(row["episode"] for row in timing[WARM:])
+    alone = statistics.mean(row["learn"] + row["save"] for row in timing[WARM:])
+    return [row["loss"] for row in metrics], episode, alone
+
+
+def read(path: Path) -> list[dict[str, float]]:
+    with open(path, newline="") as file:
+        return [{name: float(cell or "nan") for name, cell in row.items()} for row in csv.DictReader(file)]
+
+
+if __name__ == "__main__":
+    main()
