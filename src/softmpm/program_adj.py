@@ -6,7 +6,7 @@ from torch import Tensor
 
 from softmpm.buffers import SolidAdj, clear, slot, slots_in, view
 from softmpm.exact import Exact
-from softmpm.kernels.fused import fused_adj
+from softmpm.kernels.fused_adj import fused_adj
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, sorted_solid_adj
 from softmpm.kernels.types import Wanted, solid_adj_type

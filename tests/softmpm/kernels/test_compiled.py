@@ -6,7 +6,8 @@ import cubin
 import pytest
 import warp as wp
 
-from softmpm.kernels.fused import fused, fused_adj
+from softmpm.kernels.fused import fused
+from softmpm.kernels.fused_adj import fused_adj
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.types import Spec, Wanted
 
