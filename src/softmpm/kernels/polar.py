@@ -24,7 +24,7 @@ from softmpm.kernels.types import types
 
 NEWTON_STEPS = {"float32": 2, "float64": 3}  # each doubles the digits of a start that has a few
 QUARTIC_STEPS = 40  # an upper bound: at F = I none is taken, elsewhere 3 to 8
-INVERSE_STEPS = 5  # where two singular values nearly cancel each takes the error down by little
+INVERSE_STEPS = 3
 
 
 @functools.lru_cache(maxsize=None)
@@ -68,8 +68,9 @@ def _polar3(dtype: str) -> SimpleNamespace:
     real, vec, mat, divide = t.real, t.vec, t.mat, t.divide
     quat = wp.types.vector(4, real)  # (w, x, y, z), unit
     steps = NEWTON_STEPS[dtype]
-    close = 1e-3 if dtype == "float32" else 1e-6  # the eigenvalue need not be better: (R3) finishes
+    close = 1e-4 if dtype == "float32" else 1e-6  # the eigenvalue need not be better: (R3) finishes
     above = 1.0 + close
+    tiny = 1e-8 if dtype == "float32" else 1e-17
 
     @wp.func
     def axl(M: mat) -> vec:
@@ -181,6 +182,10 @@ def _polar3(dtype: str) -> SimpleNamespace:
 
     @wp.func
     def rotation(H: mat) -> mat:
+        if wp.max(wp.max(wp.abs(H[0])), wp.max(wp.max(wp.abs(H[1])), wp.max(wp.abs(H[2])))) < real(tiny):
+            return real(0.5) * (
+                H - wp.transpose(H)
+            )  # to the last digit, and a CPU is slow with the squares of these
         q = quaternion(wp.identity(n=3, dtype=real) + H)
         for _step in range(steps):
             Q = minus_identity(q)
