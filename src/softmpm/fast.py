@@ -3,6 +3,7 @@
 import threading
 import weakref
 from collections import defaultdict
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -18,29 +19,37 @@ from softmpm.replay import recording
 from softmpm.state import State
 
 
+class Pair(NamedTuple):
+    """A program and its adjoints, which hold it."""
+
+    program: Program
+    adjoints: dict[Wanted, ProgramAdj]
+
+
 class Pool:
     """Programs that were made on one arrangement and are not in use."""
 
     def __init__(self, model: Model, arrangement: Arrangement):
         self.model, self.arrangement = model, arrangement
-        self._free: dict[tuple, list[Program]] = defaultdict(list)
+        self._free: dict[tuple, list[Pair]] = defaultdict(list)
         self._scratch: dict[Wanted, Scratch] = {}
 
-    def take(self, chunk: Chunk, keep: bool) -> Program:
+    def take(self, chunk: Chunk, keep: bool) -> Pair:
         free = self._free[chunk.shape, keep]
-        return free.pop() if free else Program(self.model, self.arrangement, chunk, keep)
+        return free.pop() if free else Pair(Program(self.model, self.arrangement, chunk, keep), {})
 
-    def give(self, program: Program) -> None:
-        self._free[program.chunk.shape, program.keep].append(program)
+    def give(self, pair: Pair) -> None:
+        self._free[pair.program.chunk.shape, pair.program.keep].append(pair)
 
-    def adjoint(self, program: Program, wanted: Wanted) -> ProgramAdj:
+    def adjoint(self, pair: Pair, wanted: Wanted) -> ProgramAdj:
+        program, adjoints = pair
         if recording(self.model):
             return ProgramAdj(program, wanted, Scratch(program, wanted))
         if wanted not in self._scratch:
             self._scratch[wanted] = Scratch(program, wanted)
-        if wanted not in program.adjoints:
-            program.adjoints[wanted] = ProgramAdj(program, wanted, self._scratch[wanted])
-        return program.adjoints[wanted]
+        if wanted not in adjoints:
+            adjoints[wanted] = ProgramAdj(program, wanted, self._scratch[wanted])
+        return adjoints[wanted]
 
 
 class FastRun:
@@ -55,15 +64,16 @@ class FastRun:
 
     def __init__(self, pool: Pool, renewed: bool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
         self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
-        self.program = program = pool.take(chunk, keep)
+        self._pair = pool.take(chunk, keep)
+        program = self._pair.program
         self.end = program.run(start, pull, solid)
         self.words = program.words
         if not recording(program.model):  # else the graph that is being recorded owns the memory
-            weakref.finalize(self, pool.give, program)
+            weakref.finalize(self, pool.give, self._pair)
 
     def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
-        return self.pool.adjoint(self.program, wanted).run(adj_end, adj_solid)
+        return self.pool.adjoint(self._pair, wanted).run(adj_end, adj_solid)
 
 
 class Fast:

@@ -31,7 +31,6 @@ class Program:
 
     def __init__(self, model: Model, arrangement: Arrangement, chunk: Chunk, keep: bool):
         self.model, self.arrangement, self.chunk, self.keep = model, arrangement, chunk, keep
-        self.adjoints = {}
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
@@ -60,7 +59,7 @@ class Program:
         self.exact = None
         if model.spec.deterministic:
             self.exact = Exact(model, view(tensor(padded * t.rows), t.real), self.node_arrays)
-        self._forward = Replay(model, self._launch_all)
+        self._forward = Replay(model)
         self._commands()
 
     def _structs(self) -> None:
@@ -171,7 +170,7 @@ class Program:
         self._enter[start.low is not None](stream, *given)
         if self.exact is not None:
             self.exact.begin(solid.mass)
-        self._forward.run(stream)
+        self._forward.run(stream, self._launch_all)
         x, v, C, F, *low = (self._tensor(*shape) for shape in self._out)
         self._leave(stream, x, v, C, F, *low)
         return State(x, v, C, F).with_low(Low(*low) if low else None)

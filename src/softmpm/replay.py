@@ -89,35 +89,37 @@ class Command:
 class Replay:
     """Runs ``launches(launcher)`` the first time to record it, as a CUDA graph or, on the CPU, as a list of launches.
 
+    It is given the launches each time and does not hold them: whoever makes them holds it.
+
     While PyTorch itself records a CUDA graph, the launches become part of that one. Warp's CPU graphs would be faster still, but
     take up what other threads launch meanwhile.
     """
 
-    def __init__(self, model: Model, launches: Callable[[Launcher], None]):
-        self.model, self.launches = model, launches
+    def __init__(self, model: Model):
+        self.model = model
         self._graph: wp.Graph | None = None
         self._list: list | None = None
 
-    def run(self, stream: wp.Stream | None) -> None:
+    def run(self, stream: wp.Stream | None, launches: Callable[[Launcher], None]) -> None:
         if stream is None:
-            self._run_list()
+            self._run_list(launches)
         elif recording(self.model):
-            self.launches(Launcher(self.model, stream))
+            launches(Launcher(self.model, stream))
         else:
             if self._graph is None:
-                self._graph = self._record()
+                self._graph = self._record(launches)
             wp.capture_launch(self._graph, stream=stream)
 
-    def _run_list(self) -> None:
+    def _run_list(self, launches: Callable[[Launcher], None]) -> None:
         if self._list is None:
             self._list = []
-            self.launches(Launcher(self.model, None, self._list))
+            launches(Launcher(self.model, None, self._list))
         for launch in self._list:
             launch.launch()
 
-    def _record(self) -> wp.Graph:
+    def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph:
         stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
         with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-            self.launches(Launcher(self.model, stream))
+            launches(Launcher(self.model, stream))
         assert capture.graph is not None
         return capture.graph
