@@ -2,7 +2,6 @@
 
 import threading
 import weakref
-from collections import defaultdict
 from typing import NamedTuple
 
 from torch import Tensor
@@ -26,20 +25,38 @@ class Pair(NamedTuple):
     adjoints: dict[Wanted, ProgramAdj]
 
 
+KINDS = 4
+"""Kinds of programs that one call uses, at most: for two shapes of chunks, with and without what is inside."""
+
+
 class Pool:
-    """Programs that were made on one arrangement and are not in use."""
+    """Programs that were made on one arrangement and are not in use.
+
+    Those of the kinds that were used last stay. Others only while all together fit into the budget of a call: each length of a
+    call may have kinds of its own.
+    """
 
     def __init__(self, model: Model, arrangement: Arrangement):
         self.model, self.arrangement = model, arrangement
-        self._free: dict[tuple, list[Pair]] = defaultdict(list)
+        self._free: dict[tuple, list[Pair]] = {}  # by kind, the one used last at the end
         self._scratch: dict[Wanted, Scratch] = {}
 
-    def take(self, chunk: Chunk, keep: bool) -> Pair:
-        free = self._free[chunk.shape, keep]
-        return free.pop() if free else Pair(Program(self.model, self.arrangement, chunk, keep), {})
+    def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, list[Pair]]:
+        """A program, and where to put it after use."""
+        kind = chunk.shape, keep
+        free = self._free[kind] = self._free.pop(kind, [])
+        if free:
+            return free.pop(), free
+        if not recording(self.model):  # else nothing may be destroyed
+            self._forget()
+        return Pair(Program(self.model, self.arrangement, chunk, keep), {}), free
 
-    def give(self, pair: Pair) -> None:
-        self._free[pair.program.chunk.shape, pair.program.keep].append(pair)
+    def _forget(self) -> None:
+        """Make room for another program. Those of a forgotten kind that are still in use go with the call that uses them."""
+        for kind in list(self._free)[:-KINDS]:
+            if sum(pair.program.bytes for free in self._free.values() for pair in free) <= self.model.budget:
+                break
+            del self._free[kind]
 
     def adjoint(self, pair: Pair, wanted: Wanted) -> ProgramAdj:
         program, adjoints = pair
@@ -64,12 +81,12 @@ class FastRun:
 
     def __init__(self, pool: Pool, renewed: bool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
         self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
-        self._pair = pool.take(chunk, keep)
+        self._pair, free = pool.take(chunk, keep)
         program = self._pair.program
         self.end = program.run(start, pull, solid)
         self.words = program.words
         if not recording(program.model):  # else the graph that is being recorded owns the memory
-            weakref.finalize(self, pool.give, self._pair)
+            weakref.finalize(self, free.append, self._pair)
 
     def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""

@@ -122,6 +122,12 @@ class Program:
         inputs = (self.order_array, given, self._solid)
         self._sort = Command(model, sorted_solid(model.spec), lead, inputs, slots)
 
+    @property
+    def bytes(self) -> int:
+        """Memory of its own."""
+        sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
+        return sum(tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums))
+
     def calm(self) -> None:
         """Forget what the kernels reported."""
         self.words.copy_(self._calm)
