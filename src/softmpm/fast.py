@@ -14,7 +14,7 @@ from softmpm.memory import LONGEST
 from softmpm.model import Model
 from softmpm.program import Program
 from softmpm.program_adj import ProgramAdj, Scratch
-from softmpm.replay import recording
+from softmpm.replay import hold, recording
 from softmpm.state import State
 
 
@@ -25,38 +25,42 @@ class Pair(NamedTuple):
     adjoints: dict[Wanted, ProgramAdj]
 
 
-KINDS = 4
-"""Kinds of programs that one call uses, at most: for two shapes of chunks, with and without what is inside."""
+SHAPES = 2
+"""Shapes of chunks in one call, at most."""
 
 
 class Pool:
     """Programs that were made on one arrangement and are not in use.
 
-    Those of the kinds that were used last stay. Others only while all together fit into the budget of a call: each length of a
-    call may have kinds of its own.
+    Those for the shapes of chunks that came last stay. Others, since each length of a call may bring shapes of its own, stay only
+    while all together fit into the budget of a call.
     """
 
     def __init__(self, model: Model, arrangement: Arrangement):
         self.model, self.arrangement = model, arrangement
-        self._free: dict[tuple, list[Pair]] = {}  # by kind, the one used last at the end
+        # By whether they keep what is inside, and by shape, the one that came last at the end:
+        self._free: dict[bool, dict[tuple, list[Pair]]] = {False: {}, True: {}}
         self._scratch: dict[Wanted, Scratch] = {}
 
     def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, list[Pair]]:
-        """A program, and where to put it after use."""
-        kind = chunk.shape, keep
-        free = self._free[kind] = self._free.pop(kind, [])
+        """A program, and the list that it comes back to: whoever gives it back, only this thread changes the pool."""
+        shapes = self._free[keep]
+        free = shapes[chunk.shape] = shapes.pop(chunk.shape, [])
         if free:
-            return free.pop(), free
-        if not recording(self.model):  # else nothing may be destroyed
-            self._forget()
+            pair = free.pop()
+            if recording(self.model):
+                hold(pair.program)
+            return pair, free
+        if not recording(self.model):  # else no graph may be destroyed
+            self._forget(shapes)
         return Pair(Program(self.model, self.arrangement, chunk, keep), {}), free
 
-    def _forget(self) -> None:
-        """Make room for another program. Those of a forgotten kind that are still in use go with the call that uses them."""
-        for kind in list(self._free)[:-KINDS]:
-            if sum(pair.program.bytes for free in self._free.values() for pair in free) <= self.model.budget:
+    def _forget(self, shapes: dict[tuple, list[Pair]]) -> None:
+        """Make room for another program."""
+        for shape in list(shapes)[:-SHAPES]:
+            if sum(pair.program.bytes for free in shapes.values() for pair in free) <= self.model.budget:
                 break
-            del self._free[kind]
+            del shapes[shape]
 
     def adjoint(self, pair: Pair, wanted: Wanted) -> ProgramAdj:
         program, adjoints = pair
@@ -85,7 +89,7 @@ class FastRun:
         program = self._pair.program
         self.end = program.run(start, pull, solid)
         self.words = program.words
-        if not recording(program.model):  # else the graph that is being recorded owns the memory
+        if not recording(program.model):  # else it belongs to the graph that is being recorded
             weakref.finalize(self, free.append, self._pair)
 
     def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
@@ -130,6 +134,7 @@ class Fast:
                 "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work once "
                 "first, or let softmpm.Graph do it."
             )
+        hold(self._pool.arrangement)
         renew = self._recorded >= LONGEST or self.model.deterministic
         if renew:
             self._pool.arrangement.renew(start.x)

@@ -14,10 +14,16 @@ def recording(model: Model) -> bool:
 
 
 class Ledger:
-    """Watch words of the calls that a CUDA graph holds, to be read after each replay."""
+    """What belongs to a CUDA graph: it must live as long.
+
+    Attributes:
+        words: Watch words of the calls that the graph holds, to be read after each replay.
+        uses: What the graph reads and writes though it was made before. What is made while it is recorded lies in its own memory.
+    """
 
     def __init__(self):
         self.words: list[torch.Tensor] = []
+        self.uses: list[object] = []
 
 
 _open: list[Ledger] = []
@@ -35,11 +41,20 @@ def close_ledger() -> None:
 
 def note(words: torch.Tensor) -> None:
     """Leave the reading of these words, one for each world, to whoever replays the graph that is being recorded."""
+    _ledger().words.append(words)
+
+
+def hold(used: object) -> None:
+    """Let what was made before live as long as the graph that is being recorded."""
+    _ledger().uses.append(used)
+
+
+def _ledger() -> Ledger:
     if not _open:
         raise RuntimeError(
             "softmpm cannot tell whether a simulation fails inside a CUDA graph of your own: record it with softmpm.Graph."
         )
-    _open[-1].words.append(words)
+    return _open[-1]
 
 
 class Launcher:
