@@ -25,8 +25,9 @@ class Pair(NamedTuple):
     adjoints: dict[Wanted, ProgramAdj]
 
 
-SHAPES = 2
-"""Shapes of chunks in one call, at most."""
+STAY = {False: 8, True: 2}
+"""Shapes of chunks whose programs always stay, by whether these keep what is inside: a call has two shapes at most. Programs that
+keep nothing are small, and serve calls with and without gradient in turn."""
 
 
 class Pool:
@@ -52,12 +53,13 @@ class Pool:
                 hold(pair.program)
             return pair, free
         if not recording(self.model):  # else no graph may be destroyed
-            self._forget(shapes)
+            self._forget(keep)
         return Pair(Program(self.model, self.arrangement, chunk, keep), {}), free
 
-    def _forget(self, shapes: dict[tuple, list[Pair]]) -> None:
+    def _forget(self, keep: bool) -> None:
         """Make room for another program."""
-        for shape in list(shapes)[:-SHAPES]:
+        shapes = self._free[keep]
+        for shape in list(shapes)[: -STAY[keep]]:
             if sum(pair.program.bytes for free in shapes.values() for pair in free) <= self.model.budget:
                 break
             del shapes[shape]
