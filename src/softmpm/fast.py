@@ -2,7 +2,7 @@
 
 import threading
 import weakref
-from collections import defaultdict
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -14,33 +14,65 @@ from softmpm.memory import LONGEST
 from softmpm.model import Model
 from softmpm.program import Program
 from softmpm.program_adj import ProgramAdj, Scratch
-from softmpm.replay import recording
+from softmpm.replay import hold, recording
 from softmpm.state import State
 
 
+class Pair(NamedTuple):
+    """A program and its adjoints, which hold it."""
+
+    program: Program
+    adjoints: dict[Wanted, ProgramAdj]
+
+
+STAY = {False: 8, True: 2}
+"""Shapes of chunks whose programs always stay, by whether these keep what is inside: a call has two shapes at most. Programs that
+keep nothing are small, and serve calls with and without gradient in turn."""
+
+
 class Pool:
-    """Programs that were made on one arrangement and are not in use."""
+    """Programs that were made on one arrangement and are not in use.
+
+    Those for the shapes of chunks that came last stay. Others, since each length of a call may bring shapes of its own, stay only
+    while all together fit into the budget of a call.
+    """
 
     def __init__(self, model: Model, arrangement: Arrangement):
         self.model, self.arrangement = model, arrangement
-        self._free: dict[tuple, list[Program]] = defaultdict(list)
+        # By whether they keep what is inside, and by shape, the one that came last at the end:
+        self._free: dict[bool, dict[tuple, list[Pair]]] = {False: {}, True: {}}
         self._scratch: dict[Wanted, Scratch] = {}
 
-    def take(self, chunk: Chunk, keep: bool) -> Program:
-        free = self._free[chunk.shape, keep]
-        return free.pop() if free else Program(self.model, self.arrangement, chunk, keep)
+    def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, list[Pair]]:
+        """A program, and the list that it comes back to: whoever gives it back, only this thread changes the pool."""
+        shapes = self._free[keep]
+        free = shapes[chunk.shape] = shapes.pop(chunk.shape, [])
+        if free:
+            pair = free.pop()
+            if recording(self.model):
+                hold(pair.program)
+            return pair, free
+        if not recording(self.model):  # else no graph may be destroyed
+            self._forget(keep)
+        return Pair(Program(self.model, self.arrangement, chunk, keep), {}), free
 
-    def give(self, program: Program) -> None:
-        self._free[program.chunk.shape, program.keep].append(program)
+    def _forget(self, keep: bool) -> None:
+        """Make room for another program."""
+        shapes = self._free[keep]
+        for shape in list(shapes)[: -STAY[keep]]:
+            if sum(pair.program.bytes for free in shapes.values() for pair in free) <= self.model.budget:
+                break
+            del shapes[shape]
 
-    def adjoint(self, program: Program, wanted: Wanted) -> ProgramAdj:
+    def adjoint(self, pair: Pair, wanted: Wanted) -> ProgramAdj:
+        program, adjoints = pair
         if recording(self.model):
             return ProgramAdj(program, wanted, Scratch(program, wanted))
         if wanted not in self._scratch:
             self._scratch[wanted] = Scratch(program, wanted)
-        if wanted not in program.adjoints:
-            program.adjoints[wanted] = ProgramAdj(program, wanted, self._scratch[wanted])
-        return program.adjoints[wanted]
+        if wanted not in adjoints:
+            adjoints[wanted] = ProgramAdj(program, wanted, self._scratch[wanted])
+        return adjoints[wanted]
 
 
 class FastRun:
@@ -55,15 +87,16 @@ class FastRun:
 
     def __init__(self, pool: Pool, renewed: bool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
         self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
-        self.program = program = pool.take(chunk, keep)
+        self._pair, free = pool.take(chunk, keep)
+        program = self._pair.program
         self.end = program.run(start, pull, solid)
         self.words = program.words
-        if not recording(program.model):  # else the graph that is being recorded owns the memory
-            weakref.finalize(self, pool.give, program)
+        if not recording(program.model):  # else it belongs to the graph that is being recorded
+            weakref.finalize(self, free.append, self._pair)
 
     def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
-        return self.pool.adjoint(self.program, wanted).run(adj_end, adj_solid)
+        return self.pool.adjoint(self._pair, wanted).run(adj_end, adj_solid)
 
 
 class Fast:
@@ -103,6 +136,7 @@ class Fast:
                 "a CUDA graph is being recorded, and this model has not run before on this stream: run the same work once "
                 "first, or let softmpm.Graph do it."
             )
+        hold(self._pool.arrangement)
         renew = self._recorded >= LONGEST or self.model.deterministic
         if renew:
             self._pool.arrangement.renew(start.x)

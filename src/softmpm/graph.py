@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 import torch
 
-from softmpm.replay import close_ledger, open_ledger
+from softmpm.replay import Ledger, close_ledger, open_ledger
 from softmpm.watch import NEVER
 
 Result = TypeVar("Result")
@@ -34,6 +34,7 @@ class Graph(Generic[Result]):
         self.work, self.device = work, device
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._graph: torch.cuda.CUDAGraph | None = None
+        self._ledger: Ledger | None = None
         self._warm = False
 
     def __call__(self) -> Result:
@@ -47,10 +48,10 @@ class Graph(Generic[Result]):
         if not self._warm:
             self._warm = True  # the first call makes what a recording must not: kernels, buffers, an order of the particles
             return self._run(self._stream)
-        graph = self._graph = self._graph or self._record(self._stream)
-        graph.replay()
+        self._graph = self._graph or self._record(self._stream)
+        self._graph.replay()
         if self._failed.item():
-            self._graph = None
+            self._graph = self._ledger = None
             return self._run(self._stream)
         return self._result
 
@@ -63,12 +64,13 @@ class Graph(Generic[Result]):
         return result
 
     def _record(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
-        graph, self._ledger = torch.cuda.CUDAGraph(), open_ledger()
+        graph, ledger = torch.cuda.CUDAGraph(), open_ledger()
         try:
             torch.cuda.synchronize(self.device)
             with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
-                self._failed = (torch.cat(self._ledger.words) != NEVER).any()
+                self._failed = (torch.cat(ledger.words) != NEVER).any()
         finally:
             close_ledger()
+        self._ledger = ledger
         return graph

@@ -31,7 +31,6 @@ class Program:
 
     def __init__(self, model: Model, arrangement: Arrangement, chunk: Chunk, keep: bool):
         self.model, self.arrangement, self.chunk, self.keep = model, arrangement, chunk, keep
-        self.adjoints = {}
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
@@ -60,7 +59,7 @@ class Program:
         self.exact = None
         if model.spec.deterministic:
             self.exact = Exact(model, view(tensor(padded * t.rows), t.real), self.node_arrays)
-        self._forward = Replay(model, self._launch_all)
+        self._forward = Replay(model)
         self._commands()
 
     def _structs(self) -> None:
@@ -123,6 +122,12 @@ class Program:
         inputs = (self.order_array, given, self._solid)
         self._sort = Command(model, sorted_solid(model.spec), lead, inputs, slots)
 
+    @property
+    def bytes(self) -> int:
+        """Memory of its own."""
+        sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
+        return sum(tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums))
+
     def calm(self) -> None:
         """Forget what the kernels reported."""
         self.words.copy_(self._calm)
@@ -171,7 +176,7 @@ class Program:
         self._enter[start.low is not None](stream, *given)
         if self.exact is not None:
             self.exact.begin(solid.mass)
-        self._forward.run(stream)
+        self._forward.run(stream, self._launch_all)
         x, v, C, F, *low = (self._tensor(*shape) for shape in self._out)
         self._leave(stream, x, v, C, F, *low)
         return State(x, v, C, F).with_low(Low(*low) if low else None)

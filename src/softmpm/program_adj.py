@@ -52,7 +52,7 @@ class ProgramAdj:
                 self._parts = view(
                     self.adj_pull.new_empty(*self.adj_pull.shape[1:], PARTS), program.types.real
                 )
-        self._backward = Replay(program.model, self._launch_all)
+        self._backward = Replay(program.model)
         self._commands()
 
     def _commands(self) -> None:
@@ -80,7 +80,7 @@ class ProgramAdj:
             clear(self.adj_pull)
         program.calm()
         self._enter(stream, *adj_end)
-        self._backward.run(stream)
+        self._backward.run(stream, self._launch_all)
         start = State(*(torch.empty_like(adj) for adj in adj_end))
         self._leave(stream, *start)
         if adj_solid.mass is not None and adj_solid.mu is not None and adj_solid.lam is not None:

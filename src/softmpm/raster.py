@@ -9,7 +9,7 @@ from softmpm.failures import raise_failure
 from softmpm.kernels.raster import raster
 from softmpm.kernels.types import types
 from softmpm.model import Model
-from softmpm.replay import Launcher, note, recording
+from softmpm.replay import Launcher, hold, note, recording
 from softmpm.state import GridField, State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
@@ -59,6 +59,7 @@ def rasterize_nodes(model: Model, state: State) -> GridField:
     node = _sums(model, state, watch)
     if recording(model):
         note(watch)
+        hold(model)
     else:
         raise_failure(model, watch.tolist(), state)
     grid = model.scene.grid.shape

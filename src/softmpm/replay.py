@@ -14,10 +14,16 @@ def recording(model: Model) -> bool:
 
 
 class Ledger:
-    """Watch words of the calls that a CUDA graph holds, to be read after each replay."""
+    """What belongs to a CUDA graph: it must live as long.
+
+    Attributes:
+        words: Watch words of the calls that the graph holds, to be read after each replay.
+        uses: What the graph reads and writes though it was made before. What is made while it is recorded lies in its own memory.
+    """
 
     def __init__(self):
         self.words: list[torch.Tensor] = []
+        self.uses: list[object] = []
 
 
 _open: list[Ledger] = []
@@ -35,11 +41,20 @@ def close_ledger() -> None:
 
 def note(words: torch.Tensor) -> None:
     """Leave the reading of these words, one for each world, to whoever replays the graph that is being recorded."""
+    _ledger().words.append(words)
+
+
+def hold(used: object) -> None:
+    """Let what was made before live as long as the graph that is being recorded."""
+    _ledger().uses.append(used)
+
+
+def _ledger() -> Ledger:
     if not _open:
         raise RuntimeError(
             "softmpm cannot tell whether a simulation fails inside a CUDA graph of your own: record it with softmpm.Graph."
         )
-    _open[-1].words.append(words)
+    return _open[-1]
 
 
 class Launcher:
@@ -89,35 +104,37 @@ class Command:
 class Replay:
     """Runs ``launches(launcher)`` the first time to record it, as a CUDA graph or, on the CPU, as a list of launches.
 
+    It is given the launches each time and does not hold them: whoever makes them holds it.
+
     While PyTorch itself records a CUDA graph, the launches become part of that one. Warp's CPU graphs would be faster still, but
     take up what other threads launch meanwhile.
     """
 
-    def __init__(self, model: Model, launches: Callable[[Launcher], None]):
-        self.model, self.launches = model, launches
+    def __init__(self, model: Model):
+        self.model = model
         self._graph: wp.Graph | None = None
         self._list: list | None = None
 
-    def run(self, stream: wp.Stream | None) -> None:
+    def run(self, stream: wp.Stream | None, launches: Callable[[Launcher], None]) -> None:
         if stream is None:
-            self._run_list()
+            self._run_list(launches)
         elif recording(self.model):
-            self.launches(Launcher(self.model, stream))
+            launches(Launcher(self.model, stream))
         else:
             if self._graph is None:
-                self._graph = self._record()
+                self._graph = self._record(launches)
             wp.capture_launch(self._graph, stream=stream)
 
-    def _run_list(self) -> None:
+    def _run_list(self, launches: Callable[[Launcher], None]) -> None:
         if self._list is None:
             self._list = []
-            self.launches(Launcher(self.model, None, self._list))
+            launches(Launcher(self.model, None, self._list))
         for launch in self._list:
             launch.launch()
 
-    def _record(self) -> wp.Graph:
+    def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph:
         stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
         with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-            self.launches(Launcher(self.model, stream))
+            launches(Launcher(self.model, stream))
         assert capture.graph is not None
         return capture.graph

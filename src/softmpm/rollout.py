@@ -15,7 +15,7 @@ from softmpm.kernels.types import Wanted
 from softmpm.memory import Plan, plan
 from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
-from softmpm.replay import note, recording
+from softmpm.replay import hold, note, recording
 from softmpm.state import State
 
 
@@ -116,6 +116,7 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
 
 def _recorded(runner: _Runner, trail: Trail, state: State, stays, inside: bool) -> State:
     """:func:`rollout` while PyTorch records a graph: nothing is read back."""
+    hold(runner.model)
     for k, chunk in enumerate(trail.chunks):
         if k in stays:
             trail.states[k] = state

@@ -1,5 +1,6 @@
 """Observe → act → simulate, again and again, differentiable end to end: one closed-loop simulation."""
 
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -148,7 +149,8 @@ class ClosedLoop:
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
         self.params, self.free, self.keep_every = params, free, keep_every
         self._goal: Tensor | None = None
-        self._graph = softmpm.Graph(self._work, model.device)
+        loop = weakref.proxy(self)  # or the graph would hold what holds it
+        self._graph = softmpm.Graph(lambda: loop._work(), model.device)
 
     def __call__(
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None

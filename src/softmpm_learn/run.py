@@ -68,7 +68,7 @@ class Run:
         self.optimizer = self._make_optimizer()
         self.safe: list[Tensor] = []
         every = settings.learning.frame_every if self.learner else 0
-        parts = (task, model, self.observer, self.policy, self.params, list(self.design.parameters()))
+        parts = (task, model, self.observer, self.policy, self.design, list(self.design.parameters()))
         self.loop = ClosedLoop(*parts, keep_every=every)
 
     def _make_observer(self, out: Path) -> Observer:

@@ -1,9 +1,11 @@
 import dataclasses
+import gc
 import itertools
 import os
 import signal
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -342,3 +344,16 @@ def test_double_precision(task, settings, tmp_path):
     )
     double, single = (float(rows(tmp_path / name)[0]["loss"]) for name in ("double", "single"))
     assert double != single and double == pytest.approx(single, rel=1e-3)
+
+
+def test_a_run_that_nobody_uses_is_freed(task, settings, tmp_path):
+    """At once, with its model and its loop, whose graph on a GPU is most of a run's memory: nothing waits for Python's collector."""
+    run = train.Run(task, softmpm.build(task.scene, device="cpu"), settings, tmp_path)
+    run.loop(None)
+    seen = [weakref.ref(thing) for thing in (run, run.loop, run.loop._graph, run.model)]
+    gc.disable()
+    try:
+        del run
+        assert not [thing for ref in seen if (thing := ref()) is not None]
+    finally:
+        gc.enable()

@@ -1,0 +1,206 @@
+"""Memory goes with the last reference to it: Python is not looking for cycles here, as on a GPU it would do so too late."""
+
+import gc
+import weakref
+
+import pytest
+import torch
+from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, run
+
+import softmpm
+from softmpm import arrangement, autograd, fast, memory, plain, program, program_adj, replay, rollout
+from softmpm.horizon import Horizon
+from softmpm.memory import plan
+
+HOLD_MEMORY = (
+    softmpm.Model,
+    arrangement.Arrangement,
+    program.Program,
+    program_adj.ProgramAdj,
+    program_adj.Scratch,
+    fast.FastRun,
+    plain.PlainRun,
+)
+
+
+@pytest.fixture
+def living(monkeypatch):
+    """What models and their calls made since and that is still in memory, their tensors included, of one class or of any."""
+    seen = []
+
+    def watch(kind):
+        make = kind.__init__
+
+        def watched(self, *args, **kwargs):
+            make(self, *args, **kwargs)
+            tensors = (value for value in vars(self).values() if isinstance(value, torch.Tensor))
+            seen.extend(weakref.ref(thing) for thing in (self, *tensors))
+
+        monkeypatch.setattr(kind, "__init__", watched)
+
+    def alive(kind=object) -> list:
+        things = (ref() for ref in seen)
+        return list(
+            {id(thing): thing for thing in things if thing is not None and isinstance(thing, kind)}.values()
+        )
+
+    for kind in HOLD_MEMORY:
+        watch(kind)
+    gc.disable()
+    yield alive
+    gc.enable()
+
+
+def model(device="cpu", **settings) -> softmpm.Model:
+    return softmpm.build(busy_scene(2), device=device, **settings)
+
+
+@pytest.fixture(params=["kept", "run again"])
+def budget(request, monkeypatch) -> dict:
+    """Settings with which a call keeps everything inside its chunks, and with which it runs them again."""
+    monkeypatch.setattr(memory, "LONGEST", 8)
+    if request.param == "kept":
+        return {}
+    sizes = model().sizes()
+    settings = {"memory_budget": 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between}
+    assert not plan(Horizon(3, 7), sizes, settings["memory_budget"]).keep_all
+    return settings
+
+
+KINDS = {
+    "single precision": {},
+    "double precision": dict(dtype=torch.float64, scheme="fast"),
+    "deterministic": dict(deterministic=True),
+    "plain": dict(scheme="plain"),
+}
+
+
+@pytest.fixture(params=KINDS)
+def settings(request, budget) -> dict:
+    return KINDS[request.param] | budget
+
+
+def call(built, seed=1, substeps=7):
+    """The end of a simulation that waits for its backward pass, and its inputs."""
+    inputs = busy_inputs(built, control_steps=3, seed=seed)
+    return run(softmpm.simulate, built, inputs, substeps), inputs
+
+
+def pull(end, inputs) -> tuple[torch.Tensor, ...]:
+    return torch.autograd.grad(dot(cotangent(end), end), list(inputs.values()))
+
+
+@pytest.mark.parametrize("work", ["forward", "forward and backward", "a call that waits"])
+def test_a_model_that_nobody_uses_is_freed(living, settings, work, device):
+    """And with it its programs: building one model after the other takes no more memory than one."""
+    built = model(device=device, **settings)
+    with torch.set_grad_enabled(work != "forward"):
+        end, inputs = call(built)
+    if work == "forward and backward":
+        pull(end, inputs)
+        pull(*call(built, seed=2))
+    assert living(softmpm.Model) and living(torch.Tensor)
+    del built, end, inputs
+    assert not living()
+
+
+def test_a_model_that_failed_is_freed(living, settings, device):
+    """As soon as nobody has the error any more, be it of a forward or of a backward pass."""
+    built, failed = model(device=device, **settings), 0
+    inputs = busy_inputs(built)
+    with torch.no_grad():
+        inputs["v"] += torch.tensor([-50.0, 9.0]).to(inputs["v"])
+    try:
+        run(softmpm.simulate, built, inputs, 20)
+    except softmpm.UnstableError:
+        failed += 1
+    end, inputs = call(built)
+    try:
+        (end.x[0, 1] * torch.finfo(built.dtype).max * 10).sum().backward()
+    except softmpm.UnstableError:
+        failed += 1
+    assert failed == 2 and living(softmpm.Model)
+    del built, end, inputs
+    assert not living()
+
+
+def test_a_call_leaves_nothing_but_its_programs(living, settings, device):
+    """Whether its gradient was taken or not; a second one leaves no more."""
+    built, left = model(device=device, **settings), []
+    for _ in range(3):
+        pull(*call(built))
+        call(built, seed=2)
+        assert not living((fast.FastRun, plain.PlainRun))
+        left.append(len(living()))
+    assert left[0] == left[1] == left[2]
+
+
+def test_calls_of_many_lengths_leave_few_programs(living, device):
+    """Their memory is bounded by what two calls may keep; those of the last call are there for the next one like it."""
+    sizes, lengths = model().sizes(), range(10, 40)
+    budget = 3 * lengths[-1] * (sizes.inside + 2 * sizes.nodes)
+    built = model(device=device, memory_budget=budget)
+    for substeps in lengths:
+        assert plan(Horizon(3, substeps), sizes, budget).keep_all
+        pull(*call(built, substeps=substeps))
+        last = living(program.Program)
+        assert sum(one.bytes for one in last) <= 2 * budget
+        pull(*call(built, substeps=substeps))
+        assert living(program.Program) == last
+        del last
+
+
+def test_small_programs_all_stay(living, device):
+    """As many lengths as fit into the budget of a call, in turn, make no program twice."""
+    built, left = model(device=device), []
+    for _ in range(2):
+        for substeps in range(10, 20):
+            pull(*call(built, substeps=substeps))
+        left.append(living(program.Program))
+    assert left[0] == left[1] and len(left[0]) >= 10
+
+
+def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
+    """What was made before its recording: model, order of the particles, programs. All of it goes with the graph's ledger."""
+    built = model(**budget)
+    pull(*call(built))  # makes what a recording must not
+    before = {id(made) for made in living(HOLD_MEMORY)}
+    for module in (autograd, program, fast, rollout):
+        monkeypatch.setattr(module, "recording", lambda model: True)
+    ledger = replay.open_ledger()
+    try:
+        pull(*call(built))
+    finally:
+        replay.close_ledger()
+    del built
+    for kind in (softmpm.Model, arrangement.Arrangement, program.Program):
+        assert living(kind)
+    assert {id(held) for held in living(HOLD_MEMORY)} <= before, (
+        "the recording owns the memory of what it made"
+    )
+    del ledger
+    assert not living()
+
+
+@pytest.mark.gpu
+def test_a_graph_runs_on_memory_of_its_own():
+    """What others allocate, once nothing but the graph uses the model any more, is not where the graph writes."""
+    device = "cuda"
+    built = {"model": model(device=device)}
+    inputs = busy_inputs(built["model"])
+    weights = cotangent(built["model"].rest())
+
+    def work():
+        end = run(softmpm.simulate, built["model"], inputs, 20)
+        return *(t.detach() for t in end), *torch.autograd.grad(dot(weights, end), list(inputs.values()))
+
+    graph = softmpm.Graph(work, built["model"].device)
+    graph()
+    want = [t.clone() for t in graph()]
+    del built["model"]
+    with torch.cuda.stream(graph._stream):  # which PyTorch gives memory back to
+        others = [torch.zeros(2**k, device=device) for k in range(6, 18) for _ in range(32)]
+    torch.cuda.synchronize()
+    for got, first in zip(graph(), want, strict=True):
+        assert_relative(got, first, 2e-5)
+    assert not any(t.any() for t in others)
