@@ -8,7 +8,7 @@ from softmpm.buffers import SolidAdj, clear, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.kernels.fused_adj import fused_adj
 from softmpm.kernels.native import BLOCK
-from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, sorted_solid_adj
+from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, collectors, sorted_solid_adj
 from softmpm.kernels.types import Wanted, solid_adj_type
 from softmpm.program import Program
 from softmpm.replay import Command, Launcher, Replay
@@ -140,4 +140,4 @@ class ProgramAdj:
             launch(in_order.parts, self._parts.shape, *found, self._parts)
             launch(in_order.total, row.shape, self._parts, row)
         else:
-            launch(collect_pull(spec), tuple(slot.shape), *found, row)
+            launch(collect_pull(spec), collectors(slot.shape), *found, row)

@@ -13,7 +13,7 @@ from torch import Tensor
 from softmpm.buffers import SolidAdj, clear, view
 from softmpm.kernels.boundary import boundary
 from softmpm.kernels.grid import grid
-from softmpm.kernels.solid import collect_pull
+from softmpm.kernels.solid import collect_pull, collectors
 from softmpm.kernels.transfer import transfer, transfer_adj
 from softmpm.kernels.types import Wanted, types
 from softmpm.model import Model
@@ -133,7 +133,7 @@ class Substep:
         slots = self.model.muscle_slots.expand(*adj_solid.slot.shape)
         real, muscles = self.types.real, view(slots, wp.int32)
         arrays = (muscles, view(adj_solid.slot, real), view(adj_pull, real))
-        self.launch(collect_pull(self.model.spec), adj_solid.slot.shape, *arrays)
+        self.launch(collect_pull(self.model.spec), collectors(adj_solid.slot.shape), *arrays)
 
     def enter(self, start: State, motion) -> None:
         """From what users hold to what the kernels hold."""

@@ -1,6 +1,7 @@
 """Total stress of one particle: its law plus its muscles, as the scene has them."""
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import warp as wp
@@ -143,6 +144,16 @@ def sorted_solid_adj(spec: Spec, wanted: Wanted):
     return sort_adj
 
 
+COLLECTORS = 8_192
+"""Threads that share the particles of a world: a million sums into one number would stand in a queue."""
+
+
+def collectors(slots: Sequence[int]) -> tuple[int, int, int]:
+    """Threads of :func:`collect_pull` for slots (world, particle, slot)."""
+    worlds, particles, count = slots
+    return worlds, min(particles, COLLECTORS), count
+
+
 @functools.lru_cache(maxsize=None)
 def collect_pull(spec: Spec):
     """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
@@ -157,11 +168,21 @@ def collect_pull(spec: Spec):
         # Out, added into:
         adj_pull: wp.array2d(dtype=t.real),
     ):
-        world, p, slot = wp.tid()
-        k = muscle[world, p, slot]
-        if k >= 0:
-            wp.atomic_add(adj_pull, world, k, adj_slot[world, p, slot])
-            adj_slot[world, p, slot] = t.real(0.0)
+        world, n, slot = wp.tid()
+        last = int(-1)
+        total = t.real(0.0)
+        for p in range(n, muscle.shape[1], COLLECTORS):
+            k = muscle[world, p, slot]
+            if k != last:
+                if last >= 0:
+                    wp.atomic_add(adj_pull, world, last, total)
+                last = k
+                total = t.real(0.0)
+            if k >= 0:
+                total += adj_slot[world, p, slot]
+                adj_slot[world, p, slot] = t.real(0.0)
+        if last >= 0:
+            wp.atomic_add(adj_pull, world, last, total)
 
     return collect
 

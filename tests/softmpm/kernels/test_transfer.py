@@ -2,11 +2,13 @@
 
 import pytest
 import torch
+import warp as wp
 from helpers import assert_relative, busy_inputs, busy_scene
 
 import softmpm
 from softmpm import reference
 from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj, lame
+from softmpm.kernels.solid import COLLECTORS, collect_pull, collectors
 from softmpm.kernels.types import Wanted
 from softmpm.step import Substep
 
@@ -146,6 +148,20 @@ def test_p2g_adj(bench):
     step.collect_pull(adj_solid, pull)
     assert_relative((pull * model.strength).cpu()[None], want["activation"], LIMIT, "activation")
     assert (adj_solid.slot == 0).all(), "collecting must clear what it took"
+
+
+def test_collecting_from_many_particles(device):
+    """More than there are threads: every slot counts once, for its own muscle, is added to what is there, and cleared."""
+    spec = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64).spec
+    random = torch.Generator().manual_seed(0)
+    muscle = torch.randint(-1, 3, (2, 2 * COLLECTORS + 7, spec.muscle_slots), generator=random).int()
+    found = torch.randn(muscle.shape, generator=random, dtype=torch.float64)
+    want = torch.stack([((muscle == k) * found).sum((1, 2)) for k in range(3)], 1)
+    pull, slot = torch.ones(2, 3, dtype=torch.float64, device=device), found.to(device)
+    arrays = [wp.from_torch(tensor, requires_grad=False) for tensor in (muscle.to(device), slot, pull)]
+    wp.launch(collect_pull(spec), collectors(muscle.shape), arrays, device=wp.device_from_torch(pull.device))
+    assert_relative(pull.cpu() - 1, want, 1e-12)
+    assert (slot.cpu() == torch.where(muscle < 0, found, 0.0)).all()
 
 
 def test_twins_add_into_their_outputs(bench):
