@@ -12,14 +12,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import passing, view
+from softmpm.buffers import slot, view
 from softmpm.failures import Report
 from softmpm.kernels.native import FEW
 from softmpm.kernels.packing import packing
 from softmpm.kernels.types import types
 from softmpm.memory import window_shape
 from softmpm.model import Model
-from softmpm.replay import recording
+from softmpm.replay import Command, recording
 from softmpm.step import stream_of
 
 STALE, STALE_FEW = 1.5, 3.0
@@ -48,18 +48,18 @@ class Arrangement:
         def integers(*size):
             return torch.empty(*size, dtype=torch.int32, device=model.device)
 
-        pull = model.scene.gravity or (0.0,)
-        self._up = max(range(len(pull)), key=lambda axis: abs(pull[axis]))
         self.order = integers(model.worlds, model.particle_count)
         self.origin = integers(model.worlds, model.dim)
         self._key = torch.empty_like(self.order)
         self._ends = integers(2, model.worlds, model.dim)
+        self._find = self._finding()
         grid = model.scene.grid.shape
         self._locate(x)
         low, high = self._ends.tolist()  # waits for the device
         apart = [[max(0, h - b) for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
         wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)])
         self.shape = tuple(min(n, max(w, k)) for n, w, k in zip(grid, wide, least or wide, strict=True))
+        self._centre = self._centring()
         self.renew(x)
 
     @property
@@ -67,10 +67,21 @@ class Arrangement:
         """Nodes of one world in memory."""
         return math.prod(self.shape)
 
-    def _launch(self, kernel, dim, *inputs) -> None:
-        model = self.model
-        scale, stream = model.scale, stream_of(model.device)
-        wp.launch(kernel, dim, (scale, *inputs), device=model.wp_device, stream=stream, record_tape=False)
+    def _finding(self) -> Command:
+        """Fills the keys to sort by, and the ends of the box around the particles."""
+        model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
+        gravity = model.scene.gravity
+        up = max(range(t.dim), key=lambda axis: abs(gravity[axis])) if gravity else 0
+        places, found = [slot(model, t.vec) for _ in range(2)], (self._key, *self._ends)
+        inputs = (model.scale, up, *places, *(view(tensor, wp.int32) for tensor in found))
+        return Command(model, packing(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places)
+
+    def _centring(self) -> Command:
+        """Puts the window around that box."""
+        model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
+        ends = (view(tensor, wp.int32) for tensor in (*self._ends, self.origin))
+        inputs = (model.scale, t.ivec(*self.shape), *ends)
+        return Command(model, packing(t.dim, model.spec.dtype).centre_window, self.origin.shape, inputs, ())
 
     def _locate(self, x: Tensor) -> None:
         """Cell of each particle, and the box around them in each world.
@@ -79,26 +90,22 @@ class Arrangement:
         On the CPU, where nothing is summed in parallel, the order is that at rest, so that results never depend on what ran
         before; the window does not change a result.
         """
-        model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
+        model = self.model
         follow = x if model.device.type == "cuda" else model.positions.expand_as(x)
         self._ends[0].fill_(max(model.scene.grid.shape))
         self._ends[1].fill_(0)
-        places = [passing(place.contiguous(), t.vec) for place in (x, follow)]
-        found = [passing(found, wp.int32) for found in (self._key, *self._ends)]
-        self._launch(packing(t.dim, model.spec.dtype).locate, self.order.shape, self._up, *places, *found)
+        self._find(stream_of(model.device), x.contiguous(), follow.contiguous())
 
     def renew(self, x: Tensor) -> None:
         """Sort by cell and centre the window on the particles, without waiting for the device."""
+        model = self.model
         self._locate(x)
         key, order = torch.sort(self._key, dim=1, stable=True)
         self.order.copy_(order)
-        t = types(self.model.spec.dim, self.model.spec.dtype)
-        ends = [passing(tensor, wp.int32) for tensor in (*self._ends, self.origin)]
-        kernel = packing(t.dim, self.model.spec.dtype).centre_window
-        self._launch(kernel, self.origin.shape, t.ivec(*self.shape), *ends)
-        if not recording(self.model):
+        self._centre(stream_of(model.device))
+        if not recording(model):
             cell = key // 2
-            self._fresh = Report(self.model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])
+            self._fresh = Report(model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])
         self.stale = False
         self.version += 1
 

@@ -15,7 +15,7 @@ from softmpm.buffers import Solid, passing, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
-from softmpm.kernels.native import BLOCK, FEW, WARP
+from softmpm.kernels.native import BLOCK, FEW, VERY_FEW, WARP
 from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
 from softmpm.kernels.types import solid_types, types
@@ -146,7 +146,7 @@ class Program:
         """Particles of a warp: fewer than its threads while the GPU has more room than warps, so that each walks a shorter way."""
         if self.model.device.type != "cuda" or self.exact is not None:
             return WARP
-        return WARP if self.total > FEW else WARP // 2
+        return WARP if self.total > VERY_FEW else WARP // 2
 
     @property
     def crews(self) -> int:

@@ -16,8 +16,8 @@ WARP = 32
 """Threads that work together, and particles of a block of packed rows."""
 BLOCK = 128
 """Threads of a block."""
-FEW = 20_000
-"""Up to so many particles a block is one warp."""
+FEW, VERY_FEW = 20_000, 10_000
+"""Up to so many particles a block is one warp, and a warp has particles for half of its threads."""
 
 
 def native_module(name: str) -> str:
