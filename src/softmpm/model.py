@@ -10,11 +10,11 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.checks import check_scene
-from softmpm.horizon import Horizon
+from softmpm.description import describe
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, memory, window_shape
+from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, window_shape
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
-from softmpm.stability import stable_dt, warn_unstable
+from softmpm.stability import warn_unstable
 from softmpm.state import Low, Params, State
 
 LAWS = {NeoHookean: "neo_hookean", FixedCorotated: "fixed_corotated"}
@@ -254,39 +254,7 @@ class Model:
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""
-        spec, has = self.spec, lambda flag: "compiled" if flag else "left out"
-        limit = stable_dt(self.scene)
-        mib = {
-            name: f"{size / 2**20:.1f} MiB"
-            for name, size in memory(self, Horizon(1, substeps))._asdict().items()
-        }
-        lines = [
-            f"softmpm model: {spec.dim}D, {spec.dtype}, on {self.device}, {self.worlds} world(s) of "
-            f"{self.particle_count} particles on {' x '.join(map(str, self.scene.grid.shape))} nodes",
-            f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
-            f"  muscles    {self.muscle_count}, at most {spec.muscle_slots} on one particle"
-            if spec.muscle_slots
-            else "  muscles    left out",
-            f"  contacts   {', '.join(spec.contacts) or 'left out'}"
-            + ("" if not set(CONTACTS) - set(spec.contacts) or not spec.contacts else "; others left out"),
-            f"  friction   {has(spec.friction)}",
-            f"  gravity    {has(spec.gravity)}",
-            f"  damping    {has(spec.damping)}",
-            "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
-            f"  dt         {self.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
-            f"  scheme     {self.scheme}: {self.scheme_reason}; {self.held_nodes} nodes of each world in memory",
-            f"  sums       {self._sums()}",
-            f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, "
-            f"{mib['backward']} at the peak",
-        ]
-        return "\n".join(lines)
-
-    def _sums(self) -> str:
-        if self.spec.deterministic:
-            return "in fixed point: deterministic, the same bits from run to run"
-        if self.device.type == "cpu":
-            return "in floating point, in one order: the same bits from run to run"
-        return "in floating point, in any order: the last bits vary; deterministic=True makes them repeat"
+        return describe(self, substeps)
 
 
 def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:

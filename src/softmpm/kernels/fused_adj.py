@@ -20,6 +20,7 @@ from softmpm.kernels.grid import grid
 from softmpm.kernels.native import BLOCK, native, native_module
 from softmpm.kernels.particle import particle, particle_adj
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.stencil_adj import stencil_adj
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
 from softmpm.watch import Kind
 
@@ -35,7 +36,8 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         solid_adj_type(spec, wanted),
     )
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
-    gather_adj, slope_adj, first_node, unpack_base = s.gather_adj, s.slope_adj, s.first_node, s.unpack_base
+    sums_adj, first_node, unpack_base = stencil_adj(spec.dim, spec.dtype), s.first_node, s.unpack_base
+    gather_adj, slope_adj = sums_adj.gather_adj, sums_adj.slope_adj
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     centre, particle_of, world_of = fused(spec).centre, s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat

@@ -10,6 +10,7 @@ import warp as wp
 
 from softmpm.kernels.native import BLOCK, WARP, native, native_module
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.stencil_adj import stencil_adj
 from softmpm.kernels.types import BASE_BITS, packed_rows, types
 
 COUNT = 41  # particles: one full block of packed rows, and part of another
@@ -21,7 +22,8 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
     """One kernel for each function that is tested."""
     t, s, n = types(dim, dtype), stencil(dim, dtype), native(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
-    gather, gather_adj, slope_adj, scatter = s.gather, s.gather_adj, s.slope_adj, n.scatter
+    gather, scatter, back = s.gather, n.scatter, stencil_adj(dim, dtype)
+    gather_adj, slope_adj = back.gather_adj, back.slope_adj
     first_node, coordinates, particle_of = s.first_node, s.coordinates, s.particle_of
     pack_base, unpack_base = s.pack_base, s.unpack_base
     load_node, store_node, aligned, head = n.load_node, n.store_node, s.aligned, s.head

@@ -1,0 +1,44 @@
+"""A model in words: what was compiled for its scene, what was left out, and the memory of a call."""
+
+from softmpm.horizon import Horizon
+from softmpm.memory import memory
+from softmpm.scene import CONTACTS
+from softmpm.stability import stable_dt
+
+
+def describe(model, substeps: int) -> str:
+    """See :meth:`softmpm.Model.describe`."""
+    spec, limit = model.spec, stable_dt(model.scene)
+    sizes = memory(model, Horizon(1, substeps))._asdict()
+    mib = {name: f"{size / 2**20:.1f} MiB" for name, size in sizes.items()}
+
+    def has(flag: bool) -> str:
+        return "compiled" if flag else "left out"
+
+    muscles = f"{model.muscle_count}, at most {spec.muscle_slots} on one particle"
+    some_contacts = bool(spec.contacts) and bool(set(CONTACTS) - set(spec.contacts))
+    lines = [
+        f"softmpm model: {spec.dim}D, {spec.dtype}, on {model.device}, {model.worlds} world(s) of "
+        f"{model.particle_count} particles on {' x '.join(map(str, model.scene.grid.shape))} nodes",
+        f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
+        f"  muscles    {muscles if spec.muscle_slots else 'left out'}",
+        f"  contacts   {', '.join(spec.contacts) or 'left out'}{'; others left out' if some_contacts else ''}",
+        f"  friction   {has(spec.friction)}",
+        f"  gravity    {has(spec.gravity)}",
+        f"  damping    {has(spec.damping)}",
+        "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
+        f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
+        f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
+        f"  sums       {_sums(model)}",
+        f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, "
+        f"{mib['backward']} at the peak",
+    ]
+    return "\n".join(lines)
+
+
+def _sums(model) -> str:
+    if model.spec.deterministic:
+        return "in fixed point: deterministic, the same bits from run to run"
+    if model.device.type == "cpu":
+        return "in floating point, in one order: the same bits from run to run"
+    return "in floating point, in any order: the last bits vary; deterministic=True makes them repeat"
