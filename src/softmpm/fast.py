@@ -50,7 +50,9 @@ class Pool:
         if free:
             pair = free.pop()
             if recording(self.model):
-                hold(pair.program)
+                hold(
+                    pair
+                )  # its adjoints as well: their graphs must not be destroyed while another one is recorded
             return pair, free
         if not recording(self.model):  # else no graph may be destroyed
             self._forget(keep)

@@ -1,5 +1,6 @@
 """A whole closed loop, its gradient included, as one CUDA graph."""
 
+import gc
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -64,7 +65,8 @@ class Graph(Generic[Result]):
         return result
 
     def _record(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
-        graph, ledger = torch.cuda.CUDAGraph(), open_ledger()
+        graph, ledger, collects = torch.cuda.CUDAGraph(), open_ledger(), gc.isenabled()
+        gc.disable()  # a model that waits for the collector has graphs of its own, and destroying one would end the recording
         try:
             torch.cuda.synchronize(self.device)
             with torch.cuda.graph(graph, stream=stream):
@@ -72,5 +74,7 @@ class Graph(Generic[Result]):
                 self._failed = (torch.cat(ledger.words) != NEVER).any()
         finally:
             close_ledger()
+            if collects:
+                gc.enable()
         self._ledger = ledger
         return graph

@@ -165,11 +165,15 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     built = model(**budget)
     pull(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
+    with_graphs = [weakref.ref(made) for made in living((program.Program, program_adj.ProgramAdj))]
     for module in (autograd, program, fast, rollout):
         monkeypatch.setattr(module, "recording", lambda model: True)
     ledger = replay.open_ledger()
     try:
         pull(*call(built))
+        assert with_graphs and all(made() is not None for made in with_graphs), (
+            "a graph that is destroyed ends the recording"
+        )
     finally:
         replay.close_ledger()
     del built

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers import LAWS, busy_inputs, busy_scene, run
+from helpers import LAWS, assert_relative, busy_inputs, busy_scene, run
 
 import softmpm
 
@@ -110,15 +110,22 @@ def test_a_bad_activation_is_refused_at_whatever_control_step(scheme, device):
         run(softmpm.simulate, model, inputs, 2)
 
 
-def test_a_world_that_fails_leaves_the_others_bitwise_alone():
-    """Eight worlds, the third one poisoned: the other seven end as they do without it."""
-    model = single(worlds=8)
+def test_a_world_that_fails_leaves_the_others_alone(device):
+    """Eight worlds, the third one poisoned: the other seven end as they do without it, on the CPU to the last bit.
+
+    On a GPU all of them are in two warps, where the particles of others come after those that have stopped.
+    """
+    model = single(worlds=8, device=device)
     start = model.rest()
-    start.v.add_(torch.linspace(-0.5, 0.5, 8)[:, None, None])
+    start.v.add_(torch.linspace(-0.5, 0.5, 8, device=device)[:, None, None])
     calm = softmpm.simulate(model, start, None, model.params(), substeps=30)
-    start.v[3, 0] = torch.tensor([500.0, 0.0])
+    start.v[3, 0] = torch.tensor([500.0, 0.0], device=device)
     error = fails(model, start, substeps=30)
     others = [0, 1, 2, 4, 5, 6, 7]
     assert error.world == 3
     for name in "xvCF":
-        assert torch.equal(getattr(error.state, name)[others], getattr(calm, name)[others]), name
+        got, want = getattr(error.state, name)[others], getattr(calm, name)[others]
+        if device == "cpu":
+            assert torch.equal(got, want), name
+        else:
+            assert_relative(got, want, 1e-5, name)

@@ -191,7 +191,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         g = centre(old.fx)
         sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
         B = sums.outer - wp.outer(sums.value, g)
-        if not alive:
+        if place < total and not alive:
             stay(i, now, then)
         old.low = load_vec(now.rows, i, row_low)
         old.H = load_mat(now.rows, i, row_H)
@@ -204,6 +204,8 @@ def fused(spec: Spec) -> SimpleNamespace:
         A = affine_momentum(scale, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
         b = m * new.v - A * g
         first = held + first_node(base, origin, window.shape)
+        if place == total:
+            first = -1
         # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
         if alive and place < total:
             then.base[i] = pack_base(base)
@@ -214,8 +216,6 @@ def fused(spec: Spec) -> SimpleNamespace:
             store_mat(then.rows, i, row_C, new.C)
             if not new.sound:
                 complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
-        else:
-            first = -1
         if not last:
             hand_on(watch, window, crew, place, count, total, order, substep + 1, first, g, b, A, m, node)
 

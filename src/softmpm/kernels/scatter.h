@@ -59,7 +59,7 @@ CUDA_CALLABLE inline void add_warp(
     Sink node, const wp::vec_t<3, int>& shape, int crew, int first, const wp::vec_t<3, float>& g,
     const wp::vec_t<3, float>& b, const wp::mat_t<3, 3, float>& A, float m)
 {
-    constexpr int WIDTH = 7;  // float4 per particle: 112 bytes, free of bank conflicts
+    constexpr int WIDTH = 7;  // float4 per particle: an odd number, so that eight lanes write to all banks
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
     int lane = threadIdx.x & (LANES - 1);
     float4* all = box + (threadIdx.x - lane) * WIDTH;
@@ -128,7 +128,7 @@ CUDA_CALLABLE inline void add_warp(
     Sink node, const wp::vec_t<2, int>& shape, int crew, int first, const wp::vec_t<2, float>& g,
     const wp::vec_t<2, float>& b, const wp::mat_t<2, 2, float>& A, float m)
 {
-    constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
+    constexpr int WIDTH = 5;  // float4 per particle, as above
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
     int lane = threadIdx.x & (LANES - 1);
     float4* all = box + (threadIdx.x - lane) * WIDTH;
@@ -229,7 +229,7 @@ CUDA_CALLABLE inline void add_each(
         }
 }
 
-// The whole warp must come here together: lanes without a particle with first = -1.
+// The whole warp must come here together. Lanes after the last particle have first = -1, which ends the walk: no others may.
 template <unsigned DIM, typename T>
 CUDA_CALLABLE inline void scatter(
     wp::vec_t<4, T>* node, const wp::vec_t<DIM, int>& shape, int crew, int first, const wp::vec_t<DIM, T>& g,
