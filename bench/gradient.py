@@ -10,7 +10,7 @@ import time
 
 import torch
 from common import Table, arguments, cube, sync, turning
-from step import CASES, VARIANTS
+from step import CASES, ON_A_CPU, VARIANTS
 
 import softmpm
 from softmpm.horizon import Horizon
@@ -53,8 +53,8 @@ def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
     table = Table("Forward and backward [us/substep], float32", device, args.json)
-    for dim, particles, nodes in CASES:
-        if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
+    for dim, particles, nodes in ON_A_CPU if device.type == "cpu" else CASES:
+        if particles > (args.largest or particles):
             continue
         substeps = substeps_of(particles, device)
         for name, features in GRADIENTS.items():

@@ -23,7 +23,6 @@ from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.replay import recording
 from softmpm.rollout import Trail, rollout, rollout_adj
 from softmpm.state import GridField, Low, Params, State
-from softmpm.watch import UnstableError
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
@@ -71,6 +70,8 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     check_state(model, start)
     check_activation(model, activation)
     check_substeps(substeps)
+    if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
+        check_finite(start, activation)
     mu, lam, mass = _material(model, params)
     pull, control_steps = None, 1
     if activation is not None:
@@ -84,11 +85,7 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     keep = _Kept() if needed else None
     simulated: Any = _Simulate.apply if needed or _followed(inputs) else _Simulate.forward
-    try:
-        end = simulated(model, Horizon(control_steps, substeps), keep, *inputs, *low)
-    except UnstableError:
-        check_finite(start, activation)  # raises if it came in like that
-        raise
+    end = simulated(model, Horizon(control_steps, substeps), keep, *inputs, *low)
     state = State(*end[:4])
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
 
@@ -96,7 +93,7 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
 def _followed(tensors: Iterable[Tensor | None]) -> bool:
     """Whether PyTorch would look into a function of these without asking for its gradient: torch.func, or forward mode.
 
-    If not, and no gradient is needed, what the function runs is called directly, without 40 us of preparations.
+    If not, and no gradient is needed, what the function runs is called directly, without PyTorch's preparations.
     """
     return torch._C._are_functorch_transforms_active() or any(
         t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
@@ -169,9 +166,8 @@ class _Kept:
 
 class _Simulate(torch.autograd.Function):
     @staticmethod
-    def forward(
-        *inputs,
-    ):  # PyTorch binds arguments to the signature at each call: a short one takes 50 us less
+    def forward(*inputs):
+        # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
         model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
         start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
         end, trail = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep is not None)

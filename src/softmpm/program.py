@@ -148,16 +148,13 @@ class Program:
             return WARP
         return WARP if self.total > VERY_FEW else WARP // 2
 
-    @property
-    def crews(self) -> int:
-        """Threads of a launch in which each warp has a crew of particles."""
-        warps = -(-self.total // self.crew)
-        return -(-warps * WARP // self.block) * self.block if self.model.device.type == "cuda" else self.total
-
     @functools.cached_property
     def threads(self) -> int:
-        """Threads of a launch over particles: whole blocks on a GPU, since warps work together."""
-        return -(-self.total // self.block) * self.block if self.model.device.type == "cuda" else self.total
+        """Threads of a launch over particles: on a GPU whole blocks, since the lanes of a warp work together."""
+        if self.model.device.type != "cuda":
+            return self.total
+        warps = -(-self.total // self.crew)
+        return -(-warps * WARP // self.block) * self.block
 
     def run(self, start: State, pull: Tensor | None, solid: Solid) -> State:
         """All substeps from ``start``; the end in new tensors. Failures are in :attr:`words`."""
@@ -211,7 +208,7 @@ class Program:
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
         sizes = (self.crew, model.particle_count, self.total, self.order_flat)
         arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
-        launch(fused(model.spec).begin, self.crews, *arguments, block_dim=self.block)
+        launch(fused(model.spec).begin, self.threads, *arguments, block_dim=self.block)
         if self.exact is not None:
             self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
 
@@ -225,6 +222,6 @@ class Program:
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(fused(model.spec).advance, self.crews, *arguments, block_dim=self.block)
+        launch(fused(model.spec).advance, self.threads, *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
             self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

@@ -123,7 +123,7 @@ class ProgramAdj:
         out = (program.watch, scratch.solid_struct, sink)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
-        launch(kernel, program.crews, *arguments, block_dim=program.block)
+        launch(kernel, program.threads, *arguments, block_dim=program.block)
         if exact is not None and not start:
             exact.push(program, s - 1, states[0], None, launch)
 

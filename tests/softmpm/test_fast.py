@@ -421,7 +421,7 @@ def assert_same_failure(one, other, built) -> None:
             name == "C"
         ):  # a difference of velocities over a cell: their rounding, not its own size, is the measure
             rounding = other.state.v[at].norm() / built.scene.grid.spacing
-            assert (got[at] - want[at]).norm() <= 2e-6 * rounding
+            assert (got[at] - want[at]).norm() <= 5e-7 * rounding
         else:
             assert_relative(got[at], want[at], 2e-6, f"{name} of the particle")
 

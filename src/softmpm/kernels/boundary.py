@@ -134,4 +134,4 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
             low_x[world, p] = out.low_x
             low_F[world, p] = out.low_f
 
-    return SimpleNamespace(entered=entered, left=left, enter=enter, leave=leave)
+    return SimpleNamespace(Entered=Entered, entered=entered, left=left, enter=enter, leave=leave)

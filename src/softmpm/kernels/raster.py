@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels import failure
+from softmpm.kernels.boundary import boundary
 from softmpm.kernels.spline import spline
 from softmpm.kernels.types import types
 from softmpm.watch import Kind
@@ -20,42 +21,18 @@ from softmpm.watch import Kind
 @functools.lru_cache(maxsize=None)
 def raster(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
-    real, vec, mat, ivec, node_vec, Scale = t.real, t.vec, t.mat, t.ivec, t.node, t.Scale
+    real, vec, mat, node_vec, Scale = t.real, t.vec, t.mat, t.node, t.Scale
+    Entered, entered = boundary(dim, dtype).Entered, boundary(dim, dtype).entered
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
     pack, momentum, report = s.pack, s.momentum, failure.report(dim, dtype).report
     bad_start = int(Kind.START)
     module = f"softmpm.raster.d{dim}.{dtype}"
 
-    @wp.struct
-    class Place:
-        base: ivec  # first node of the stencil
-        fx: vec  # position from there, in cells
-        inside: bool
-
     @wp.func
-    def placed(scale: Scale, x: vec) -> Place:
-        at = Place()
-        at.inside = True
-        for axis in range(dim):
-            cell = wp.float64(x[axis]) / scale.exact_spacing
-            first = wp.floor(cell - wp.float64(0.5))
-            if first >= wp.float64(0.0) and first <= wp.float64(scale.shape[axis] - 3):
-                at.base[axis] = int(first)
-            else:
-                at.inside = False
-            at.fx[axis] = real(cell - wp.float64(at.base[axis]))
-        return at
-
-    @wp.func
-    def entered(
-        scale: Scale, watch: wp.array(dtype=wp.int64), world: int, p: int, x: vec, v: vec, C: mat
-    ) -> Place:
-        """Where a particle is; reports one that is off the grid or not finite."""
-        at = placed(scale, x)
-        if not (at.inside and wp.isfinite(wp.dot(v, v) + wp.ddot(C, C))):
-            report(watch, world, 0, bad_start, p)
-        return at
+    def placed(scale: Scale, x: vec, v: vec, C: mat) -> Entered:
+        """A particle as the kernels hold it; F does not enter and is taken as I."""
+        return entered(scale, x, v, C, wp.identity(n=dim, dtype=real), vec(), mat())
 
     @wp.kernel(module=module, enable_backward=False)
     def splat(
@@ -73,7 +50,9 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     ):
         world, p = wp.tid()
         speed = v[world, p]
-        at = entered(scale, watch, world, p, x[world, p], speed, C[world, p])
+        at = placed(scale, x[world, p], speed, C[world, p])
+        if not at.sound:
+            report(watch, world, 0, bad_start, p)
         affine = scale.spacing * C[world, p]
         m = mass[p]
         w = weights(at.fx)
@@ -105,7 +84,9 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         """As ``splat``, into integers, whose sum does not depend on the order."""
         world, p = wp.tid()
         speed = v[world, p]
-        at = entered(scale, watch, world, p, x[world, p], speed, C[world, p])
+        at = placed(scale, x[world, p], speed, C[world, p])
+        if not at.sound:
+            report(watch, world, 0, bad_start, p)
         affine = scale.spacing * C[world, p]
         m = mass[p]
         w = weights(at.fx)
@@ -136,7 +117,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     ):
         world, p = wp.tid()
         speed = v[world, p]
-        at = placed(scale, x[world, p])
+        at = placed(scale, x[world, p], speed, C[world, p])
         affine = scale.spacing * C[world, p]
         m = mass[p]
         w = weights(at.fx)

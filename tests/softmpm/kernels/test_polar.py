@@ -37,9 +37,9 @@ def test_rotation_is_that_of_the_svd(dim, dtype, limit, device):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("dtype, limit", [("float64", 1e-13), ("float32", 2e-5)])
+@pytest.mark.parametrize("dtype, limit", [("float64", 4e-14), ("float32", 3e-6)])
 def test_rotation_of_many(dim, dtype, limit, device):
-    """Stretches of 1 : 3000 and turned inside out, down to where two of them cancel to a hundredth; the error over their sum."""
+    """Stretches of 1 : 50, half of them turned inside out, two cancelling to a hundredth at most; the error over their sum."""
     generator = torch.Generator().manual_seed(4)
     turn = torch.linalg.qr(torch.randn(2, 20_000, dim, dim, generator=generator, dtype=torch.float64))[0]
     stretch = torch.exp(4 * torch.rand(20_000, dim, generator=generator, dtype=torch.float64)).sort(1, True)[
