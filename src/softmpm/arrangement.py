@@ -15,7 +15,7 @@ from torch import Tensor
 from softmpm.buffers import slot, view
 from softmpm.failures import Report
 from softmpm.kernels.native import FEW
-from softmpm.kernels.packing import packing
+from softmpm.kernels.sorting import sorting
 from softmpm.kernels.types import types
 from softmpm.memory import window_shape
 from softmpm.model import Model
@@ -74,14 +74,14 @@ class Arrangement:
         up = max(range(t.dim), key=lambda axis: abs(gravity[axis])) if gravity else 0
         places, found = [slot(model, t.vec) for _ in range(2)], (self._key, *self._ends)
         inputs = (model.scale, up, *places, *(view(tensor, wp.int32) for tensor in found))
-        return Command(model, packing(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places)
+        return Command(model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places)
 
     def _centring(self) -> Command:
         """Puts the window around that box."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         ends = (view(tensor, wp.int32) for tensor in (*self._ends, self.origin))
         inputs = (model.scale, t.ivec(*self.shape), *ends)
-        return Command(model, packing(t.dim, model.spec.dtype).centre_window, self.origin.shape, inputs, ())
+        return Command(model, sorting(t.dim, model.spec.dtype).centre_window, self.origin.shape, inputs, ())
 
     def _locate(self, x: Tensor) -> None:
         """Cell of each particle, and the box around them in each world.

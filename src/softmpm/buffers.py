@@ -22,10 +22,15 @@ def passing(tensor: Tensor, dtype):
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
-def slot(model: Model, dtype):
-    """As :func:`passing`, for contiguous tensors (world, particle, ...) that come later, see :class:`softmpm.replay.Command`."""
-    shape = (model.worlds, model.particle_count, *getattr(dtype, "_shape_", ()))
-    return passing(torch.empty(shape, dtype=model.dtype, device="meta"), dtype)
+def slot(model: Model, dtype, *size: int):
+    """As :func:`passing`, for contiguous tensors that come later, see :class:`softmpm.replay.Command`.
+
+    Args:
+        size: Of the tensors, without the last axes of vectors and matrices; (world, particle) if nothing is said.
+    """
+    shape = (*(size or (model.worlds, model.particle_count)), *getattr(dtype, "_shape_", ()))
+    kind = torch.int32 if dtype is wp.int32 else model.dtype
+    return passing(torch.empty(shape, dtype=kind, device="meta"), dtype)
 
 
 def slots_in(struct, names: Sequence[str], model: Model, dtype) -> list:

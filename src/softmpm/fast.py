@@ -7,6 +7,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from softmpm.arrangement import Arrangement
+from softmpm.between import SortedAdj, SortedState, Unpacking
 from softmpm.buffers import Solid, SolidAdj
 from softmpm.horizon import Chunk
 from softmpm.kernels.types import Wanted
@@ -37,8 +38,8 @@ class Pool:
     while all together fit into the budget of a call.
     """
 
-    def __init__(self, model: Model, arrangement: Arrangement):
-        self.model, self.arrangement = model, arrangement
+    def __init__(self, model: Model, arrangement: Arrangement, unpacking: Unpacking):
+        self.model, self.arrangement, self.unpacking = model, arrangement, unpacking
         # By whether they keep what is inside, and by shape, the one that came last at the end:
         self._free: dict[bool, dict[tuple, list[Pair]]] = {False: {}, True: {}}
         self._scratch: dict[Wanted, Scratch] = {}
@@ -77,28 +78,50 @@ class Pool:
         return adjoints[wanted]
 
 
+class _Lease:
+    """A program out on loan: it goes back to the pool when nothing refers to what is in it any more."""
+
+    def __init__(self, pool: Pool, chunk: Chunk, keep: bool):
+        self.pair, free = pool.take(chunk, keep)
+        if not recording(pool.model):  # else it belongs to the graph that is being recorded
+            weakref.finalize(self, free.append, self.pair)
+
+
 class FastRun:
     """One chunk that ran; as long as it lives, its program keeps what is inside.
 
     Attributes:
         renewed: Whether the arrangement was made for its start.
-        start, end: State before and after it; the end is handed over once the run is kept.
+        start, end: State before and after it.
         words: What the kernels reported, see watch.py; then cells met along the order of the particles, and whether one is
             near the window's edge; shape (world + 2,).
     """
 
-    def __init__(self, pool: Pool, renewed: bool, chunk: Chunk, start: State, pull, solid: Solid, keep: bool):
+    def __init__(
+        self,
+        pool: Pool,
+        renewed: bool,
+        chunk: Chunk,
+        start: State | SortedState,
+        pull: Tensor | None,
+        solid: Solid,
+        keep: bool,
+    ):
         self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
-        self._pair, free = pool.take(chunk, keep)
-        program = self._pair.program
-        self.end = program.run(start, pull, solid)
+        self._lease = _Lease(pool, chunk, keep)
+        program = self._lease.pair.program
+        program.run(start, pull, solid)
+        self.end = SortedState(pool.unpacking, program.base[-1], program.rows[-1], program.order, self._lease)
         self.words = program.words
-        if not recording(program.model):  # else it belongs to the graph that is being recorded
-            weakref.finalize(self, free.append, self._pair)
 
-    def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
+    def pull_back(
+        self, adj_end: State | SortedAdj, adj_solid: SolidAdj, wanted: Wanted
+    ) -> tuple[SortedAdj, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
-        return self.pool.adjoint(self._pair, wanted).run(adj_end, adj_solid)
+        adjoint = self.pool.adjoint(self._lease.pair, wanted)
+        adj_pull = adjoint.run(adj_end, adj_solid)
+        adj, order = adjoint.scratch.adj, adjoint.program.order  # both serve other runs before long
+        return SortedAdj(self.pool.unpacking, adj.clone(), order.clone()), adj_pull
 
 
 class Fast:
@@ -107,16 +130,19 @@ class Fast:
     def __init__(self, model: Model):
         self.model = model
         self._pool: Pool | None = None
+        self._unpacking = Unpacking(model)
         self._widened = False  # the window was just put around the start of the chunk that comes next
         # Substeps of the graph that is being recorded since it last renewed the order:
         self._recorded = LONGEST
 
-    def run(self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool) -> FastRun:
+    def run(
+        self, chunk: Chunk, start: State | SortedState, pull: Tensor | None, solid: Solid, keep: bool
+    ) -> FastRun:
         renewed = self._arrange(start, chunk)
         assert self._pool is not None
         return FastRun(self._pool, renewed, chunk, start, pull, solid, keep)
 
-    def _arrange(self, start: State, chunk: Chunk) -> bool:
+    def _arrange(self, start: State | SortedState, chunk: Chunk) -> bool:
         """See to it that there is an arrangement fit for use; whether it was made for this start."""
         if recording(self.model):
             return self._arrange_blindly(start, chunk)
@@ -131,7 +157,7 @@ class Fast:
         self._widened = False
         return True
 
-    def _arrange_blindly(self, start: State, chunk: Chunk) -> bool:
+    def _arrange_blindly(self, start: State | SortedState, chunk: Chunk) -> bool:
         """Inside a graph nobody can look whether the order is stale: it is renewed every so often."""
         if self._pool is None:
             raise RuntimeError(
@@ -148,7 +174,7 @@ class Fast:
 
     def _use(self, arrangement: Arrangement) -> None:
         if self._pool is None or arrangement is not self._pool.arrangement:
-            self._pool = Pool(self.model, arrangement)
+            self._pool = Pool(self.model, arrangement, self._unpacking)
 
     def widen(self, run: FastRun) -> None:
         """A particle left the window during ``run``: put it around the start, or take a larger one if that was done before."""

@@ -4,8 +4,8 @@ A call is cut into chunks. To pull a chunk back, what is inside it must be there
 nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
 
     keep all:  everything inside all chunks, N (S + G); nothing runs twice
-    schedule:  one chunk at a time is run again, L (S + G); of the ⌈N/L⌉ states between chunks, s are kept, s B,
-               and the others are found by running chunks again, as few as possible (schedule.py)
+    schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
+               chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (schedule.py)
 """
 
 import functools
@@ -54,6 +54,8 @@ class Sizes(NamedTuple):
     """State of all worlds between chunks."""
     longest: int
     """Substeps of a chunk, at most."""
+    chunk: int
+    """Substeps that take as long as what comes with each chunk besides its substeps."""
 
 
 class Plan(NamedTuple):
@@ -75,7 +77,7 @@ class Plan(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def plan(horizon, sizes: Sizes, budget: int) -> Plan:
-    """The plan that runs least again within the budget [B].
+    """The plan that takes the least time within the budget [B].
 
     Args:
         horizon: A :class:`softmpm.horizon.Horizon`.
@@ -88,13 +90,16 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     if everything <= budget or horizon.total == 0:
         return Plan(sizes.longest, 0, everything, 0)
     best, least = None, math.inf
-    for longest in (2**k for k in range(sizes.longest.bit_length() - 1, -1, -1)):
+    for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
-        length = max(chunk.length for chunk in chunks)
-        inside = (length + 1) * sizes.inside + length * sizes.nodes
+        inside = sum((n + 1) * sizes.inside + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
         slots = min(len(chunks), (budget - inside - sizes.between) // sizes.between)
-        if slots >= 1 and (again := recomputed(len(chunks), slots) * length) < least:
-            best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), again
+        if slots < 1:
+            continue
+        runs = recomputed(len(chunks), slots)
+        length = max(chunk.length for chunk in chunks)
+        if (cost := runs * length + (2 * len(chunks) + runs) * sizes.chunk) < least:
+            best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
     if best is None:
         smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes
         raise ValueError(
@@ -102,6 +107,13 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
             "raise it, or make the scene smaller."
         )
     return best
+
+
+def _lengths(substeps: int, longest: int) -> list[int]:
+    """Of chunks, the longest first: halved again and again, and those that leave no shorter chunk, whose memory would be one more."""
+    halved = (longest >> k for k in range(longest.bit_length()))
+    even = (n for n in range(1, longest + 1) if substeps % n == 0)
+    return sorted({*halved, *even}, reverse=True)
 
 
 class Memory(NamedTuple):
@@ -121,17 +133,20 @@ def memory(model, horizon) -> Memory:
     particles = model.worlds * model.particle_count
     state = particles * real * (2 * model.dim + 2 * model.dim**2)  # x, v, C, F of the end, or their adjoints
     low = state // 2 if real == 4 else 0
-    material = 4 * particles * real
-    pull = particles * model.spec.muscle_slots * real
+    material, pull = 4 * particles * real, particles * model.spec.muscle_slots * real
     chosen = plan(horizon, sizes, model.budget)
-    forward = (
-        sizes.inside * (1 if model.scheme == "fast" else 2) + 3 * sizes.nodes + 2 * material + state + low
-    )
-    adjoints = 2 * state + 2 * material + pull + 3 * sizes.nodes + sizes.inside
-    kept = chosen.kept
-    if model.spec.deterministic:  # each program adds up in fixed point, and so does the backward pass
-        own = sizes.inside + 2 * sizes.nodes
-        forward += own
-        kept += own * (len(horizon.chunks(chosen.longest)) if chosen.keep_all else 1)
+    if model.scheme == "fast":
+        chunks = len(horizon.chunks(sizes.longest))
+        # At most three chunks at a time: one that runs, one launched ahead, one that holds the start of the first.
+        program = material + sizes.nodes + (2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0)
+        forward = min(chunks, 3) * (program + sizes.inside + 2 * sizes.nodes)
+        handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
+        own = program * (len(horizon.chunks(chosen.longest)) if chosen.keep_all else 1)
+        small = 0 if chosen.keep_all else forward
+    else:
+        forward, handed, own, small = 2 * sizes.inside, sizes.inside, 0, 0
+    kept = chosen.kept + own + small + material
+    adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
+    if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
-    return Memory(forward, kept + 2 * material, kept + chosen.recomputed + 2 * material + state + adjoints)
+    return Memory(forward + material + state + low, kept, kept + chosen.recomputed + state + adjoints)

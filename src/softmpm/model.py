@@ -248,9 +248,16 @@ class Model:
         if self.scheme == "fast":
             inside = particles * (4 + real * packed_rows(d).rows)
             nodes = self.worlds * self.held_nodes * 4 * real
-            return Sizes(inside, nodes, between, longest_chunk(particles))
+            between = inside + 4 * particles  # and their order
+            return Sizes(inside, nodes, between, longest_chunk(particles), self._price_of_a_chunk())
         inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-        return Sizes(inside, 0, between, longest_chunk(particles))
+        return Sizes(inside, 0, between, longest_chunk(particles), self._price_of_a_chunk())
+
+    def _price_of_a_chunk(self) -> int:
+        """In substeps: on a GPU the host's half millisecond for few particles, sorting and moving them for many."""
+        if self.device.type == "cpu":
+            return 1
+        return max(4, min(48, 3_000_000 // (self.worlds * self.particle_count)))
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""

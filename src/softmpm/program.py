@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.arrangement import Arrangement
+from softmpm.between import SortedState, padded
 from softmpm.buffers import Solid, passing, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.horizon import Chunk
@@ -18,10 +19,11 @@ from softmpm.kernels.fused import fused
 from softmpm.kernels.native import BLOCK, FEW, VERY_FEW, WARP
 from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
+from softmpm.kernels.sorting import sorting
 from softmpm.kernels.types import solid_types, types
 from softmpm.model import Model
 from softmpm.replay import Command, Launcher, Replay, recording
-from softmpm.state import Low, State
+from softmpm.state import State
 from softmpm.step import stream_of
 from softmpm.watch import NEVER
 
@@ -34,7 +36,7 @@ class Program:
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
-        padded = -(-self.total // WARP) * WARP
+        places = padded(model)
 
         def tensor(*size, dtype=model.dtype):
             return torch.empty(*size, dtype=dtype, device=model.device)
@@ -49,8 +51,8 @@ class Program:
         # What the sorted material was taken from, if it needs no gradient:
         self._given: tuple[Tensor, ...] = ()
         slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
-        self.base = tensor(slots, padded, dtype=torch.int32)
-        self.rows = tensor(slots, padded * t.rows)
+        self.base = tensor(slots, places, dtype=torch.int32)
+        self.rows = tensor(slots, places * t.rows)
         self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
         self.velocity = tensor(model.worlds * arrangement.node_count, 4)
         rows = chunk.row(chunk.length - 1) + 1
@@ -58,7 +60,7 @@ class Program:
         self._structs()
         self.exact = None
         if model.spec.deterministic:
-            self.exact = Exact(model, view(tensor(padded * t.rows), t.real), self.node_arrays)
+            self.exact = Exact(model, view(tensor(places * t.rows), t.real), self.node_arrays)
         self._forward = Replay(model)
         self._commands()
 
@@ -112,11 +114,10 @@ class Program:
             return Command(model, pack.enter, lead, inputs, slots)
 
         self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
-        out = state + low if model.dtype == torch.float32 else state
-        self._out = [(*lead, *dtype._shape_) for dtype in out]
-        slots = [slot(model, dtype) for dtype in out]
-        inputs = (*at, self.packed[-1], *slots, *(6 - len(out)) * (None,), view(self.words[-2:], wp.int64))
-        self._leave = Command(model, pack.leave, lead, inputs, slots)
+        places, sort = padded(model), sorting(t.dim, model.spec.dtype)
+        slots = [slot(model, wp.int32), slot(model, wp.int32, places), slot(model, t.real, places * t.rows)]
+        inputs = (self.window, self.order_array, *slots, self.watch, self.packed[0])
+        self._move = Command(model, sort.move, lead, inputs, slots)
         given = Solid.fixed(model)
         slots = slots_in(given, ("mass", "mu", "lam"), model, t.real)
         inputs = (self.order_array, given, self._solid)
@@ -156,8 +157,8 @@ class Program:
         warps = -(-self.total // self.crew)
         return -(-warps * WARP // self.block) * self.block
 
-    def run(self, start: State, pull: Tensor | None, solid: Solid) -> State:
-        """All substeps from ``start``; the end in new tensors. Failures are in :attr:`words`."""
+    def run(self, start: State | SortedState, pull: Tensor | None, solid: Solid) -> None:
+        """All substeps from ``start``; the end is the last of :attr:`base` and :attr:`rows`. Failures are in :attr:`words`."""
         stream = stream_of(self.model.device)
         moved = recording(self.model) or self._version != self.arrangement.version
         if moved:
@@ -169,14 +170,20 @@ class Program:
             self.pull.copy_(pull)
         if not self._has(solid) or moved:
             self._sort(stream, solid.mass, solid.mu, solid.lam)
-        given = [tensor.contiguous() for tensor in (*start, *(start.low or ()))]  # kept until it is launched
-        self._enter[start.low is not None](stream, *given)
+        self._take(stream, start)
         if self.exact is not None:
             self.exact.begin(solid.mass)
         self._forward.run(stream, self._launch_all)
-        x, v, C, F, *low = (self._tensor(*shape) for shape in self._out)
-        self._leave(stream, x, v, C, F, *low)
-        return State(x, v, C, F).with_low(Low(*low) if low else None)
+
+    def _take(self, stream: wp.Stream | None, start: State | SortedState) -> None:
+        """Put the start where the kernels look for it."""
+        if isinstance(start, SortedState):
+            self._move(stream, start.places(), start.base, start.rows)
+        else:
+            given = [
+                tensor.contiguous() for tensor in (*start, *(start.low or ()))
+            ]  # kept until it is launched
+            self._enter[start.low is not None](stream, *given)
 
     def _has(self, solid: Solid) -> bool:
         """Whether the material is the one of the run before: the very tensors, which nothing else writes to. Takes note of it."""
@@ -202,6 +209,10 @@ class Program:
             arguments = (self.model.scale, self.model.walls, self.window, now, self.velocity_array, then)
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
+        if not recording(self.model):  # else nobody can look
+            survey = sorting(self.types.dim, self.model.spec.dtype).survey
+            arguments = (self.model.scale, self.window, self.model.particle_count, self.packed[-1].base)
+            launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
 
     def _begin(self, launch: Launcher) -> None:
         """P2G of the first substep."""

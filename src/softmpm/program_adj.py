@@ -4,11 +4,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from softmpm.between import SortedAdj
 from softmpm.buffers import SolidAdj, clear, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.kernels.fused_adj import fused_adj
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, collectors, sorted_solid_adj
+from softmpm.kernels.sorting import sorting
 from softmpm.kernels.types import Wanted, solid_adj_type
 from softmpm.program import Program
 from softmpm.replay import Command, Launcher, Replay
@@ -59,17 +61,19 @@ class ProgramAdj:
         """The twins of those of the program."""
         program, t, model = self.program, self.program.types, self.program.model
         pack, lead, adj, at = program.packing, program.lead, self.scratch.adj_array, program.order_array
-        end, start = ([slot(model, dtype) for dtype in (t.vec, t.vec, t.mat, t.mat)] for _ in range(2))
+        end = [slot(model, dtype) for dtype in (t.vec, t.vec, t.mat, t.mat)]
         self._enter = Command(model, pack.enter_adj, lead, (model.scale, at, *end, adj), end)
-        self._leave = Command(model, pack.leave_adj, lead, (model.scale, at, adj, *start), start)
+        given = [slot(model, wp.int32), slot(model, t.real, len(self.scratch.adj))]
+        move = sorting(t.dim, model.spec.dtype).move_adj
+        self._move = Command(model, move, lead, (at, *given, adj), given)
         if self.wanted.material:
             found = solid_adj_type(model.spec, self.wanted)()
             slots = slots_in(found, ("mass", "mu", "lam"), model, t.real)
             kernel = sorted_solid_adj(model.spec, self.wanted)
             self._sort = Command(model, kernel, lead, (at, self.scratch.solid_struct, found), slots)
 
-    def run(self, adj_end: State, adj_solid: SolidAdj) -> tuple[State, Tensor | None]:
-        """Adjoint of the start in new tensors, and of the pull (control step, world, muscle); adds into ``adj_solid``."""
+    def run(self, adj_end: State | SortedAdj, adj_solid: SolidAdj) -> Tensor | None:
+        """Leaves the adjoint of the start in the scratch and adds into ``adj_solid``; gives that of the pull, if it is wanted."""
         program, scratch = self.program, self.scratch
         stream = stream_of(program.model.device)
         for tensor in scratch.tensors:
@@ -79,13 +83,14 @@ class ProgramAdj:
         if self.adj_pull is not None:
             clear(self.adj_pull)
         program.calm()
-        self._enter(stream, *adj_end)
+        if isinstance(adj_end, SortedAdj):
+            self._move(stream, adj_end.places(), adj_end.rows)
+        else:
+            self._enter(stream, *adj_end)
         self._backward.run(stream, self._launch_all)
-        start = State(*(torch.empty_like(adj) for adj in adj_end))
-        self._leave(stream, *start)
         if adj_solid.mass is not None and adj_solid.mu is not None and adj_solid.lam is not None:
             self._sort(stream, adj_solid.mass, adj_solid.mu, adj_solid.lam)
-        return start, None if self.adj_pull is None else self.adj_pull.clone()
+        return None if self.adj_pull is None else self.adj_pull.clone()
 
     def _launch_all(self, launch: Launcher) -> None:
         for s in range(self.program.chunk.length, -1, -1):

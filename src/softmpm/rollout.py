@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from softmpm import schedule
+from softmpm.between import SortedState
 from softmpm.buffers import Solid, SolidAdj
 from softmpm.failures import Report, outgrown, raise_failure, raise_gradient_failure
 from softmpm.fast import Fast, FastRun, fast
@@ -17,6 +19,7 @@ from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
 from softmpm.replay import hold, note, recording
 from softmpm.state import State
+from softmpm.watch import NEVER
 
 
 @dataclass
@@ -27,8 +30,8 @@ class Trail:
     chunks: tuple[Chunk, ...]
     runs: list[FastRun | PlainRun]
     """Every chunk, if everything is kept."""
-    states: dict[int, State]
-    """Else states before some of the chunks."""
+    states: dict[int, State | SortedState]
+    """Else states before some of the chunks, in memory of their own."""
 
     def keep(self, run: FastRun | PlainRun) -> None:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
@@ -37,14 +40,14 @@ class Trail:
 
 
 class _Runner:
-    """Runs the chunks of one call by the model's scheme."""
+    """Runs the chunks of one call by the model's scheme, from a :class:`State` or what the scheme gave as an end."""
 
     def __init__(self, model: Model, pull: Tensor | None, solid: Solid):
         self.model, self.pull, self.solid = model, pull, solid
         stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
         self.scheme = fast(model, stream) if model.scheme == "fast" else Plain(model)
 
-    def run(self, chunk: Chunk, start: State, keep: bool) -> FastRun | PlainRun:
+    def run(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
         pull = None if self.pull is None else self.pull[chunk.rows]
         return self.scheme.run(chunk, start, pull, self.solid, keep)
 
@@ -61,10 +64,11 @@ class _Runner:
                 self.scheme.widen(run)
                 return False
             run.pool.arrangement.judge(cells, bool(near_edge))
-        raise_failure(self.model, words, run.end, run.chunk.first)
+        if any(word != NEVER for word in words):
+            raise_failure(self.model, words, _as_state(run.end), run.chunk.first)
         return True
 
-    def settle(self, chunk: Chunk, start: State, keep: bool) -> FastRun | PlainRun:
+    def settle(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
         """Run a chunk, and wait until it can be used."""
         while True:
             run = self.run(chunk, start, keep)
@@ -95,7 +99,8 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all
     if recording(model):
         return _recorded(runner, trail, start, stays, inside), trail if keep else None
-    state, k, before = start, 0, None
+    state: State | SortedState = start
+    k, before = 0, None
     while k < len(trail.chunks) or before is not None:
         ahead = None
         if k < len(trail.chunks):
@@ -107,24 +112,33 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
         if before is not None and inside:
             trail.keep(before[0])
         if k in stays:
-            trail.states[k] = state
+            trail.states[k] = _kept(state)
         if ahead is not None:
             state, k = ahead[0].end, k + 1
         before = ahead
-    return state, trail if keep else None
+    return _as_state(state), trail if keep else None
 
 
-def _recorded(runner: _Runner, trail: Trail, state: State, stays, inside: bool) -> State:
+def _as_state(between: State | SortedState) -> State:
+    return between if isinstance(between, State) else between.state()
+
+
+def _kept(between: State | SortedState) -> State | SortedState:
+    """To be kept without the buffers that it lies in."""
+    return between if isinstance(between, State) else between.copy()
+
+
+def _recorded(runner: _Runner, trail: Trail, state: State | SortedState, stays, inside: bool) -> State:
     """:func:`rollout` while PyTorch records a graph: nothing is read back."""
     hold(runner.model)
     for k, chunk in enumerate(trail.chunks):
         if k in stays:
-            trail.states[k] = state
+            trail.states[k] = _kept(state)
         run = runner.settle(chunk, state, inside)
         state = run.end
         if inside:
             trail.keep(run)
-    return state
+    return _as_state(state)
 
 
 def rollout_adj(
@@ -146,7 +160,7 @@ def rollout_adj(
     """
     adj_solid = SolidAdj.zeros(model, wanted)
     adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
-    adj = State(*(a.contiguous() for a in adj_end))
+    adj: Any = State(*(a.contiguous() for a in adj_end))
     reports = []
     for run in _inside_out(trail, _Runner(model, pull, solid)):
         adj, part = run.pull_back(adj, adj_solid, wanted)
@@ -160,7 +174,7 @@ def rollout_adj(
     for report, last in reports:
         words = report.read()[: model.worlds]
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
-    return adj, adj_solid, adj_pull
+    return adj if isinstance(adj, State) else adj.state(), adj_solid, adj_pull
 
 
 def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:
@@ -168,14 +182,15 @@ def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:
     if trail.plan.keep_all:
         yield from reversed(trail.runs)
         return
-    states, hand = dict(trail.states), State(*(4 * (torch.empty(0),)))
+    states = dict(trail.states)
+    hand: State | SortedState = State(*(4 * (torch.empty(0),)))
     for action, k in schedule.going_back(len(trail.chunks), trail.plan.slots):
         if action == "restore":
             hand = states[k]
         elif action == "advance":
             hand = runner.settle(trail.chunks[k], hand, keep=False).end
         elif action == "keep":
-            states[k] = hand
+            states[k] = _kept(hand)
         elif action == "drop":
             del states[k]
         else:

@@ -218,12 +218,12 @@ def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device)
 
 
 def test_chunks_of_a_long_control_step_share_programs(made, short_chunks, device):
-    """Wherever in the control step they lie: two at a time forward, since one is launched ahead, and one kept going back."""
+    """Wherever in the control step they lie: three at a time forward, with one launched ahead and one that holds a start, one going back."""
     sizes = model().sizes()
     built = model(device=device, memory_budget=9 * (sizes.inside + sizes.nodes) + 20 * sizes.between)
     inputs = busy_inputs(built, control_steps=1, seed=1)
     pull(run(softmpm.simulate, built, inputs, 8 * SHORT), inputs)
-    assert [keep for _, keep in made].count(False) <= 2 and [keep for _, keep in made].count(True) == 1, made
+    assert [keep for _, keep in made].count(False) <= 3 and [keep for _, keep in made].count(True) == 1, made
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -293,7 +293,7 @@ def test_material_is_not_mixed_up_when_the_order_is_renewed(device):
     def chunk_of(k):
         pull = torch.zeros(1, 1, built.muscle_count, device=device)
         mu, lam, mass = masses[k]
-        return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end.v
+        return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end.state().v
 
     first, _ = chunk_of(0), chunk_of(0)  # the second takes note of a material that was already in order
     runner._pool.arrangement.renew(start.x)

@@ -65,6 +65,9 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func_native(f"softmpm::store_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]);")
     def store_mat(packed: wp.array(dtype=real), i: int, r: int, value: mat): ...
 
+    @wp.func_native(f"softmpm::copy_rows<{rows}>(source.data, j, target.data, i);")
+    def copy_rows(source: wp.array(dtype=real), j: int, target: wp.array(dtype=real), i: int): ...
+
     return SimpleNamespace(
         scatter=scatter,
         load_node=load_node,
@@ -73,4 +76,5 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         load_mat=load_mat,
         store_vec=store_vec,
         store_mat=store_mat,
+        copy_rows=copy_rows,
     )

@@ -283,4 +283,15 @@ template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(
         at[k * LANES] = in[k];
 }
 
+// All rows of particle j to the place of particle i.
+template <int ROWS, typename T> CUDA_CALLABLE inline void copy_rows(const T* source, int j, T* target, int i)
+{
+    const T* from = packed<ROWS>(source, j, 0);
+    T *to = packed<ROWS>(target, i, 0), value[ROWS];
+    for (int r = 0; r < ROWS; ++r)
+        value[r] = from[r * LANES];
+    for (int r = 0; r < ROWS; ++r)
+        to[r * LANES] = value[r];
+}
+
 }  // namespace softmpm
