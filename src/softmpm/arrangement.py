@@ -38,12 +38,14 @@ class Arrangement:
         origin: First node of the window, shape (world, dim), int32.
         shape: Nodes of the window along each axis.
         version: How often it was renewed.
+        stale: Whether to renew it.
+        outgrown: Whether to take a larger one.
     """
 
     def __init__(self, model: Model, x: Tensor, least: tuple[int, ...] = ()):
         self.model, self.version = model, 0
         self._fresh: Report | None = None  # cells met along the order when it was new
-        self.stale = False
+        self.stale = self.outgrown = False
 
         def integers(*size):
             return torch.empty(*size, dtype=torch.int32, device=model.device)
@@ -112,6 +114,10 @@ class Arrangement:
     def grown(self, x: Tensor) -> "Arrangement":
         """Another one with a window half as large again."""
         return Arrangement(self.model, x, least=tuple(math.ceil(1.5 * n) for n in self.shape))
+
+    def outgrow(self) -> None:
+        """A particle left the window inside a recorded graph, where nobody could renew it in time."""
+        self.outgrown = True
 
     def judge(self, cells: int, near_edge: bool) -> None:
         """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""

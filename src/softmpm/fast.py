@@ -149,6 +149,8 @@ class Fast:
         self._recorded = LONGEST
         if self._pool is None:
             self._use(Arrangement(self.model, start.x))
+        elif self._pool.arrangement.outgrown:
+            self._use(self._pool.arrangement.grown(start.x))
         elif self._pool.arrangement.stale or self.model.deterministic:  # else it would tell what ran before
             self._pool.arrangement.renew(start.x)  # if they do not fit into the window, the call will say so
         else:

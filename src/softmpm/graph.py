@@ -16,7 +16,8 @@ class Graph(Generic[Result]):
     """Work that calls :func:`softmpm.simulate`, recorded once and replayed: no launch costs the host anything any more.
 
     On the CPU, where simulations are replayed anyway, it calls the work each time. A replay that fails is done again by
-    calling the work, which raises what there is to raise, or takes a larger part of the grid into memory.
+    calling the work, which raises what there is to raise. If a particle only left the part of the grid that is in memory, a
+    larger part is taken before, and the next call records again.
 
     Args:
         work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
@@ -52,6 +53,8 @@ class Graph(Generic[Result]):
         self._graph = self._graph or self._record(self._stream)
         self._graph.replay()
         if self._failed.item():
+            assert self._ledger is not None
+            self._ledger.widen()
             self._graph = self._ledger = None
             return self._run(self._stream)
         return self._result

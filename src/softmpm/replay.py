@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 import warp as wp
 
+from softmpm.failures import outgrown
 from softmpm.model import Model
 
 
@@ -18,12 +19,20 @@ class Ledger:
 
     Attributes:
         words: Watch words of the calls that the graph holds, to be read after each replay.
+        windows: Those of calls that have a window, and what to call if a particle left it.
         uses: What the graph reads and writes though it was made before. What is made while it is recorded lies in its own memory.
     """
 
     def __init__(self):
         self.words: list[torch.Tensor] = []
+        self.windows: list[tuple[torch.Tensor, Callable[[], None]]] = []
         self.uses: list[object] = []
+
+    def widen(self) -> None:
+        """After a replay that failed: see to it that the next recording has larger windows where a particle left one."""
+        for words, outgrow in self.windows:
+            if outgrown(words.tolist()):
+                outgrow()
 
 
 _open: list[Ledger] = []
@@ -39,9 +48,16 @@ def close_ledger() -> None:
     _open.pop()
 
 
-def note(words: torch.Tensor) -> None:
-    """Leave the reading of these words, one for each world, to whoever replays the graph that is being recorded."""
-    _ledger().words.append(words)
+def note(words: torch.Tensor, outgrow: Callable[[], None] | None = None) -> None:
+    """Leave the reading of these words, one for each world, to whoever replays the graph that is being recorded.
+
+    Args:
+        outgrow: Called if they say that a particle left the window; None where there is no window.
+    """
+    ledger = _ledger()
+    ledger.words.append(words)
+    if outgrow:
+        ledger.windows.append((words, outgrow))
 
 
 def hold(used: object) -> None:

@@ -73,7 +73,8 @@ class _Runner:
         while True:
             run = self.run(chunk, start, keep)
             if recording(self.model):
-                note(run.words[: self.model.worlds].clone())  # the backward pass uses them anew
+                words = run.words[: self.model.worlds].clone()  # the backward pass uses them anew
+                note(words, run.pool.arrangement.outgrow if isinstance(run, FastRun) else None)
                 return run
             if self.settled(run, Report(run.words)):
                 return run

@@ -1,8 +1,11 @@
 """Order of the particles and window of the grid: neither changes a result, whatever moves where."""
 
+import contextlib
 import itertools
 import math
 import time
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ import torch
 from helpers import LAWS, assert_relative, cotangent, dot
 
 import softmpm
-from softmpm import arrangement
+from softmpm import arrangement, autograd, fast, program, rollout
 from softmpm.arrangement import STALE_FEW, Arrangement
 from softmpm.memory import MARGIN
 
@@ -197,18 +200,28 @@ def watched(monkeypatch) -> type[Watched]:
     return Watched
 
 
-def end_and_gradient(model, v: torch.Tensor, substeps: int, calls: int = 1, twist: float = 0.0):
-    """End and ∂L/∂v of a flight with velocity ``v`` [m/s] of each particle, turning at ``twist`` [1/s]."""
-    state = model.rest()
+def flight(model, v: torch.Tensor, substeps: int, calls: int = 1, twist: float = 0.0):
+    """A flight with velocity ``v`` [m/s] of each particle, turning at ``twist`` [1/s]: its start, and what gives its end and ∂L/∂v."""
+    state, params = model.rest(), model.params()
     turn = torch.zeros_like(state.C)
     turn[..., 0, 1], turn[..., 1, 0] = -twist, twist
-    start = state._replace(v=(state.v + v.to(state.v)).requires_grad_(), C=turn)
-    end = start.with_low(state.low)
-    for _ in range(calls):
-        end = softmpm.simulate(model, end, None, model.params(), substeps=substeps)
-    weights = [w / w.abs().max() for w in cotangent(end)]
-    (gradient,) = torch.autograd.grad(dot(weights, end), start.v)
-    return [t.detach().cpu() for t in end], gradient.cpu()
+    start = state._replace(v=(state.v + v.to(state.v)).requires_grad_(), C=turn).with_low(state.low)
+    weights = [w / w.abs().max() for w in cotangent(state)]
+
+    def fly():
+        end = start
+        for _ in range(calls):
+            end = softmpm.simulate(model, end, None, params, substeps=substeps)
+        return [t.detach() for t in end], *torch.autograd.grad(dot(weights, end), start.v)
+
+    return start, fly
+
+
+def end_and_gradient(model, v: torch.Tensor, substeps: int, calls: int = 1, twist: float = 0.0):
+    """Of one such flight."""
+    _, fly = flight(model, v, substeps, calls, twist)
+    end, gradient = fly()
+    return [t.cpu() for t in end], gradient.cpu()
 
 
 def assert_same(got, want, limit: float) -> None:
@@ -328,3 +341,59 @@ def test_the_size_of_the_grid_costs_nothing(dtype, limit, watched, device):
     found[0][0][0] = small  # compared here: x in the large grid has fewer digits of a cell
     assert (large - small).abs().max() <= limit * 1024 * DX
     assert_same(*found, limit)
+
+
+# -- a window inside a recorded graph ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recordings(monkeypatch, device) -> list[softmpm.Graph]:
+    """Graphs, once for each time that they were recorded. On the CPU what is recorded runs, reading nothing back."""
+    recorded, record = [], softmpm.Graph._record
+    monkeypatch.setattr(softmpm.Graph, "_record", lambda *args: recorded.append(args[0]) or record(*args))
+    if device == "cpu":
+
+        @contextlib.contextmanager
+        def blindly(*_, **__):
+            with monkeypatch.context() as patch:
+                for module in (arrangement, autograd, fast, program, rollout):
+                    patch.setattr(module, "recording", lambda model: True)
+                yield
+
+        pretended = SimpleNamespace(cat=torch.cat, cuda=MagicMock(graph=blindly))
+        monkeypatch.setattr("softmpm.graph.torch", pretended)
+    return recorded
+
+
+CUDA = torch.device("cuda")
+WANDERS = torch.tensor([4.5, 1.0], dtype=torch.float64)
+"""1.8 cells in a call of 25 substeps [m/s]; before a recording renews its window, it goes 11."""
+
+
+def test_a_window_that_is_too_small_for_a_recording_grows_once(watched, recordings, device):
+    """Calls that look follow the robot without growing, a replay does not: it is done again, recorded again, and that stays."""
+    build = {"corners": [(15, 28)], "grid": (80, 64), "device": device}
+    _, fly = flight(robot(2, **build), WANDERS, 25, calls=14, twist=3.0)
+    graph, found = softmpm.Graph(fly, CUDA), []
+    for recorded, grown in ((0, 0), (1, 1), (2, 1), (2, 1)):
+        end, gradient = graph()
+        found.append(([t.cpu() for t in end], gradient.cpu()))
+        assert (len(recordings), len(watched.grown_from)) == (recorded, grown)
+    want = end_and_gradient(robot(2, **build, scheme="plain"), WANDERS, 25, calls=14, twist=3.0)
+    for got in found:
+        assert_same(got, want, 1e-12)  # 350 substeps
+
+
+def test_a_replay_that_fails_otherwise_leaves_the_window_as_it_is(watched, recordings, device):
+    """A robot that leaves the grid itself raises, and once it is slow again the same window serves."""
+    model = robot(2, [(3, 28)], grid=(80, 64), device=device)
+    start, fly = flight(model, -0.01 * WANDERS, 25, calls=4)
+    graph = softmpm.Graph(fly, CUDA)
+    graph()
+    start.v.detach().mul_(100)
+    with pytest.raises(softmpm.UnstableError, match="off the grid"):
+        graph()
+    start.v.detach().div_(100)
+    for _ in range(2):
+        graph()
+    assert len(recordings) == 2 and len(watched.made) == 1
