@@ -34,8 +34,9 @@ def window_shape(grid: Sequence[int], reach: Sequence[int]) -> tuple[int, ...]:
         grid: Nodes of the whole grid.
         reach: How far the particles' base nodes lie apart.
     """
-    wide = (apart + 3 + 2 * MARGIN[len(grid)] for apart in reach)
-    return tuple(min(nodes, 4 * math.ceil(w / 4)) for nodes, w in zip(grid, wide, strict=True))
+    wide = [apart + 3 + 2 * MARGIN[len(grid)] for apart in reach]
+    wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns begin where reads from memory do
+    return tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
 
 
 def longest_chunk(particles: int) -> int:

@@ -366,8 +366,8 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
 
 
 CUDA = torch.device("cuda")
-WANDERS = torch.tensor([4.5, 1.0], dtype=torch.float64)
-"""1.8 cells in a call of 25 substeps [m/s]; before a recording renews its window, it goes 11."""
+WANDERS = torch.tensor([4.0, 1.0], dtype=torch.float64)
+"""1.6 cells in a call of 25 substeps [m/s]; before a recording renews its window, it goes 9.6."""
 
 
 def test_a_window_that_is_too_small_for_a_recording_grows_once(watched, recordings, device):

@@ -218,7 +218,7 @@ def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device)
 
 
 def test_chunks_of_a_long_control_step_share_programs(made, short_chunks, device):
-    """Wherever in the control step they lie: three at a time forward, with one launched ahead and one that holds a start, one going back."""
+    """Wherever in the control step they lie: forward three, one launched ahead and one that holds a start; going back one."""
     sizes = model().sizes()
     built = model(device=device, memory_budget=9 * (sizes.inside + sizes.nodes) + 20 * sizes.between)
     inputs = busy_inputs(built, control_steps=1, seed=1)
