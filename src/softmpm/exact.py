@@ -58,4 +58,4 @@ class Exact:
         mass = self._none if mass is None else mass
         arguments = (program.window, program.total, states, self.shares(k), mass, self.sums(k))
         kernel = fixed(self.model.dim).push
-        launch(kernel, program.threads, *arguments, block_dim=program.block)
+        launch(kernel, program.threads(program.crew), *arguments, block_dim=program.block)

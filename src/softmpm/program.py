@@ -144,17 +144,22 @@ class Program:
 
     @functools.cached_property
     def crew(self) -> int:
-        """Particles of a warp: fewer than its threads while the GPU has more room than warps, so that each walks a shorter way."""
-        if self.model.device.type != "cuda" or self.exact is not None:
-            return WARP
-        return WARP if self.total > VERY_FEW else WARP // 2
+        """Particles of a warp going forward; see :meth:`crew_of`."""
+        return self.crew_of(half=self.types.dim == 2)
 
-    @functools.cached_property
-    def threads(self) -> int:
+    def crew_of(self, half: bool) -> int:
+        """Particles of a warp: all of its threads, or ``half`` of them while the GPU has more room than warps.
+
+        Then each walks a shorter way, but more sums are sent: whether that pays was measured.
+        """
+        few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
+        return WARP // 2 if half and few else WARP
+
+    def threads(self, crew: int) -> int:
         """Threads of a launch over particles: on a GPU whole blocks, since the lanes of a warp work together."""
         if self.model.device.type != "cuda":
             return self.total
-        warps = -(-self.total // self.crew)
+        warps = -(-self.total // crew)
         return -(-warps * WARP // self.block) * self.block
 
     def run(self, start: State | SortedState, pull: Tensor | None, solid: Solid) -> None:
@@ -219,7 +224,7 @@ class Program:
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
         sizes = (self.crew, model.particle_count, self.total, self.order_flat)
         arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
-        launch(fused(model.spec).begin, self.threads, *arguments, block_dim=self.block)
+        launch(fused(model.spec).begin, self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None:
             self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
 
@@ -233,6 +238,6 @@ class Program:
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(fused(model.spec).advance, self.threads, *arguments, block_dim=self.block)
+        launch(fused(model.spec).advance, self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
             self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

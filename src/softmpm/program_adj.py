@@ -119,16 +119,17 @@ class ProgramAdj:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
         model, length, exact = program.model, program.chunk.length, scratch.exact
+        crew = program.crew_of(half=True)
         sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
-        parameters = (model.scale, solid, program.window, length - 1 - s, start, end, program.crew)
+        parameters = (model.scale, solid, program.window, length - 1 - s, start, end, crew)
         sizes = (model.particle_count, program.total, program.order_flat)
         states = (program.packed[max(s - 1, 0)], program.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
         out = (program.watch, scratch.solid_struct, sink)
         kernel = fused_adj(model.spec, self.wanted).advance_adj
         arguments = (*parameters, *sizes, *states, *grids, *out)
-        launch(kernel, program.threads, *arguments, block_dim=program.block)
+        launch(kernel, program.threads(crew), *arguments, block_dim=program.block)
         if exact is not None and not start:
             exact.push(program, s - 1, states[0], None, launch)
 

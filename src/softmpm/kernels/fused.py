@@ -19,7 +19,7 @@ import warp as wp
 from softmpm.kernels import failure
 from softmpm.kernels.fixed import fixed
 from softmpm.kernels.grid import grid
-from softmpm.kernels.native import native, native_module
+from softmpm.kernels.native import BLOCK, native, native_module
 from softmpm.kernels.particle import particle
 from softmpm.kernels.stencil import stencil
 from softmpm.kernels.types import Spec, solid_types, types
@@ -46,6 +46,9 @@ def fused(spec: Spec) -> SimpleNamespace:
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     report = failure.report(spec.dim, spec.dtype).report
     module = native_module(spec.module + ".fused")
+    bounds = (
+        (BLOCK, 6) if dim == 2 else None
+    )  # measured; in 3D the compiler alone finds what is fastest on the whole
 
     @wp.func
     def centre(fx: vec) -> vec:
@@ -156,7 +159,7 @@ def fused(spec: Spec) -> SimpleNamespace:
             first = -1
         hand_on(watch, window, crew, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def advance(
         # Parameters:
         scale: Scale,

@@ -17,7 +17,7 @@ WARP = 32
 BLOCK = 128
 """Threads of a block."""
 FEW, VERY_FEW = 20_000, 10_000
-"""Up to so many particles a block is one warp, and a warp has particles for half of its threads."""
+"""Up to so many particles a block is one warp, and a warp may have particles for half of its threads only."""
 
 
 def native_module(name: str) -> str:
@@ -65,6 +65,12 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func_native(f"softmpm::store_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]);")
     def store_mat(packed: wp.array(dtype=real), i: int, r: int, value: mat): ...
 
+    @wp.func_native(f"softmpm::spread<{dim}>(&out.data->c[0], row, value.c, i, total);")
+    def spread_vec(out: wp.array2d(dtype=vec), row: int, value: vec, i: int, total: int): ...
+
+    @wp.func_native(f"softmpm::spread<{dim * dim}>(&out.data->data[0][0], row, &value.data[0][0], i, total);")
+    def spread_mat(out: wp.array2d(dtype=mat), row: int, value: mat, i: int, total: int): ...
+
     @wp.func_native(f"softmpm::copy_rows<{rows}>(source.data, j, target.data, i);")
     def copy_rows(source: wp.array(dtype=real), j: int, target: wp.array(dtype=real), i: int): ...
 
@@ -76,5 +82,7 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         load_mat=load_mat,
         store_vec=store_vec,
         store_mat=store_mat,
+        spread_vec=spread_vec,
+        spread_mat=spread_mat,
         copy_rows=copy_rows,
     )

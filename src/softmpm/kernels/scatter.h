@@ -7,24 +7,15 @@
 // with g the distance from the middle node in cells, -1/2 <= g < 1/2. Both scatters have this form: momentum and mass of the
 // forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
 // share their nodes. The warp therefore turns the sum around: its first lanes, the ``crew``, have a particle each and write its
-// (b, A, m) and weights to shared memory, then three groups of nine lanes own the nodes, walk through a third of the particles
-// each, add up in registers while the cell stays the same, and send one 16-byte reduction per node and cell. Lanes 27 to 31 own
-// nothing. The end of the particles is the end of a cell, with -1 for the next.
+// (b, A, m, g) to shared memory, then three groups of nine lanes own the nodes, walk through a third of the particles each, add up
+// in registers while the cell stays the same, and send one 16-byte reduction per node and cell. Lanes 27 to 31 own nothing. What
+// comes next is read before it is waited for: with few particles that is where the time goes.
 namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 
 // Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
-
-// Weights of the three nodes along an axis.
-template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
-{
-    T low = T(0.5) - g, high = T(0.5) + g;
-    w[0] = T(0.5) * low * low;
-    w[1] = T(0.75) - g * g;
-    w[2] = T(0.5) * high * high;
-}
 
 #if defined(__CUDA_ARCH__)
 
@@ -53,43 +44,80 @@ template <> CUDA_CALLABLE inline void add(float* p, float x, float y, float z, f
 }
 #endif
 
+// w(o, g) = level + bend (g - peak)^2, for the o that a lane owns
+struct Weight {
+    float level, bend, peak;
+    CUDA_CALLABLE inline explicit Weight(int o)
+        : level(o == 0 ? 0.75f : 0.0f)
+        , bend(o == 0 ? -1.0f : 0.5f)
+        , peak(-0.5f * float(o))
+    {
+    }
+    CUDA_CALLABLE inline float operator()(float g) const
+    {
+        float d = g - peak;
+        return level + bend * d * d;
+    }
+};
+
 // Three dimensions: a lane owns a column of three nodes along z, and hands it on when the next cell is the one above.
 template <class Sink>
 CUDA_CALLABLE inline void add_warp(
     Sink node, const wp::vec_t<3, int>& shape, int crew, int first, const wp::vec_t<3, float>& g,
     const wp::vec_t<3, float>& b, const wp::mat_t<3, 3, float>& A, float m)
 {
-    constexpr int WIDTH = 7;  // float4 per particle: an odd number, so that eight lanes write to all banks
+    constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
     int lane = threadIdx.x & (LANES - 1);
     float4* all = box + (threadIdx.x - lane) * WIDTH;
     float4* mine = all + lane * WIDTH;
-    float wx[3], wy[3], wz[3];
-    weights(g[0], wx);
-    weights(g[1], wy);
-    weights(g[2], wz);
+    float low = 0.5f - g[2], high = 0.5f + g[2];
     mine[0] = make_float4(b[0], b[1], b[2], m);
-    mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], wz[0]);
-    mine[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], wz[1]);
-    mine[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], wz[2]);
-    mine[4] = make_float4(wx[0] * wy[0], wx[0] * wy[1], wx[0] * wy[2], wx[1] * wy[0]);
-    mine[5] = make_float4(wx[1] * wy[1], wx[1] * wy[2], wx[2] * wy[0], wx[2] * wy[1]);
-    mine[6] = make_float4(wx[2] * wy[2], __int_as_float(first), 0.0f, 0.0f);
+    mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], g[0]);
+    mine[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], g[1]);
+    mine[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], 0.5f * low * low);
+    mine[4] = make_float4(0.75f - g[2] * g[2], 0.5f * high * high, __int_as_float(first), 0.0f);
     __syncwarp();
 
     int group = lane / 9, column = lane % 9;
     int ox = column / 3 - 1, oy = column % 3 - 1;
+    Weight wx(ox), wy(oy);
     float fx = float(ox), fy = float(oy);
-    int share = (crew + 2) / 3, begin = group * share, end = group < 3 ? min(begin + share, crew) : begin;
+    int share = (crew + 2) / 3, begin = group * share, end = min(begin + share, crew);
+    if (group == 3)
+        begin = end;  // lanes 27 to 31 own nothing
     Sink origin = node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]);
     float4 below = make_float4(0.0f, 0.0f, 0.0f, 0.0f), middle = below, above = below;
-    const float4 zero = below, *q = all + begin * WIDTH, *stop = all + end * WIDTH;
-    int current = q < stop ? __float_as_int(q[6].y) : -1;
-    while (current >= 0) {
-        float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
-        float w = reinterpret_cast<const float*>(q + 4)[column];
+    const float4 zero = below;
+    int current = -1;
+    const float4* q = all + min(begin, LANES - 1) * WIDTH;
+    float4 n0 = q[0], n1 = q[1], n2 = q[2], n3 = q[3], n4 = q[4];  // the particle after this one: read before it is waited for
+    for (int p = begin; p < end; ++p) {
+        float4 q0 = n0, q1 = n1, q2 = n2, q3 = n3, q4 = n4;
+        q = all + min(p + 1, LANES - 1) * WIDTH;
+        n0 = q[0], n1 = q[1], n2 = q[2], n3 = q[3], n4 = q[4];
+        int next = __float_as_int(q4.z);
+        if (next < 0)
+            break;  // the last particle was the one before
+        if (next != current) {
+            if (current >= 0) {
+                auto at = cell(origin, current);
+                add(at, below.x, below.y, below.z, below.w);
+                if (next == current + 1) {
+                    below = middle;
+                    middle = above;
+                } else {
+                    add(at + 4, middle.x, middle.y, middle.z, middle.w);
+                    add(at + 8, above.x, above.y, above.z, above.w);
+                    below = middle = zero;
+                }
+                above = zero;
+            }
+            current = next;
+        }
+        float w = wx(q1.w) * wy(q2.w);
         float x = q0.x + q1.x * fx + q2.x * fy, y = q0.y + q1.y * fx + q2.y * fy, z = q0.z + q1.z * fx + q2.z * fy;
-        float w0 = w * q1.w, w1 = w * q2.w, w2 = w * q3.w;
+        float w0 = w * q3.w, w1 = w * q4.x, w2 = w * q4.y;
         below.x += w0 * (x - q3.x);
         below.y += w0 * (y - q3.y);
         below.z += w0 * (z - q3.z);
@@ -102,22 +130,12 @@ CUDA_CALLABLE inline void add_warp(
         above.y += w2 * (y + q3.y);
         above.z += w2 * (z + q3.z);
         above.w += w2 * q0.w;
-        q += WIDTH;
-        int next = q < stop ? __float_as_int(q[6].y) : -1;
-        if (next != current) {
-            auto at = cell(origin, current);
-            add(at, below.x, below.y, below.z, below.w);
-            if (next == current + 1) {
-                below = middle;
-                middle = above;
-            } else {
-                add(at + 4, middle.x, middle.y, middle.z, middle.w);
-                add(at + 8, above.x, above.y, above.z, above.w);
-                below = middle = zero;
-            }
-            above = zero;
-            current = next;
-        }
+    }
+    if (current >= 0) {
+        auto at = cell(origin, current);
+        add(at, below.x, below.y, below.z, below.w);
+        add(at + 4, middle.x, middle.y, middle.z, middle.w);
+        add(at + 8, above.x, above.y, above.z, above.w);
     }
     __syncwarp();
 }
@@ -128,43 +146,48 @@ CUDA_CALLABLE inline void add_warp(
     Sink node, const wp::vec_t<2, int>& shape, int crew, int first, const wp::vec_t<2, float>& g,
     const wp::vec_t<2, float>& b, const wp::mat_t<2, 2, float>& A, float m)
 {
-    constexpr int WIDTH = 5;  // float4 per particle, as above
+    constexpr int WIDTH = 3;
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
     int lane = threadIdx.x & (LANES - 1);
     float4* all = box + (threadIdx.x - lane) * WIDTH;
     float4* mine = all + lane * WIDTH;
-    float wx[3], wy[3];
-    weights(g[0], wx);
-    weights(g[1], wy);
     mine[0] = make_float4(b[0], b[1], m, __int_as_float(first));
     mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[0][1], A.data[1][1]);
-    mine[2] = make_float4(wx[0] * wy[0], wx[0] * wy[1], wx[0] * wy[2], wx[1] * wy[0]);
-    mine[3] = make_float4(wx[1] * wy[1], wx[1] * wy[2], wx[2] * wy[0], wx[2] * wy[1]);
-    mine[4].x = wx[2] * wy[2];
+    mine[2] = make_float4(g[0], g[1], 0.0f, 0.0f);
     __syncwarp();
 
     int group = lane / 9, own = lane % 9;
     int ox = own / 3 - 1, oy = own % 3 - 1;
+    Weight wx(ox), wy(oy);
     float fx = float(ox), fy = float(oy);
-    int share = (crew + 2) / 3, begin = group * share, end = group < 3 ? min(begin + share, crew) : begin;
+    int share = (crew + 2) / 3, begin = group * share, end = min(begin + share, crew);
+    if (group == 3)
+        begin = end;
     Sink origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
     float x = 0.0f, y = 0.0f, mass = 0.0f;
-    const float4 *q = all + begin * WIDTH, *stop = all + end * WIDTH;
-    int current = q < stop ? __float_as_int(q[0].w) : -1;
-    while (current >= 0) {
-        float4 q0 = q[0], q1 = q[1];
-        float w = reinterpret_cast<const float*>(q + 2)[own];
-        x += w * (q0.x + q1.x * fx + q1.z * fy);
-        y += w * (q0.y + q1.y * fx + q1.w * fy);
-        mass += w * q0.z;
-        q += WIDTH;
-        int next = q < stop ? __float_as_int(q[0].w) : -1;
+    int current = -1;
+    const float4* q = all + min(begin, LANES - 1) * WIDTH;
+    float4 n0 = q[0], n1 = q[1], n2 = q[2];
+    for (int p = begin; p < end; ++p) {
+        float4 q0 = n0, q1 = n1, q2 = n2;
+        q = all + min(p + 1, LANES - 1) * WIDTH;
+        n0 = q[0], n1 = q[1], n2 = q[2];
+        int next = __float_as_int(q0.w);
+        if (next < 0)
+            break;
         if (next != current) {
-            add(cell(origin, current), x, y, mass, 0.0f);
+            if (current >= 0)
+                add(cell(origin, current), x, y, mass, 0.0f);
             x = y = mass = 0.0f;
             current = next;
         }
+        float w = wx(q2.x) * wy(q2.y);
+        x += w * (q0.x + q1.x * fx + q1.z * fy);
+        y += w * (q0.y + q1.y * fx + q1.w * fy);
+        mass += w * q0.z;
     }
+    if (current >= 0)
+        add(cell(origin, current), x, y, mass, 0.0f);
     __syncwarp();
 }
 
@@ -183,6 +206,15 @@ template <typename T> inline void add(T* p, T x, T y, T z, T m)
 }
 
 #endif
+
+// Weights of the three nodes along an axis.
+template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
+{
+    T low = T(0.5) - g, high = T(0.5) + g;
+    w[0] = T(0.5) * low * low;
+    w[1] = T(0.75) - g * g;
+    w[2] = T(0.5) * high * high;
+}
 
 // (A1) node by node: on the CPU, and in double precision.
 template <class Sink, typename T>
@@ -281,6 +313,29 @@ template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(
     T* at = packed<ROWS>(rows, i, r);
     for (int k = 0; k < COUNT; ++k)
         at[k * LANES] = in[k];
+}
+
+// The numbers of each lane's particle to their row of an array in the user's order: lane by lane they would go to COUNT times as
+// many places as the rows are. Threads stand in a line, this one is number i of ``total``; all of a warp come here together.
+template <int COUNT, typename T> CUDA_CALLABLE inline void spread(T* out, int row, const T* value, int i, int total)
+{
+#if defined(__CUDA_ARCH__)
+    __shared__ T box[WP_TILE_BLOCK_DIM * COUNT];
+    int lane = threadIdx.x & (LANES - 1), lanes = min(LANES, total - (i - lane));
+    unsigned together = 0xffffffffu >> (LANES - lanes);
+    T* all = box + (threadIdx.x - lane) * COUNT;
+    for (int k = 0; k < COUNT; ++k)
+        all[lane * COUNT + k] = value[k];
+    __syncwarp(together);
+    for (int n = lane; n < lanes * COUNT; n += lanes) {
+        int owner = n / COUNT;
+        out[(long long)__shfl_sync(together, row, owner) * COUNT + n - owner * COUNT] = all[n];
+    }
+    __syncwarp(together);
+#else
+    for (int k = 0; k < COUNT; ++k)
+        out[(long long)row * COUNT + k] = value[k];
+#endif
 }
 
 // All rows of particle j to the place of particle i.
