@@ -38,7 +38,7 @@ def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
     gpu = device.type == "cuda"
-    particles, nodes, substeps = (64_000, 48, 128) if gpu else (1_000, 16, 20)
+    particles, nodes, substeps = (64_000, 48, 512) if gpu else (1_000, 16, 20)
     table = Table(f"Features, 3D, {particles} particles, float32", device, args.json)
     for name, features in FEATURES.items():
         model = softmpm.build(

@@ -19,7 +19,7 @@ def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
     table = Table("Gradient with little memory, float32", device, args.json)
-    cases = [(64_000, 48, [32, 4, 1, 0.25]), (1_000_000, 96, [60, 6])]
+    cases = [(64_000, 48, [32, 4, 1, 0.25]), (1_000_000, 96, [60, 5, 3])]
     substeps = 1000
     if device.type == "cpu":
         cases, substeps = [(1_000, 16, [1, 0.01])], 100

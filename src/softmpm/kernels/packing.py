@@ -24,6 +24,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     Scale, Packed, Window = t.Scale, t.Packed, t.Window
     entered, left = b.entered, b.left
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    spread_vec, spread_mat = n.spread_vec, n.spread_mat
     pack_base, unpack_base, report = s.pack_base, s.unpack_base, failure.report(dim, dtype).report
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     kept_inside, bad_start = sorting(dim, dtype).kept_inside, int(Kind.START)
@@ -78,8 +79,9 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         low_F: wp.array2d(dtype=mat),
     ):
         world, place = wp.tid()
+        total = order.shape[0] * order.shape[1]
         i = world * order.shape[1] + place
-        p = order[world, place]
+        row = world * order.shape[1] + order[world, place]
         out = left(
             scale,
             unpack_base(base[i]),
@@ -87,13 +89,13 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
             load_vec(rows, i, row_low),
             load_mat(rows, i, row_H),
         )
-        x[world, p] = out.x
-        v[world, p] = load_vec(rows, i, row_v)
-        C[world, p] = load_mat(rows, i, row_C)
-        F[world, p] = out.F
+        spread_vec(x, row, out.x, i, total)
+        spread_vec(v, row, load_vec(rows, i, row_v), i, total)
+        spread_mat(C, row, load_mat(rows, i, row_C), i, total)
+        spread_mat(F, row, out.F, i, total)
         if wp.static(dtype == "float32"):
-            low_x[world, p] = out.low_x
-            low_F[world, p] = out.low_f
+            spread_vec(low_x, row, out.low_x, i, total)
+            spread_mat(low_F, row, out.low_f, i, total)
 
     @wp.kernel(module=module, enable_backward=False)
     def positions(
@@ -149,12 +151,13 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     ):
         """Adjoint of ``enter``."""
         world, place = wp.tid()
+        total = order.shape[0] * order.shape[1]
         i = world * order.shape[1] + place
-        p = order[world, place]
-        adj_x[world, p] = load_vec(adj, i, row_fx) / scale.spacing
-        adj_v[world, p] = load_vec(adj, i, row_v)
-        adj_F[world, p] = load_mat(adj, i, row_H)
-        adj_C[world, p] = load_mat(adj, i, row_C)
+        row = world * order.shape[1] + order[world, place]
+        spread_vec(adj_x, row, load_vec(adj, i, row_fx) / scale.spacing, i, total)
+        spread_vec(adj_v, row, load_vec(adj, i, row_v), i, total)
+        spread_mat(adj_F, row, load_mat(adj, i, row_H), i, total)
+        spread_mat(adj_C, row, load_mat(adj, i, row_C), i, total)
 
     return SimpleNamespace(
         enter=enter,

@@ -55,3 +55,17 @@ def test_sum_over_a_warp(warp, dim, order, crew, count):
     np.testing.assert_allclose(node, want, rtol=0, atol=1e-5)
     if order == "sorted" and count == WARP:
         assert sent < 3**dim * count / 3
+
+
+@pytest.mark.parametrize("count", [32, 13, 1])
+def test_rows_in_the_order_of_the_user(warp, count):
+    """Each lane's numbers come to its row, in a warp that is full or the last of many."""
+    random = np.random.default_rng(0)
+    row, value = (
+        random.permutation(40)[:count].astype(np.int32),
+        random.normal(size=(count, 9)).astype(np.float32),
+    )
+    out, want = (np.zeros((40, 9), np.float32) for _ in range(2))
+    want[row] = value
+    warp.spread9(*(a.ctypes.data_as(ctypes.c_void_p) for a in (out, row, value)), count)
+    assert (out == want).all()

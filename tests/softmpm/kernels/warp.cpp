@@ -30,8 +30,17 @@ template <typename T> T __ldg(const T* p) { return *p; }
 thread_local struct {
     int x;
 } threadIdx;
-std::barrier<> lanes_meet(32);
-inline void __syncwarp() { lanes_meet.arrive_and_wait(); }
+std::barrier<>* lanes_meet;  // those that take part
+inline void __syncwarp(unsigned = 0xffffffffu) { lanes_meet->arrive_and_wait(); }
+int told[32];
+inline int __shfl_sync(unsigned, int value, int lane)
+{
+    told[threadIdx.x] = value;
+    __syncwarp();
+    int heard = told[lane];
+    __syncwarp();
+    return heard;
+}
 
 std::mutex adding;
 int reductions;  // sums of a node that were sent, four numbers each
@@ -56,26 +65,36 @@ template <unsigned N, unsigned M, typename T> struct mat_t {
 
 #include "scatter.h"
 
+// Run a function of the lane on the first ``count`` lanes at once.
+template <typename Work> void run(int count, Work work)
+{
+    std::vector<std::thread> warp;
+    std::barrier<> meeting(count);
+    lanes_meet = &meeting;
+    for (int lane = 0; lane < count; ++lane)
+        warp.emplace_back([=] {
+            threadIdx.x = lane;
+            work(lane);
+        });
+    for (auto& thread : warp)
+        thread.join();
+}
+
 // Add what the lanes give to the nodes; arrays of 32 each. How many sums were sent.
 template <int DIM>
 int add(float* node, const int* shape, int crew, const int* first, const float* g, const float* b, const float* A, const float* m)
 {
-    std::vector<std::thread> warp;
     wp::vec_t<DIM, int> size;
     std::copy_n(shape, DIM, size.c);
     reductions = 0;
-    for (int lane = 0; lane < 32; ++lane)
-        warp.emplace_back([=] {
-            wp::vec_t<DIM, float> g_, b_;
-            wp::mat_t<DIM, DIM, float> A_;
-            std::copy_n(g + DIM * lane, DIM, g_.c);
-            std::copy_n(b + DIM * lane, DIM, b_.c);
-            std::copy_n(A + DIM * DIM * lane, DIM * DIM, &A_.data[0][0]);
-            threadIdx.x = lane;
-            softmpm::add_warp(node, size, crew, first[lane], g_, b_, A_, m[lane]);
-        });
-    for (auto& thread : warp)
-        thread.join();
+    run(32, [=](int lane) {
+        wp::vec_t<DIM, float> g_, b_;
+        wp::mat_t<DIM, DIM, float> A_;
+        std::copy_n(g + DIM * lane, DIM, g_.c);
+        std::copy_n(b + DIM * lane, DIM, b_.c);
+        std::copy_n(A + DIM * DIM * lane, DIM * DIM, &A_.data[0][0]);
+        softmpm::add_warp(node, size, crew, first[lane], g_, b_, A_, m[lane]);
+    });
     return reductions / 4;
 }
 
@@ -86,4 +105,10 @@ extern "C" int add2(float* n, const int* s, int c, const int* f, const float* g,
 extern "C" int add3(float* n, const int* s, int c, const int* f, const float* g, const float* b, const float* A, const float* m)
 {
     return add<3>(n, s, c, f, g, b, A, m);
+}
+
+// The numbers of the first ``count`` lanes' particles, nine each, to their rows.
+extern "C" void spread9(float* out, const int* row, const float* value, int count)
+{
+    run(count, [=](int lane) { softmpm::spread<9>(out, row[lane], value + 9 * lane, 64 + lane, 64 + count); });
 }
