@@ -2,14 +2,14 @@
 
 One elastic cube, one run, float32, every contender in turn, medians after a warm-up, microseconds per substep:
 
-    softmpm           `simulate` as it comes: checks on, states kept in segments if all would take more than 64 MiB
+    softmpm           `simulate` as it comes: checks on, everything kept if that takes a sixteenth of the GPU's memory at most
     softmpm, all      the same with a memory budget for all states, which is what the others keep
     Warp, generated   bench/naive_warp.py: three kernels, Warp's generated adjoint, one CUDA graph forward, one backward
     Taichi            bench/taichi_mpm.py: the DiffTaichi scheme, in a process of its own
 
 `forward` is a run without gradient, `kept` one that keeps what the backward pass needs, `backward` that pass with whatever it
-recomputes. `forward x` and `gradient x` say how often softmpm fits into the time of the contender, the latter for kept and
-backward together. softmpm's times hold its checks and all of Python; a CUDA graph has none of that.
+recomputes. `forward x`, `backward x` and `gradient x` say how often softmpm fits into the time of the contender, the last one for
+kept and backward together. softmpm's times hold its checks and all of Python; a CUDA graph has none of that.
 
 All must compute the same: after 30 substeps, `apart` is the largest difference of a coordinate from softmpm's in dx, `gradient
 apart` the relative difference of the gradient of a random projection of x with respect to the first v. Beyond the tolerances
@@ -199,14 +199,15 @@ def read_taichi(path: Path, device: torch.device) -> list[dict] | None:
 def row(name: str, found: dict | None, ours: dict, substeps: int, dx: float) -> dict:
     """A line of the table; dashes if the contender did not run."""
     if found is None:
-        names = ("forward", "kept", "backward", "forward x", "gradient x", "apart [dx]", "gradient apart")
-        return {"contender": name} | dict.fromkeys(names, "-")
+        times = ("forward", "kept", "backward", "forward x", "backward x", "gradient x")
+        return {"contender": name} | dict.fromkeys((*times, "apart [dx]", "gradient apart"), "-")
     off = found["adj_v"].astype(np.float64) - ours["adj_v"]
     both = [r["kept"] + r["backward"] for r in (found, ours)]
     return {
         "contender": name,
         **{part: float(found[part]) / substeps * 1e6 for part in ("forward", "kept", "backward")},
         "forward x": float(found["forward"] / ours["forward"]),
+        "backward x": float(found["backward"] / ours["backward"]),
         "gradient x": float(both[0] / both[1]),
         "apart [dx]": float(np.abs(found["end"].astype(np.float64) - ours["end"]).max() / dx),
         "gradient apart": float(np.linalg.norm(off) / np.linalg.norm(ours["adj_v"])),
