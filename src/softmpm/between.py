@@ -1,4 +1,8 @@
-"""States and adjoints between two chunks, as the kernels hold them: only the two ends of a call are in the user's order."""
+"""States and adjoints between two chunks, as the kernels hold them: only the two ends of a call are in the user's order.
+
+A chunk takes its start straight from the buffers in which the one before left its end. These stay on loan as long as somebody holds
+the :class:`SortedState`.
+"""
 
 import torch
 import warp as wp
@@ -21,27 +25,25 @@ def padded(model: Model) -> int:
 
 
 class Unpacking:
-    """The launches that lead from packed particles back to the user's order. They belong to one thread and stream."""
+    """The launches that lead from packed particles back to the user's order."""
 
     def __init__(self, model: Model):
         self.model = model
         spec, lead = model.spec, (model.worlds, model.particle_count)
         t, pack, places = types(spec.dim, spec.dtype), packing(spec.dim, spec.dtype), padded(model)
-        end = t.vec, t.vec, t.mat, t.mat
-        low = (t.vec, t.mat) if model.dtype == torch.float32 else ()
+        order, base, rows = (wp.int32,), (wp.int32, places), (t.real, places * t.rows)
+        scale, end = (model.scale,), [(t.vec,), (t.vec,), (t.mat,), (t.mat,)]
+        low = [(t.vec,), (t.mat,)] if model.dtype == torch.float32 else []
+        nothing = (2 - len(low)) * (None,)
 
-        def command(kernel, parameters, held, out, none=()) -> Command:
-            given = [slot(model, wp.int32)]  # the order
-            given += [slot(model, wp.int32, places)] * ("base" in held)
-            given += [slot(model, t.real, places * t.rows)] * ("rows" in held)
-            slots = given + [slot(model, dtype) for dtype in out]
+        def command(kernel, parameters, *fields, none=()) -> Command:
+            slots = [slot(model, *field) for field in fields]
             return Command(model, kernel, lead, (*parameters, *slots, *none), slots)
 
-        self.invert = command(sorting(spec.dim, spec.dtype).invert, (), (), (wp.int32,))
-        scale, both, none = (model.scale,), ("base", "rows"), (2 - len(low)) * (None,)
-        self.leave = command(pack.leave, scale, both, end + low, none)
-        self.positions = command(pack.positions, scale, both, (t.vec,))
-        self.leave_adj = command(pack.leave_adj, scale, ("rows",), end)
+        self.invert = command(sorting(spec.dim, spec.dtype).invert, (), order, (wp.int32,))
+        self.leave = command(pack.leave, scale, order, base, rows, *end, *low, none=nothing)
+        self.positions = command(pack.positions, scale, order, base, rows, (t.vec,))
+        self.leave_adj = command(pack.leave_adj, scale, order, rows, *end)
 
     def fields(self, *axes: int) -> list[Tensor]:
         """New tensors of the shape (world, particle, ...) with so many more axes each."""

@@ -26,9 +26,9 @@ class Pair(NamedTuple):
     adjoints: dict[Wanted, ProgramAdj]
 
 
-STAY = {False: 8, True: 2}
-"""Shapes of chunks whose programs always stay, by whether these keep what is inside: a call has two shapes at most. Programs that
-keep nothing are small, and serve calls with and without gradient in turn."""
+STAY = {False: 4, True: 2}
+"""Shapes of chunks whose programs always stay, by whether these keep what is inside: a call has two shapes at most, and programs that
+keep nothing serve calls with and without gradient in turn."""
 
 
 class Pool:
@@ -88,11 +88,11 @@ class _Lease:
 
 
 class FastRun:
-    """One chunk that ran; as long as it lives, its program keeps what is inside.
+    """One chunk that ran; as long as it or its end lives, its program is used for nothing else.
 
     Attributes:
         renewed: Whether the arrangement was made for its start.
-        start, end: State before and after it.
+        start, end: State before and after it; the end lies in the program's buffers.
         words: What the kernels reported, see watch.py; then cells met along the order of the particles, and whether one is
             near the window's edge; shape (world + 2,).
     """

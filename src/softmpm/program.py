@@ -1,7 +1,8 @@
 """The fast scheme's substeps of one chunk as a fixed list of launches on buffers of its own, replayed as a graph.
 
 A graph holds addresses, so everything that changes between calls is copied to fixed places first: the start, the material, the
-pull of the muscles. A program that kept its states is lent to one call until its backward pass is done.
+pull of the muscles. A program is lent: one that kept its states until the backward pass is done, any other until nothing starts from
+its end.
 """
 
 import functools
@@ -101,7 +102,7 @@ class Program:
             self.solids.append(solid)
 
     def _commands(self) -> None:
-        """The launches between what users hold and the buffers."""
+        """The launches that fill the buffers, from what users hold or from the end of another program."""
         model, t, pack, lead = self.model, self.types, self.packing, self.lead
         at, low = (model.scale, self.window, self.order_array), (t.vec, t.mat)
         state = (t.vec, t.vec, t.mat, t.mat)
@@ -144,16 +145,16 @@ class Program:
 
     @functools.cached_property
     def crew(self) -> int:
-        """Particles of a warp going forward; see :meth:`crew_of`."""
-        return self.crew_of(half=self.types.dim == 2)
+        """Particles of a warp going forward."""
+        return self.crew_of(may_halve=self.types.dim == 2)
 
-    def crew_of(self, half: bool) -> int:
-        """Particles of a warp: all of its threads, or ``half`` of them while the GPU has more room than warps.
+    def crew_of(self, may_halve: bool) -> int:
+        """Particles of a warp: as many as it has threads or, if it may, half as many while the GPU has more room than warps.
 
-        Then each walks a shorter way, but more sums are sent: whether that pays was measured.
+        Then each walks a shorter way, but more sums are sent: where that pays was measured.
         """
         few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
-        return WARP // 2 if half and few else WARP
+        return WARP // 2 if may_halve and few else WARP
 
     def threads(self, crew: int) -> int:
         """Threads of a launch over particles: on a GPU whole blocks, since the lanes of a warp work together."""
@@ -185,9 +186,7 @@ class Program:
         if isinstance(start, SortedState):
             self._move(stream, start.places(), start.base, start.rows)
         else:
-            given = [
-                tensor.contiguous() for tensor in (*start, *(start.low or ()))
-            ]  # kept until it is launched
+            given = [tensor.contiguous() for tensor in (*start, *(start.low or ()))]
             self._enter[start.low is not None](stream, *given)
 
     def _has(self, solid: Solid) -> bool:
@@ -214,10 +213,9 @@ class Program:
             arguments = (self.model.scale, self.model.walls, self.window, now, self.velocity_array, then)
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
-        if not recording(self.model):  # else nobody can look
-            survey = sorting(self.types.dim, self.model.spec.dtype).survey
-            arguments = (self.model.scale, self.window, self.model.particle_count, self.packed[-1].base)
-            launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
+        survey = sorting(self.types.dim, self.model.spec.dtype).survey
+        arguments = (self.model.scale, self.window, self.model.particle_count, self.packed[-1].base)
+        launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
 
     def _begin(self, launch: Launcher) -> None:
         """P2G of the first substep."""

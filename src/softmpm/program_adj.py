@@ -83,14 +83,18 @@ class ProgramAdj:
         if self.adj_pull is not None:
             clear(self.adj_pull)
         program.calm()
-        if isinstance(adj_end, SortedAdj):
-            self._move(stream, adj_end.places(), adj_end.rows)
-        else:
-            self._enter(stream, *adj_end)
+        self._take(stream, adj_end)
         self._backward.run(stream, self._launch_all)
         if adj_solid.mass is not None and adj_solid.mu is not None and adj_solid.lam is not None:
             self._sort(stream, adj_solid.mass, adj_solid.mu, adj_solid.lam)
         return None if self.adj_pull is None else self.adj_pull.clone()
+
+    def _take(self, stream: wp.Stream | None, adj_end: State | SortedAdj) -> None:
+        """Put the adjoint of the end where the kernels look for it."""
+        if isinstance(adj_end, SortedAdj):
+            self._move(stream, adj_end.places(), adj_end.rows)
+        else:
+            self._enter(stream, *adj_end)
 
     def _launch_all(self, launch: Launcher) -> None:
         for s in range(self.program.chunk.length, -1, -1):
@@ -119,7 +123,7 @@ class ProgramAdj:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         program, scratch, (here, before) = self.program, self.scratch, self._adj_nodes(s)
         model, length, exact = program.model, program.chunk.length, scratch.exact
-        crew = program.crew_of(half=True)
+        crew = program.crew_of(may_halve=True)
         sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = program.solid(min(s, length - 1)), s == 0, s == length
         parameters = (model.scale, solid, program.window, length - 1 - s, start, end, crew)

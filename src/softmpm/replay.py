@@ -1,5 +1,6 @@
 """Launches that are made once and then repeated: one on other tensors each time, or a list on fixed ones as a graph."""
 
+import threading
 from collections.abc import Callable, Sequence
 
 import torch
@@ -107,14 +108,18 @@ class Command:
         self._slots = slots
         launch = wp.launch(kernel, dim, inputs, device=model.wp_device, record_tape=False, record_cmd=True)
         assert launch is not None
-        self._launch = launch
+        self._launch, self._filling = launch, threading.Lock()
 
     def __call__(self, stream: wp.Stream | None, *tensors: torch.Tensor) -> None:
-        """Launch it on contiguous tensors of the slots' shapes and precision."""
-        for slot, tensor in zip(self._slots, tensors, strict=True):
-            assert tensor.is_contiguous()
-            slot.data = tensor.data_ptr()
-        self._launch.launch(stream)
+        """Launch it on contiguous tensors of the slots' shapes and precision.
+
+        A backward pass runs in a thread of its own and shares commands with that of the call: one of them at a time.
+        """
+        assert all(tensor.is_contiguous() for tensor in tensors)
+        with self._filling:
+            for slot, tensor in zip(self._slots, tensors, strict=True):
+                slot.data = tensor.data_ptr()
+            self._launch.launch(stream)
 
 
 class Replay:
@@ -149,7 +154,7 @@ class Replay:
             launch.launch()
 
     def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph:
-        stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
+        stream = wp.Stream(self.model.wp_device)  # PyTorch's come again: one could be the current one
         with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
             launches(Launcher(self.model, stream))
         assert capture.graph is not None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from softmpm import schedule
-from softmpm.between import SortedState
+from softmpm.between import SortedAdj, SortedState
 from softmpm.buffers import Solid, SolidAdj
 from softmpm.failures import Report, outgrown, raise_failure, raise_gradient_failure
 from softmpm.fast import Fast, FastRun, fast
@@ -120,12 +120,13 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     return _as_state(state), trail if keep else None
 
 
-def _as_state(between: State | SortedState) -> State:
+def _as_state(between: State | SortedState | SortedAdj) -> State:
+    """In the user's order."""
     return between if isinstance(between, State) else between.state()
 
 
 def _kept(between: State | SortedState) -> State | SortedState:
-    """To be kept without the buffers that it lies in."""
+    """In memory of its own, so that a program's buffers are not on loan meanwhile; a :class:`State` is never written to."""
     return between if isinstance(between, State) else between.copy()
 
 
@@ -175,7 +176,7 @@ def rollout_adj(
     for report, last in reports:
         words = report.read()[: model.worlds]
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
-    return adj if isinstance(adj, State) else adj.state(), adj_solid, adj_pull
+    return _as_state(adj), adj_solid, adj_pull
 
 
 def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:

@@ -1,5 +1,7 @@
 """The fast scheme: when it is chosen, that it does what the plain one does, and that its programs serve many calls."""
 
+import queue
+import sys
 import threading
 
 import numpy as np
@@ -9,6 +11,7 @@ from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent,
 
 import softmpm
 from softmpm import autograd, fast, memory, program
+from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid
 from softmpm.horizon import Chunk, Horizon
 from softmpm.kernels.types import BASE_BITS, packed_rows
@@ -391,6 +394,90 @@ def test_threads_share_a_model(short_chunks, device):
     for seed, found in got.items():
         for gradient in found:
             assert_gradient(gradient, want[seed], device)
+
+
+def test_a_backward_pass_in_another_thread(short_chunks, device, monkeypatch):
+    """One thread simulates, another pulls back what it gave, at once: both launch what leads from chunk to chunk."""
+    monkeypatch.setattr(memory, "LONGEST", 1)
+    built, want, rounds = model(device=device), alone(1, device), 30
+    waiting, errors = queue.Queue(4), []
+    list(calls(built, [1]))
+
+    def simulate():
+        for _ in range(rounds):
+            for call in calls(built, [1]):
+                waiting.put(call)
+
+    def pull_back():
+        for _ in range(rounds):
+            try:
+                assert_gradient(pull(*waiting.get(timeout=60)), want, device)
+            except BaseException as error:
+                errors.append(error)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=work) for work in (simulate, pull_back)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not errors, errors[0]
+
+
+# -- from chunk to chunk --------------------------------------------------------------------------------------------
+
+
+def test_a_start_stays_until_nothing_needs_it(device):
+    """Chunks that run ahead write nowhere into what an earlier one started from: it may have to run again."""
+    built = model(device=device)
+    mu, lam, mass = autograd._material(built, built.params())
+    runner, chunk, state = fast.Fast(built), Chunk(0, 2, 2), built.rest()
+    state.v.add_(0.3)
+    pull = torch.zeros(1, 1, built.muscle_count, device=device)
+
+    def after(start):
+        return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end
+
+    first = after(state)
+    want, later = first.state(), first
+    for _ in range(4):
+        later = after(later)
+    for got, held in zip(first.state(), want, strict=True):
+        assert torch.equal(got, held)
+
+
+@pytest.fixture
+def shuffled(monkeypatch):
+    """Before each chunk another order is drawn at random."""
+    renew = Arrangement.renew
+
+    def anew(self, x):
+        renew(self, x)
+        for order in self.order:
+            order.copy_(order[torch.randperm(len(order)).to(order.device)])
+
+    monkeypatch.setattr(Arrangement, "renew", anew)
+    monkeypatch.setattr(Arrangement, "judge", lambda self, *_: setattr(self, "stale", True))
+
+
+@pytest.mark.parametrize("kept", ["all", "some"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_order_may_change_from_chunk_to_chunk(dim, kept, shuffled, short_chunks, device):
+    """End and gradients are those of the plain scheme when particles of two worlds change their places before each chunk."""
+    settings = {"dim": dim, "device": device, "dtype": torch.float64, "worlds": 2}
+    sizes = model(**settings).sizes()
+    budget = 2**30 if kept == "all" else 9 * (sizes.inside + sizes.nodes) + 3 * sizes.between
+    built = [model(scheme="fast", memory_budget=budget, **settings), model(scheme="plain", **settings)]
+    assert plan(Horizon(2, 20), built[0].sizes(), built[0].budget).keep_all == (kept == "all")
+    got, want = (
+        gradients(softmpm.simulate, m, busy_inputs(m, control_steps=2, seed=1), substeps=20) for m in built
+    )
+    for name in INPUTS:
+        assert_relative(got[name], want[name], 1e-12, name)
 
 
 # -- failures -----------------------------------------------------------------------------------------------------
