@@ -1,6 +1,7 @@
 """What does a gradient through a thousand substeps cost with little memory? `python bench/memory.py [--device cuda] [--json FILE]`
 
-Peak memory of one call and its backward pass, and the time of both, against memory for everything where that fits.
+Peak memory of one call and its backward pass, what the formula of docs/memory.md says of it, and the time of both, against memory for
+everything where that fits.
 """
 
 import time
@@ -10,7 +11,7 @@ from common import Table, arguments, cube, sync, turning
 
 import softmpm
 from softmpm.horizon import Horizon
-from softmpm.memory import plan
+from softmpm.memory import memory, plan
 
 GIB = 2**30
 
@@ -26,7 +27,8 @@ def main():
     for particles, nodes, budgets in cases:
         for budget in budgets:
             model = softmpm.build(cube(3, particles, nodes), device=device, memory_budget=round(budget * GIB))
-            chosen = plan(Horizon(1, substeps), model.sizes(), model.budget)
+            horizon = Horizon(1, substeps)
+            chosen = plan(horizon, model.sizes(), model.budget)
             start, params, seconds = turning(model), model.params(), []
             start.v.requires_grad_()
             for _ in range(2):  # the first compiles
@@ -48,6 +50,7 @@ def main():
                     "chunk": chosen.longest,
                     "states kept": chosen.slots or "all",
                     "peak GiB": peak / GIB,
+                    "formula GiB": memory(model, horizon).backward / GIB,
                     "forward and backward s": seconds[-1],
                 }
             )

@@ -2,8 +2,9 @@
 
 Neither has to be exact. An order that has grown stale costs speed, never correctness, and is renewed when particles that stand
 next to each other share their cell too rarely. The window is the part of the grid that is in memory, in each world at a place of
-its own; a particle that is about to leave it is seen in time, one that does leave it stops the call, which then starts again
-with a larger window. The cost of a substep follows the window, not the grid.
+its own; a particle that is about to leave it is seen in time. When one does leave it, its chunk runs again: with the window put
+around its start or, if it was already there, with a larger one. A recorded graph cannot look: after a replay in which a particle left,
+the window grows and the graph is recorded once more. The cost of a substep follows the window, not the grid.
 """
 
 import math
@@ -39,7 +40,7 @@ class Arrangement:
         shape: Nodes of the window along each axis.
         version: How often it was renewed.
         stale: Whether to renew it.
-        outgrown: Whether to take a larger one.
+        outgrown: Whether to take a larger one, because a particle left the window inside a recorded graph.
     """
 
     def __init__(self, model: Model, x: Tensor, least: tuple[int, ...] = ()):
@@ -116,7 +117,7 @@ class Arrangement:
         return Arrangement(self.model, x, least=tuple(math.ceil(1.5 * n) for n in self.shape))
 
     def outgrow(self) -> None:
-        """A particle left the window inside a recorded graph, where nobody could renew it in time."""
+        """Take note that a particle left the window inside a recorded graph: the next call that is not recorded takes a larger one."""
         self.outgrown = True
 
     def judge(self, cells: int, near_edge: bool) -> None:

@@ -3,7 +3,7 @@
 A call is cut into chunks. To pull a chunk back, what is inside it must be there: its states and the mass and momentum of the
 nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
 
-    keep all:  everything inside all chunks, N (S + G); nothing runs twice
+    keep all:  everything inside all chunks, N (S + G) and one S for each; nothing runs twice
     schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
                chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (schedule.py)
 """
@@ -44,8 +44,17 @@ def longest_chunk(particles: int) -> int:
     return LONGEST if particles < MANY else LONGEST_OF_MANY
 
 
+def price_of_chunk(particles: int) -> int:
+    """What each chunk costs besides its substeps, in substeps, as measured with the fast scheme on an H200.
+
+    Half a millisecond of the host with few particles; sorting and moving them with many.
+    """
+    least, most = 4, 48
+    return max(least, min(most, 3_000_000 // particles))
+
+
 class Sizes(NamedTuple):
-    """Bytes of what a call may keep."""
+    """Bytes of what a call may keep, and what decides how long its chunks are."""
 
     inside: int
     """State of all worlds inside a chunk."""
@@ -55,8 +64,8 @@ class Sizes(NamedTuple):
     """State of all worlds between chunks."""
     longest: int
     """Substeps of a chunk, at most."""
-    chunk: int
-    """Substeps that take as long as what comes with each chunk besides its substeps."""
+    price: int
+    """What each chunk costs besides its substeps, in substeps."""
 
 
 class Plan(NamedTuple):
@@ -99,7 +108,8 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
             continue
         runs = recomputed(len(chunks), slots)
         length = max(chunk.length for chunk in chunks)
-        if (cost := runs * length + (2 * len(chunks) + runs) * sizes.chunk) < least:
+        # Each chunk runs forward and is pulled back, some run again between.
+        if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
             best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
     if best is None:
         smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes
@@ -111,7 +121,10 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
 
 
 def _lengths(substeps: int, longest: int) -> list[int]:
-    """Of chunks, the longest first: halved again and again, and those that leave no shorter chunk, whose memory would be one more."""
+    """Lengths of chunks to try, the longest first: halved again and again, and those that divide a control step.
+
+    These leave no shorter chunk, which would need buffers of its own.
+    """
     halved = (longest >> k for k in range(longest.bit_length()))
     even = (n for n in range(1, longest + 1) if substeps % n == 0)
     return sorted({*halved, *even}, reverse=True)
@@ -129,7 +142,7 @@ class Memory(NamedTuple):
 
 
 def memory(model, horizon) -> Memory:
-    """Evaluates (memory) for one call, all gradients wanted."""
+    """Evaluates the formula of docs/memory.md for one call, all gradients wanted."""
     real, sizes = model.dtype.itemsize, model.sizes()
     particles = model.worlds * model.particle_count
     state = particles * real * (2 * model.dim + 2 * model.dim**2)  # x, v, C, F of the end, or their adjoints
@@ -137,17 +150,31 @@ def memory(model, horizon) -> Memory:
     material, pull = 4 * particles * real, particles * model.spec.muscle_slots * real
     chosen = plan(horizon, sizes, model.budget)
     if model.scheme == "fast":
-        chunks = len(horizon.chunks(sizes.longest))
-        # At most three chunks at a time: one that runs, one launched ahead, one that holds the start of the first.
         program = material + sizes.nodes + (2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0)
-        forward = min(chunks, 3) * (program + sizes.inside + 2 * sizes.nodes)
+        small = program + sizes.inside + 2 * sizes.nodes
+        forward = small * _at_once(horizon, sizes.longest)
         handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
-        own = program * (len(horizon.chunks(chosen.longest)) if chosen.keep_all else 1)
-        small = 0 if chosen.keep_all else forward
+        if chosen.keep_all:
+            own = program * len(horizon.chunks(chosen.longest))
+        else:
+            own = program * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
+            # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
+            handed += 2 * small if model.device.type == "cuda" else 0
     else:
-        forward, handed, own, small = 2 * sizes.inside, sizes.inside, 0, 0
-    kept = chosen.kept + own + small + material
+        forward, handed, own = 2 * sizes.inside, sizes.inside, 0
+    kept = chosen.kept + own + material
     adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
     return Memory(forward + material + state + low, kept, kept + chosen.recomputed + state + adjoints)
+
+
+def _shapes(horizon, longest: int) -> int:
+    return len({chunk.shape for chunk in horizon.chunks(longest)})
+
+
+def _at_once(horizon, longest: int) -> int:
+    """Programs of chunks that keep nothing inside: one that runs, one launched ahead, one that holds the start of the first, and one of
+    another shape that waits.
+    """
+    return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))

@@ -12,7 +12,7 @@ from torch import Tensor
 from softmpm.checks import check_scene
 from softmpm.description import describe
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, window_shape
+from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, price_of_chunk, window_shape
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
 from softmpm.stability import warn_unstable
 from softmpm.state import Low, Params, State
@@ -243,21 +243,16 @@ class Model:
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see softmpm/memory.py."""
         real, d, particles = self.dtype.itemsize, self.dim, self.worlds * self.particle_count
-        low = 1.5 if real == 4 else 1
-        between = round(particles * real * low * (2 * d + 2 * d * d))
         if self.scheme == "fast":
             inside = particles * (4 + real * packed_rows(d).rows)
             nodes = self.worlds * self.held_nodes * 4 * real
             between = inside + 4 * particles  # and their order
-            return Sizes(inside, nodes, between, longest_chunk(particles), self._price_of_a_chunk())
-        inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-        return Sizes(inside, 0, between, longest_chunk(particles), self._price_of_a_chunk())
-
-    def _price_of_a_chunk(self) -> int:
-        """In substeps: on a GPU the host's half millisecond for few particles, sorting and moving them for many."""
-        if self.device.type == "cpu":
-            return 1
-        return max(4, min(48, 3_000_000 // (self.worlds * self.particle_count)))
+        else:
+            inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
+            nodes = 0
+            between = round(particles * real * (1.5 if real == 4 else 1) * (2 * d + 2 * d * d))
+        price = 1 if self.device.type == "cpu" else price_of_chunk(particles)
+        return Sizes(inside, nodes, between, longest_chunk(particles), price)
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""

@@ -46,9 +46,8 @@ def fused(spec: Spec) -> SimpleNamespace:
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     report = failure.report(spec.dim, spec.dtype).report
     module = native_module(spec.module + ".fused")
-    bounds = (
-        (BLOCK, 6) if dim == 2 else None
-    )  # measured; in 3D the compiler alone finds what is fastest on the whole
+    # At least six blocks on a multiprocessor, measured; in 3D the compiler alone finds what is fastest on the whole.
+    bounds = (BLOCK, 6) if dim == 2 else None
 
     @wp.func
     def centre(fx: vec) -> vec:

@@ -7,15 +7,24 @@
 // with g the distance from the middle node in cells, -1/2 <= g < 1/2. Both scatters have this form: momentum and mass of the
 // forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
 // share their nodes. The warp therefore turns the sum around: its first lanes, the ``crew``, have a particle each and write its
-// (b, A, m, g) to shared memory, then three groups of nine lanes own the nodes, walk through a third of the particles each, add up
-// in registers while the cell stays the same, and send one 16-byte reduction per node and cell. Lanes 27 to 31 own nothing. What
-// comes next is read before it is waited for: with few particles that is where the time goes.
+// (b, A, m, g) to shared memory, in 3D the weights along z in place of g_z; then three groups of nine lanes own the nodes, walk through
+// a third of the particles each, add up in registers while the cell stays the same, and send one 16-byte reduction per node and cell.
+// Lanes 27 to 31 own nothing. What comes next is read before it is waited for: with few particles that is where the time goes.
 namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 
 // Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
+
+// Weights of the three nodes along an axis.
+template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
+{
+    T low = T(0.5) - g, high = T(0.5) + g;
+    w[0] = T(0.5) * low * low;
+    w[1] = T(0.75) - g * g;
+    w[2] = T(0.5) * high * high;
+}
 
 #if defined(__CUDA_ARCH__)
 
@@ -71,12 +80,13 @@ CUDA_CALLABLE inline void add_warp(
     int lane = threadIdx.x & (LANES - 1);
     float4* all = box + (threadIdx.x - lane) * WIDTH;
     float4* mine = all + lane * WIDTH;
-    float low = 0.5f - g[2], high = 0.5f + g[2];
+    float wz[3];
+    weights(g[2], wz);
     mine[0] = make_float4(b[0], b[1], b[2], m);
     mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], g[0]);
     mine[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], g[1]);
-    mine[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], 0.5f * low * low);
-    mine[4] = make_float4(0.75f - g[2] * g[2], 0.5f * high * high, __int_as_float(first), 0.0f);
+    mine[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], wz[0]);
+    mine[4] = make_float4(wz[1], wz[2], __int_as_float(first), 0.0f);
     __syncwarp();
 
     int group = lane / 9, column = lane % 9;
@@ -146,7 +156,7 @@ CUDA_CALLABLE inline void add_warp(
     Sink node, const wp::vec_t<2, int>& shape, int crew, int first, const wp::vec_t<2, float>& g,
     const wp::vec_t<2, float>& b, const wp::mat_t<2, 2, float>& A, float m)
 {
-    constexpr int WIDTH = 3;
+    constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, free of bank conflicts as well
     __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
     int lane = threadIdx.x & (LANES - 1);
     float4* all = box + (threadIdx.x - lane) * WIDTH;
@@ -206,15 +216,6 @@ template <typename T> inline void add(T* p, T x, T y, T z, T m)
 }
 
 #endif
-
-// Weights of the three nodes along an axis.
-template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
-{
-    T low = T(0.5) - g, high = T(0.5) + g;
-    w[0] = T(0.5) * low * low;
-    w[1] = T(0.75) - g * g;
-    w[2] = T(0.5) * high * high;
-}
 
 // (A1) node by node: on the CPU, and in double precision.
 template <class Sink, typename T>
@@ -315,8 +316,9 @@ template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(
         at[k * LANES] = in[k];
 }
 
-// The numbers of each lane's particle to their row of an array in the user's order: lane by lane they would go to COUNT times as
-// many places as the rows are. Threads stand in a line, this one is number i of ``total``; all of a warp come here together.
+// Write the COUNT numbers of each lane's particle to its row of an array in the user's order. The lanes of a warp write a row together:
+// alone, a lane would touch a row COUNT times, one number at a time. Threads stand in a line, this one is number i of ``total``; all of
+// a warp come here together.
 template <int COUNT, typename T> CUDA_CALLABLE inline void spread(T* out, int row, const T* value, int i, int total)
 {
 #if defined(__CUDA_ARCH__)

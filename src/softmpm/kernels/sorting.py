@@ -1,4 +1,4 @@
-"""The order of the particles: where they are, whether it is still good, and how to take up another one.
+"""The order of the particles: keys to sort by, how good it still is, how to pass from one to another; and where the window goes.
 
 ``order`` names, for each place in the packed particles, the particle of its world that stands there.
 """
@@ -47,9 +47,8 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         x: wp.array2d(dtype=vec),
         sorted_x: wp.array2d(dtype=vec),  # what the order follows
         # Out:
-        key: wp.array2d(
-            dtype=wp.int32
-        ),  # grows with the cell, along the last axis first; odd in its upper half
+        # It grows with the cell, along the last axis first, and is odd in the upper half of a cell.
+        key: wp.array2d(dtype=wp.int32),
         # Out, lowered and raised:
         low: wp.array2d(dtype=wp.int32),
         high: wp.array2d(dtype=wp.int32),
@@ -102,24 +101,24 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         # In:
         base: wp.array(dtype=wp.int32),
         # Out, added into:
-        cells: wp.array(
-            dtype=wp.int64
-        ),  # met going along the order; then whether a particle is near the window's edge
+        # Cells met going along the order; then whether a particle is near the window's edge.
+        found: wp.array(dtype=wp.int64),
     ):
+        """How good order and window still are."""
         i = wp.tid()
         world = i / count
         sample = 1 + count * window.origin.shape[0] / SAMPLES  # all of few particles, some warps of many
         if (i / WARP) % sample == 0 and (i == world * count or base[i] != base[i - 1]):
-            wp.atomic_add(cells, 0, wp.int64(sample))
+            wp.atomic_add(found, 0, wp.int64(sample))
         here = unpack_base(base[i])
         for axis in range(dim):
             first = window.origin[world][axis]
             room = here[axis] - first
             if room < 2 and first > 0:
-                cells[1] = wp.int64(1)
+                found[1] = wp.int64(1)
             room = first + window.shape[axis] - 3 - here[axis]
             if room < 2 and first + window.shape[axis] < scale.shape[axis]:
-                cells[1] = wp.int64(1)
+                found[1] = wp.int64(1)
 
     @wp.kernel(module=module, enable_backward=False)
     def invert(

@@ -1,0 +1,80 @@
+"""The plan of what a call keeps, and the formula of its memory."""
+
+import numpy as np
+import pytest
+from helpers import busy_scene
+
+import softmpm
+from softmpm.horizon import Horizon
+from softmpm.memory import Plan, Sizes, plan, price_of_chunk
+from softmpm.schedule import going_back
+
+SIZES = Sizes(inside=100, nodes=10, between=104, longest=64, price=4)
+
+
+def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
+    """Substeps that run again before their pull-back, and how many chunks run in all, by going through the moves."""
+    chunks = horizon.chunks(chosen.longest)
+    moves = list(going_back(len(chunks), chosen.slots))
+    substeps = sum(chunks[move.stage].length for move in moves if move.kind == "advance")
+    return substeps, len(chunks) + sum(move.kind in ("advance", "pull_back") for move in moves)
+
+
+def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
+    """In substeps."""
+    substeps, chunks = again(chosen, horizon)
+    return substeps + sizes.price * chunks
+
+
+@pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
+def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon):
+    """What is kept and what is run again fit, shorter last chunks included; with more memory it takes no longer."""
+    times = []
+    for budget in np.geomspace(600, 100_000, 20).astype(int):
+        chosen = plan(horizon, SIZES, int(budget))
+        if chosen.keep_all:
+            break
+        shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
+        inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
+        assert chosen.kept == chosen.slots * SIZES.between and chosen.recomputed == inside + SIZES.between
+        assert chosen.kept + chosen.recomputed <= budget
+        times.append(seconds(chosen, horizon, SIZES))
+    assert len(times) > 3 and times == sorted(times, reverse=True)
+
+
+def test_the_price_of_a_chunk_makes_chunks_longer():
+    """Where memory is short, many short chunks run least again; what each costs besides decides against them."""
+    horizon, budget = Horizon(1, 64), 64 * 110 // 5
+    free, dear = (plan(horizon, SIZES._replace(price=price), budget) for price in (0, 10))
+    assert free.longest < dear.longest
+    assert (
+        again(free, horizon)[0] < again(dear, horizon)[0]
+        and again(free, horizon)[1] > again(dear, horizon)[1]
+    )
+    for sizes, better, worse in (
+        (SIZES._replace(price=0), free, dear),
+        (SIZES._replace(price=10), dear, free),
+    ):
+        assert seconds(better, horizon, sizes) < seconds(worse, horizon, sizes)
+
+
+def test_chunks_that_divide_a_control_step_save_the_memory_of_a_shorter_one():
+    """1000 substeps: 25 at a time, where 32 would leave 8, with buffers of their own."""
+    assert plan(Horizon(1, 1000), SIZES, 6_000).longest == 25
+    assert plan(Horizon(1, 1024), SIZES, 6_000).longest == 32
+
+
+def test_the_price_of_a_chunk_falls_with_the_particles():
+    """48 substeps for few of them, 4 for many, never rising in between."""
+    prices = [price_of_chunk(n) for n in (1, 62_500, 62_501, 300_000, 750_000, 10_000_000)]
+    assert prices[:2] == [48, 48] and prices[-2:] == [4, 4] and prices == sorted(prices, reverse=True)
+
+
+def test_sizes_of_both_schemes():
+    """Between chunks the fast scheme keeps a state and an order; the plain one keeps no nodes."""
+    fast, plain = (
+        softmpm.build(busy_scene(3), device="cpu", scheme=name).sizes() for name in ("fast", "plain")
+    )
+    particles = softmpm.build(busy_scene(3), device="cpu").particle_count
+    assert fast.between == fast.inside + 4 * particles and fast.nodes > 0
+    assert plain.nodes == 0 and fast.price == plain.price == 1
