@@ -238,7 +238,7 @@ class Model:
         if self.scheme == "plain":
             return self.node_count
         cells = np.floor(self._exact_positions / self.scene.grid.spacing - 0.5)
-        return math.prod(window_shape(self.scene.grid.shape, np.ptp(cells, axis=0).astype(int)))
+        return math.prod(window_shape(self.scene.grid.shape, np.ptp(cells, axis=0).astype(int).tolist()))
 
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see softmpm/memory.py."""

@@ -154,7 +154,7 @@ class Replay:
             launch.launch()
 
     def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph:
-        stream = wp.Stream(self.model.wp_device)  # PyTorch's come again: one could be the current one
+        stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
         with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
             launches(Launcher(self.model, stream))
         assert capture.graph is not None
