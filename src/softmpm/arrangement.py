@@ -3,8 +3,9 @@
 Neither has to be exact. An order that has grown stale costs speed, never correctness, and is renewed when particles that stand
 next to each other share their cell too rarely. The window is the part of the grid that is in memory, in each world at a place of
 its own; a particle that is about to leave it is seen in time. When one does leave it, its chunk runs again: with the window put
-around its start or, if it was already there, with a larger one. A recorded graph cannot look: after a replay in which a particle left,
-the window grows and the graph is recorded once more. The cost of a substep follows the window, not the grid.
+around its start or, if it was already there or this is not the first time, with a larger one. A recorded graph cannot look: after a
+replay in which a particle left, the window grows and the graph is recorded once more. The cost of a substep follows the window, not the
+grid.
 """
 
 import math
@@ -18,7 +19,7 @@ from softmpm.failures import Report
 from softmpm.kernels.native import FEW
 from softmpm.kernels.sorting import sorting
 from softmpm.kernels.types import types
-from softmpm.memory import window_shape
+from softmpm.memory import MARGIN, window_shape
 from softmpm.model import Model
 from softmpm.replay import Command, recording
 from softmpm.step import stream_of
@@ -32,7 +33,7 @@ class Arrangement:
 
     Args:
         x: Positions to start from [m], shape (world, particle, dim).
-        least: Nodes that the window has at least along each axis.
+        before: One whose window was too small, if there is one: its margin is doubled, and nothing gets smaller.
 
     Attributes:
         order: Particle at each place, shape (world, particle), int32.
@@ -40,13 +41,15 @@ class Arrangement:
         shape: Nodes of the window along each axis.
         version: How often it was renewed.
         stale: Whether to renew it.
+        left: Whether a particle left the window before.
         outgrown: Whether to take a larger one, because a particle left the window inside a recorded graph.
     """
 
-    def __init__(self, model: Model, x: Tensor, least: tuple[int, ...] = ()):
+    def __init__(self, model: Model, x: Tensor, before: "Arrangement | None" = None):
         self.model, self.version = model, 0
+        self._margin = 2 * before._margin + 1 if before else MARGIN[model.dim]
         self._fresh: Report | None = None  # cells met along the order when it was new
-        self.stale = self.outgrown = False
+        self.stale = self.left = self.outgrown = False
 
         def integers(*size):
             return torch.empty(*size, dtype=torch.int32, device=model.device)
@@ -60,8 +63,8 @@ class Arrangement:
         self._locate(x)
         low, high = self._ends.tolist()  # waits for the device
         apart = [[max(0, h - b) for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
-        wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)])
-        self.shape = tuple(min(n, max(w, k)) for n, w, k in zip(grid, wide, least or wide, strict=True))
+        wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)], self._margin)
+        self.shape = tuple(max(sizes) for sizes in zip(wide, before.shape if before else wide, strict=True))
         self._centre = self._centring()
         self.renew(x)
 
@@ -113,8 +116,8 @@ class Arrangement:
         self.version += 1
 
     def grown(self, x: Tensor) -> "Arrangement":
-        """Another one with a window half as large again."""
-        return Arrangement(self.model, x, least=tuple(math.ceil(1.5 * n) for n in self.shape))
+        """Another one with a larger window."""
+        return Arrangement(self.model, x, before=self)
 
     def outgrow(self) -> None:
         """Take note that a particle left the window inside a recorded graph: the next call that is not recorded takes a larger one."""

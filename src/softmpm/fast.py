@@ -179,13 +179,14 @@ class Fast:
             self._pool = Pool(self.model, arrangement, self._unpacking)
 
     def widen(self, run: FastRun) -> None:
-        """A particle left the window during ``run``: put it around the start, or take a larger one if that was done before."""
+        """A particle left the window during ``run``: put it around the start, once; whatever moves so fast needs a larger one."""
         arrangement = run.pool.arrangement
-        if run.renewed:
+        if run.renewed or arrangement.left:
             self._use(arrangement.grown(run.start.x))
         else:
             arrangement.renew(run.start.x)
-            self._widened = True
+            arrangement.left = True
+        self._widened = True
 
 
 class _Local(threading.local):

@@ -27,14 +27,15 @@ MARGIN = {2: 6, 3: 3}
 """Nodes of a window around the particles' stencils, on each side, in 2D and 3D."""
 
 
-def window_shape(grid: Sequence[int], reach: Sequence[int]) -> tuple[int, ...]:
+def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int = 0) -> tuple[int, ...]:
     """Nodes along each axis of the part of the grid that is in memory.
 
     Args:
         grid: Nodes of the whole grid.
         reach: How far the particles' base nodes lie apart.
+        margin: Nodes around their stencils on each side, if more than :data:`MARGIN`.
     """
-    wide = [apart + 3 + 2 * MARGIN[len(grid)] for apart in reach]
+    wide = [apart + 3 + 2 * max(margin, MARGIN[len(grid)]) for apart in reach]
     wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns begin where reads from memory do
     return tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
 

@@ -134,17 +134,21 @@ def test_the_window_moves_with_the_robot(device):
     assert (found.origin - before).cpu().tolist() == [[0, 0], [30, 0], [0, -9]]
 
 
-def test_a_grown_window_is_half_as_large_again(device):
-    """Or as large as the grid, or as the particles need by then; the old one stays as it is."""
+def test_a_grown_window_has_twice_the_margin(device):
+    """Or is as large as the grid, or as the particles need by then; the old one stays as it is."""
     model = robot(2, [(20, 20)], grid=(80, 26), device=device)
     x = model.rest().x
     found = Arrangement(model, x)
     before = found.shape
     grown = found.grown(x)
-    assert grown.shape == (math.ceil(1.5 * before[0]), 26) and found.shape == before
+    wider = 2 * (MARGIN[2] + 1)  # a margin of m becomes one of 2 m + 1
+    assert grown.shape == (before[0] + wider, 26) and found.shape == before
+    assert grown.grown(x).shape == (before[0] + wider + 2 * wider, 26)
     x[0, 0, 0] += 40 * DX
     assert found.grown(x).shape[0] >= 40 + 3 + 2 * MARGIN[2]
     assert found.grown(x).grown(x).shape == (80, 26)
+    x[0, 0, 0] -= 40 * DX
+    assert found.grown(x).grown(x).grown(x).shape == (80, 26)
 
 
 def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
@@ -253,6 +257,20 @@ def test_a_window_that_must_grow_in_the_second_chunk(watched, monkeypatch, devic
     got = end_and_gradient(robot(2, **build), v, 80, twist=3.0)
     assert len(watched.made) >= 2 and watched.made[-1][0] > watched.made[0][0]
     assert_same(got, end_and_gradient(robot(2, **build, scheme="plain"), v, 80, twist=3.0), 1e-13)
+
+
+def test_a_window_that_is_left_again_and_again_grows(watched, monkeypatch, device):
+    """A motion that leaves it in every call: chunks run twice at first, then never again."""
+    monkeypatch.setattr("softmpm.memory.LONGEST", 16)
+    model = robot(2, [(30, 30)], grid=(100, 64), device=device)
+    v, runs, found = torch.tensor([14.0, 0.0], dtype=torch.float64), [], []  # 3.6 cells in each chunk of 16
+    run = softmpm.fast.Fast.run
+    monkeypatch.setattr("softmpm.fast.Fast.run", lambda *given: runs.append(given[1].first) or run(*given))
+    for _ in range(5):
+        runs.clear()
+        end_and_gradient(model, v, 80)
+        found.append(len(runs))
+    assert found[0] > 5 and found[-2:] == [5, 5] and 1 <= len(watched.grown_from) <= 2
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
