@@ -10,6 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+LIGHT = wp.constant(1e-18)
+"""Nodes up to this mass [kg] count as empty: the generated adjoint divides by its square, and what they hold is less than rounding."""
+
 
 @functools.lru_cache(maxsize=None)
 def kernels(dim: int) -> SimpleNamespace:
@@ -122,7 +125,7 @@ def kernels(dim: int) -> SimpleNamespace:
         velocity: wp.array(dtype=vec),
     ):
         i = wp.tid()
-        if node_mass[i] > 0.0:
+        if node_mass[i] > LIGHT:
             velocity[i] = node_momentum[i] / node_mass[i] + dt * gravity
 
     @kernel

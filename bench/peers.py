@@ -41,6 +41,8 @@ CHECKED = 30
 """Substeps after which results are compared."""
 TAICHI_SECONDS = 400
 """Time for Taichi, of which it compiles for about a minute."""
+WARM = 4
+"""Runs before those that count."""
 APART, GRADIENT_APART = 1e-4, 1e-3
 """Tolerances. The peers round x to float32 in every substep, 3e-8 m or 4e-6 dx on the finest grid; softmpm keeps the rest."""
 
@@ -108,9 +110,9 @@ def keep(contender):
 
 
 def times(contender, device: torch.device, repeats: int) -> dict[str, float]:
-    """Seconds of a run without gradient, of one that keeps, and of its backward pass."""
-    forward, kept, backward = median_seconds(contender.forward, device, repeats), [], []
-    for _ in range(repeats + 1):
+    """Seconds of a run without gradient, of one that keeps, and of its backward pass, once windows and programs are settled."""
+    kept, backward = [], []
+    for _ in range(repeats + WARM):
         sync(device)
         begin = time.perf_counter()
         keep(contender)
@@ -121,9 +123,9 @@ def times(contender, device: torch.device, repeats: int) -> dict[str, float]:
         kept.append(middle - begin)
         backward.append(time.perf_counter() - middle)
     return {
-        "forward": forward,
-        "kept": statistics.median(kept[1:]),
-        "backward": statistics.median(backward[1:]),
+        "forward": median_seconds(contender.forward, device, repeats),
+        "kept": statistics.median(kept[WARM:]),
+        "backward": statistics.median(backward[WARM:]),
     }
 
 
