@@ -62,7 +62,10 @@ class Sorted:
 
     def __init__(self, unpacking: Unpacking, rows: Tensor, order: Tensor):
         self._unpacking, self.rows, self.order = unpacking, rows, order
-        self._stream = stream_of(unpacking.model.device)
+
+    @property
+    def _stream(self) -> wp.Stream | None:
+        return stream_of(self._unpacking.model.device)
 
     def places(self) -> Tensor:
         """Where each particle stands, shape (world, particle), int32."""

@@ -82,9 +82,8 @@ def _check_walls(scene: Scene) -> None:
     grid = scene.grid
     for w, wall in enumerate(scene.walls):
         _check_axes(f"wall {w} normal", wall.normal, grid)
-        reach = (
-            np.array(wall.normal) * (np.array(grid.shape) - 1) * grid.spacing
-        )  # n·x along the grid's edges
+        # n·x along the grid's edges:
+        reach = np.array(wall.normal) * (np.array(grid.shape) - 1) * grid.spacing
         low, high = np.minimum(reach, 0.0).sum(), np.maximum(reach, 0.0).sum()
         need(
             low <= wall.offset,

@@ -51,9 +51,8 @@ class Pool:
         if free:
             pair = free.pop()
             if recording(self.model):
-                hold(
-                    pair
-                )  # its adjoints as well: their graphs must not be destroyed while another one is recorded
+                # With its adjoints: their graphs must not be destroyed while another one is recorded.
+                hold(pair)
             return pair, free
         if not recording(self.model):  # else no graph may be destroyed
             self._forget(keep)

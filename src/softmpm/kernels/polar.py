@@ -183,9 +183,8 @@ def _polar3(dtype: str) -> SimpleNamespace:
     @wp.func
     def rotation(H: mat) -> mat:
         if wp.max(wp.max(wp.abs(H[0])), wp.max(wp.max(wp.abs(H[1])), wp.max(wp.abs(H[2])))) < real(tiny):
-            return real(0.5) * (
-                H - wp.transpose(H)
-            )  # to the last digit, and a CPU is slow with the squares of these
+            # To the last digit, and a CPU is slow with the squares of these.
+            return real(0.5) * (H - wp.transpose(H))
         q = quaternion(wp.identity(n=3, dtype=real) + H)
         for _step in range(steps):
             Q = minus_identity(q)

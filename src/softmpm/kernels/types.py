@@ -103,9 +103,8 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         H: wp.array2d(dtype=mat)  # F - I
 
     if dtype == "float32":
-        Motion.__annotations__["fx_low"] = wp.array2d(
-            dtype=vec
-        )  # what rounding took off fx (compensated sum)
+        # What rounding took off fx (compensated sum):
+        Motion.__annotations__["fx_low"] = wp.array2d(dtype=vec)
 
     class MotionAdj:
         fx: wp.array2d(dtype=vec)  # ∂L/∂fx = dx ∂L/∂x
@@ -116,9 +115,8 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
     class Packed:
         """The same in the fast scheme: rows of blocks of 32 particles, sorted by cell (kernels/scatter.h)."""
 
-        base: wp.array(
-            dtype=wp.int32
-        )  # first node of the stencil, its coordinates in 10 (3D) or 16 (2D) bits each
+        # First node of the stencil, its coordinates in 10 (3D) or 16 (2D) bits each:
+        base: wp.array(dtype=wp.int32)
         rows: wp.array(dtype=real)  # fx, fx_low, v, H, C
 
     class Window:
