@@ -193,8 +193,6 @@ def fused(spec: Spec) -> SimpleNamespace:
         g = centre(old.fx)
         sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
         B = sums.outer - wp.outer(sums.value, g)
-        if place < total and not alive:
-            stay(i, now, then)
         old.low = load_vec(now.rows, i, row_low)
         old.H = load_mat(now.rows, i, row_H)
         new = moved(scale, body, origin, window.shape, world, p, old, sums.value, B)
@@ -209,15 +207,18 @@ def fused(spec: Spec) -> SimpleNamespace:
         if place == total:
             first = -1
         # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
-        if alive and place < total:
-            then.base[i] = pack_base(base)
-            store_vec(then.rows, i, row_fx, new.fx)
-            store_vec(then.rows, i, row_low, new.low)
-            store_vec(then.rows, i, row_v, new.v)
-            store_mat(then.rows, i, row_H, new.H)
-            store_mat(then.rows, i, row_C, new.C)
-            if not new.sound:
-                complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
+        if place < total:
+            if alive:
+                then.base[i] = pack_base(base)
+                store_vec(then.rows, i, row_fx, new.fx)
+                store_vec(then.rows, i, row_low, new.low)
+                store_vec(then.rows, i, row_v, new.v)
+                store_mat(then.rows, i, row_H, new.H)
+                store_mat(then.rows, i, row_C, new.C)
+                if not new.sound:
+                    complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
+            else:
+                stay(i, now, then)
         if not last:
             hand_on(watch, window, crew, place, count, total, order, substep + 1, first, g, b, A, m, node)
 
