@@ -1,4 +1,4 @@
-"""The chart of docs/performance.md from bench/results: `python bench/chart.py`."""
+"""The charts of docs/performance.md from bench/results: `python bench/chart.py`."""
 
 import json
 from pathlib import Path
@@ -9,6 +9,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
+IMAGES = HERE.parent / "docs" / "images"
 SIZES = {
     "2D\n6,400": (2, 6_400),
     "3D\n8,000": (3, 8_000),
@@ -23,29 +24,54 @@ BARS = {
 }
 
 
+CONTENDERS = {"softmpm": "#1f5f9e", "Warp, generated": "#8f8f8f", "Taichi": "#d9a441"}
+
+
+def rows(file: str) -> list[dict]:
+    return json.loads((HERE / "results" / f"{file}.h200.json").read_text())["rows"]
+
+
 def value(file: str, column: str, dim: int, particles: int) -> float:
-    rows = json.loads((HERE / "results" / f"{file}.h200.json").read_text())["rows"]
-    found = [r for r in rows if r["dim"] == dim and r["scene"] == "neo-Hookean"]
+    found = [r for r in rows(file) if r["dim"] == dim and r["scene"] == "neo-Hookean"]
     return min(found, key=lambda r: abs(r["particles"] - particles))[column]
 
 
-def main():
-    figure, axes = plt.subplots(figsize=(8, 3.6), layout="constrained")
-    width = 0.8 / len(BARS)
-    for k, (label, (file, column, colour)) in enumerate(BARS.items()):
-        heights = [value(file, column, *size) for size in SIZES.values()]
-        bars = axes.bar(
-            [i + (k - 1.5) * width for i in range(len(SIZES))], heights, width, label=label, color=colour
-        )
-        axes.bar_label(bars, fmt="%.0f", fontsize=8)
+def bars(axes, heights: dict[str, list[float]], colours: list[str]) -> None:
+    """Groups of bars with their heights, one group for each of SIZES."""
+    width = 0.8 / len(heights)
+    for k, ((label, values), colour) in enumerate(zip(heights.items(), colours, strict=True)):
+        places = [i + (k - (len(heights) - 1) / 2) * width for i in range(len(SIZES))]
+        axes.bar_label(axes.bar(places, values, width, label=label, color=colour), fmt="%.0f", fontsize=8)
     axes.set_yscale("log")
     axes.set_xticks(range(len(SIZES)), list(SIZES))
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def schemes() -> None:
+    figure, axes = plt.subplots(figsize=(8, 3.6), layout="constrained")
+    heights = {
+        label: [value(*where, *size) for size in SIZES.values()] for label, (*where, _) in BARS.items()
+    }
+    bars(axes, heights, [colour for *_, colour in BARS.values()])
     axes.set_ylabel("µs per substep")
     axes.set_title("Falling elastic cube, neo-Hookean, float32, one H200", fontsize=10)
     axes.legend(frameon=False, ncols=2, fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(HERE.parent / "docs" / "images" / "performance.png", dpi=150)
+    figure.savefig(IMAGES / "performance.png", dpi=150)
+
+
+def peers() -> None:
+    figure, both = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained", sharey=True)
+    for axes, way in zip(both, ("forward", "backward"), strict=True):
+        found = [r for r in rows("peers") if r["order"] == "random"]
+        heights = {name: [r[way] for r in found if r["contender"] == name] for name in CONTENDERS}
+        bars(axes, heights, list(CONTENDERS.values()))
+        axes.set_title(way, fontsize=10)
+    both[0].set_ylabel("µs per substep")
+    both[0].legend(frameon=False, fontsize=9)
+    figure.suptitle("Swirling elastic cube, particles in random order, one H200", fontsize=10)
+    figure.savefig(IMAGES / "peers.png", dpi=150)
 
 
 if __name__ == "__main__":
-    main()
+    schemes()
+    peers()
