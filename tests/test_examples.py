@@ -9,14 +9,13 @@ README = Path(__file__).parents[1] / "README.md"
 
 
 def test_the_code_of_the_readme_runs():
-    """The ten lines give a gradient for every control step."""
+    """They give a gradient for every control step; some of it is more than rounding."""
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     names: dict = {}
     exec(code, names)
     gradient = names["activation"].grad
-    assert (
-        gradient.shape == (10, 1, 1) and bool(torch.isfinite(gradient).all()) and bool((gradient != 0).all())
-    )
+    assert gradient.shape == (25, 1, 1) and bool(torch.isfinite(gradient).all())
+    assert gradient.abs().max() > 1e-4 and bool((gradient != 0).all())
 
 
 def test_every_file_that_the_readme_names_is_there():

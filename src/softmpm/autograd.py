@@ -14,7 +14,7 @@ from softmpm.checks import (
     check_finite,
     check_params,
     check_state,
-    check_substeps,
+    check_whole,
 )
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
@@ -66,10 +66,14 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
         with torch.inference_mode(False), torch.no_grad():
             return _simulate(model, start, activation, params, substeps)
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"simulate needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
+        )
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
-    check_substeps(substeps)
+    check_whole("substeps", substeps)
     if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
     mu, lam, mass = _material(model, params)

@@ -5,7 +5,7 @@ Each message says what must hold, what came instead and what to do. Rules of one
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -166,10 +166,11 @@ def check_params(model: Sizes, params: NamedTuple) -> None:
             )
 
 
-def check_substeps(substeps: int) -> None:
-    whole = isinstance(substeps, (int, np.integer)) and not isinstance(substeps, bool)
-    if not whole or substeps < 1:
-        raise ValueError(f"substeps must be a whole number of at least 1, got {substeps!r}.")
+def check_whole(name: str, value: Any) -> None:
+    """A whole number of at least 1."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < 1:
+        raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
 
 
 @torch.no_grad()

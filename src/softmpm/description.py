@@ -1,5 +1,6 @@
 """A model in words: what was compiled for its scene, what was left out, and the memory of a call."""
 
+from softmpm.checks import check_whole
 from softmpm.horizon import Horizon
 from softmpm.memory import memory
 from softmpm.scene import CONTACTS
@@ -9,8 +10,7 @@ from softmpm.stability import stable_dt
 def describe(model, substeps: int) -> str:
     """See :meth:`softmpm.Model.describe`."""
     spec, limit = model.spec, stable_dt(model.scene)
-    sizes = memory(model, Horizon(1, substeps))._asdict()
-    mib = {name: f"{size / 2**20:.1f} MiB" for name, size in sizes.items()}
+    check_whole("substeps", substeps)
 
     def has(flag: bool) -> str:
         return "compiled" if flag else "left out"
@@ -30,10 +30,19 @@ def describe(model, substeps: int) -> str:
         f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
         f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
         f"  sums       {_sums(model)}",
-        f"  memory     {mib['forward']} to run; {substeps} substeps with gradient: {mib['kept']} kept, "
-        f"{mib['backward']} at the peak",
+        f"  memory     {_memory(model, substeps)}",
     ]
     return "\n".join(lines)
+
+
+def _memory(model, substeps: int) -> str:
+    try:
+        found = memory(model, Horizon(1, substeps))
+    except ValueError as error:
+        return str(error)
+    forward, kept, backward = (f"{size / 2**20:.1f} MiB" for size in found[:3])
+    often = "once" if found.runs == 1 else f"{found.runs:.3g} times"
+    return f"{forward} to run; {substeps} substeps with gradient: {kept} kept, {backward} at the peak, each runs forward {often}"
 
 
 def _sums(model) -> str:

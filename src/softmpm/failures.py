@@ -109,10 +109,13 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) ->
     if kind is Kind.LEFT_GRID or (
         kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))
     ):
+        away = max(max(low - c, c - h) for c, h in zip(x, high, strict=True))
+        thrown = kind is Kind.LEFT_GRID and not away <= dx  # it was on the grid a substep before
+        larger = "Make the grid larger, add walls, or start further inside."
         return (
             f"is at {_numbers(x)} m, off the grid",
             box,
-            "Make the grid larger, add walls, or start further inside.",
+            f"It was thrown out. {smaller}" if thrown else larger,
         )
     if kind is Kind.INVERTED:
         J = torch.linalg.det(F.double()).item()

@@ -115,8 +115,8 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     if best is None:
         smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes
         raise ValueError(
-            f"a gradient needs at least {smallest / 2**20:.1f} MiB for states, memory_budget is {budget / 2**20:.1f} MiB: "
-            "raise it, or make the scene smaller."
+            f"a gradient needs at least {smallest:,} bytes for states, memory_budget is {budget:,} bytes: raise it, or make the "
+            "scene smaller."
         )
     return best
 
@@ -140,6 +140,8 @@ class Memory(NamedTuple):
     """What a call with gradient keeps until its backward pass."""
     backward: int
     """Peak of the backward pass, kept states included."""
+    runs: float
+    """How often a substep runs forward, in the mean; with little memory the backward pass takes so much longer."""
 
 
 def memory(model, horizon) -> Memory:
@@ -167,7 +169,9 @@ def memory(model, horizon) -> Memory:
     adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
-    return Memory(forward + material + state + low, kept, kept + chosen.recomputed + state + adjoints)
+    chunks = len(horizon.chunks(chosen.longest))
+    runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.slots) / chunks
+    return Memory(forward + material + state + low, kept, kept + chosen.recomputed + state + adjoints, runs)
 
 
 def _shapes(horizon, longest: int) -> int:

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.checks import check_scene
+from softmpm.checks import check_scene, check_whole
 from softmpm.description import describe
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
 from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, price_of_chunk, window_shape
@@ -38,8 +38,8 @@ def build(
         device: Where; None takes CUDA if there is one, and says so in the log.
         dtype: ``torch.float32`` or ``torch.float64``.
         worlds: Number of independent copies of the scene that run in one launch.
-        memory_budget: Most bytes that one ``simulate`` call may keep for its backward pass, None for a sensible choice;
-            see docs/memory.md.
+        memory_budget: Most bytes of states that one ``simulate`` call may keep for its backward pass, or run again at a time;
+            None for a sensible choice. ``describe`` says what a call takes in all; see docs/memory.md.
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
@@ -54,14 +54,16 @@ def build(
     check_scene(scene)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
-    if not (isinstance(worlds, int) and worlds >= 1):
-        raise ValueError(f"worlds must be a whole number of at least 1, got {worlds!r}.")
-    if memory_budget is not None and not memory_budget > 0:
-        raise ValueError(f"memory_budget must be a positive number of bytes or None, got {memory_budget}.")
+    check_whole("worlds", worlds)
+    if memory_budget is not None:
+        if isinstance(memory_budget, float) and memory_budget.is_integer():
+            memory_budget = int(memory_budget)
+        check_whole("memory_budget, in bytes,", memory_budget)
+        memory_budget = int(memory_budget)
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     warn_unstable(scene)
-    return Model(scene, _device(device), dtype, worlds, memory_budget, scheme, deterministic)
+    return Model(scene, _device(device), dtype, int(worlds), memory_budget, scheme, deterministic)
 
 
 def _device(device: str | torch.device | None) -> torch.device:
@@ -253,6 +255,11 @@ class Model:
             between = round(particles * real * (1.5 if real == 4 else 1) * (2 * d + 2 * d * d))
         price = 1 if self.device.type == "cpu" else price_of_chunk(particles)
         return Sizes(inside, nodes, between, longest_chunk(particles), price)
+
+    def __reduce__(self):
+        raise TypeError(
+            "a model cannot be copied or pickled, it holds kernels and buffers: take its scene, and build it again."
+        )
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""

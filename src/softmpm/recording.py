@@ -212,7 +212,8 @@ def _one_world(name: str, tensor: Tensor, world: int, shape: tuple[int, ...]) ->
     one = tensor[world] if tensor.ndim == len(shape) + 1 else tensor
     if tuple(one.shape) != shape:
         raise ValueError(
-            f"{name} must have shape {shape}, or that after a first axis world, got {tuple(tensor.shape)}."
+            f"{name} must have shape {shape}, or that after a first axis world, got {tuple(tensor.shape)}; a frame is one instant, "
+            "so of many control steps it takes one."
         )
     return _numpy(one)
 

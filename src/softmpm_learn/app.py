@@ -59,6 +59,8 @@ def main() -> None:
         if not group.first:
             raise SystemExit(1) from None  # the first process says the same
         _give_up(error)
+    except KeyboardInterrupt:
+        _interrupted("Nothing is lost if a run had not begun; else go on with resume=<its folder>.")
 
 
 def register(began: float | None = None) -> None:
@@ -108,6 +110,8 @@ def job(config: DictConfig, group: Group) -> None:
         place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
         place.write_text(traceback.format_exc(), encoding="utf-8")
         _give_up(error, "" if isinstance(error, EXPECTED) else f" The traceback is in {place}.")
+    except KeyboardInterrupt:
+        _interrupted(f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}")
 
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
@@ -129,6 +133,11 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
 def _give_up(error: Exception, more: str = "") -> NoReturn:
     print(f"softmpm_learn: {sentence(error)}{more}", file=sys.stderr)
     raise SystemExit(1)
+
+
+def _interrupted(advice: str) -> NoReturn:
+    print(f"softmpm_learn: interrupted. {advice}", file=sys.stderr)
+    raise SystemExit(130)
 
 
 def sentence(error: BaseException) -> str:

@@ -17,7 +17,7 @@ from softmpm.checks import (
     check_params,
     check_scene,
     check_state,
-    check_substeps,
+    check_whole,
 )
 from softmpm.scene import Body, Grid, Muscle, NeoHookean, Particles, Scene, Wall
 from softmpm.shapes import box
@@ -169,8 +169,8 @@ def test_good_tensors_pass():
         check_activation(MODEL, torch.zeros(control_steps, 2, 4))
     for shape in [(), (1,), (3,), (1, 3), (2, 1), (2, 3), (1, 1)]:
         check_params(MODEL, params(young=torch.ones(shape)))
-    check_substeps(1)
-    check_substeps(np.int64(20))
+    check_whole("substeps", 1)
+    check_whole("substeps", np.int64(20))
     check_bounds(params())
     check_finite(state(), torch.zeros(1, 2, 4))
     check_finite(state(), None)
@@ -245,7 +245,7 @@ def test_wrong_records():
 def test_substeps(substeps):
     """Substeps are a whole number of at least one."""
     with pytest.raises(ValueError, match="substeps must be a whole number of at least 1, got"):
-        check_substeps(substeps)
+        check_whole("substeps", substeps)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])

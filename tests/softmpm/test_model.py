@@ -1,6 +1,8 @@
 """A model compiles, stores and passes what its scene requires, and says so."""
 
+import copy
 import logging
+import pickle
 import threading
 import warnings
 
@@ -274,3 +276,45 @@ def test_results_are_of_the_promised_types():
     assert isinstance(softmpm.stable_dt(model.scene), softmpm.StableDt)
     assert isinstance(softmpm.warp_state(model), softmpm.WarpState)
     assert isinstance(softmpm.warp_solid(model), softmpm.WarpSolid)
+
+
+@pytest.mark.parametrize("budget", [0, -5, 1.5, float("nan"), "1GiB", True])
+def test_a_budget_is_a_whole_number_of_bytes(budget):
+    """Anything else is refused when the model is made; 1e6 means what it says, and worlds may be a NumPy integer."""
+    with pytest.raises(
+        ValueError, match="memory_budget, in bytes, must be a whole number of at least 1, got"
+    ):
+        softmpm.build(busy_scene(2), device="cpu", memory_budget=budget)
+    built = softmpm.build(busy_scene(2), device="cpu", memory_budget=1e6, worlds=np.int64(2))
+    assert built.budget == 1_000_000 and built.worlds == 2
+    with pytest.raises(ValueError, match="worlds must be a whole number"):
+        softmpm.build(busy_scene(2), device="cpu", worlds=1.0)
+
+
+def test_describe_says_how_often_a_substep_runs():
+    """Once with memory for everything, more often with less; and what is missing where not even one fits."""
+
+    def line(substeps=1000, **budget) -> str:
+        text = softmpm.build(busy_scene(2), device="cpu", **budget).describe(substeps)
+        return next(line for line in text.splitlines() if line.startswith("  memory"))
+
+    assert line().endswith("each runs forward once")
+    often = [float(line(memory_budget=n).split()[-2]) for n in (200_000, 60_000, 30_000)]
+    assert 2 <= often[0] <= often[1] < often[2]
+    assert "needs at least" in line(memory_budget=1000)
+    with pytest.raises(ValueError, match="substeps must be a whole number of at least 1, got 0"):
+        line(0)
+
+
+def test_a_model_is_not_copied_or_pickled():
+    """It says what to do instead."""
+    model = softmpm.build(busy_scene(2), device="cpu")
+    for take in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="take its scene, and build it again"):
+            take(model)
+
+
+def test_simulate_wants_a_model():
+    model = softmpm.build(busy_scene(2), device="cpu")
+    with pytest.raises(TypeError, match=r"needs a model, as softmpm.build\(scene\) gives it, got Scene"):
+        softmpm.simulate(model.scene, model.rest(), None, model.params(), substeps=1)

@@ -217,5 +217,7 @@ def test_a_budget_that_is_too_small_says_what_it_needs():
     """Not even √N states fit: the message has both sizes and a way out."""
     scene = busy_scene(2)
     model = softmpm.build(scene, device="cpu", memory_budget=1000)
-    with pytest.raises(ValueError, match="needs at least .* MiB for states, memory_budget is"):
+    with pytest.raises(
+        ValueError, match=r"needs at least [\d,]+ bytes for states, memory_budget is 1,000 bytes"
+    ):
         gradients(softmpm.simulate, model, busy_inputs(model), substeps=50)

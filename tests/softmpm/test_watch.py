@@ -39,6 +39,15 @@ def test_leaving_the_grid_names_particle_world_and_substep(device):
         assert torch.equal(getattr(error.state, name)[:2], getattr(calm, name)[:2]), name
 
 
+def test_advice_depends_on_how_far_a_particle_left_the_grid(device):
+    """A step beyond the edge asks for more room; one that jumps over many cells was thrown there, and needs a smaller step."""
+    for speed, advice in ((100.0, "Make the grid larger"), (10_000.0, "It was thrown out. Use a smaller dt")):
+        model = single(device=device)
+        start = model.rest()
+        start.v[0, 1, 0] = speed
+        assert advice in str(fails(model, start))
+
+
 def test_inversion_is_an_error_where_the_law_forbids_it(device):
     """A neo-Hookean particle must keep det F > 0; a fixed corotated one may pass through."""
     for law in LAWS:
