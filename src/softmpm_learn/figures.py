@@ -36,19 +36,21 @@ def loss_figure(
     names = [
         name for name, (_, values) in curves.items() if np.isfinite(np.asarray(values, dtype=float)).any()
     ]
-    figure = _figure(7.0, 1.2 + 2.0 * max(1, len(names)))
+    figure, first = _figure(7.0, 1.2 + 2.0 * max(1, len(names))), None
     for place, name in enumerate(names):
         iteration, value = (np.asarray(array, dtype=float) for array in curves[name])
-        axes = figure.add_subplot(len(names), 1, place + 1)
+        axes = figure.add_subplot(len(names), 1, place + 1, sharex=first)
+        first = first or axes
         axes.plot(iteration, value, color="#1f5fa8", marker="o" if len(value) < 3 else None, markersize=4)
         if name == best:
             axes.plot(iteration, np.fmin.accumulate(value), color="0.6", linestyle="--", label="best so far")
             axes.legend(frameon=False)
-        axes.set_ylabel(name)
+        axes.set_title(name, fontsize=9, loc="left")
         axes.spines[["top", "right"]].set_visible(False)
         axes.margins(x=0.01)
         if place == len(names) - 1:
             axes.set_xlabel("iteration")
+            axes.xaxis.get_major_locator().set_params(integer=True)
     figure.savefig(path, dpi=120)
 
 
@@ -80,6 +82,7 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
                 panel.set_title(f"{'xy'[component]} velocity, {_value(step, steps):+.1f}", fontsize=7)
             if column == 0:
                 panel.set_ylabel(f"feature {feature + 1}", fontsize=8)
+    figure.supxlabel("red: to the left, down; blue: to the right, up; a scale for each feature", fontsize=7)
     figure.savefig(path, dpi=120)
 
 
@@ -128,6 +131,7 @@ def robot_figure(
         panel.set_title(title, fontsize=8, loc="left")
     for panel in panels[len(frames) :]:
         panel.set_axis_off()
+    parts[0].supxlabel("m; muscles are red where they pull, blue where they push", fontsize=7)
     if design:
         _draw_design(parts[1], scene, design)
     figure.savefig(path, dpi=130)
