@@ -4,8 +4,11 @@ import torch
 from torch import Tensor
 
 from softmpm.model import Model
+from softmpm.scene import NeoHookean
 from softmpm.state import State
 from softmpm.watch import NEVER, Kind, UnstableError, decode
+
+HOOKEAN = "a neo-Hookean particle needs det F > 0"
 
 
 class Report:
@@ -33,13 +36,16 @@ def outgrown(words: list[int]) -> bool:
     return any(word != NEVER and decode(word)[1] is Kind.LEFT_WINDOW for word in words)
 
 
-def raise_failure(model: Model, words: list[int], end: State, first: int = 0) -> None:
+def raise_failure(
+    model: Model, words: list[int], end: State, first: int = 0, start: State | None = None
+) -> None:
     """Raise what the kernels reported, if anything.
 
     Args:
         words: One for each world.
         end: State in which the worlds stopped.
         first: Substep of the call that the kernels counted as 0.
+        start: State of the call before it, if it is at hand: looked at for what was wrong from the beginning.
     """
     failed = [world for world, word in enumerate(words) if word != NEVER]
     if not failed:
@@ -47,7 +53,12 @@ def raise_failure(model: Model, words: list[int], end: State, first: int = 0) ->
     world = min(failed, key=lambda w: words[w])
     substep, kind, particle = decode(words[world])
     substep += first
-    value, limit, advice = _explain(model, kind, world, particle, end)
+    if substep == 0 and start is not None and (inverted := _inverted(model, start, world)) is not None:
+        kind, particle, end = Kind.START, inverted, start
+        advice = "Start from a deformation gradient F that is not inverted."
+        value, limit = f"is inverted, det F = {_det(start, world, particle):.4g}", HOOKEAN
+    else:
+        value, limit, advice = _explain(model, kind, world, particle, end)
     where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
     time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
     others = f" ({len(failed) - 1} more world(s) failed too.)" if len(failed) > 1 else ""
@@ -105,7 +116,7 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) ->
     smaller = (
         "Use a smaller dt (softmpm.stable_dt gives a safe one), a weaker activation, or a softer material."
     )
-    x, F = end.x[world, particle].tolist(), end.F[world, particle]
+    x = end.x[world, particle].tolist()
     if kind is Kind.LEFT_GRID or (
         kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))
     ):
@@ -118,14 +129,25 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) ->
             f"It was thrown out. {smaller}" if thrown else larger,
         )
     if kind is Kind.INVERTED:
-        J = torch.linalg.det(F.double()).item()
-        return f"is inverted, det F = {J:.4g}", "a neo-Hookean particle needs det F > 0", smaller
+        return f"is inverted, det F = {_det(end, world, particle):.4g}", HOOKEAN, smaller
     bad = [name for name in "xvCF" if not bool(torch.isfinite(getattr(end, name)[world, particle]).all())]
     return (
         f"has a value in {', '.join(bad) or 'its norm'} that is not finite",
         "every value must be finite",
         smaller,
     )
+
+
+def _det(state: State, world: int, particle: int) -> float:
+    return torch.linalg.det(state.F[world, particle].double()).item()
+
+
+def _inverted(model: Model, start: State, world: int) -> int | None:
+    """The first neo-Hookean particle of a start that is inverted."""
+    laws = [isinstance(body.material, NeoHookean) for body in model.scene.bodies]
+    hookean = torch.tensor(laws, device=model.device)[model.body]
+    bad = ((torch.linalg.det(start.F[world].double()) <= 0) & hookean).nonzero()
+    return int(bad[0]) if len(bad) else None
 
 
 def _numbers(values) -> str:

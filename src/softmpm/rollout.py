@@ -65,7 +65,8 @@ class _Runner:
                 return False
             run.pool.arrangement.judge(cells, bool(near_edge))
         if any(word != NEVER for word in words):
-            raise_failure(self.model, words, _as_state(run.end), run.chunk.first)
+            start = run.start if isinstance(run.start, State) else None
+            raise_failure(self.model, words, _as_state(run.end), run.chunk.first, start)
         return True
 
     def settle(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:

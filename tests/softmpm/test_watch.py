@@ -39,6 +39,20 @@ def test_leaving_the_grid_names_particle_world_and_substep(device):
         assert torch.equal(getattr(error.state, name)[:2], getattr(calm, name)[:2]), name
 
 
+def test_a_start_that_is_inverted_is_named(device):
+    """Not a value somewhere that is not finite, which is what it leads to; a fixed corotated body may start like that."""
+    model = single(device=device, worlds=2)
+    start = model.rest()
+    start.F[1, 2] = -start.F[1, 2].flip(-1)
+    error = fails(model, start)
+    assert (error.kind, error.world, error.particle, error.substep) == ("start", 1, 2, 0)
+    assert "det F = -1 in the start state" in str(error) and "not inverted" in str(error)
+    model = single("fixed_corotated", device)
+    start = model.rest()
+    start.F[0, 2] = -start.F[0, 2].flip(-1)
+    softmpm.simulate(model, start, None, model.params(), substeps=1)
+
+
 def test_advice_depends_on_how_far_a_particle_left_the_grid(device):
     """A step beyond the edge asks for more room; one that jumps over many cells was thrown there, and needs a smaller step."""
     for speed, advice in ((100.0, "Make the grid larger"), (10_000.0, "It was thrown out. Use a smaller dt")):
