@@ -286,6 +286,26 @@ def test_ctrl_c_ends_cleanly_and_saves(tmp_path):
     assert (tmp_path / "run" / "loss.png").exists()
 
 
+def test_an_interruption_elsewhere_says_how_to_go_on(monkeypatch, capsys, tmp_path):
+    """While pictures are drawn, or before anything began: one sentence, no traceback, and the exit code of an interruption."""
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    for name, advice in (
+        ("run_experiment", f"resume={tmp_path}/run"),
+        ("to_run", "Nothing is lost if a run had not begun"),
+    ):
+        monkeypatch.setattr(app, name, interrupted)
+        with pytest.raises(SystemExit) as caught:
+            main(monkeypatch, *TINY, f"hydra.run.dir={tmp_path}/run")
+        said = capsys.readouterr().err
+        assert (
+            caught.value.code == 130 and "interrupted." in said and advice in said and "Traceback" not in said
+        )
+
+
 def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_path):
     """Where rerun is not installed a run still ends well, and says which command converts its recording elsewhere."""
 
