@@ -174,8 +174,7 @@ class Fast:
         return renew
 
     def _use(self, arrangement: Arrangement) -> None:
-        if self._pool is None or arrangement is not self._pool.arrangement:
-            self._pool = Pool(self.model, arrangement, self._unpacking)
+        self._pool = Pool(self.model, arrangement, self._unpacking)
 
     def widen(self, run: FastRun) -> None:
         """A particle left the window during ``run``: put it around the start, once; whatever moves so fast needs a larger one."""

@@ -74,7 +74,7 @@ class Graph(Generic[Result]):
             torch.cuda.synchronize(self.device)
             with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
-                self._failed = (torch.cat(ledger.words) != NEVER).any()
+                self._failed = (torch.cat([words for words, _ in ledger.words]) != NEVER).any()
         finally:
             close_ledger()
             if collects:

@@ -24,18 +24,18 @@ CPU_BUDGET = 64 * 2**20
 
 
 MARGIN = {2: 6, 3: 3}
-"""Nodes of a window around the particles' stencils, on each side, in 2D and 3D."""
+"""Nodes of a window around the particles' stencils, on each side, in 2D and 3D, until they leave it."""
 
 
-def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int = 0) -> tuple[int, ...]:
+def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int) -> tuple[int, ...]:
     """Nodes along each axis of the part of the grid that is in memory.
 
     Args:
         grid: Nodes of the whole grid.
         reach: How far the particles' base nodes lie apart.
-        margin: Nodes around their stencils on each side, if more than :data:`MARGIN`.
+        margin: Nodes around their stencils on each side.
     """
-    wide = [apart + 3 + 2 * max(margin, MARGIN[len(grid)]) for apart in reach]
+    wide = [apart + 3 + 2 * margin for apart in reach]
     wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns begin where reads from memory do
     return tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
 
@@ -46,9 +46,9 @@ def longest_chunk(particles: int) -> int:
 
 
 def price_of_chunk(particles: int) -> int:
-    """What each chunk costs besides its substeps, in substeps, as measured with the fast scheme on an H200.
+    """What each chunk is taken to cost on a GPU besides its substeps, in substeps.
 
-    Half a millisecond of the host with few particles; sorting and moving them with many.
+    With few particles it is the host's time, with many that of sorting and moving them.
     """
     least, most = 4, 48
     return max(least, min(most, 3_000_000 // particles))
@@ -132,7 +132,7 @@ def _lengths(substeps: int, longest: int) -> list[int]:
 
 
 class Memory(NamedTuple):
-    """Bytes that a call takes at its peak, besides what the model itself holds."""
+    """Bytes that a call takes at its peak, besides what the model itself holds, and how often it runs."""
 
     forward: int
     """A call without gradient."""

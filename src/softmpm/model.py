@@ -12,7 +12,7 @@ from torch import Tensor
 from softmpm.checks import check_scene, check_whole
 from softmpm.description import describe
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import CPU_BUDGET, Sizes, longest_chunk, price_of_chunk, window_shape
+from softmpm.memory import CPU_BUDGET, MARGIN, Sizes, longest_chunk, price_of_chunk, window_shape
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
 from softmpm.stability import warn_unstable
 from softmpm.state import Low, Params, State
@@ -240,7 +240,8 @@ class Model:
         if self.scheme == "plain":
             return self.node_count
         cells = np.floor(self._exact_positions / self.scene.grid.spacing - 0.5)
-        return math.prod(window_shape(self.scene.grid.shape, np.ptp(cells, axis=0).astype(int).tolist()))
+        reach = np.ptp(cells, axis=0).astype(int).tolist()
+        return math.prod(window_shape(self.scene.grid.shape, reach, MARGIN[self.dim]))
 
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see softmpm/memory.py."""

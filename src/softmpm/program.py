@@ -151,7 +151,7 @@ class Program:
     def crew_of(self, may_halve: bool) -> int:
         """Particles of a warp: as many as it has threads or, if it may, half as many while the GPU has more room than warps.
 
-        Then each walks a shorter way, but more sums are sent: where that pays was measured.
+        Then each walks a shorter way, but more sums are sent: whether that pays, bench/step.py and gradient.py say.
         """
         few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
         return WARP // 2 if may_halve and few else WARP

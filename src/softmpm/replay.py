@@ -19,20 +19,19 @@ class Ledger:
     """What belongs to a CUDA graph: it must live as long.
 
     Attributes:
-        words: Watch words of the calls that the graph holds, to be read after each replay.
-        windows: Those of calls that have a window, and what to call if a particle left it.
+        words: Watch words of the calls that the graph holds, to be read after each replay, and what to call if they say that a
+            particle left the window; None where there is no window.
         uses: What the graph reads and writes though it was made before. What is made while it is recorded lies in its own memory.
     """
 
     def __init__(self):
-        self.words: list[torch.Tensor] = []
-        self.windows: list[tuple[torch.Tensor, Callable[[], None]]] = []
+        self.words: list[tuple[torch.Tensor, Callable[[], None] | None]] = []
         self.uses: list[object] = []
 
     def widen(self) -> None:
         """After a replay that failed: see to it that the next recording has larger windows where a particle left one."""
-        for words, outgrow in self.windows:
-            if outgrown(words.tolist()):
+        for words, outgrow in self.words:
+            if outgrow and outgrown(words.tolist()):
                 outgrow()
 
 
@@ -50,15 +49,8 @@ def close_ledger() -> None:
 
 
 def note(words: torch.Tensor, outgrow: Callable[[], None] | None = None) -> None:
-    """Leave the reading of these words, one for each world, to whoever replays the graph that is being recorded.
-
-    Args:
-        outgrow: Called if they say that a particle left the window; None where there is no window.
-    """
-    ledger = _ledger()
-    ledger.words.append(words)
-    if outgrow:
-        ledger.windows.append((words, outgrow))
+    """Leave the reading of these words, one for each world, to whoever replays the graph being recorded; see :class:`Ledger`."""
+    _ledger().words.append((words, outgrow))
 
 
 def hold(used: object) -> None:

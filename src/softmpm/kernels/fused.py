@@ -46,7 +46,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     report = failure.report(spec.dim, spec.dtype).report
     module = native_module(spec.module + ".fused")
-    # At least six blocks on a multiprocessor, measured; in 3D the compiler alone finds what is fastest on the whole.
+    # At least six blocks on a multiprocessor: a matter of bench/step.py. In 3D the compiler does better alone.
     bounds = (BLOCK, 6) if dim == 2 else None
 
     @wp.func
