@@ -54,7 +54,7 @@ def raise_failure(
     substep, kind, particle = decode(words[world])
     substep += first
     if substep == 0 and start is not None and (inverted := _inverted(model, start, world)) is not None:
-        kind, particle, end = Kind.START, inverted, start
+        kind, particle = Kind.START, inverted
         advice = "Start from a deformation gradient F that is not inverted."
         value, limit = f"is inverted, det F = {_det(start, world, particle):.4g}", HOOKEAN
     else:

@@ -47,6 +47,8 @@ def test_a_start_that_is_inverted_is_named(device):
     error = fails(model, start)
     assert (error.kind, error.world, error.particle, error.substep) == ("start", 1, 2, 0)
     assert "det F = -1 in the start state" in str(error) and "not inverted" in str(error)
+    calm = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
+    assert_relative(error.state.x[0], calm.x[0], 1e-6)  # the other world went on to the end
     model = single("fixed_corotated", device)
     start = model.rest()
     start.F[0, 2] = -start.F[0, 2].flip(-1)
