@@ -60,7 +60,7 @@ def main() -> None:
             raise SystemExit(1) from None  # the first process says the same
         _give_up(error)
     except KeyboardInterrupt:
-        _interrupted("Nothing is lost if a run had not begun; else go on with resume=<its folder>.")
+        _interrupted(group, "No iteration had begun.")
 
 
 def register(began: float | None = None) -> None:
@@ -111,7 +111,7 @@ def job(config: DictConfig, group: Group) -> None:
         place.write_text(traceback.format_exc(), encoding="utf-8")
         _give_up(error, "" if isinstance(error, EXPECTED) else f" The traceback is in {place}.")
     except KeyboardInterrupt:
-        _interrupted(f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}")
+        _interrupted(group, f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}")
 
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
@@ -131,13 +131,17 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
 
 
 def _give_up(error: Exception, more: str = "") -> NoReturn:
-    print(f"softmpm_learn: {sentence(error)}{more}", file=sys.stderr)
-    raise SystemExit(1)
+    _end(1, f"{sentence(error)}{more}")
 
 
-def _interrupted(advice: str) -> NoReturn:
-    print(f"softmpm_learn: interrupted. {advice}", file=sys.stderr)
-    raise SystemExit(130)
+def _interrupted(group: Group, advice: str) -> NoReturn:
+    _end(130, f"interrupted. {advice}" if group.first else "")
+
+
+def _end(code: int, said: str) -> NoReturn:
+    if said:
+        print(f"softmpm_learn: {said}", file=sys.stderr)
+    raise SystemExit(code)
 
 
 def sentence(error: BaseException) -> str:

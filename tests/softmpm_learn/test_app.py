@@ -295,7 +295,7 @@ def test_an_interruption_elsewhere_says_how_to_go_on(monkeypatch, capsys, tmp_pa
     monkeypatch.chdir(tmp_path)
     for name, advice in (
         ("run_experiment", f"resume={tmp_path}/run"),
-        ("to_run", "Nothing is lost if a run had not begun"),
+        ("to_run", "No iteration had begun."),
     ):
         monkeypatch.setattr(app, name, interrupted)
         with pytest.raises(SystemExit) as caught:
