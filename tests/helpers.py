@@ -4,6 +4,8 @@ import numpy as np
 import torch
 
 import softmpm
+from softmpm.horizon import Horizon
+from softmpm.memory import plan
 
 LAWS = {"neo_hookean": softmpm.NeoHookean, "fixed_corotated": softmpm.FixedCorotated}
 INPUTS = ("x", "v", "C", "F", "activation", "young", "poisson", "density")
@@ -99,3 +101,11 @@ def relative(got: torch.Tensor, want: torch.Tensor) -> float:
 def assert_relative(got, want, limit: float, what: str = "") -> None:
     error = relative(torch.as_tensor(got), torch.as_tensor(want))
     assert error <= limit, f"{what} differs by {error:.2e} relative, limit {limit:.0e}"
+
+
+def little_memory(model) -> dict[str, int]:
+    """Settings with which a call of 3 times 7 substeps keeps one state and runs chunks again."""
+    sizes = model.sizes()
+    budget = 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between
+    assert not plan(Horizon(3, 7), sizes, budget).keep_all
+    return {"memory_budget": budget}

@@ -7,7 +7,17 @@ import threading
 import numpy as np
 import pytest
 import torch
-from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
+from helpers import (
+    INPUTS,
+    assert_relative,
+    busy_inputs,
+    busy_scene,
+    cotangent,
+    dot,
+    gradients,
+    little_memory,
+    run,
+)
 
 import softmpm
 from softmpm import autograd, fast, memory, program
@@ -193,12 +203,7 @@ def assert_gradient(got, want, device) -> None:
 @pytest.fixture(params=["kept", "run again"])
 def budget(request) -> dict:
     """Settings with which a call keeps everything inside, and with which it keeps one state and runs chunks again."""
-    if request.param == "kept":
-        return {}
-    sizes = model().sizes()
-    settings = {"memory_budget": 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between}
-    assert not plan(Horizon(3, 7), sizes, settings["memory_budget"]).keep_all
-    return settings
+    return {} if request.param == "kept" else little_memory(model())
 
 
 def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device):

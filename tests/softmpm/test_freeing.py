@@ -5,7 +5,7 @@ import weakref
 
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, run
+from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory, run
 
 import softmpm
 from softmpm import arrangement, autograd, fast, memory, plain, program, program_adj, replay, rollout
@@ -59,12 +59,7 @@ def model(device="cpu", **settings) -> softmpm.Model:
 def budget(request, monkeypatch) -> dict:
     """Settings with which a call keeps everything inside its chunks, and with which it runs them again."""
     monkeypatch.setattr(memory, "LONGEST", 8)
-    if request.param == "kept":
-        return {}
-    sizes = model().sizes()
-    settings = {"memory_budget": 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between}
-    assert not plan(Horizon(3, 7), sizes, settings["memory_budget"]).keep_all
-    return settings
+    return {} if request.param == "kept" else little_memory(model())
 
 
 KINDS = {
