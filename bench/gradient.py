@@ -1,8 +1,8 @@
 """How long is a substep backward? `python bench/gradient.py [--device cuda] [--json bench/results/gradient.json]`
 
 Forward with gradient and backward of one call, each divided by its substeps; medians after a warm-up. ``kept``: memory for
-everything inside, nothing runs twice. ``again``: memory for a fifth of it, so that the backward pass runs the substeps again;
-its time includes that. The cube falls; activation gets a
+everything inside, nothing runs twice. ``again``: a call of more substeps, as many as a long gradient has, with memory for a fifth of
+what it would keep, so that the backward pass runs the substeps again; its time includes that. The cube falls; activation gets a
 gradient where the scene has muscles, the materials only in the rows that say so.
 """
 
@@ -19,10 +19,12 @@ from softmpm.memory import plan
 GRADIENTS = VARIANTS | {"neo-Hookean, materials": {}, "neo-Hookean, turning": {}}
 
 
-def substeps_of(particles: int, device: torch.device) -> int:
+def substeps_of(particles: int, device: torch.device) -> dict[str, int]:
+    """By what is measured: what is kept must fit into the memory of the device."""
     if device.type == "cpu":
-        return 50
-    return 512 if particles < 500_000 else 64 if particles < 5_000_000 else 32
+        return {"kept": 50, "again": 50}
+    kept = 512 if particles < 500_000 else 64 if particles < 5_000_000 else 32
+    return {"kept": kept, "again": 256 if particles > 5_000_000 else 512}
 
 
 def measure(
@@ -56,18 +58,24 @@ def main():
     for dim, particles, nodes in ON_A_CPU if device.type == "cpu" else CASES:
         if particles > (args.largest or particles):
             continue
-        substeps = substeps_of(particles, device)
         for name, features in GRADIENTS.items():
             scene = cube(dim, particles, nodes, **features)
-            row = {"dim": dim, "particles": None, "nodes": nodes, "scene": name, "substeps": substeps}
-            everything = plan(Horizon(1, substeps), softmpm.build(scene, device=device).sizes(), 2**62).kept
-            for kind, budget in (("kept", 2**62), ("again", everything // 5)):
+            row = {"dim": dim, "particles": None, "nodes": nodes, "scene": name}
+            for kind, substeps in substeps_of(particles, device).items():
+                everything = plan(
+                    Horizon(1, substeps), softmpm.build(scene, device=device).sizes(), 2**62
+                ).kept
+                budget = 2**62 if kind == "kept" else everything // 5
                 model = softmpm.build(scene, device=device, memory_budget=budget)
                 row["particles"] = model.particle_count
                 figures = measure(
                     model, substeps, args.repeats, materials="materials" in name, turns="turning" in name
                 )
-                row |= {f"forward, {kind}": figures[0], f"backward, {kind}": figures[1]}
+                row |= {
+                    f"{kind}, substeps": substeps,
+                    f"forward, {kind}": figures[0],
+                    f"backward, {kind}": figures[1],
+                }
                 del model
                 if device.type == "cuda":
                     torch.cuda.empty_cache()
