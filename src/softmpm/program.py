@@ -138,10 +138,15 @@ class Program:
         """Material and pull of substep ``s``."""
         return self.solids[self.chunk.row(s) if self.pull is not None else 0]
 
-    @functools.cached_property
+    @property
+    def few(self) -> bool:
+        """Whether a GPU has more room than there are warps."""
+        return self.total <= FEW
+
+    @property
     def block(self) -> int:
-        """Threads of a block over particles; a single warp if the GPU has more room than warps."""
-        return BLOCK if self.total > FEW else WARP
+        """Threads of a block over particles."""
+        return WARP if self.few else BLOCK
 
     @functools.cached_property
     def crew(self) -> int:
@@ -236,6 +241,6 @@ class Program:
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(fused(model.spec).advance, self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(fused(model.spec).advance[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
             self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

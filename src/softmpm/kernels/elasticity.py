@@ -70,9 +70,7 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
     def log1p(j: real) -> real:
         """log(1 + j) to the last digit also for small j (Kahan)."""
         u = real(1.0) + j
-        if u == real(1.0):
-            return j
-        return wp.log(u) * divide(j, u - real(1.0))
+        return wp.where(u == real(1.0), j, wp.log(u) * divide(j, u - real(1.0)))
 
     @wp.func
     def no_rotation(H: mat) -> mat:

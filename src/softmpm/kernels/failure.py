@@ -59,13 +59,14 @@ def check(spec: Spec) -> SimpleNamespace:
     def sound(
         body: Solid, corner: ivec, shape: ivec, world: int, p: int, fx: vec, base: ivec, H: mat
     ) -> bool:
-        """The new state may be kept: ``fx`` as it came, ``base`` as it would be, on ``shape`` nodes from ``corner``."""
-        if not (allowed(body, world, p, H) and wp.dot(fx, fx) < real(1.0e12)):
-            return False
-        for axis in range(dim):
-            if wp.uint32(base[axis] - corner[axis]) > wp.uint32(shape[axis] - 3):  # also below zero
-                return False
-        return True
+        """The new state may be kept: ``fx`` as it came, ``base`` as it would be, on ``shape`` nodes from ``corner``.
+
+        Without a branch: behind one, a GPU would start late to read what the stress needs.
+        """
+        ok = int(allowed(body, world, p, H)) & int(wp.dot(fx, fx) < real(1.0e12))
+        for axis in range(dim):  # unsigned: below zero is far above as well
+            ok &= int(wp.uint32(base[axis] - corner[axis]) <= wp.uint32(shape[axis] - 3))
+        return ok != 0
 
     @wp.func
     def complain(

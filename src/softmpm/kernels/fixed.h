@@ -102,7 +102,7 @@ CUDA_CALLABLE inline void scatter_fixed(
     const wp::vec_t<DIM, float>& b, const wp::mat_t<DIM, DIM, float>& A, float m)
 {
 #if defined(__CUDA_ARCH__)
-    add_warp(node, shape, LANES, first, g, b, A, m);
+    add_warp(node, shape, first, g, b, A, m);
 #else
     add_each(node, shape, first, g, b, A, m);
 #endif

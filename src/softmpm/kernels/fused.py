@@ -46,8 +46,6 @@ def fused(spec: Spec) -> SimpleNamespace:
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     report = failure.report(spec.dim, spec.dtype).report
     module = native_module(spec.module + ".fused")
-    # At least six blocks on a multiprocessor: a matter of bench/step.py. In 3D the compiler does better alone.
-    bounds = (BLOCK, 6) if dim == 2 else None
 
     @wp.func
     def centre(fx: vec) -> vec:
@@ -93,7 +91,6 @@ def fused(spec: Spec) -> SimpleNamespace:
     def hand_on(
         watch: wp.array(dtype=wp.int64),
         window: Window,
-        crew: int,
         place: int,
         count: int,
         total: int,
@@ -111,7 +108,7 @@ def fused(spec: Spec) -> SimpleNamespace:
             if not give(node, place, count, total, b, A):
                 report(watch, place / count, substep, not_finite, order[place])
         else:
-            scatter(node, window.shape, crew, first, g, b, A, m)
+            scatter(node, window.shape, first, g, b, A, m)
 
     @wp.func
     def stay(i: int, now: Packed, then: Packed):
@@ -156,9 +153,8 @@ def fused(spec: Spec) -> SimpleNamespace:
         )
         if place == total:
             first = -1
-        hand_on(watch, window, crew, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
+        hand_on(watch, window, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def advance(
         # Parameters:
         scale: Scale,
@@ -220,8 +216,20 @@ def fused(spec: Spec) -> SimpleNamespace:
             else:
                 stay(i, now, then)
         if not last:
-            hand_on(watch, window, crew, place, count, total, order, substep + 1, first, g, b, A, m, node)
+            hand_on(watch, window, place, count, total, order, substep + 1, first, g, b, A, m, node)
+
+    def compiled(few: bool) -> wp.Kernel:
+        """``advance`` for few particles, where a warp may have the registers to wait for all that it reads at once, or for many."""
+        name, bounds = (".few", (BLOCK, 3)) if few else ("", None)
+        where = native_module(spec.module + ".fused" + name)
+        return wp.kernel(module=where, enable_backward=False, grid_stride=False, launch_bounds=bounds)(
+            advance
+        )
 
     return SimpleNamespace(
-        clear=clear, grid_velocity=grid_velocity, begin=begin, advance=advance, centre=centre
+        clear=clear,
+        grid_velocity=grid_velocity,
+        begin=begin,
+        advance={few: compiled(few) for few in (True, False)},
+        centre=centre,
     )

@@ -84,7 +84,6 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             if wp.static(not exact):
                 store_node(cleared, i, node_vec())
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 3))
     def advance_adj(
         # Parameters:
         scale: Scale,
@@ -121,8 +120,6 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             origin = window.origin[world]
             held = world * window.count
             old_fx = load_vec(before.rows, i, row_fx)
-            if not start:
-                first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
             adj = ParticleAdj()
             adj.fx = load_vec(adj_now, i, row_fx)
             adj.H = load_mat(adj_now, i, row_H)
@@ -157,6 +154,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
                 store_vec(adj_now, i, row_v, adj.v)
                 store_mat(adj_now, i, row_C, adj.C)
             else:
+                first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
                 g = centre(old_fx)
                 adj = moved_adj(scale, load_mat(before.rows, i, row_H), C, adj)
                 B = adj.C
@@ -169,6 +167,16 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             if wp.static(exact):
                 give(adj_velocity, i, count, total, b, B)
             else:
-                scatter(adj_velocity, window.shape, crew, first, g, b, B, real(0.0))
+                scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
 
-    return SimpleNamespace(grid_velocity_adj=grid_velocity_adj, advance_adj=advance_adj)
+    def compiled(few: bool) -> wp.Kernel:
+        """``advance_adj`` for few particles or for many, as in fused.py: with so many registers that so many blocks fit at a time."""
+        name, blocks = (".few", 2) if few else ("", 3)
+        where = native_module(adj_module(spec, wanted) + ".fused" + name)
+        return wp.kernel(
+            module=where, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, blocks)
+        )(advance_adj)
+
+    return SimpleNamespace(
+        grid_velocity_adj=grid_velocity_adj, advance_adj={few: compiled(few) for few in (True, False)}
+    )

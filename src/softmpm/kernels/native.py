@@ -37,10 +37,8 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, node_vec, rows = t.real, t.vec, t.mat, t.ivec, t.aligned, t.rows
 
-    @wp.func_native(f"softmpm::scatter<{dim}>(node.data, shape, crew, first, g, b, A, m);")
-    def scatter(
-        node: wp.array(dtype=node_vec), shape: ivec, crew: int, first: int, g: vec, b: vec, A: mat, m: real
-    ): ...
+    @wp.func_native(f"softmpm::scatter<{dim}>(node.data, shape, first, g, b, A, m);")
+    def scatter(node: wp.array(dtype=node_vec), shape: ivec, first: int, g: vec, b: vec, A: mat, m: real): ...
 
     @wp.func_native("return softmpm::load_node(node.data, i);")
     def load_node(node: wp.array(dtype=node_vec), i: int) -> node_vec: ...

@@ -6,10 +6,10 @@
 //
 // with g the distance from the middle node in cells, -1/2 <= g < 1/2. Both scatters have this form: momentum and mass of the
 // forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
-// share their nodes. The warp therefore turns the sum around: its first lanes, the ``crew``, have a particle each and write its
+// share their nodes. The warp therefore turns the sum around: its lanes, or the first of them, have a particle each and write its
 // (b, A, m, g) to shared memory, in 3D the weights along z in place of g_z; then three groups of nine lanes own the nodes, walk through
 // a third of the particles each, add up in registers while the cell stays the same, and send one 16-byte reduction per node and cell.
-// Lanes 27 to 31 own nothing. What comes next is read before it is waited for: with few particles that is where the time goes.
+// Lanes 27 to 31 own nothing.
 namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
@@ -69,135 +69,162 @@ struct Weight {
     }
 };
 
-// Three dimensions: a lane owns a column of three nodes along z, and hands it on when the next cell is the one above.
-template <class Sink>
-CUDA_CALLABLE inline void add_warp(
-    Sink node, const wp::vec_t<3, int>& shape, int crew, int first, const wp::vec_t<3, float>& g,
-    const wp::vec_t<3, float>& b, const wp::mat_t<3, 3, float>& A, float m)
-{
-    constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
-    __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
-    int lane = threadIdx.x & (LANES - 1);
-    float4* all = box + (threadIdx.x - lane) * WIDTH;
-    float4* mine = all + lane * WIDTH;
-    float wz[3];
-    weights(g[2], wz);
-    mine[0] = make_float4(b[0], b[1], b[2], m);
-    mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], g[0]);
-    mine[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], g[1]);
-    mine[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], wz[0]);
-    mine[4] = make_float4(wz[1], wz[2], __int_as_float(first), 0.0f);
-    __syncwarp();
+// What a lane owns of the nodes around the cell that the walk is in, and how a particle lies in shared memory for it.
+template <int DIM, class Sink> struct Owner;
 
-    int group = lane / 9, column = lane % 9;
-    int ox = column / 3 - 1, oy = column % 3 - 1;
-    Weight wx(ox), wy(oy);
-    float fx = float(ox), fy = float(oy);
-    int share = (crew + 2) / 3, begin = group * share, end = min(begin + share, crew);
-    if (group == 3)
-        begin = end;  // lanes 27 to 31 own nothing
-    Sink origin = node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]);
-    float4 below = make_float4(0.0f, 0.0f, 0.0f, 0.0f), middle = below, above = below;
-    const float4 zero = below;
-    int current = -1;
-    const float4* q = all + min(begin, LANES - 1) * WIDTH;
-    float4 n0 = q[0], n1 = q[1], n2 = q[2], n3 = q[3], n4 = q[4];  // the particle after this one: read before it is waited for
-    for (int p = begin; p < end; ++p) {
-        float4 q0 = n0, q1 = n1, q2 = n2, q3 = n3, q4 = n4;
-        q = all + min(p + 1, LANES - 1) * WIDTH;
-        n0 = q[0], n1 = q[1], n2 = q[2], n3 = q[3], n4 = q[4];
-        int next = __float_as_int(q4.z);
-        if (next < 0)
-            break;  // the last particle was the one before
-        if (next != current) {
-            if (current >= 0) {
-                auto at = cell(origin, current);
-                add(at, below.x, below.y, below.z, below.w);
-                if (next == current + 1) {
-                    below = middle;
-                    middle = above;
-                } else {
-                    add(at + 4, middle.x, middle.y, middle.z, middle.w);
-                    add(at + 8, above.x, above.y, above.z, above.w);
-                    below = middle = zero;
-                }
-                above = zero;
+// Three dimensions: a column of three nodes along z, which is handed on when the next cell is the one above.
+template <class Sink> struct Owner<3, Sink> {
+    static constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
+    Weight wx, wy;
+    float fx, fy;
+    Sink origin;
+    int current;
+    float4 below, middle, above;
+
+    CUDA_CALLABLE static inline void write(
+        float4* q, int first, const wp::vec_t<3, float>& g, const wp::vec_t<3, float>& b, const wp::mat_t<3, 3, float>& A, float m)
+    {
+        float wz[3];
+        weights(g[2], wz);
+        q[0] = make_float4(b[0], b[1], b[2], m);
+        q[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], g[0]);
+        q[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], g[1]);
+        q[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], wz[0]);
+        q[4] = make_float4(wz[1], wz[2], __int_as_float(first), 0.0f);
+    }
+    CUDA_CALLABLE static inline int first(const float4* q) { return __float_as_int(q[4].z); }
+
+    CUDA_CALLABLE inline Owner(Sink node, const wp::vec_t<3, int>& shape, int ox, int oy, int start)
+        : wx(ox)
+        , wy(oy)
+        , fx(float(ox))
+        , fy(float(oy))
+        , origin(node + 4 * (long long)(((ox + 1) * shape[1] + oy + 1) * shape[2]))
+        , current(start)
+        , below(make_float4(0.0f, 0.0f, 0.0f, 0.0f))
+        , middle(below)
+        , above(below)
+    {
+    }
+    CUDA_CALLABLE inline void take(const float4* q)
+    {
+        float w = wx(q[1].w) * wy(q[2].w), w0 = w * q[3].w, w1 = w * q[4].x, w2 = w * q[4].y, m = q[0].w;
+        float x = q[0].x + q[1].x * fx + q[2].x * fy, y = q[0].y + q[1].y * fx + q[2].y * fy, z = q[0].z + q[1].z * fx + q[2].z * fy;
+        float x0 = x - q[3].x, y0 = y - q[3].y, z0 = z - q[3].z, x2 = x + q[3].x, y2 = y + q[3].y, z2 = z + q[3].z;
+        // In each branch, not behind them: sums that are handed on and added to at once take no copies.
+        auto gain = [&](const float4& b, const float4& c, const float4& a) {
+            below = make_float4(b.x + w0 * x0, b.y + w0 * y0, b.z + w0 * z0, b.w + w0 * m);
+            middle = make_float4(c.x + w1 * x, c.y + w1 * y, c.z + w1 * z, c.w + w1 * m);
+            above = make_float4(a.x + w2 * x2, a.y + w2 * y2, a.z + w2 * z2, a.w + w2 * m);
+        };
+        const float4 zero = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        int next = first(q);
+        if (next == current) {
+            gain(below, middle, above);
+        } else {
+            auto at = cell(origin, current);
+            add(at, below.x, below.y, below.z, below.w);
+            if (next == current + 1) {
+                gain(middle, above, zero);
+            } else {
+                add(at + 4, middle.x, middle.y, middle.z, middle.w);
+                add(at + 8, above.x, above.y, above.z, above.w);
+                gain(zero, zero, zero);
             }
             current = next;
         }
-        float w = wx(q1.w) * wy(q2.w);
-        float x = q0.x + q1.x * fx + q2.x * fy, y = q0.y + q1.y * fx + q2.y * fy, z = q0.z + q1.z * fx + q2.z * fy;
-        float w0 = w * q3.w, w1 = w * q4.x, w2 = w * q4.y;
-        below.x += w0 * (x - q3.x);
-        below.y += w0 * (y - q3.y);
-        below.z += w0 * (z - q3.z);
-        below.w += w0 * q0.w;
-        middle.x += w1 * x;
-        middle.y += w1 * y;
-        middle.z += w1 * z;
-        middle.w += w1 * q0.w;
-        above.x += w2 * (x + q3.x);
-        above.y += w2 * (y + q3.y);
-        above.z += w2 * (z + q3.z);
-        above.w += w2 * q0.w;
     }
-    if (current >= 0) {
+    CUDA_CALLABLE inline void send()
+    {
         auto at = cell(origin, current);
         add(at, below.x, below.y, below.z, below.w);
         add(at + 4, middle.x, middle.y, middle.z, middle.w);
         add(at + 8, above.x, above.y, above.z, above.w);
     }
-    __syncwarp();
-}
+};
 
-// Two dimensions: a lane owns one node. The node is (x, y, m, 0).
-template <class Sink>
-CUDA_CALLABLE inline void add_warp(
-    Sink node, const wp::vec_t<2, int>& shape, int crew, int first, const wp::vec_t<2, float>& g,
-    const wp::vec_t<2, float>& b, const wp::mat_t<2, 2, float>& A, float m)
-{
-    constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, free of bank conflicts as well
-    __shared__ float4 box[WP_TILE_BLOCK_DIM * WIDTH];
-    int lane = threadIdx.x & (LANES - 1);
-    float4* all = box + (threadIdx.x - lane) * WIDTH;
-    float4* mine = all + lane * WIDTH;
-    mine[0] = make_float4(b[0], b[1], m, __int_as_float(first));
-    mine[1] = make_float4(A.data[0][0], A.data[1][0], A.data[0][1], A.data[1][1]);
-    mine[2] = make_float4(g[0], g[1], 0.0f, 0.0f);
-    __syncwarp();
+// Two dimensions: one node, which is (x, y, m, 0).
+template <class Sink> struct Owner<2, Sink> {
+    static constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, free of bank conflicts as well
+    Weight wx, wy;
+    float fx, fy;
+    Sink origin;
+    int current;
+    float x, y, mass;
 
-    int group = lane / 9, own = lane % 9;
-    int ox = own / 3 - 1, oy = own % 3 - 1;
-    Weight wx(ox), wy(oy);
-    float fx = float(ox), fy = float(oy);
-    int share = (crew + 2) / 3, begin = group * share, end = min(begin + share, crew);
-    if (group == 3)
-        begin = end;
-    Sink origin = node + 4 * (long long)((ox + 1) * shape[1] + oy + 1);
-    float x = 0.0f, y = 0.0f, mass = 0.0f;
-    int current = -1;
-    const float4* q = all + min(begin, LANES - 1) * WIDTH;
-    float4 n0 = q[0], n1 = q[1], n2 = q[2];
-    for (int p = begin; p < end; ++p) {
-        float4 q0 = n0, q1 = n1, q2 = n2;
-        q = all + min(p + 1, LANES - 1) * WIDTH;
-        n0 = q[0], n1 = q[1], n2 = q[2];
-        int next = __float_as_int(q0.w);
-        if (next < 0)
-            break;
+    CUDA_CALLABLE static inline void write(
+        float4* q, int first, const wp::vec_t<2, float>& g, const wp::vec_t<2, float>& b, const wp::mat_t<2, 2, float>& A, float m)
+    {
+        q[0] = make_float4(b[0], b[1], m, __int_as_float(first));
+        q[1] = make_float4(A.data[0][0], A.data[1][0], A.data[0][1], A.data[1][1]);
+        q[2] = make_float4(g[0], g[1], 0.0f, 0.0f);
+    }
+    CUDA_CALLABLE static inline int first(const float4* q) { return __float_as_int(q[0].w); }
+
+    CUDA_CALLABLE inline Owner(Sink node, const wp::vec_t<2, int>& shape, int ox, int oy, int start)
+        : wx(ox)
+        , wy(oy)
+        , fx(float(ox))
+        , fy(float(oy))
+        , origin(node + 4 * (long long)((ox + 1) * shape[1] + oy + 1))
+        , current(start)
+        , x(0.0f)
+        , y(0.0f)
+        , mass(0.0f)
+    {
+    }
+    CUDA_CALLABLE inline void take(const float4* q)
+    {
+        int next = first(q);
         if (next != current) {
-            if (current >= 0)
-                add(cell(origin, current), x, y, mass, 0.0f);
+            send();
             x = y = mass = 0.0f;
             current = next;
         }
-        float w = wx(q2.x) * wy(q2.y);
-        x += w * (q0.x + q1.x * fx + q1.z * fy);
-        y += w * (q0.y + q1.y * fx + q1.w * fy);
-        mass += w * q0.z;
+        float w = wx(q[2].x) * wy(q[2].y);
+        x += w * (q[0].x + q[1].x * fx + q[1].z * fy);
+        y += w * (q[0].y + q[1].y * fx + q[1].w * fy);
+        mass += w * q[0].z;
     }
-    if (current >= 0)
-        add(cell(origin, current), x, y, mass, 0.0f);
+    CUDA_CALLABLE inline void send() { add(cell(origin, current), x, y, mass, 0.0f); }
+};
+
+template <unsigned DIM, class Sink>
+CUDA_CALLABLE inline void add_warp(
+    Sink node, const wp::vec_t<DIM, int>& shape, int first, const wp::vec_t<DIM, float>& g,
+    const wp::vec_t<DIM, float>& b, const wp::mat_t<DIM, DIM, float>& A, float m)
+{
+    using Lane = Owner<DIM, Sink>;
+    constexpr int WIDTH = Lane::WIDTH;
+    __shared__ float4 box[(WP_TILE_BLOCK_DIM + 2) * WIDTH];  // the walk reads up to two particles behind the last
+    int lane = threadIdx.x & (LANES - 1);
+    float4* particles = box + (threadIdx.x - lane) * WIDTH;
+    Lane::write(particles + lane * WIDTH, first, g, b, A, m);
+    int count = __popc(__ballot_sync(0xffffffffu, first >= 0));
+    int group = lane / 9, own = lane % 9, share = (count + 2) / 3;
+    int begin = group * share, end = min(begin + share, count);
+    if (group == 3)
+        begin = end = 0;  // lanes 27 to 31 own nothing
+    __syncwarp();
+
+    // Each particle is read before it is waited for, which with few particles is where the time goes; into two places in turn, so that
+    // none is copied.
+    float4 one[WIDTH], other[WIDTH];
+    auto read = [particles](float4* into, int p) {
+        for (int k = 0; k < WIDTH; ++k)
+            into[k] = particles[p * WIDTH + k];
+    };
+    read(one, begin);
+    Lane owner(node, shape, own / 3 - 1, own % 3 - 1, Lane::first(one));
+    for (int p = begin; p < end; p += 2) {
+        read(other, p + 1);
+        owner.take(one);
+        read(one, p + 2);
+        if (p + 1 < end)
+            owner.take(other);
+    }
+    if (begin < end)
+        owner.send();
     __syncwarp();
 }
 
@@ -262,15 +289,15 @@ CUDA_CALLABLE inline void add_each(
         }
 }
 
-// The whole warp must come here together. Lanes after the last particle have first = -1, which ends the walk: no others may.
+// The whole warp must come here together; lanes without a particle have first = -1 and come after all others.
 template <unsigned DIM, typename T>
 CUDA_CALLABLE inline void scatter(
-    wp::vec_t<4, T>* node, const wp::vec_t<DIM, int>& shape, int crew, int first, const wp::vec_t<DIM, T>& g,
+    wp::vec_t<4, T>* node, const wp::vec_t<DIM, int>& shape, int first, const wp::vec_t<DIM, T>& g,
     const wp::vec_t<DIM, T>& b, const wp::mat_t<DIM, DIM, T>& A, T m)
 {
 #if defined(__CUDA_ARCH__)
     if constexpr (sizeof(T) == 4) {
-        add_warp(reinterpret_cast<T*>(node), shape, crew, first, g, b, A, m);
+        add_warp(reinterpret_cast<T*>(node), shape, first, g, b, A, m);
         return;
     }
 #endif
@@ -296,10 +323,11 @@ template <typename T> CUDA_CALLABLE inline void store_node(wp::vec_t<4, T>* node
         p[a] = v[a];
 }
 
-// Packed particles: blocks of 32, in each block one row of 32 numbers after the other. Particle i, row r.
+// Packed particles: blocks of 32, in each block one row of 32 numbers after the other. Particle i, row r. A model of the fast scheme
+// has no more particles than 32-bit indices reach.
 template <int ROWS, typename T> CUDA_CALLABLE inline T* packed(T* rows, int i, int r)
 {
-    return rows + (long long)(i / LANES) * (ROWS * LANES) + (i % LANES) + r * LANES;
+    return rows + (unsigned(i) / LANES * (ROWS * LANES) + unsigned(i) % LANES + r * LANES);
 }
 
 template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(const T* rows, int i, int r, T* out)

@@ -8,7 +8,7 @@ import warp as wp
 
 from softmpm.kernels.fused import fused
 from softmpm.kernels.fused_adj import fused_adj
-from softmpm.kernels.native import BLOCK
+from softmpm.kernels.native import BLOCK, WARP
 from softmpm.kernels.types import Spec, Wanted
 
 ARCH = 90
@@ -22,26 +22,27 @@ def compiler():
         pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
 
 
-def kernel(dim: int, law: str, which: str):
-    """What goes over the particles, in a scene with everything but damping."""
+def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
+    """What goes over the particles, in a bare scene or in one with everything but damping."""
     spec = Spec(
         dim=dim,
         dtype="float32",
         laws=(law,),
-        muscle_slots=2,
-        contacts=("separate",),
-        friction=True,
+        muscle_slots=0 if bare else 2,
+        contacts=() if bare else ("separate",),
+        friction=not bare,
         gravity=True,
         damping=False,
     )
     if which == "adjoint":
-        return fused_adj(spec, Wanted(material=True, activation=True)).advance_adj
-    return fused(spec).advance
+        return fused_adj(spec, Wanted(material=not bare, activation=not bare)).advance_adj[few]
+    return fused(spec).advance[few]
 
 
 def compiled(kernel) -> tuple[str, cubin.Kernel]:
     """PTX of this kernel, and what its binary says about it; from Warp's cache if nothing has changed."""
-    wp.set_module_options({"block_dim": BLOCK}, module=kernel.module)
+    threads = WARP if kernel.module.name.endswith(".few") else BLOCK
+    wp.set_module_options({"block_dim": threads}, module=kernel.module)
     (ptx,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
     (binary,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=False)
     name = re.compile(rf"{kernel.key}_\w*_cuda_kernel_forward")
@@ -50,11 +51,13 @@ def compiled(kernel) -> tuple[str, cubin.Kernel]:
     return code, facts
 
 
+@pytest.mark.parametrize("few", [False, True], ids=["many", "few"])
+@pytest.mark.parametrize("bare", [False, True], ids=["full", "bare"])
 @pytest.mark.parametrize("which", ["forward", "adjoint"])
 @pytest.mark.parametrize("dim, law", CASES)
-def test_machine_code(dim, law, which):
+def test_machine_code(dim, law, which, bare, few):
     """Nodes are read and added 16 bytes at a time, never number by number; no register is spilled, nothing is in local memory."""
-    code, facts = compiled(kernel(dim, law, which))
+    code, facts = compiled(kernel(dim, law, which, bare, few))
     print(f"\n{dim}D {law} {which}: {facts}")
     assert len(re.findall(r"\bred\.global\.add\.v4\.f32", code)) > 0
     assert not re.findall(r"\b(?:red|atom)\.global\.add\.f32", code)
@@ -70,7 +73,7 @@ def test_machine_code(dim, law, which):
 
 def test_spilled_registers_would_be_seen():
     """The reader finds them where there must be some: the same kernel with room for four times as many blocks at a time."""
-    spilling = kernel(3, "neo_hookean", "adjoint")
+    spilling = kernel(3, "neo_hookean", "adjoint", bare=False, few=False)
     options = dict(spilling.options)
     try:
         spilling.options["launch_bounds"] = (BLOCK, 16)

@@ -83,7 +83,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         i = particle_of(wp.tid(), crew, count)
         p = wp.min(i, count - 1)
         at = wp.where(i < count, first[p], -1)
-        scatter(node, shape, crew, at, g[p], b[p], A[p], m[p])
+        scatter(node, shape, at, g[p], b[p], A[p], m[p])
 
     @wp.kernel(module=module, enable_backward=False)
     def bases(base: wp.array(dtype=ivec), packed: wp.array(dtype=int), back: wp.array(dtype=ivec)):

@@ -1,6 +1,7 @@
 // A warp on the CPU: 32 threads that wait for each other where the lanes of a warp do. Runs the sums of scatter.h as a GPU would.
 #include <algorithm>
 #include <barrier>
+#include <bit>
 #include <cstring>
 #include <mutex>
 #include <thread>
@@ -32,6 +33,7 @@ thread_local struct {
 } threadIdx;
 std::barrier<>* lanes_meet;  // those that take part
 inline void __syncwarp(unsigned = 0xffffffffu) { lanes_meet->arrive_and_wait(); }
+inline int __popc(unsigned bits) { return std::popcount(bits); }
 int told[32];
 inline int __shfl_sync(unsigned, int value, int lane)
 {
@@ -40,6 +42,17 @@ inline int __shfl_sync(unsigned, int value, int lane)
     int heard = told[lane];
     __syncwarp();
     return heard;
+}
+
+inline unsigned __ballot_sync(unsigned, bool vote)
+{
+    unsigned votes = 0;
+    told[threadIdx.x] = vote;
+    __syncwarp();
+    for (int lane = 0; lane < 32; ++lane)
+        votes |= unsigned(told[lane]) << lane;
+    __syncwarp();
+    return votes;
 }
 
 std::mutex adding;
@@ -82,7 +95,7 @@ template <typename Work> void run(int count, Work work)
 
 // Add what the lanes give to the nodes; arrays of 32 each. How many sums were sent.
 template <int DIM>
-int add(float* node, const int* shape, int crew, const int* first, const float* g, const float* b, const float* A, const float* m)
+int add(float* node, const int* shape, const int* first, const float* g, const float* b, const float* A, const float* m)
 {
     wp::vec_t<DIM, int> size;
     std::copy_n(shape, DIM, size.c);
@@ -93,18 +106,18 @@ int add(float* node, const int* shape, int crew, const int* first, const float* 
         std::copy_n(g + DIM * lane, DIM, g_.c);
         std::copy_n(b + DIM * lane, DIM, b_.c);
         std::copy_n(A + DIM * DIM * lane, DIM * DIM, &A_.data[0][0]);
-        softmpm::add_warp(node, size, crew, first[lane], g_, b_, A_, m[lane]);
+        softmpm::add_warp(node, size, first[lane], g_, b_, A_, m[lane]);
     });
     return reductions / 4;
 }
 
-extern "C" int add2(float* n, const int* s, int c, const int* f, const float* g, const float* b, const float* A, const float* m)
+extern "C" int add2(float* n, const int* s, const int* f, const float* g, const float* b, const float* A, const float* m)
 {
-    return add<2>(n, s, c, f, g, b, A, m);
+    return add<2>(n, s, f, g, b, A, m);
 }
-extern "C" int add3(float* n, const int* s, int c, const int* f, const float* g, const float* b, const float* A, const float* m)
+extern "C" int add3(float* n, const int* s, const int* f, const float* g, const float* b, const float* A, const float* m)
 {
-    return add<3>(n, s, c, f, g, b, A, m);
+    return add<3>(n, s, f, g, b, A, m);
 }
 
 // The numbers of the first ``count`` lanes' particles, nine each, to their rows.
