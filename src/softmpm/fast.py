@@ -2,6 +2,7 @@
 
 import threading
 import weakref
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
@@ -31,6 +32,20 @@ STAY = {False: 4, True: 2}
 keep nothing serve calls with and without gradient in turn."""
 
 
+class _Shelf(list[Pair]):
+    """Programs of one shape that wait for use. A program out on loan does not hold it, so that what waits goes with its pool."""
+
+    def back(self) -> Callable[[Pair], None]:
+        """What puts a program back, if the shelf is still there then."""
+        here = weakref.ref(self)
+
+        def put(pair: Pair) -> None:
+            if (shelf := here()) is not None:
+                shelf.append(pair)
+
+        return put
+
+
 class Pool:
     """Programs that were made on one arrangement and are not in use.
 
@@ -41,13 +56,13 @@ class Pool:
     def __init__(self, model: Model, arrangement: Arrangement, unpacking: Unpacking):
         self.model, self.arrangement, self.unpacking = model, arrangement, unpacking
         # By whether they keep what is inside, and by shape, the one that came last at the end:
-        self._free: dict[bool, dict[tuple, list[Pair]]] = {False: {}, True: {}}
+        self._free: dict[bool, dict[tuple, _Shelf]] = {False: {}, True: {}}
         self._scratch: dict[Wanted, Scratch] = {}
 
-    def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, list[Pair]]:
-        """A program, and the list that it comes back to: whoever gives it back, only this thread changes the pool."""
+    def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, _Shelf]:
+        """A program, and the shelf that it comes back to: whoever gives it back, only this thread changes the pool."""
         shapes = self._free[keep]
-        free = shapes[chunk.shape] = shapes.pop(chunk.shape, [])
+        free = shapes[chunk.shape] = shapes.pop(chunk.shape, _Shelf())
         if free:
             pair = free.pop()
             if recording(self.model):
@@ -83,7 +98,7 @@ class _Lease:
     def __init__(self, pool: Pool, chunk: Chunk, keep: bool):
         self.pair, free = pool.take(chunk, keep)
         if not recording(pool.model):  # else it belongs to the graph that is being recorded
-            weakref.finalize(self, free.append, self.pair)
+            weakref.finalize(self, free.back(), self.pair)
 
 
 class FastRun:

@@ -140,8 +140,8 @@ class Program:
 
     @property
     def few(self) -> bool:
-        """Whether a GPU has more room than there are warps."""
-        return self.total <= FEW
+        """Whether this is a GPU that has more room than there are warps."""
+        return self.model.device.type == "cuda" and self.total <= FEW
 
     @property
     def block(self) -> int:

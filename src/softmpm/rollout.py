@@ -79,6 +79,7 @@ class _Runner:
                 return run
             if self.settled(run, Report(run.words)):
                 return run
+            del run  # or its program would be there beside the next one, which has a larger window
 
 
 def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, solid: Solid, keep: bool):
@@ -109,7 +110,8 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
             run = runner.run(trail.chunks[k], state, inside)
             ahead = run, Report(run.words)
         if before is not None and not runner.settled(*before):
-            k, state, before = k - 1, before[0].start, None  # what ran ahead of it is void
+            k, state, before = k - 1, before[0].start, None
+            del run, ahead  # what ran ahead of it is void
             continue
         if before is not None and inside:
             trail.keep(before[0])

@@ -130,6 +130,34 @@ def test_a_call_leaves_nothing_but_its_programs(living, settings, device):
     assert left[0] == left[1] == left[2]
 
 
+@pytest.mark.parametrize("report", range(7))
+def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatch, report):
+    """Of its programs only the one in whose buffers the chunk starts, when those for the larger window are made.
+
+    The particle that left is seen in one report after the other: three are of the forward pass, the others of chunks that run again.
+    """
+    monkeypatch.setattr(memory, "LONGEST", 8)
+    built, seen, others = model(**little_memory(model())), [], []
+    pull(*call(built))
+    (smaller,) = living(arrangement.Arrangement)
+    smaller.left = True
+    del smaller
+    outgrown, make = rollout.outgrown, program.Program.__init__
+
+    def left_once(words) -> bool:
+        seen.append(words)
+        return outgrown(words) or len(seen) == report + 1
+
+    def making(self, model, window, *args):
+        others.append(sum(one.arrangement is not window for one in living(program.Program)))
+        make(self, model, window, *args)
+
+    monkeypatch.setattr(rollout, "outgrown", left_once)
+    monkeypatch.setattr(program.Program, "__init__", making)
+    pull(*call(built))
+    assert len(seen) > report and others and max(others) <= 1
+
+
 def test_calls_of_many_lengths_leave_few_programs(living, device):
     """Their memory is bounded by what two calls may keep; those of the last call are there for the next one like it."""
     sizes, lengths = model().sizes(), range(10, 40)
