@@ -55,6 +55,7 @@ def simulate(
         State after ``control_step * substeps * dt`` seconds, in new tensors.
 
     Raises:
+        TypeError: ``model`` is something else.
         ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
         UnstableError: A particle became non-finite, inverted or left the grid; names world, particle, substep and limit.
     """
@@ -66,10 +67,7 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
         with torch.inference_mode(False), torch.no_grad():
             return _simulate(model, start, activation, params, substeps)
-    if not isinstance(model, Model):
-        raise TypeError(
-            f"simulate needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
-        )
+    _check_model(model, "simulate")
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
@@ -140,16 +138,24 @@ def rasterize(model: Model, state: State) -> GridField:
         ``mass`` [kg] of shape (world, *nodes) and ``velocity`` [m/s] of shape (world, *nodes, dim), zero where there is no mass.
 
     Raises:
-        ValueError, UnstableError: As :func:`simulate`, for the state.
+        TypeError, ValueError, UnstableError: As :func:`simulate`, for the model and the state.
     """
     return _rasterize(model, state)
 
 
 @_opaque
 def _rasterize(model: Model, state: State) -> GridField:
+    _check_model(model, "rasterize")
     state = _cast(model, state)
     check_state(model, state)
     return GridField(*_Rasterize.apply(model, state.x, state.v, state.C))
+
+
+def _check_model(model: Any, wants: str) -> None:
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"{wants} needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
+        )
 
 
 def _cast(model: Model, value: Any) -> Any:

@@ -17,7 +17,7 @@ from softmpm.schedule import recomputed
 
 LONGEST = 128
 """Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
-MANY, LONGEST_OF_MANY = 200_000, 64
+MANY, LONGEST_OF_MANY = 30_000, 64
 """From so many particles on the host has time enough, and sorting in time is worth more."""
 CPU_BUDGET = 64 * 2**20
 """Without a budget, what a call on the CPU may keep; on a GPU it is a sixteenth of its memory."""

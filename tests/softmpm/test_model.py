@@ -314,7 +314,12 @@ def test_a_model_is_not_copied_or_pickled():
             take(model)
 
 
-def test_simulate_wants_a_model():
-    model = softmpm.build(busy_scene(2), device="cpu")
-    with pytest.raises(TypeError, match=r"needs a model, as softmpm.build\(scene\) gives it, got Scene"):
+def test_a_scene_is_no_model():
+    model, given = (
+        softmpm.build(busy_scene(2), device="cpu"),
+        r"as softmpm.build\(scene\) gives it, got Scene",
+    )
+    with pytest.raises(TypeError, match=f"simulate needs a model, {given}"):
         softmpm.simulate(model.scene, model.rest(), None, model.params(), substeps=1)
+    with pytest.raises(TypeError, match=f"rasterize needs a model, {given}"):
+        softmpm.rasterize(model.scene, model.rest())
