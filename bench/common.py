@@ -35,7 +35,7 @@ def cube(
     side = round(particles ** (1 / dim))
     axis = (np.arange(side) - (side - 1) / 2) * dx / 2 + 0.5 * (domain or nodes) * dx
     positions = np.stack(np.meshgrid(*[axis] * dim, indexing="ij"), -1).reshape(-1, dim)
-    np.random.default_rng(seed).shuffle(positions)
+    positions = np.random.default_rng(seed).permutation(positions)
     body = softmpm.Body(
         softmpm.Particles(positions, (dx / 2) ** dim), law(density=1.0, young=100.0, poisson=0.3)
     )

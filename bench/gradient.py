@@ -60,14 +60,11 @@ def main():
             continue
         for name, features in GRADIENTS.items():
             scene = cube(dim, particles, nodes, **features)
-            row = {"dim": dim, "particles": None, "nodes": nodes, "scene": name}
+            row, sizes = {"dim": dim, "particles": None, "nodes": nodes, "scene": name}, None
             for kind, substeps in substeps_of(particles, device).items():
-                everything = plan(
-                    Horizon(1, substeps), softmpm.build(scene, device=device).sizes(), 2**62
-                ).kept
-                budget = 2**62 if kind == "kept" else everything // 5
+                budget = 2**62 if kind == "kept" else plan(Horizon(1, substeps), sizes, 2**62).kept // 5
                 model = softmpm.build(scene, device=device, memory_budget=budget)
-                row["particles"] = model.particle_count
+                row["particles"], sizes = model.particle_count, model.sizes()
                 figures = measure(
                     model, substeps, args.repeats, materials="materials" in name, turns="turning" in name
                 )

@@ -15,6 +15,8 @@ from softmpm.scene import Grid, Scene, need
 
 SAME_PLACE = 1e-6
 """Two particles nearer than this share of a cell are one particle twice."""
+MIXERS = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
+"""Odd numbers without a pattern, that sums of multiples of them seldom agree modulo 2^64."""
 
 
 def check_scene(scene: Scene) -> None:
@@ -53,7 +55,8 @@ def _check_distinct(scene: Scene) -> None:
     positions = np.concatenate([body.particles.positions for body in scene.bodies])
     # An offset that no lattice has keeps two copies, equal up to rounding, on the same side of a bin's edge.
     bins = np.floor(positions / (SAME_PLACE * scene.grid.spacing) + 0.381966).astype(np.int64)
-    order = np.lexsort(bins.T)
+    order = _suspects(bins)
+    order = order[np.lexsort(bins[order].T)]
     twice = (np.diff(bins[order], axis=0) == 0).all(axis=1)
     if twice.any():
         first = int(np.argmax(twice))
@@ -64,6 +67,14 @@ def _check_distinct(scene: Scene) -> None:
             f"{_tuple(positions[i])} m, and {twice.sum() - 1} more such pairs: bodies must not overlap. "
             "Move one, or keep only the particles that the other has not."
         )
+
+
+def _suspects(bins: np.ndarray) -> np.ndarray:
+    """Rows that may equal another one: numbers made of the rows do. To sort these is far quicker than to sort the rows."""
+    mixed = (bins.astype(np.uint64) * np.array(MIXERS[: bins.shape[1]], dtype=np.uint64)).sum(axis=1)
+    ordered = np.sort(mixed)
+    again = ordered[1:][ordered[1:] == ordered[:-1]]
+    return np.flatnonzero(np.isin(mixed, again)) if again.size else np.empty(0, dtype=np.int64)
 
 
 def _check_muscles(scene: Scene) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from softmpm import checks
 from softmpm.checks import (
     BOUNDS,
     check_activation,
@@ -106,6 +107,14 @@ def test_rounding_hides_no_copy(sign):
     copy = np.array((0.25, 0.5)) * (1 + sign * 1e-15)
     refused(scene(body((0.25, 0.5)), body(copy)), "at the same place")
     check_scene(scene(body((0.25, 0.5)), body(copy + 1e-5 * DX)))
+
+
+def test_numbers_that_agree_by_chance_are_no_particle_twice(monkeypatch):
+    """What the rows are told apart by first need not tell them apart."""
+    monkeypatch.setattr(checks, "MIXERS", (0, 1, 0))
+    one, other = body((0.25, 0.5)), body((0.75, 0.5))
+    check_scene(scene(one, other))
+    refused(scene(one, other, body((0.75, 0.5))), "at the same place")
 
 
 def test_message_of_a_particle_twice():
