@@ -144,6 +144,12 @@ class Program:
         return self.model.device.type == "cuda" and self.total <= FEW
 
     @property
+    def _kernels(self):
+        """What goes over the particles."""
+        kernels = fused(self.model.spec)
+        return kernels.few if self.few else kernels.many
+
+    @property
     def block(self) -> int:
         """Threads of a block over particles."""
         return WARP if self.few else BLOCK
@@ -227,7 +233,7 @@ class Program:
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
         sizes = (self.crew, model.particle_count, self.total, self.order_flat)
         arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
-        launch(fused(model.spec).begin, self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(self._kernels.begin, self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None:
             self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
 
@@ -241,6 +247,6 @@ class Program:
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(fused(model.spec).advance[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(self._kernels.advance, self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
             self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

@@ -24,6 +24,7 @@ from softmpm import autograd, fast, memory, program
 from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid
 from softmpm.horizon import Chunk, Horizon
+from softmpm.kernels.native import WARP
 from softmpm.kernels.types import BASE_BITS, packed_rows
 from softmpm.memory import plan
 
@@ -86,11 +87,9 @@ def test_a_grid_too_large_for_packed_coordinates_takes_the_plain_scheme(dim):
 
 
 def test_more_numbers_than_indices_reach_take_the_plain_scheme():
-    """Particles of all worlds times the numbers of each must stay below 2³¹."""
-    for worlds, scheme in (
-        (2**31 // packed_rows(2).rows + 1, "plain"),
-        (2**31 // packed_rows(2).rows, "fast"),
-    ):
+    """Particles of all worlds, in whole warps, times the numbers of each must stay below 2³¹."""
+    most = 2**31 // packed_rows(2).rows // WARP * WARP
+    for worlds, scheme in ((most + 1, "plain"), (most, "fast")):
         small = softmpm.build(tiny((8, 8)), device="cpu")
         small.worlds = worlds  # a real one would not fit into memory
         chosen, reason = small._scheme("auto")

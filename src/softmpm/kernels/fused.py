@@ -120,7 +120,6 @@ def fused(spec: Spec) -> SimpleNamespace:
         store_mat(then.rows, i, row_H, load_mat(now.rows, i, row_H))
         store_mat(then.rows, i, row_C, load_mat(now.rows, i, row_C))
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def begin(
         # Parameters:
         scale: Scale,
@@ -218,18 +217,16 @@ def fused(spec: Spec) -> SimpleNamespace:
         if not last:
             hand_on(watch, window, place, count, total, order, substep + 1, first, g, b, A, m, node)
 
-    def compiled(few: bool) -> wp.Kernel:
-        """``advance`` for few particles, where a warp may have the registers to wait for all that it reads at once, or for many."""
+    def compiled(few: bool) -> SimpleNamespace:
+        """What goes over particles: few, where a warp may have the registers to wait for all that it reads at once, or many."""
         name, bounds = (".few", (BLOCK, 3)) if few else ("", None)
-        where = native_module(spec.module + ".fused" + name)
-        return wp.kernel(module=where, enable_backward=False, grid_stride=False, launch_bounds=bounds)(
-            advance
+        options = dict(
+            module=native_module(spec.module + ".fused" + name), enable_backward=False, grid_stride=False
+        )
+        return SimpleNamespace(
+            begin=wp.kernel(**options)(begin), advance=wp.kernel(**options, launch_bounds=bounds)(advance)
         )
 
     return SimpleNamespace(
-        clear=clear,
-        grid_velocity=grid_velocity,
-        begin=begin,
-        advance={few: compiled(few) for few in (True, False)},
-        centre=centre,
+        clear=clear, grid_velocity=grid_velocity, centre=centre, few=compiled(True), many=compiled(False)
     )
