@@ -73,8 +73,7 @@ def _suspects(bins: np.ndarray) -> np.ndarray:
     """Rows that may equal another one: numbers made of the rows do. To sort these is far quicker than to sort the rows."""
     mixed = (bins.astype(np.uint64) * np.array(MIXERS[: bins.shape[1]], dtype=np.uint64)).sum(axis=1)
     ordered = np.sort(mixed)
-    again = ordered[1:][ordered[1:] == ordered[:-1]]
-    return np.flatnonzero(np.isin(mixed, again)) if again.size else np.empty(0, dtype=np.int64)
+    return np.flatnonzero(np.isin(mixed, ordered[1:][ordered[1:] == ordered[:-1]]))
 
 
 def _check_muscles(scene: Scene) -> None:

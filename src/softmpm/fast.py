@@ -2,7 +2,6 @@
 
 import threading
 import weakref
-from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
@@ -33,17 +32,13 @@ keep nothing serve calls with and without gradient in turn."""
 
 
 class _Shelf(list[Pair]):
-    """Programs of one shape that wait for use. A program out on loan does not hold it, so that what waits goes with its pool."""
+    """Programs of one shape that wait for use. Unlike a plain list it can be referred to weakly: see :func:`_put_back`."""
 
-    def back(self) -> Callable[[Pair], None]:
-        """What puts a program back, if the shelf is still there then."""
-        here = weakref.ref(self)
 
-        def put(pair: Pair) -> None:
-            if (shelf := here()) is not None:
-                shelf.append(pair)
-
-        return put
+def _put_back(shelf: weakref.ref[_Shelf], pair: Pair) -> None:
+    """A program that was on loan. It did not hold the shelf meanwhile, so that what waits goes with its pool."""
+    if (there := shelf()) is not None:
+        there.append(pair)
 
 
 class Pool:
@@ -98,7 +93,7 @@ class _Lease:
     def __init__(self, pool: Pool, chunk: Chunk, keep: bool):
         self.pair, free = pool.take(chunk, keep)
         if not recording(pool.model):  # else it belongs to the graph that is being recorded
-            weakref.finalize(self, free.back(), self.pair)
+            weakref.finalize(self, _put_back, weakref.ref(free), self.pair)
 
 
 class FastRun:

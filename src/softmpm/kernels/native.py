@@ -17,7 +17,7 @@ WARP = 32
 BLOCK = 128
 """Threads of a block."""
 FEW, VERY_FEW = 20_000, 10_000
-"""Up to so many particles a block is one warp, and a warp may have particles for half of its threads only."""
+"""Up to so many particles have kernels of their own in blocks of one warp, and a warp may have some for half of its threads only."""
 
 
 def native_module(name: str) -> str:
