@@ -4,12 +4,14 @@ A chunk takes its start straight from the buffers in which the one before left i
 the :class:`SortedState`.
 """
 
+import math
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from softmpm.buffers import slot
-from softmpm.kernels.native import WARP
+from softmpm.kernels.native import padded
 from softmpm.kernels.packing import packing
 from softmpm.kernels.sorting import sorting
 from softmpm.kernels.types import types
@@ -19,18 +21,13 @@ from softmpm.state import Low, State
 from softmpm.step import stream_of
 
 
-def padded(model: Model) -> int:
-    """Places of packed particles, which come in whole warps."""
-    return -(-model.worlds * model.particle_count // WARP) * WARP
-
-
 class Unpacking:
     """The launches that lead from packed particles back to the user's order."""
 
     def __init__(self, model: Model):
         self.model = model
         spec, lead = model.spec, (model.worlds, model.particle_count)
-        t, pack, places = types(spec.dim, spec.dtype), packing(spec.dim, spec.dtype), padded(model)
+        t, pack, places = types(spec.dim, spec.dtype), packing(spec.dim, spec.dtype), padded(math.prod(lead))
         order, base, rows = (wp.int32,), (wp.int32, places), (t.real, places * t.rows)
         scale, end = (model.scale,), [(t.vec,), (t.vec,), (t.mat,), (t.mat,)]
         low = [(t.vec,), (t.mat,)] if model.dtype == torch.float32 else []

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from softmpm.checks import check_scene, check_whole
 from softmpm.description import describe
-from softmpm.kernels.native import WARP
+from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
 from softmpm.memory import CPU_BUDGET, MARGIN, Sizes, longest_chunk, price_of_chunk, window_shape
 from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
@@ -196,8 +196,7 @@ class Model:
     def _scheme(self, wanted: str) -> tuple[str, str]:
         """The scheme, and why."""
         largest = 2 ** BASE_BITS[self.dim]
-        places = -(-self.worlds * self.particle_count // WARP) * WARP
-        numbers = places * packed_rows(self.dim).rows
+        numbers = padded(self.worlds * self.particle_count) * packed_rows(self.dim).rows
         obstacle = None
         if max(self.scene.grid.shape) > largest:
             obstacle = f"the grid has more than {largest} nodes along an axis"

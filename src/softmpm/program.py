@@ -12,12 +12,12 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.arrangement import Arrangement
-from softmpm.between import SortedState, padded
+from softmpm.between import SortedState
 from softmpm.buffers import Solid, passing, slot, slots_in, view
 from softmpm.exact import Exact
 from softmpm.horizon import Chunk
 from softmpm.kernels.fused import fused
-from softmpm.kernels.native import BLOCK, FEW, VERY_FEW, WARP
+from softmpm.kernels.native import BLOCK, FEW, VERY_FEW, WARP, padded
 from softmpm.kernels.packing import packing
 from softmpm.kernels.solid import sorted_solid
 from softmpm.kernels.sorting import sorting
@@ -37,7 +37,7 @@ class Program:
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
-        places = padded(model)
+        places = padded(self.total)
 
         def tensor(*size, dtype=model.dtype):
             return torch.empty(*size, dtype=dtype, device=model.device)
@@ -115,7 +115,7 @@ class Program:
             return Command(model, pack.enter, lead, inputs, slots)
 
         self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
-        places, sort = padded(model), sorting(t.dim, model.spec.dtype)
+        places, sort = padded(self.total), sorting(t.dim, model.spec.dtype)
         slots = [slot(model, wp.int32), slot(model, wp.int32, places), slot(model, t.real, places * t.rows)]
         inputs = (self.window, self.order_array, *slots, self.watch, self.packed[0])
         self._move = Command(model, sort.move, lead, inputs, slots)
@@ -142,12 +142,6 @@ class Program:
     def few(self) -> bool:
         """Whether this is a GPU that has more room than there are warps."""
         return self.model.device.type == "cuda" and self.total <= FEW
-
-    @property
-    def _kernels(self):
-        """What goes over the particles."""
-        kernels = fused(self.model.spec)
-        return kernels.few if self.few else kernels.many
 
     @property
     def block(self) -> int:
@@ -233,7 +227,7 @@ class Program:
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
         sizes = (self.crew, model.particle_count, self.total, self.order_flat)
         arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
-        launch(self._kernels.begin, self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(fused(model.spec).begin[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None:
             self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
 
@@ -247,6 +241,6 @@ class Program:
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(self._kernels.advance, self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(fused(model.spec).advance[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
             self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

@@ -131,8 +131,7 @@ class ProgramAdj:
         states = (program.packed[max(s - 1, 0)], program.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
         out = (program.watch, scratch.solid_struct, sink)
-        kernels = fused_adj(model.spec, self.wanted)
-        kernel = (kernels.few if program.few else kernels.many).advance_adj
+        kernel = fused_adj(model.spec, self.wanted).advance_adj[program.few]
         arguments = (*parameters, *sizes, *states, *grids, *out)
         launch(kernel, program.threads(crew), *arguments, block_dim=program.block)
         if exact is not None and not start:

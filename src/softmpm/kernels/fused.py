@@ -217,16 +217,19 @@ def fused(spec: Spec) -> SimpleNamespace:
         if not last:
             hand_on(watch, window, place, count, total, order, substep + 1, first, g, b, A, m, node)
 
-    def compiled(few: bool) -> SimpleNamespace:
-        """What goes over particles: few, where a warp may have the registers to wait for all that it reads at once, or many."""
-        name, bounds = (".few", (BLOCK, 3)) if few else ("", None)
-        options = dict(
-            module=native_module(spec.module + ".fused" + name), enable_backward=False, grid_stride=False
-        )
-        return SimpleNamespace(
-            begin=wp.kernel(**options)(begin), advance=wp.kernel(**options, launch_bounds=bounds)(advance)
-        )
+    def by_number(kernel, bounds_of_few=None) -> dict[bool, wp.Kernel]:
+        """It goes over particles: many, or few, where a warp may have the registers to wait for all that it reads at once."""
+        few = native_module(spec.module + ".fused.few")
+        options = dict(enable_backward=False, grid_stride=False)
+        return {
+            False: wp.kernel(**options, module=module)(kernel),
+            True: wp.kernel(**options, module=few, launch_bounds=bounds_of_few)(kernel),
+        }
 
     return SimpleNamespace(
-        clear=clear, grid_velocity=grid_velocity, centre=centre, few=compiled(True), many=compiled(False)
+        clear=clear,
+        grid_velocity=grid_velocity,
+        begin=by_number(begin),
+        advance=by_number(advance, (BLOCK, 3)),
+        centre=centre,
     )

@@ -169,11 +169,13 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
             else:
                 scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
 
-    def compiled(few: bool) -> SimpleNamespace:
+    def compiled(few: bool) -> wp.Kernel:
         """``advance_adj`` for few particles or for many, as in fused.py: with so many registers that so many blocks fit at a time."""
         name, blocks = (".few", 2) if few else ("", 3)
         where = native_module(adj_module(spec, wanted) + ".fused" + name)
         options = dict(module=where, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, blocks))
-        return SimpleNamespace(advance_adj=wp.kernel(**options)(advance_adj))
+        return wp.kernel(**options)(advance_adj)
 
-    return SimpleNamespace(grid_velocity_adj=grid_velocity_adj, few=compiled(True), many=compiled(False))
+    return SimpleNamespace(
+        grid_velocity_adj=grid_velocity_adj, advance_adj={few: compiled(few) for few in (False, True)}
+    )

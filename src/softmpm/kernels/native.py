@@ -20,6 +20,11 @@ FEW, VERY_FEW = 20_000, 10_000
 """Up to so many particles have kernels of their own in blocks of one warp, and a warp may have some for half of its threads only."""
 
 
+def padded(particles: int) -> int:
+    """Places that packed particles take, which come in whole warps."""
+    return -(-particles // WARP) * WARP
+
+
 def native_module(name: str) -> str:
     """Give the Warp module of this name what native functions need; returns the name.
 

@@ -35,9 +35,8 @@ def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
         damping=False,
     )
     if which == "adjoint":
-        kernels = fused_adj(spec, Wanted(material=not bare, activation=not bare))
-        return (kernels.few if few else kernels.many).advance_adj
-    return (fused(spec).few if few else fused(spec).many).advance
+        return fused_adj(spec, Wanted(material=not bare, activation=not bare)).advance_adj[few]
+    return fused(spec).advance[few]
 
 
 def compiled(kernel) -> tuple[str, cubin.Kernel]:
