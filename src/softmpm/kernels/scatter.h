@@ -7,9 +7,9 @@
 // with g the distance from the middle node in cells, -1/2 <= g < 1/2. Both scatters have this form: momentum and mass of the
 // forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
 // share their nodes. The warp therefore turns the sum around: its lanes, or the first of them, have a particle each and write its
-// (b, A, m, g) to shared memory, in 3D the weights along z in place of g_z; then three groups of nine lanes own the nodes, walk through
-// a third of the particles each, add up in registers while the cell stays the same, and send one 16-byte reduction per node and cell.
-// Lanes 27 to 31 own nothing.
+// (b, A, m, g) to shared memory in the order of the cells, in 3D the weights along z in place of g_z; then three groups of nine lanes
+// own the nodes, walk through a third of the particles each, add up in registers while the cell stays the same, and send one 16-byte
+// reduction per node and cell. Lanes 27 to 31 own nothing.
 namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
@@ -69,12 +69,39 @@ struct Weight {
     }
 };
 
+// Where this lane's particle stands among those of its warp, sorted by their first nodes; lanes without a particle, which come last,
+// stay last. An order of all particles grows stale as they move, but those of a warp stay near each other: sorted anew they still
+// share their nodes.
+CUDA_CALLABLE inline int sorted_place(int first)
+{
+    constexpr unsigned ALL = 0xffffffffu;
+    __shared__ int place[WP_TILE_BLOCK_DIM];
+    int lane = threadIdx.x & (LANES - 1);
+    unsigned key = first, before = __shfl_up_sync(ALL, key, 1);
+    if (__all_sync(ALL, lane == 0 || before <= key))
+        return lane;
+    unsigned lowest = key;
+    for (int step = 1; step < LANES; step *= 2)
+        lowest = min(lowest, __shfl_xor_sync(ALL, lowest, step));
+    // A bitonic sort of lanes. Nodes too far from the lowest one to be told apart stay in the order of their lanes.
+    unsigned all = min(key - lowest, ~0u / LANES) * LANES + lane;
+    for (int size = 2; size <= LANES; size *= 2)
+        for (int step = size / 2; step > 0; step /= 2) {
+            unsigned other = __shfl_xor_sync(ALL, all, step);
+            bool lower = ((lane & step) == 0) == ((lane & size) == 0);
+            all = lower ? min(all, other) : max(all, other);
+        }
+    place[threadIdx.x - lane + all % LANES] = lane;
+    __syncwarp();
+    return place[threadIdx.x];
+}
+
 // What a lane owns of the nodes around the cell that the walk is in, and how a particle lies in shared memory for it.
 template <int DIM, class Sink> struct Owner;
 
 // Three dimensions: a column of three nodes along z, which is handed on when the next cell is the one above.
 template <class Sink> struct Owner<3, Sink> {
-    static constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts
+    static constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts when sorted
     Weight wx, wy;
     float fx, fy;
     Sink origin;
@@ -145,7 +172,7 @@ template <class Sink> struct Owner<3, Sink> {
 
 // Two dimensions: one node, which is (x, y, m, 0).
 template <class Sink> struct Owner<2, Sink> {
-    static constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, free of bank conflicts as well
+    static constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, the same
     Weight wx, wy;
     float fx, fy;
     Sink origin;
@@ -199,7 +226,7 @@ CUDA_CALLABLE inline void add_warp(
     __shared__ float4 box[(WP_TILE_BLOCK_DIM + 2) * WIDTH];  // the walk reads up to two particles behind the last
     int lane = threadIdx.x & (LANES - 1);
     float4* particles = box + (threadIdx.x - lane) * WIDTH;
-    Lane::write(particles + lane * WIDTH, first, g, b, A, m);
+    Lane::write(particles + sorted_place(first) * WIDTH, first, g, b, A, m);
     int count = __popc(__ballot_sync(0xffffffffu, first >= 0));
     int group = lane / 9, own = lane % 9, share = (count + 2) / 3;
     int begin = group * share, end = min(begin + share, count);

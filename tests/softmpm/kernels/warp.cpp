@@ -12,6 +12,7 @@
 #define WP_TILE_BLOCK_DIM 32
 #define __shared__ static
 
+using std::max;
 using std::min;
 
 struct float4 {
@@ -44,6 +45,16 @@ inline int __shfl_sync(unsigned, int value, int lane)
     return heard;
 }
 
+template <typename T> T exchanged(T value, int lane)  // with what all others tell
+{
+    return T(__shfl_sync(0, int(value), lane));
+}
+inline unsigned __shfl_up_sync(unsigned, unsigned value, int by)
+{
+    int lane = threadIdx.x;
+    return exchanged(value, lane < by ? lane : lane - by);
+}
+inline unsigned __shfl_xor_sync(unsigned, unsigned value, int mask) { return exchanged(value, int(threadIdx.x) ^ mask); }
 inline unsigned __ballot_sync(unsigned, bool vote)
 {
     unsigned votes = 0;
@@ -54,6 +65,8 @@ inline unsigned __ballot_sync(unsigned, bool vote)
     __syncwarp();
     return votes;
 }
+
+inline bool __all_sync(unsigned, bool vote) { return __ballot_sync(0, vote) == ~0u; }
 
 std::mutex adding;
 int reductions;  // sums of a node that were sent, four numbers each
