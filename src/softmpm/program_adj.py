@@ -7,6 +7,7 @@ from torch import Tensor
 from softmpm.between import SortedAdj
 from softmpm.buffers import SolidAdj, clear, slot, slots_in, view
 from softmpm.exact import Exact
+from softmpm.kernels.fused import fused
 from softmpm.kernels.fused_adj import fused_adj
 from softmpm.kernels.native import BLOCK
 from softmpm.kernels.solid import PARTS, collect_pull, collect_pull_in_order, collectors, sorted_solid_adj
@@ -97,6 +98,8 @@ class ProgramAdj:
             self._enter(stream, *adj_end)
 
     def _launch_all(self, launch: Launcher) -> None:
+        velocity = self.scratch.velocity_array
+        launch(fused(self.program.model.spec).clear, len(self.scratch.velocity), velocity, block_dim=BLOCK)
         for s in range(self.program.chunk.length, -1, -1):
             self._grid(s, launch)
             self._particles(s, launch)

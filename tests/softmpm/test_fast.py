@@ -20,7 +20,7 @@ from helpers import (
 )
 
 import softmpm
-from softmpm import autograd, fast, memory, program
+from softmpm import autograd, fast, memory, program, program_adj
 from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid
 from softmpm.horizon import Chunk, Horizon
@@ -50,11 +50,12 @@ def same_on(device: str) -> float:
 
 
 def tiny(shape) -> softmpm.Scene:
+    """One particle, exactly halfway between two nodes along each axis."""
     body = softmpm.Body(
-        softmpm.Particles(np.full((1, len(shape)), 0.35), 1e-3),
+        softmpm.Particles(np.full((1, len(shape)), 0.4375), 1e-3),
         softmpm.NeoHookean(density=1.0, young=10.0, poisson=0.3),
     )
-    return softmpm.Scene(grid=softmpm.Grid(shape=shape, spacing=0.1), bodies=[body], dt=1e-3)
+    return softmpm.Scene(grid=softmpm.Grid(shape=shape, spacing=0.125), bodies=[body], dt=1e-3)
 
 
 def test_auto_takes_the_fast_scheme_in_single_precision():
@@ -125,6 +126,35 @@ def test_fast_and_plain_agree(dim, dtype, limit, limit_adj, control_steps, subst
     got, want = (end_and_gradients(m, control_steps, substeps) for m in built)
     for name in want:
         assert_relative(got[name], want[name], limit if name in "xvCF" else limit_adj, name)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_new_memory_holds_leaves_no_trace(dim, deterministic, device, monkeypatch):
+    """A particle halfway between two nodes meets others with weight zero, and nothing sets their velocity."""
+
+    def full_of(number: float, buffers: type) -> type:
+        class Full(buffers):
+            def __init__(self, *args, **kwargs):
+                super().__init__(*args, **kwargs)
+                self.nodes.fill_(number)
+                self.velocity.fill_(number)
+
+        return Full
+
+    found = []
+    for number in (0.0, torch.nan):
+        monkeypatch.setattr(fast, "Program", full_of(number, program.Program))
+        monkeypatch.setattr(fast, "Scratch", full_of(number, program_adj.Scratch))
+        built = softmpm.build(tiny((16,) * dim), device=device, scheme="fast", deterministic=deterministic)
+        start = built.rest()
+        start.v.add_(torch.tensor([0.3, 0.2, 0.1][:dim], device=device))
+        inputs = [part.requires_grad_() for part in start[:3]]
+        end = softmpm.simulate(built, start, None, built.params(), substeps=1)
+        loss = sum(part.square().sum() for part in end)
+        found.append([*(part.detach() for part in end), *torch.autograd.grad(loss, inputs)])
+    for clean, dirty in zip(*found, strict=True):
+        assert torch.equal(clean, dirty)
 
 
 @pytest.mark.parametrize("scene", ["passive", "many blocks"])

@@ -1,7 +1,8 @@
 """Sums over particles in fixed point, the same from run to run: what takes the place of ``scatter`` in the fast scheme.
 
 A particle's share of a sum is (b + A o, m), see scatter.h. The unit of the sums follows from the largest share (fixed.h), so
-there is a step more: ``give`` keeps b and A and notes their size, ``push`` adds up, ``take`` reads a node and clears it.
+there is a step more: ``give`` keeps b and A and notes their size, ``push`` adds up, ``take`` reads a node and clears it,
+``leave`` keeps what is made of it.
 """
 
 import functools
@@ -20,6 +21,7 @@ def fixed(dim: int) -> SimpleNamespace:
     t, n, s = types(dim, "float32"), native(dim, "float32"), stencil(dim, "float32")
     vec, mat, ivec, node_vec, Packed, Window = t.vec, t.mat, t.ivec, t.aligned, t.Packed, t.Window
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    store_node = n.store_node
     first_node, unpack_base = s.first_node, s.unpack_base
     row_fx, row_v, row_C = t.row_fx, t.row_v, t.row_c
 
@@ -82,11 +84,17 @@ def fixed(dim: int) -> SimpleNamespace:
         return wp.isfinite(size * float(count))  # else its world's sums are not numbers
 
     @wp.func
+    def leave(sums: Sums, i: int, value: node_vec):
+        store_node(sums.node, i, value)
+
+    @wp.func
     def take(sums: Sums, i: int) -> node_vec:
-        """The sum of node ``i``, which is cleared."""
+        """The sum of node ``i``, left for its readers and cleared."""
         if i < sums.other_largest.shape[0] / 2:
             sums.other_largest[2 * i] = float(0.0)  # the largest mass stays
-        return take_fixed(sums.fixed, sums.largest, sums.nodes, sums.particles, i)
+        sum = take_fixed(sums.fixed, sums.largest, sums.nodes, sums.particles, i)
+        leave(sums, i, sum)
+        return sum
 
     @wp.kernel(module=native_module(f"softmpm.fixed.d{dim}"), enable_backward=False, grid_stride=False)
     def push(
@@ -120,4 +128,4 @@ def fixed(dim: int) -> SimpleNamespace:
             )
         scatter(sums.fixed, sums.largest, sums.nodes, sums.particles, window.shape, first, g, b, A, m)
 
-    return SimpleNamespace(Shares=Shares, Sums=Sums, give=give, take=take, push=push)
+    return SimpleNamespace(Shares=Shares, Sums=Sums, give=give, take=take, leave=leave, push=push)

@@ -6,6 +6,9 @@ A substep is two launches. With M the nodes' momentum and mass, V their velocity
     grid      V ← (G1), (G2) of M,  next M ← 0
     advance   particles: V → (T2), (T3) → new state → (T1) → next M
 
+A node without mass keeps the V it has, which saves most of the writing where the window is mostly empty. Particles meet it with weights
+only that are zero, or so small that a mass times them is; V starts from zero, so that this V is a number.
+
 A deterministic model adds up in a launch more, ``push`` of fixed.py, between begin or advance and grid.
 
 All that is particle- or node-wise is shared with the plain scheme: particle.py, grid.py, failure.py. Adjoint: fused_adj.py.
@@ -42,7 +45,8 @@ def fused(spec: Spec) -> SimpleNamespace:
     node_velocity = grid(spec).node_velocity
     running, complain = failure.report(spec.dim, spec.dtype).running, failure.check(spec).complain
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
-    exact, give, take, not_finite = spec.deterministic, fixed(dim).give, fixed(dim).take, int(Kind.NOT_FINITE)
+    exact, give, not_finite = spec.deterministic, fixed(dim).give, int(Kind.NOT_FINITE)
+    take = fixed(dim).take if exact else load_node
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     report = failure.report(spec.dim, spec.dtype).report
     module = native_module(spec.module + ".fused")
@@ -57,6 +61,7 @@ def fused(spec: Spec) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def clear(node: wp.array(dtype=node_vec)):
+        """The first M, and V before it."""
         store_node(node, wp.tid(), node_vec())
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -72,18 +77,12 @@ def fused(spec: Spec) -> SimpleNamespace:
         cleared: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
-        here = node_vec()
-        if wp.static(exact):
-            here = take(node, i)
-            store_node(node.node, i, here)
-        else:
-            here = load_node(node, i)
-        v = vec()
+        here = take(node, i)
         if here[dim] > real(0.0):
             world = i / window.count
             place = coordinates(i - world * window.count, window.shape) + window.origin[world]
             v = node_velocity(scale, walls, place, head(here), here[dim])
-        store_node(velocity, i, aligned(v, real(0.0)))
+            store_node(velocity, i, aligned(v, real(0.0)))
         if i < cleared.shape[0]:
             store_node(cleared, i, node_vec())
 

@@ -5,6 +5,8 @@ From the last substep to the first, with M the nodes' momentum and mass, V their
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
     advance_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
 
+Nodes without mass keep their V̄, to which nothing was added, and their V, as in fused.py.
+
 A deterministic model adds up in a launch more, ``push`` of fixed.py, between the two.
 """
 
@@ -47,7 +49,8 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
     report, bad_gradient = failure.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
     row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
-    exact, give, take = spec.deterministic, fixed(dim).give, fixed(dim).take
+    exact, give = spec.deterministic, fixed(dim).give
+    take, leave = (fixed(dim).take, fixed(dim).leave) if exact else (load_node, store_node)
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     module = native_module(adj_module(spec, wanted) + ".fused")
 
@@ -71,16 +74,15 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         place = coordinates(i - world * window.count, window.shape) + window.origin[world]
         if i < node.shape[0]:
             here = load_node(node, i)
-            if wp.static(exact):
-                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(take(adj, i)))
-                store_node(adj.node, i, aligned(back.p, back.m))
-            else:
-                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(load_node(adj, i)))
-                store_node(adj, i, aligned(back.p, back.m))
+            adj_v = take(adj, i)
+            if here[dim] > real(0.0):
+                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(adj_v))
+                leave(adj, i, aligned(back.p, back.m))
         if i < node_before.shape[0]:
             there = load_node(node_before, i)
-            v = node_velocity(scale, walls, place, head(there), there[dim])
-            store_node(velocity, i, aligned(v, real(0.0)))
+            if there[dim] > real(0.0):
+                v = node_velocity(scale, walls, place, head(there), there[dim])
+                store_node(velocity, i, aligned(v, real(0.0)))
             if wp.static(not exact):
                 store_node(cleared, i, node_vec())
 
