@@ -28,15 +28,21 @@ class Trail:
 
     plan: Plan
     chunks: tuple[Chunk, ...]
+    start: State
     runs: list[FastRun | PlainRun]
     """Every chunk, if everything is kept."""
     states: dict[int, State | SortedState]
-    """Else states before some of the chunks, in memory of their own."""
+    """Else states before some of the chunks, in memory of their own, until a backward pass takes them."""
 
     def keep(self, run: FastRun | PlainRun) -> None:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
         del run.end
         self.runs.append(run)
+
+    @property
+    def stays(self) -> tuple[int, ...]:
+        """The chunks before which the state is kept."""
+        return schedule.kept_first(len(self.chunks), self.plan.slots) if self.plan.slots else ()
 
 
 class _Runner:
@@ -97,8 +103,8 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     """
     sizes = model.sizes()
     chosen = plan(horizon, sizes, model.budget) if keep else Plan(sizes.longest, 0, 0, 0)
-    trail = Trail(chosen, horizon.chunks(chosen.longest), [], {})
-    stays = schedule.kept_first(len(trail.chunks), chosen.slots) if chosen.slots else ()
+    trail = Trail(chosen, horizon.chunks(chosen.longest), start, [], {})
+    stays = trail.stays
     runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all
     if recording(model):
         return _recorded(runner, trail, start, stays, inside), trail if keep else None
@@ -182,12 +188,31 @@ def rollout_adj(
     return _as_state(adj), adj_solid, adj_pull
 
 
+def _taken(trail: Trail, runner: _Runner) -> dict[int, State | SortedState]:
+    """What the forward pass kept; the trail has it no longer, so that each state is free as soon as it is dropped.
+
+    A second backward pass finds nothing there, and the chunks run again first.
+    """
+    states = dict(trail.states)
+    trail.states.clear()
+    if states:
+        return states
+    state: State | SortedState = trail.start
+    stays = trail.stays
+    for k in range(stays[-1] + 1):
+        if k > 0:
+            state = runner.settle(trail.chunks[k - 1], state, keep=False).end
+        if k in stays:
+            states[k] = _kept(state)
+    return states
+
+
 def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:
     """Every chunk as a run that kept what is inside, from the last to the first."""
     if trail.plan.keep_all:
         yield from reversed(trail.runs)
         return
-    states = dict(trail.states)
+    states = _taken(trail, runner)
     hand: State | SortedState = State(*(4 * (torch.empty(0),)))
     for action, k in schedule.going_back(len(trail.chunks), trail.plan.slots):
         if action == "restore":

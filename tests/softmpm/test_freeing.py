@@ -9,6 +9,7 @@ from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, li
 
 import softmpm
 from softmpm import arrangement, autograd, fast, memory, plain, program, program_adj, replay, rollout
+from softmpm.between import SortedState
 from softmpm.horizon import Horizon
 from softmpm.memory import plan
 
@@ -157,6 +158,34 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
     monkeypatch.setattr(program.Program, "__init__", making)
     pull(*call(built))
     assert len(seen) > report and others and max(others) <= 1
+
+
+def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, device):
+    """Those that were kept on the way forward go as others take their slots; a second backward pass has to find them again."""
+    built, kept, most = model(device=device, **little_memory(model())), [], []
+    horizon, copied, runs = Horizon(3, 7), SortedState.copy, program.Program.run
+    chosen = plan(horizon, built.sizes(), built.budget)
+    assert len(horizon.chunks(chosen.longest)) > 2 * chosen.slots > 4
+
+    def copying(self):
+        copy = copied(self)
+        kept.append(weakref.ref(copy))
+        return copy
+
+    def running(self, *args):
+        most.append(sum(ref() is not None for ref in kept))
+        return runs(self, *args)
+
+    monkeypatch.setattr(SortedState, "copy", copying)
+    monkeypatch.setattr(program.Program, "run", running)
+    end, inputs = call(built)
+    weights = dot(cotangent(end), end)
+    first = torch.autograd.grad(weights, list(inputs.values()), retain_graph=True)
+    again = torch.autograd.grad(weights, list(inputs.values()))
+    # The start takes a slot, but it is the user's; and the state that was dropped last is in hand.
+    assert len(kept) > 2 * chosen.slots and max(most) <= chosen.slots
+    for got, want in zip(again, first, strict=True):
+        assert_relative(got, want, 0.0 if device == "cpu" else 2e-5)
 
 
 def test_calls_of_many_lengths_leave_few_programs(living, device):
