@@ -15,6 +15,8 @@ from softmpm.scene import Grid, Scene, need
 
 SAME_PLACE = 1e-6
 """Two particles nearer than this share of a cell are one particle twice."""
+MOST_WALLS = 64
+"""Each one is compiled into the kernels of the grid, and its numbers are passed with every launch."""
 MIXERS = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
 """Odd numbers without a pattern, that sums of multiples of them seldom agree modulo 2^64."""
 
@@ -90,6 +92,11 @@ def _check_muscles(scene: Scene) -> None:
 
 def _check_walls(scene: Scene) -> None:
     grid = scene.grid
+    need(
+        len(scene.walls) <= MOST_WALLS,
+        f"a scene has at most {MOST_WALLS} walls, since each is compiled into its kernels; got {len(scene.walls)}. "
+        "Leave out those that no body reaches.",
+    )
     for w, wall in enumerate(scene.walls):
         _check_axes(f"wall {w} normal", wall.normal, grid)
         # n·x along the grid's edges:

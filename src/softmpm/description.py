@@ -16,13 +16,14 @@ def describe(model, substeps: int) -> str:
         return "compiled" if flag else "left out"
 
     muscles = f"{model.muscle_count}, at most {spec.muscle_slots} on one particle"
-    some_contacts = bool(spec.contacts) and bool(set(CONTACTS) - set(spec.contacts))
+    counts = {kind: spec.contacts.count(kind) for kind in CONTACTS if kind in spec.contacts}
+    contacts = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     lines = [
         f"softmpm model: {spec.dim}D, {spec.dtype}, on {model.device}, {model.worlds} world(s) of "
         f"{model.particle_count} particles on {' x '.join(map(str, model.scene.grid.shape))} nodes",
         f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
         f"  muscles    {muscles if spec.muscle_slots else 'left out'}",
-        f"  contacts   {', '.join(spec.contacts) or 'left out'}{'; others left out' if some_contacts else ''}",
+        f"  walls      {contacts or 'left out'}",
         f"  friction   {has(spec.friction)}",
         f"  gravity    {has(spec.gravity)}",
         f"  damping    {has(spec.damping)}",

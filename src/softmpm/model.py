@@ -14,7 +14,7 @@ from softmpm.description import describe
 from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
 from softmpm.memory import CPU_BUDGET, MARGIN, Sizes, longest_chunk, price_of_chunk, window_shape
-from softmpm.scene import CONTACTS, FixedCorotated, NeoHookean, Scene
+from softmpm.scene import FixedCorotated, NeoHookean, Scene
 from softmpm.stability import warn_unstable
 from softmpm.state import Low, Params, State
 
@@ -144,17 +144,11 @@ class Model:
 
     def _walls(self):
         walls, given = solid_types(self.spec).Walls(), self.scene.walls
-        walls.count = len(given)
         if given:
-            vec = wp.types.vector(self.dim, wp.float64)
-            walls.normal = wp.array([w.normal for w in given], dtype=vec, device=self.wp_device)
-            walls.offset = wp.array([w.offset for w in given], dtype=wp.float64, device=self.wp_device)
-        if len(self.spec.contacts) > 1:
-            kinds = [self.spec.contacts.index(w.contact) for w in given]
-            walls.contact = wp.array(kinds, dtype=wp.int32, device=self.wp_device)
+            walls.normal = [number for w in given for number in w.normal]
+            walls.offset = [w.offset for w in given]
         if self.spec.friction:
-            real = types(self.spec.dim, self.spec.dtype).real
-            walls.friction = wp.array([w.friction for w in given], dtype=real, device=self.wp_device)
+            walls.friction = [w.friction for w in given]
         return walls
 
     def rest(self) -> State:
@@ -283,13 +277,12 @@ def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
 
 def _spec(scene: Scene, dtype: torch.dtype, slots: int, fixed_point: bool) -> Spec:
     laws = {LAWS[type(body.material)] for body in scene.bodies}
-    contacts = {wall.contact for wall in scene.walls}
     return Spec(
         dim=scene.grid.dim,
         dtype=str(dtype).removeprefix("torch."),
         laws=tuple(law for law in LAWS.values() if law in laws),
         muscle_slots=slots,
-        contacts=tuple(kind for kind in CONTACTS if kind in contacts),
+        contacts=tuple(wall.contact for wall in scene.walls),
         friction=any(wall.friction > 0 for wall in scene.walls),
         gravity=any(g != 0 for g in scene.gravity or ()),
         damping=scene.damping > 0,

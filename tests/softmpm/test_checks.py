@@ -140,6 +140,12 @@ def test_walls_cover_some_nodes_not_all():
     refused(scene(walls=[Wall(normal=(1, 0), offset=1.0)]), "wall 0 covers every node")
 
 
+def test_walls_can_be_counted():
+    wall = Wall(normal=(0, 1), offset=0.1)
+    check_scene(scene(walls=64 * [wall]))
+    refused(scene(walls=65 * [wall]), "at most 64 walls", "got 65")
+
+
 def test_acceptable_scene_in_space():
     """A 3D scene that keeps every rule passes."""
     muscle = Muscle(particles=np.arange(8), direction=(0, 1, 0), strength=1.0)

@@ -34,12 +34,12 @@ def test_what_a_scene_lacks_is_not_passed():
     """No argument for muscles, laws, walls or friction that are not there."""
     plain = solid_types(softmpm.build(plain_scene(), device="cpu").spec)
     assert fields(plain.Solid) == {"mass", "mu", "lam", "volume"}
-    assert fields(plain.Walls) == {"count"}
+    assert fields(plain.Walls) == {"nothing"}
     busy = solid_types(softmpm.build(busy_scene(2), device="cpu").spec)
     assert fields(busy.Solid) - fields(plain.Solid) == {"law", "muscle", "fibre", "pull"}
-    assert fields(busy.Walls) - fields(plain.Walls) == {"normal", "offset", "contact", "friction"}
+    assert fields(busy.Walls) == {"normal", "offset", "friction"}
     one = softmpm.build(plain_scene(walls=[softmpm.Wall(normal=(0, 1), offset=0.3)]), device="cpu").spec
-    assert fields(solid_types(one).Walls) == {"count", "normal", "offset"}
+    assert fields(solid_types(one).Walls) == {"normal", "offset"}
 
 
 def test_what_a_scene_lacks_is_not_compiled(tmp_path):
@@ -123,7 +123,7 @@ def test_describe_says_what_was_compiled_and_left_out():
         "2D, float32",
         "neo_hookean; others left out",
         "muscles    left out",
-        "contacts   left out",
+        "walls      left out",
         "stable up to",
     ):
         assert phrase in text, phrase

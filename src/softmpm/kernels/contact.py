@@ -19,30 +19,28 @@ from softmpm.kernels.types import Spec, solid_types, types
 
 
 @functools.lru_cache(maxsize=None)
-def contact(spec: Spec) -> SimpleNamespace:
+def contact(spec: Spec, k: int) -> SimpleNamespace:
+    """Wall number ``k``."""
     t = types(spec.dim, spec.dtype)
     real, vec, ivec = t.real, t.vec, t.ivec
     Walls = solid_types(spec).Walls
-    several = len(spec.contacts) > 1
-    stick, slip = (spec.contacts.index(kind) if kind in spec.contacts else -1 for kind in ("stick", "slip"))
-    separate, rough = "separate" in spec.contacts, spec.friction
+    stick, slip = spec.contacts[k] == "stick", spec.contacts[k] == "slip"
+    rough = spec.friction
 
     @wp.func
-    def inside(walls: Walls, k: int, node: ivec, spacing: wp.float64) -> bool:
+    def inside(walls: Walls, node: ivec, spacing: wp.float64) -> bool:
         """Decided in float64, so that both precisions put a node on the surface to the same side."""
         reach = wp.float64(0.0)
         for axis in range(spec.dim):
-            reach += walls.normal[k][axis] * (wp.float64(node[axis]) * spacing)
+            reach += walls.normal[k, axis] * (wp.float64(node[axis]) * spacing)
         return reach <= walls.offset[k]
 
     @wp.func
-    def kind_of(walls: Walls, k: int) -> int:
-        if wp.static(several):
-            return walls.contact[k]
-        return 0
+    def normal(walls: Walls) -> vec:
+        return vec(walls.normal[k])
 
     @wp.func
-    def slide(walls: Walls, k: int, v_n: real, v_t: vec) -> vec:
+    def slide(walls: Walls, v_n: real, v_t: vec) -> vec:
         """Tangential velocity that friction leaves, for v_n < 0."""
         if wp.static(rough):
             limit = -walls.friction[k] * v_n
@@ -54,7 +52,7 @@ def contact(spec: Spec) -> SimpleNamespace:
         return v_t
 
     @wp.func
-    def slide_adj(walls: Walls, k: int, v_n: real, v_t: vec, adj: vec, n: vec) -> vec:
+    def slide_adj(walls: Walls, v_n: real, v_t: vec, adj: vec, n: vec) -> vec:
         """∂L/∂v through v_t and v_n (C3); ``adj`` lies in the tangent plane."""
         if wp.static(rough):
             c = walls.friction[k]
@@ -72,35 +70,27 @@ def contact(spec: Spec) -> SimpleNamespace:
         return adj
 
     @wp.func
-    def respond(walls: Walls, k: int, v: vec) -> vec:
-        n = vec(walls.normal[k])
+    def respond(walls: Walls, v: vec) -> vec:
+        if wp.static(stick):
+            return vec()
+        n = normal(walls)
         v_n = wp.dot(v, n)
-        kind = kind_of(walls, k)
-        if wp.static(stick >= 0):
-            if kind == stick:
-                return vec()
-        if wp.static(slip >= 0):
-            if kind == slip:
-                return v - v_n * n
-        if wp.static(separate):
-            if v_n < real(0.0):
-                return slide(walls, k, v_n, v - v_n * n)
+        if wp.static(slip):
+            return v - v_n * n
+        if v_n < real(0.0):
+            return slide(walls, v_n, v - v_n * n)
         return v
 
     @wp.func
-    def respond_adj(walls: Walls, k: int, v: vec, adj: vec) -> vec:
-        n = vec(walls.normal[k])
+    def respond_adj(walls: Walls, v: vec, adj: vec) -> vec:
+        if wp.static(stick):
+            return vec()
+        n = normal(walls)
         v_n = wp.dot(v, n)
-        kind = kind_of(walls, k)
-        if wp.static(stick >= 0):
-            if kind == stick:
-                return vec()
-        if wp.static(slip >= 0):
-            if kind == slip:
-                return adj - wp.dot(adj, n) * n
-        if wp.static(separate):
-            if v_n < real(0.0):
-                return slide_adj(walls, k, v_n, v - v_n * n, adj - wp.dot(adj, n) * n, n)
+        if wp.static(slip):
+            return adj - wp.dot(adj, n) * n
+        if v_n < real(0.0):
+            return slide_adj(walls, v_n, v - v_n * n, adj - wp.dot(adj, n) * n, n)
         return adj
 
     return SimpleNamespace(inside=inside, respond=respond, respond_adj=respond_adj)

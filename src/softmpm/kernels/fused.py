@@ -59,6 +59,12 @@ def fused(spec: Spec) -> SimpleNamespace:
             g[axis] = fx[axis] - real(1.0)
         return g
 
+    @wp.func
+    def place_of(window: Window, i: int, total: int) -> t.ivec:
+        """Coordinates on the grid of node ``i`` of all ``total`` in memory."""
+        world = world_of(i, window.count, total)
+        return coordinates(i - world * window.count, window.shape) + window.origin[world]
+
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def clear(node: wp.array(dtype=node_vec)):
         """The first M, and V before it."""
@@ -77,10 +83,9 @@ def fused(spec: Spec) -> SimpleNamespace:
         cleared: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
+        place = place_of(window, i, velocity.shape[0])  # while the node is on its way
         here = take(node, i)
         if here[dim] > real(0.0):
-            world = i / window.count
-            place = coordinates(i - world * window.count, window.shape) + window.origin[world]
             v = node_velocity(scale, walls, place, head(here), here[dim])
             store_node(velocity, i, aligned(v, real(0.0)))
         if i < cleared.shape[0]:
@@ -231,4 +236,5 @@ def fused(spec: Spec) -> SimpleNamespace:
         begin=by_number(begin),
         advance=by_number(advance, (BLOCK, 3)),
         centre=centre,
+        place_of=place_of,
     )

@@ -40,8 +40,13 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     sums_adj, first_node, unpack_base = stencil_adj(spec.dim, spec.dtype), s.first_node, s.unpack_base
     gather_adj, slope_adj = sums_adj.gather_adj, sums_adj.slope_adj
-    aligned, head, coordinates = s.aligned, s.head, s.coordinates
-    centre, particle_of, world_of = fused(spec).centre, s.particle_of, s.world_of
+    aligned, head = s.aligned, s.head
+    centre, place_of, particle_of, world_of = (
+        fused(spec).centre,
+        fused(spec).place_of,
+        s.particle_of,
+        s.world_of,
+    )
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum = one.rotation, one.affine_momentum
@@ -70,8 +75,7 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         cleared: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
-        world = i / window.count
-        place = coordinates(i - world * window.count, window.shape) + window.origin[world]
+        place = place_of(window, i, velocity.shape[0])
         if i < node.shape[0]:
             here = load_node(node, i)
             adj_v = take(adj, i)

@@ -24,10 +24,7 @@ def grid(spec: Spec) -> SimpleNamespace:
     Walls = solid_types(spec).Walls
     nodes = spline(spec.dim, spec.dtype)
     node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
-    inside, respond, respond_adj = (
-        getattr(contact(spec), name) for name in ("inside", "respond", "respond_adj")
-    )
-    dim, walled, gravity, damping = spec.dim, bool(spec.contacts), spec.gravity, spec.damping
+    dim, gravity, damping = spec.dim, spec.gravity, spec.damping
 
     @wp.struct
     class NodeAdj:
@@ -43,23 +40,58 @@ def grid(spec: Spec) -> SimpleNamespace:
             v = scale.decay * v
         return v
 
-    @wp.func
-    def after_walls(scale: Scale, walls: Walls, here: ivec, count: int, v: vec) -> vec:
+    def after_walls(count: int) -> wp.Function:
         """v after the first ``count`` walls (G2)."""
-        w = v
-        for k in range(count):
-            if inside(walls, k, here, scale.exact_spacing):
-                w = respond(walls, k, w)
-        return w
+        if count == 0:
+
+            @wp.func
+            def after(scale: Scale, walls: Walls, here: ivec, v: vec) -> vec:
+                return v
+        else:
+            before, wall = after_walls(count - 1), contact(spec, count - 1)
+            inside, respond = wall.inside, wall.respond
+
+            @wp.func
+            def after(scale: Scale, walls: Walls, here: ivec, v: vec) -> vec:
+                w = before(scale, walls, here, v)
+                if inside(walls, here, scale.exact_spacing):
+                    w = respond(walls, w)
+                return w
+
+        return after
+
+    def pull_back(k: int) -> wp.Function:
+        """Adjoint of the velocity before wall ``k``, from that of the velocity after all walls."""
+        if k == len(spec.contacts):
+
+            @wp.func
+            def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
+                return adj
+        else:
+            through_others, wall = pull_back(k + 1), contact(spec, k)
+            inside, respond, respond_adj = wall.inside, wall.respond, wall.respond_adj
+
+            @wp.func
+            def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
+                meets = inside(walls, here, scale.exact_spacing)
+                w = v
+                if meets:
+                    w = respond(walls, v)
+                adj_v = through_others(scale, walls, here, w, adj)
+                if meets:
+                    adj_v = respond_adj(walls, v, adj_v)
+                return adj_v
+
+        return back
+
+    after_all_walls, pull_back_through_all = after_walls(len(spec.contacts)), pull_back(0)
 
     @wp.func
     def node_velocity(scale: Scale, walls: Walls, here: ivec, p: vec, m: real) -> vec:
         """Velocity of the node at ``here`` from its momentum and mass (G1), (G2)."""
         v = vec()
         if m > real(0.0):
-            v = free_velocity(scale, p / m)
-            if wp.static(walled):
-                v = after_walls(scale, walls, here, walls.count, v)
+            v = after_all_walls(scale, walls, here, free_velocity(scale, p / m))
         return v
 
     @wp.func
@@ -69,13 +101,7 @@ def grid(spec: Spec) -> SimpleNamespace:
         adj = NodeAdj()
         if m > real(0.0):
             u = p / m
-            adj_v = adj_velocity
-            if wp.static(walled):
-                v = free_velocity(scale, u)
-                for i in range(walls.count):
-                    k = walls.count - 1 - i
-                    if inside(walls, k, here, scale.exact_spacing):
-                        adj_v = respond_adj(walls, k, after_walls(scale, walls, here, k, v), adj_v)
+            adj_v = pull_back_through_all(scale, walls, here, free_velocity(scale, u), adj_velocity)
             adj.p = adj_v / m
             if wp.static(damping):
                 adj.p = scale.decay * adj.p

@@ -65,7 +65,8 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
 
         @wp.func
         def coordinates(n: int, shape: ivec) -> ivec:
-            return ivec(n / shape[1], n % shape[1])
+            column = n / shape[1]
+            return ivec(column, n - column * shape[1])
 
         @wp.func
         def pack_base(base: ivec) -> int:
@@ -115,7 +116,9 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
 
         @wp.func
         def coordinates(n: int, shape: ivec) -> ivec:
-            return ivec(n / (shape[1] * shape[2]), (n / shape[2]) % shape[1], n % shape[2])
+            column = n / shape[2]
+            plane = column / shape[1]
+            return ivec(plane, column - plane * shape[1], n - column * shape[2])
 
         @wp.func
         def pack_base(base: ivec) -> int:

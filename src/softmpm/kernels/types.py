@@ -1,6 +1,7 @@
 """What the kernels are specialised for, and the types that follow from it."""
 
 import functools
+import itertools
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ class Spec:
     dtype: str  # "float32" or "float64"
     laws: tuple[str, ...]  # of "neo_hookean", "fixed_corotated"
     muscle_slots: int  # muscles that overlap on one particle, at most; 0 is a passive scene
-    contacts: tuple[str, ...]  # kinds present, of "stick", "slip", "separate"
+    contacts: tuple[str, ...]  # of each wall: "stick", "slip" or "separate"
     friction: bool
     gravity: bool
     damping: bool
@@ -31,9 +32,9 @@ class Spec:
             name for name in ("friction", "gravity", "damping", "deterministic") if getattr(self, name)
         ]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
-        return ".".join(
-            ["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *self.contacts, *features]
-        )
+        runs = ((kind, len(list(walls))) for kind, walls in itertools.groupby(self.contacts))
+        walls = [kind if count == 1 else f"{kind}{count}" for kind, count in runs]
+        return ".".join(["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *walls, *features])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,14 +170,15 @@ def solid_types(spec: Spec) -> SimpleNamespace:
         solid["fibre"] = wp.array(dtype=t.vec)  # unit direction d, (muscle,)
         solid["pull"] = wp.array2d(dtype=t.real)  # activation times strength [Pa], (world, muscle)
 
-    walls = dict(count=int)
-    if spec.contacts:
-        walls["normal"] = wp.array(dtype=wp.types.vector(spec.dim, wp.float64))
-        walls["offset"] = wp.array(dtype=wp.float64)
-    if len(spec.contacts) > 1:
-        walls["contact"] = wp.array(dtype=wp.int32)  # index into spec.contacts
+    # Walls lie in the parameters of a launch, not in memory that a kernel would have to wait for.
+    count, walls = len(spec.contacts), {}
+    if count:
+        walls["normal"] = wp.types.matrix((count, spec.dim), wp.float64)
+        walls["offset"] = wp.types.vector(count, wp.float64)
     if spec.friction:
-        walls["friction"] = wp.array(dtype=t.real)
+        walls["friction"] = wp.types.vector(count, t.real)
+    if not walls:
+        walls["nothing"] = int  # Warp has no empty struct
     return SimpleNamespace(
         Solid=_struct("Solid", spec.module, solid), Walls=_struct("Walls", spec.module, walls)
     )
