@@ -187,11 +187,11 @@ class _Simulate(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.model, ctx.horizon, keep, *differentiable = inputs[:11]
+        ctx.model, ctx.horizon, keep, *tensors = inputs
         ctx.trail = None if keep is None else keep.trail
         ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*differentiable)
+        ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place
 
     @staticmethod
     def backward(ctx, *adj_end):

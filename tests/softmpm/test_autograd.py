@@ -93,6 +93,17 @@ def test_an_input_changed_in_place_before_backward_raises(model):
         end.x.sum().backward()
 
 
+def test_rounding_of_a_start_changed_in_place_before_backward_raises(device):
+    """What a state carries besides its four tensors is guarded as they are: going back may start there again."""
+    model = softmpm.build(busy_scene(2), device=device)
+    inputs = busy_inputs(model)
+    start = run(softmpm.simulate, model, inputs, 2)
+    end = softmpm.simulate(model, start, None, model.params(), substeps=2)
+    start.low.x.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        end.x.sum().backward()
+
+
 def test_only_what_is_asked_for_is_computed(model):
     """The gradient of one input alone is the same as among all; the others get none."""
     inputs = busy_inputs(model)
