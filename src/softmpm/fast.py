@@ -53,6 +53,9 @@ class Pool:
         # By whether they keep what is inside, and by shape, the one that came last at the end:
         self._free: dict[bool, dict[tuple, _Shelf]] = {False: {}, True: {}}
         self._scratch: dict[Wanted, Scratch] = {}
+        self.turn = (
+            threading.Lock()
+        )  # for the scratch: other threads may go back through what this one's calls kept
 
     def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, _Shelf]:
         """A program, and the shelf that it comes back to: whoever gives it back, only this thread changes the pool."""
@@ -127,10 +130,11 @@ class FastRun:
         self, adj_end: State | SortedAdj, adj_solid: SolidAdj, wanted: Wanted
     ) -> tuple[SortedAdj, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
-        adjoint = self.pool.adjoint(self._lease.pair, wanted)
-        adj_pull = adjoint.run(adj_end, adj_solid)
-        adj, order = adjoint.scratch.adj, adjoint.program.order  # both serve other runs before long
-        return SortedAdj(self.pool.unpacking, adj.clone(), order.clone()), adj_pull
+        with self.pool.turn:
+            adjoint = self.pool.adjoint(self._lease.pair, wanted)
+            adj_pull = adjoint.run(adj_end, adj_solid)
+            adj, order = adjoint.scratch.adj, adjoint.program.order  # both serve other runs before long
+            return SortedAdj(self.pool.unpacking, adj.clone(), order.clone()), adj_pull
 
 
 class Fast:

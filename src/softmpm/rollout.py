@@ -1,7 +1,8 @@
 """Many substeps: chunk after chunk, what is kept on the way forward, what runs again on the way back."""
 
+import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -29,10 +30,13 @@ class Trail:
     plan: Plan
     chunks: tuple[Chunk, ...]
     start: State
-    runs: list[FastRun | PlainRun]
+    """The user's, which is never written to."""
+    runs: list[FastRun | PlainRun] = field(default_factory=list)
     """Every chunk, if everything is kept."""
-    states: dict[int, State | SortedState]
-    """Else states before some of the chunks, in memory of their own, until a backward pass takes them."""
+    states: dict[int, State | SortedState] = field(default_factory=dict)
+    """Else the states before some of the chunks, the first of which is the start, until a backward pass takes them."""
+    turn: threading.Lock = field(default_factory=threading.Lock)
+    """One backward pass at a time."""
 
     def keep(self, run: FastRun | PlainRun) -> None:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
@@ -103,7 +107,7 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     """
     sizes = model.sizes()
     chosen = plan(horizon, sizes, model.budget) if keep else Plan(sizes.longest, 0, 0, 0)
-    trail = Trail(chosen, horizon.chunks(chosen.longest), start, [], {})
+    trail = Trail(chosen, horizon.chunks(chosen.longest), start)
     stays = trail.stays
     runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all
     if recording(model):
@@ -173,15 +177,16 @@ def rollout_adj(
     adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
     adj: Any = State(*(a.contiguous() for a in adj_end))
     reports = []
-    for run in _inside_out(trail, _Runner(model, pull, solid)):
-        adj, part = run.pull_back(adj, adj_solid, wanted)
-        if adj_pull is not None and part is not None:
-            adj_pull[run.chunk.rows] += part
-        if recording(model):
-            note(run.words[: model.worlds])
-        else:
-            reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
-        del run  # or it would keep its memory while the one before runs again
+    with trail.turn:
+        for run in _inside_out(trail, _Runner(model, pull, solid)):
+            adj, part = run.pull_back(adj, adj_solid, wanted)
+            if adj_pull is not None and part is not None:
+                adj_pull[run.chunk.rows] += part
+            if recording(model):
+                note(run.words[: model.worlds])
+            else:
+                reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
+            del run  # or it would keep its memory while the one before runs again
     for report, last in reports:
         words = report.read()[: model.worlds]
         raise_gradient_failure(model, words, adj_end, last, horizon.total)

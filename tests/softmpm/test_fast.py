@@ -1,5 +1,6 @@
 """The fast scheme: when it is chosen, that it does what the plain one does, and that its programs serve many calls."""
 
+import itertools
 import queue
 import sys
 import threading
@@ -359,9 +360,24 @@ def test_outstanding_gradients_keep_their_own_states(made, short_chunks, budget,
     assert counts[0] == counts[1]
 
 
-def test_backward_twice(budget, device):
+KINDS = {
+    "single precision": {},
+    "double precision": dict(dtype=torch.float64),
+    "deterministic": dict(deterministic=True),
+    "plain": dict(scheme="plain"),
+}
+
+
+@pytest.fixture(params=itertools.product(KINDS, ["kept", "run again"]), ids=", ".join)
+def kind(request) -> dict:
+    """Settings of a model, and with which its calls keep everything inside, or run chunks again."""
+    name, memory = request.param
+    return KINDS[name] | ({} if memory == "kept" else little_memory(model(**KINDS[name])))
+
+
+def test_backward_twice(kind, short_chunks, device):
     """With ``retain_graph`` the second gradient is the first, also when another call ran in between."""
-    built = model(device=device, **budget)
+    built = model(device=device, **kind)
     ((end, inputs),) = calls(built, [1])
     first = pull(end, inputs, retain_graph=True)
     second = pull(end, inputs, retain_graph=True)
@@ -370,6 +386,53 @@ def test_backward_twice(budget, device):
     third = pull(end, inputs)
     for again in (second, third):
         assert_gradient(again, first, device)
+
+
+@pytest.mark.gpu
+def test_backward_twice_inside_a_graph(budget, short_chunks):
+    """Recorded, and with little memory run again for the second gradient: both are those without a graph."""
+    built = model(device="cuda", **budget)
+    inputs, weights = busy_inputs(built, control_steps=3, seed=1), cotangent(built.rest())
+
+    def work():
+        loss = dot(weights, run(softmpm.simulate, built, inputs, 7))
+        return [torch.autograd.grad(loss, list(inputs.values()), retain_graph=True) for _ in range(2)]
+
+    want, graph = work()[0], softmpm.Graph(work, built.device)
+    for _ in range(3):  # without recording, recorded, replayed
+        for found in graph():
+            for name, got, wanted in zip(inputs, found, want, strict=True):
+                assert_relative(got, wanted, 2e-5, name)
+
+
+@pytest.mark.parametrize("seeds", [(1, 1, 1), (1, 2, 3)], ids=["one call", "three calls"])
+def test_threads_go_back_through_calls_of_another(kind, seeds, short_chunks):
+    """At the same time, through one call or one each: they take turns, and each gets what one gets alone."""
+    built, together, found = model(**kind), threading.Barrier(len(seeds)), queue.Queue()
+    waiting = {seed: next(calls(built, [seed])) for seed in set(seeds)}
+    want = {seed: pull(*call, retain_graph=True) for seed, call in waiting.items()}
+
+    def work(seed):
+        together.wait()
+        try:
+            found.put((seed, pull(*waiting[seed], retain_graph=True)))
+        except Exception as error:
+            found.put((seed, error))
+
+    switching = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        for _ in range(5):
+            threads = [threading.Thread(target=work, args=(seed,)) for seed in seeds]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+    finally:
+        sys.setswitchinterval(switching)
+    for seed, got in (found.get() for _ in range(5 * len(seeds))):
+        assert not isinstance(got, Exception), got
+        assert_gradient(got, want[seed], "cpu")
 
 
 def test_interleaved_calls(budget, device):
