@@ -1,9 +1,10 @@
 """What does a gradient through a thousand substeps cost with little memory? `python bench/memory.py [--device cuda] [--json FILE]`
 
-Peak memory of one call and its backward pass, what the formula of docs/memory.md says of it, and the time of both, against memory for
-everything where that fits.
+Peak memory of one call and its backward pass, what the formula of docs/memory.md says of it, and the median time of both, against
+memory for everything where that fits.
 """
 
+import statistics
 import time
 
 import torch
@@ -14,6 +15,8 @@ from softmpm.horizon import Horizon
 from softmpm.memory import memory, plan
 
 GIB = 2**30
+WARM = 2
+"""Calls that do not count: one compiles, the next records graphs."""
 
 
 def main():
@@ -31,7 +34,7 @@ def main():
             chosen = plan(horizon, model.sizes(), model.budget)
             start, params, seconds = turning(model), model.params(), []
             start.v.requires_grad_()
-            for _ in range(2):  # the first compiles
+            for _ in range(WARM + args.repeats):
                 if device.type == "cuda":
                     torch.cuda.reset_peak_memory_stats()
                 sync(device)
@@ -51,7 +54,7 @@ def main():
                     "states kept": chosen.slots or "all",
                     "peak GiB": peak / GIB,
                     "formula GiB": memory(model, horizon).backward / GIB,
-                    "forward and backward s": seconds[-1],
+                    "forward and backward s": statistics.median(seconds[WARM:]),
                 }
             )
             del model, start, params
