@@ -162,7 +162,7 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
 
 def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, device):
     """Those that were kept on the way forward go as others take their slots; a second backward pass has to find them again."""
-    built, kept, most = model(device=device, **little_memory(model())), [], []
+    built, kept, most, programs = model(device=device, **little_memory(model())), [], [], []
     horizon, copied, runs = Horizon(3, 7), SortedState.copy, program.Program.run
     chosen = plan(horizon, built.sizes(), built.budget)
     assert len(horizon.chunks(chosen.longest)) > 2 * chosen.slots > 4
@@ -174,6 +174,7 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
 
     def running(self, *args):
         most.append(sum(ref() is not None for ref in kept))
+        programs.append(len(living(program.Program)))
         return runs(self, *args)
 
     monkeypatch.setattr(SortedState, "copy", copying)
@@ -184,6 +185,7 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
     again = torch.autograd.grad(weights, list(inputs.values()))
     # The start takes a slot, but it is the user's; and the state that was dropped last is in hand.
     assert len(kept) > 2 * chosen.slots and max(most) <= chosen.slots
+    assert max(programs) < chosen.slots  # what is kept holds none
     for got, want in zip(again, first, strict=True):
         assert_relative(got, want, 0.0 if device == "cpu" else 2e-5)
 

@@ -56,6 +56,24 @@ def test_sum_over_a_warp(warp, dim, order, count):
 
 
 @pytest.mark.parametrize("count", [32, 13, 1])
+@pytest.mark.parametrize("farthest", [40, 2**26, 2**31 - 1])
+def test_places_within_a_warp(warp, farthest, count):
+    """A permutation in which lanes without a particle stay last and others are sorted; nodes too far away to be told apart follow."""
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        first, place = np.full(WARP, -1, np.int32), np.zeros(WARP, np.int32)
+        first[:count] = random.integers(0, farthest, count, endpoint=True)
+        first[: count // 2] %= 40
+        warp.places(*(a.ctypes.data_as(ctypes.c_void_p) for a in (place, first)))
+        assert sorted(place) == list(range(WARP))
+        moved = np.empty_like(first)
+        moved[place] = first
+        assert (moved[count:] == -1).all()
+        near = moved[:count] - first[:count].min() < 2**27 - 1
+        assert (np.diff(moved[:count][near]) >= 0).all() and not (np.diff(near.astype(int)) > 0).any()
+
+
+@pytest.mark.parametrize("count", [32, 13, 1])
 def test_rows_in_the_order_of_the_user(warp, count):
     """Each lane's numbers come to its row, in a warp that is full or the last of many."""
     random = np.random.default_rng(0)

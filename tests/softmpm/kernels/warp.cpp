@@ -133,6 +133,12 @@ extern "C" int add3(float* n, const int* s, const int* f, const float* g, const 
     return add<3>(n, s, f, g, b, A, m);
 }
 
+// Where each lane's particle stands among those of its warp.
+extern "C" void places(int* place, const int* first)
+{
+    run(32, [=](int lane) { place[lane] = softmpm::sorted_place(first[lane]); });
+}
+
 // The numbers of the first ``count`` lanes' particles, nine each, to their rows.
 extern "C" void spread9(float* out, const int* row, const float* value, int count)
 {
