@@ -2,7 +2,7 @@
 
 The copy bandwidth of the device, measured here, against the bytes that a forward substep of the cases of bench/step.py must move
 at least: every state read and written once, the material of a particle read once (16 B: volume, mass, μ, λ), momentum and velocity of
-the nodes in memory once.
+the nodes in memory once (a little less is enough: velocities of empty nodes are not written).
 The reads of the grid by 3^dim nodes a particle, and all atomic additions, are taken to cost nothing. `floor us` is the time of these
 bytes at copy speed, `times floor` how often it fits into the measured substep. A scene that fits into the caches may beat its floor.
 """

@@ -6,8 +6,8 @@ A substep is two launches. With M the nodes' momentum and mass, V their velocity
     grid      V ← (G1), (G2) of M,  next M ← 0
     advance   particles: V → (T2), (T3) → new state → (T1) → next M
 
-A node without mass keeps the V it has, which saves most of the writing where the window is mostly empty. Particles meet it with weights
-only that are zero, or so small that a mass times them is; V starts from zero, so that this V is a number.
+A node without mass keeps the V it has. Only particles read it whose weight there is zero, or too small to give it mass; V starts from
+zero, so that they read a number.
 
 A deterministic model adds up in a launch more, ``push`` of fixed.py, between begin or advance and grid.
 

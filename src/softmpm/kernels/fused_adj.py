@@ -5,7 +5,7 @@ From the last substep to the first, with M the nodes' momentum and mass, V their
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
     advance_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
 
-Nodes without mass keep their V̄, to which nothing was added, and their V, as in fused.py.
+Nodes without mass keep their V and their V̄, as in fused.py.
 
 A deterministic model adds up in a launch more, ``push`` of fixed.py, between the two.
 """

@@ -172,7 +172,7 @@ template <class Sink> struct Owner<3, Sink> {
 
 // Two dimensions: one node, which is (x, y, m, 0).
 template <class Sink> struct Owner<2, Sink> {
-    static constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, the same
+    static constexpr int WIDTH = 3;  // float4 per particle: 48 bytes, likewise free of conflicts when sorted
     Weight wx, wy;
     float fx, fy;
     Sink origin;
