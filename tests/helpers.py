@@ -8,6 +8,13 @@ from softmpm.horizon import Horizon
 from softmpm.memory import plan
 
 LAWS = {"neo_hookean": softmpm.NeoHookean, "fixed_corotated": softmpm.FixedCorotated}
+KINDS = {
+    "single precision": dict(scheme="fast"),
+    "double precision": dict(scheme="fast", dtype=torch.float64),
+    "deterministic": dict(scheme="fast", deterministic=True),
+    "plain": dict(scheme="plain"),
+}
+"""Settings of models that keep things in ways of their own."""
 INPUTS = ("x", "v", "C", "F", "activation", "young", "poisson", "density")
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import (
     INPUTS,
+    KINDS,
     assert_relative,
     busy_inputs,
     busy_scene,
@@ -230,6 +231,19 @@ def assert_gradient(got, want, device) -> None:
         assert_relative(got[name], want[name], same_on(device), name)
 
 
+def at_once(*threads: threading.Thread) -> None:
+    """Run them all, and let each be interrupted as often as can be."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+
+
 @pytest.fixture(params=["kept", "run again"])
 def budget(request) -> dict:
     """Settings with which a call keeps everything inside, and with which it keeps one state and runs chunks again."""
@@ -360,14 +374,6 @@ def test_outstanding_gradients_keep_their_own_states(made, short_chunks, budget,
     assert counts[0] == counts[1]
 
 
-KINDS = {
-    "single precision": {},
-    "double precision": dict(dtype=torch.float64),
-    "deterministic": dict(deterministic=True),
-    "plain": dict(scheme="plain"),
-}
-
-
 @pytest.fixture(params=itertools.product(KINDS, ["kept", "run again"]), ids=", ".join)
 def kind(request) -> dict:
     """Settings of a model, and with which its calls keep everything inside, or run chunks again."""
@@ -419,17 +425,8 @@ def test_threads_go_back_through_calls_of_another(kind, seeds, short_chunks):
         except Exception as error:
             found.put((seed, error))
 
-    switching = sys.getswitchinterval()
-    sys.setswitchinterval(1e-5)
-    try:
-        for _ in range(5):
-            threads = [threading.Thread(target=work, args=(seed,)) for seed in seeds]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-    finally:
-        sys.setswitchinterval(switching)
+    for _ in range(5):
+        at_once(*(threading.Thread(target=work, args=(seed,)) for seed in seeds))
     for seed, got in (found.get() for _ in range(5 * len(seeds))):
         assert not isinstance(got, Exception), got
         assert_gradient(got, want[seed], "cpu")
@@ -482,11 +479,7 @@ def test_threads_share_a_model(short_chunks, device):
         except Exception as error:
             errors.append(error)
 
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in want]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(*(threading.Thread(target=work, args=(seed,)) for seed in want))
     assert not errors, errors
     for seed, found in got.items():
         for gradient in found:
@@ -517,16 +510,7 @@ def test_a_backward_pass_in_another_thread(short_chunks, device, monkeypatch):
             except Exception as error:
                 errors.append(error)
 
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        threads = [threading.Thread(target=work) for work in (simulate, pull_back)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
+    at_once(*(threading.Thread(target=work) for work in (simulate, pull_back)))
     assert not errors, errors
 
 

@@ -5,7 +5,7 @@ import weakref
 
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory, run
+from helpers import KINDS, assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory, run
 
 import softmpm
 from softmpm import arrangement, autograd, fast, memory, plain, program, program_adj, replay, rollout
@@ -61,14 +61,6 @@ def budget(request, monkeypatch) -> dict:
     """Settings with which a call keeps everything inside its chunks, and with which it runs them again."""
     monkeypatch.setattr(memory, "LONGEST", 8)
     return {} if request.param == "kept" else little_memory(model())
-
-
-KINDS = {
-    "single precision": {},
-    "double precision": dict(dtype=torch.float64, scheme="fast"),
-    "deterministic": dict(deterministic=True),
-    "plain": dict(scheme="plain"),
-}
 
 
 @pytest.fixture(params=KINDS)
