@@ -1,6 +1,8 @@
 """A model compiles, stores and passes what its scene requires, and says so."""
 
 import copy
+import dataclasses
+import itertools
 import logging
 import pickle
 import threading
@@ -16,6 +18,7 @@ import softmpm
 from softmpm.buffers import SolidAdj
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted, adj_module, solid_types
+from softmpm.scene import CONTACTS
 from softmpm.step import Substep
 
 
@@ -114,6 +117,17 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
     assert a == b and a.module == b.module
     wanted = Wanted(material=True, activation=False)
     assert adj_module(a, wanted) != adj_module(a, Wanted(material=False, activation=False))
+
+
+def test_modules_of_many_walls_have_names_short_enough_for_files():
+    """With everything a scene can have, 64 walls of changing kinds among it; Warp adds numbers of its own."""
+    kinds = itertools.islice(itertools.cycle(CONTACTS), 64)
+    walls = [softmpm.Wall(normal=(0, 1), offset=0.3, contact=kind) for kind in kinds]
+    spec = softmpm.build(busy_scene(2, walls=walls), device="cpu", deterministic=True).spec
+    name = adj_module(spec, Wanted(material=True, activation=True)) + ".fused.few"
+    assert len(f"wp_{name}_1234567_p1234567_t123456789012345") <= 255
+    fewer = dataclasses.replace(spec, contacts=spec.contacts[1:])
+    assert spec.module != fewer.module
 
 
 def test_describe_says_what_was_compiled_and_left_out():

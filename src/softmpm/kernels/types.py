@@ -1,7 +1,6 @@
 """What the kernels are specialised for, and the types that follow from it."""
 
 import functools
-import itertools
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -9,6 +8,8 @@ from typing import Any, NamedTuple
 import warp as wp
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
+LETTER = {"stick": "k", "slip": "l", "separate": "s"}
+"""Of a wall in the name of a module, which becomes that of a file: many walls must fit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +33,7 @@ class Spec:
             name for name in ("friction", "gravity", "damping", "deterministic") if getattr(self, name)
         ]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
-        runs = ((kind, len(list(walls))) for kind, walls in itertools.groupby(self.contacts))
-        walls = [kind if count == 1 else f"{kind}{count}" for kind, count in runs]
+        walls = ["walls_" + "".join(LETTER[kind] for kind in self.contacts)] if self.contacts else []
         return ".".join(["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *walls, *features])
 
 

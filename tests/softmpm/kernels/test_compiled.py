@@ -1,5 +1,6 @@
 """The machine code of the fast scheme's kernels, compiled here for a GPU that need not be here: sm_90, as for an H100."""
 
+import dataclasses
 import re
 
 import cubin
@@ -22,9 +23,9 @@ def compiler():
         pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
 
 
-def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
-    """What goes over the particles, in a bare scene or in one with everything but damping."""
-    spec = Spec(
+def scene_spec(dim: int, law: str, bare: bool) -> Spec:
+    """A bare scene, or one with everything but damping."""
+    return Spec(
         dim=dim,
         dtype="float32",
         laws=(law,),
@@ -34,6 +35,11 @@ def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
         gravity=True,
         damping=False,
     )
+
+
+def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
+    """What goes over the particles."""
+    spec = scene_spec(dim, law, bare)
     if which == "adjoint":
         return fused_adj(spec, Wanted(material=not bare, activation=not bare)).advance_adj[few]
     return fused(spec).advance[few]
@@ -69,6 +75,19 @@ def test_machine_code(dim, law, which, bare, few):
     assert not re.findall(r"^\s+[a-z]+\.\S*f64\b.*", code, re.MULTILINE), (
         "double precision where float32 is meant"
     )
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_walls_are_not_in_memory(dim):
+    """Whatever their number, the kernels of the grid load nothing for them and have nothing in local memory."""
+    loads = []
+    for kinds in (("separate",), ("separate", "slip", "stick", "slip", "separate", "separate")):
+        spec = dataclasses.replace(scene_spec(dim, "neo_hookean", bare=False), contacts=kinds)
+        wanted = Wanted(material=False, activation=False)
+        both = [compiled(k) for k in (fused(spec).grid_velocity, fused_adj(spec, wanted).grid_velocity_adj)]
+        assert all(facts.frame == facts.stack == 0 for _, facts in both)
+        loads.append([len(re.findall(r"\bld\.global", code)) for code, _ in both])
+    assert loads[0] == loads[1] and min(loads[0]) > 0
 
 
 def test_spilled_registers_would_be_seen():
