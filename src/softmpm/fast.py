@@ -53,9 +53,8 @@ class Pool:
         # By whether they keep what is inside, and by shape, the one that came last at the end:
         self._free: dict[bool, dict[tuple, _Shelf]] = {False: {}, True: {}}
         self._scratch: dict[Wanted, Scratch] = {}
-        self.turn = (
-            threading.Lock()
-        )  # for the scratch: other threads may go back through what this one's calls kept
+        # For the scratch, since other threads may go back through what this one's calls kept:
+        self.turn = threading.Lock()
 
     def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, _Shelf]:
         """A program, and the shelf that it comes back to: whoever gives it back, only this thread changes the pool."""

@@ -208,8 +208,9 @@ class Program:
     def _launch_all(self, launch: Launcher) -> None:
         nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec)
         held = len(self.velocity)
-        for cleared in (self.velocity_array, *(nodes[:1] if self.exact is None else ())):
-            launch(kernels.clear, held, cleared, block_dim=BLOCK)
+        launch(kernels.clear, held, self.velocity_array, block_dim=BLOCK)
+        if self.exact is None:
+            launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
         self._begin(launch)
         for s in range(length):
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing

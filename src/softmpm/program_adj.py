@@ -98,8 +98,8 @@ class ProgramAdj:
             self._enter(stream, *adj_end)
 
     def _launch_all(self, launch: Launcher) -> None:
-        velocity = self.scratch.velocity_array
-        launch(fused(self.program.model.spec).clear, len(self.scratch.velocity), velocity, block_dim=BLOCK)
+        clear_nodes, held = fused(self.program.model.spec).clear, len(self.scratch.velocity)
+        launch(clear_nodes, held, self.scratch.velocity_array, block_dim=BLOCK)
         for s in range(self.program.chunk.length, -1, -1):
             self._grid(s, launch)
             self._particles(s, launch)

@@ -108,10 +108,10 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     sizes = model.sizes()
     chosen = plan(horizon, sizes, model.budget) if keep else Plan(sizes.longest, 0, 0, 0)
     trail = Trail(chosen, horizon.chunks(chosen.longest), start)
-    stays = trail.stays
     runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all
     if recording(model):
-        return _recorded(runner, trail, start, stays, inside), trail if keep else None
+        return _recorded(runner, trail, inside), trail if keep else None
+    stays = trail.stays
     state: State | SortedState = start
     k, before = 0, None
     while k < len(trail.chunks) or before is not None:
@@ -143,9 +143,11 @@ def _kept(between: State | SortedState) -> State | SortedState:
     return between if isinstance(between, State) else between.copy()
 
 
-def _recorded(runner: _Runner, trail: Trail, state: State | SortedState, stays, inside: bool) -> State:
+def _recorded(runner: _Runner, trail: Trail, inside: bool) -> State:
     """:func:`rollout` while PyTorch records a graph: nothing is read back."""
     hold(runner.model)
+    state: State | SortedState = trail.start
+    stays = trail.stays
     for k, chunk in enumerate(trail.chunks):
         if k in stays:
             trail.states[k] = _kept(state)

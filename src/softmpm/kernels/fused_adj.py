@@ -41,12 +41,8 @@ def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     sums_adj, first_node, unpack_base = stencil_adj(spec.dim, spec.dtype), s.first_node, s.unpack_base
     gather_adj, slope_adj = sums_adj.gather_adj, sums_adj.slope_adj
     aligned, head = s.aligned, s.head
-    centre, place_of, particle_of, world_of = (
-        fused(spec).centre,
-        fused(spec).place_of,
-        s.particle_of,
-        s.world_of,
-    )
+    centre, place_of = fused(spec).centre, fused(spec).place_of
+    particle_of, world_of = s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum = one.rotation, one.affine_momentum
