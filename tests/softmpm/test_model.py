@@ -131,7 +131,7 @@ def test_modules_of_many_walls_have_names_short_enough_for_files():
 
 
 def test_describe_says_what_was_compiled_and_left_out():
-    """Dimension, laws, muscles, contacts, gradients, dt and memory, in words."""
+    """Dimension, laws, muscles, walls, gradients, dt and memory, in words."""
     text = softmpm.build(plain_scene(), device="cpu").describe()
     for phrase in (
         "2D, float32",
@@ -329,10 +329,8 @@ def test_a_model_is_not_copied_or_pickled():
 
 
 def test_a_scene_is_no_model():
-    model, given = (
-        softmpm.build(busy_scene(2), device="cpu"),
-        r"as softmpm.build\(scene\) gives it, got Scene",
-    )
+    model = softmpm.build(busy_scene(2), device="cpu")
+    given = r"as softmpm.build\(scene\) gives it, got Scene"
     with pytest.raises(TypeError, match=f"simulate needs a model, {given}"):
         softmpm.simulate(model.scene, model.rest(), None, model.params(), substeps=1)
     with pytest.raises(TypeError, match=f"rasterize needs a model, {given}"):
