@@ -140,8 +140,9 @@ class Replay:
 
     def _run_list(self, launches: Callable[[Launcher], None]) -> None:
         if self._list is None:
-            self._list = []
-            launches(Launcher(self.model, None, self._list))
+            collected = []
+            launches(Launcher(self.model, None, collected))
+            self._list = collected  # only now: an interruption, while they compile, would leave a part of it
         for launch in self._list:
             launch.launch()
 

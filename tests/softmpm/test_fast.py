@@ -8,6 +8,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from helpers import (
     INPUTS,
     KINDS,
@@ -22,7 +23,7 @@ from helpers import (
 )
 
 import softmpm
-from softmpm import autograd, fast, memory, program, program_adj
+from softmpm import autograd, fast, memory, program, program_adj, replay
 from softmpm.arrangement import Arrangement
 from softmpm.buffers import Solid
 from softmpm.horizon import Chunk, Horizon
@@ -624,6 +625,33 @@ def test_a_failing_call_leaves_the_model_as_it_was(short_chunks, device):
     failure(built, v=kick)
     assert_gradient(pull(end, inputs), alone(1, device), device)
     assert_gradient(pull(*next(calls(built, [2]))), alone(2, device), device)
+
+
+def test_an_interrupted_call_leaves_the_model_as_it_was(budget, short_chunks, monkeypatch, device):
+    """Wherever it was, at a launch that compiles or a buffer that does not fit: the next call is what it is on a fresh model."""
+    want, points = alone(2, device, **budget), 0
+    for point in itertools.count(0, 5):
+        built = model(device=device, **budget)
+        with monkeypatch.context() as patch:
+            steps = itertools.count()
+
+            def stops(work, steps=steps, point=point):
+                def stopping(*args, **kwargs):
+                    if next(steps) == point:
+                        raise torch.OutOfMemoryError("no room")
+                    return work(*args, **kwargs)
+
+                return stopping
+
+            for owner, name in ((torch, "empty"), (wp, "launch"), (replay.Command, "__call__")):
+                patch.setattr(owner, name, stops(getattr(owner, name)))
+            try:
+                pull(*next(calls(built, [1])))
+                break
+            except torch.OutOfMemoryError:
+                points += 1
+        assert_gradient(pull(*next(calls(built, [2]))), want, device)
+    assert points > 20
 
 
 def test_a_failure_in_the_start_is_reported_as_such(device):
