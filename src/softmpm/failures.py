@@ -22,7 +22,8 @@ class Report:
             self._words = torch.empty(words.shape, dtype=words.dtype, pin_memory=True)
             self._words.copy_(words, non_blocking=True)
             self._event = torch.cuda.Event()
-            self._event.record()
+            # Unasked, PyTorch would take the stream of the current GPU:
+            self._event.record(torch.cuda.current_stream(words.device))
 
     def read(self) -> list[int]:
         """Waits for the device to come to where the report was made."""
