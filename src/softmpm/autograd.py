@@ -21,7 +21,7 @@ from softmpm.kernels.types import Wanted
 from softmpm.model import Model
 from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.replay import recording
-from softmpm.rollout import Trail, rollout, rollout_adj
+from softmpm.rollout import Trail, rollout, rollout_adj, short_of_memory
 from softmpm.state import GridField, Low, Params, State
 
 _SECOND = (
@@ -58,6 +58,7 @@ def simulate(
         TypeError: ``model`` is something else.
         ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
         UnstableError: A particle became non-finite, inverted or left the grid; names world, particle, substep and limit.
+        torch.OutOfMemoryError: With a note on what the call takes. The backward pass may raise it and UnstableError as well.
     """
     return _simulate(model, start, activation, params, substeps)
 
@@ -180,7 +181,9 @@ class _Simulate(torch.autograd.Function):
         # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
         model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
         start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
-        end, trail = rollout(model, horizon, start, pull, Solid(mass, mu, lam, pull), keep=keep is not None)
+        solid, needed = Solid(mass, mu, lam, pull), keep is not None
+        with short_of_memory(model, horizon, needed):
+            end, trail = rollout(model, horizon, start, pull, solid, needed)
         if keep is not None:
             keep.trail = trail
         return (*end, *(end.low or (None, None)))
@@ -219,10 +222,10 @@ class _SimulateBackward(torch.autograd.Function):
                 for adj, shape in zip(adj_end, shapes, strict=True)
             )
         )
-        adj, solid, adj_pull = rollout_adj(
-            model, horizon, trail, pull, Solid(mass, mu, lam, pull), adj_end, wanted
-        )
-        return adj_pull, solid.mu, solid.lam, solid.mass, *adj
+        solid = Solid(mass, mu, lam, pull)
+        with short_of_memory(model, horizon, gradient=True):
+            adj, adj_solid, adj_pull = rollout_adj(model, horizon, trail, pull, solid, adj_end, wanted)
+        return adj_pull, adj_solid.mu, adj_solid.lam, adj_solid.mass, *adj
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -211,3 +211,8 @@ def fast(model: Model, stream: int) -> Fast:
     if stream not in local.of_stream:
         local.of_stream[stream] = Fast(weakref.proxy(model))
     return local.of_stream[stream]
+
+
+def forget(model: Model) -> None:
+    """Let go of what waits for the calls to come."""
+    model.__dict__.pop("_runners", None)

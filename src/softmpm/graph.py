@@ -17,7 +17,7 @@ class Graph(Generic[Result]):
 
     On the CPU, where simulations are replayed anyway, it calls the work each time. A replay that fails is done again by
     calling the work, which raises what there is to raise. If a particle only left the part of the grid that is in memory, a
-    larger part is taken before, and the next call records again.
+    larger part is taken before. Once a call has come through, the next one records again.
 
     Args:
         work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
@@ -48,15 +48,19 @@ class Graph(Generic[Result]):
         if self._stream is None:
             return self.work()
         if not self._warm:
-            self._warm = True  # the first call makes what a recording must not: kernels, buffers, an order of the particles
-            return self._run(self._stream)
+            result = self._run(self._stream)
+            self._warm = (
+                True  # it made what a recording must not: kernels, buffers, an order of the particles
+            )
+            return result
         self._graph = self._graph or self._record(self._stream)
         self._graph.replay()
         if self._failed.item():
             assert self._ledger is not None
             self._ledger.widen()
             self._graph = self._ledger = None
-            return self._run(self._stream)
+            self._warm = False
+            return self()
         return self._result
 
     def _run(self, stream: torch.cuda.Stream) -> Result:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,10 +13,10 @@ from softmpm import schedule
 from softmpm.between import SortedAdj, SortedState
 from softmpm.buffers import Solid, SolidAdj
 from softmpm.failures import Report, outgrown, raise_failure, raise_gradient_failure
-from softmpm.fast import Fast, FastRun, fast
+from softmpm.fast import Fast, FastRun, fast, forget
 from softmpm.horizon import Chunk, Horizon
 from softmpm.kernels.types import Wanted
-from softmpm.memory import Plan, plan
+from softmpm.memory import Plan, memory, plan
 from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
 from softmpm.replay import hold, note, recording
@@ -232,3 +233,21 @@ def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:
             del states[k]
         else:
             yield runner.settle(trail.chunks[k], hand, keep=True)
+
+
+@contextmanager
+def short_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[None]:
+    """If a call does not fit, gives back what waited for others, and says what it takes."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        if not recording(model):
+            forget(model)
+        forward, kept, backward = (f"{size / 2**20:,.1f} MiB" for size in memory(model, horizon)[:3])
+        takes = f"{backward} with its backward pass, {kept} of it kept in between" if gradient else forward
+        saves = "; a smaller memory_budget (softmpm.build) takes time instead" if gradient else ""
+        error.add_note(
+            f"softmpm: a call of {horizon.total} substeps with {model.particle_count:,} particles in {model.worlds} world(s) takes "
+            f"{takes}, by the formula of docs/memory.md. Fewer particles or worlds take less{saves}."
+        )
+        raise

@@ -22,7 +22,7 @@ from omegaconf.errors import (
 )
 
 from softmpm_learn.config import RunConf, conf_dir, load, save, to_run, unknown_key
-from softmpm_learn.distributed import Group, OtherProcessError, joined
+from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
 from softmpm_learn.experiment import run_experiment
 from softmpm_learn.tasks import TASKS
 from softmpm_learn.train import TrainingError
@@ -162,7 +162,7 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
-    text = str(error) if str(error).strip() else "no details"
+    text = in_full(error).strip() or "no details"
     return _line(
         text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
     )

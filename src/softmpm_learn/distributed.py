@@ -20,6 +20,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+def in_full(error: BaseException | None) -> str:
+    """Its message and its notes."""
+    return " ".join([str(error), *getattr(error, "__notes__", ())])
+
+
 class OtherProcessError(RuntimeError):
     """Raised where nothing failed, because something did in another process; the message is the one given there."""
 
@@ -130,7 +135,7 @@ class Group:
         failed = self.size - self._largest(0 if error is None else self.size - self.rank)
         if failed == self.size:
             return
-        message = self.tell(" ".join([str(error), *getattr(error, "__notes__", [])]), source=failed)
+        message = self.tell(in_full(error), source=failed)
         if error is not None and failed == self.rank:
             raise error
         raise OtherProcessError(message) from error

@@ -25,7 +25,7 @@ from torch import Tensor
 import softmpm
 from softmpm import Model
 from softmpm_learn import checkpoint
-from softmpm_learn.distributed import Group, OtherProcessError
+from softmpm_learn.distributed import Group, OtherProcessError, in_full
 from softmpm_learn.episode import Episode, run_episode
 from softmpm_learn.journal import TIMING, Journal
 from softmpm_learn.run import Run
@@ -142,8 +142,7 @@ def optimise(
             break
         except (softmpm.UnstableError, OtherProcessError) as error:
             if not run.safe or retries == run.settings.optimizer.retries:
-                problem = " ".join([str(error), *getattr(error, "__notes__", [])])
-                raise TrainingError(run.iteration, problem) from error
+                raise TrainingError(run.iteration, in_full(error)) from error
             logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
             run.step_back()
             retries += 1

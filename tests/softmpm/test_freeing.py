@@ -183,6 +183,31 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
         assert_relative(got, want, 0.0 if device == "cpu" else 2e-5)
 
 
+@pytest.mark.parametrize("failing", ["forward", "backward"])
+def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failing, monkeypatch, device):
+    """Also what the calls before left to be used again: it may be what there is no room for."""
+    built = model(device=device, **settings)
+    pull(*call(built))
+    waiting = call(built) if failing == "backward" else None
+    owner, name = (arrangement.Arrangement, "judge") if failing == "forward" else (fast.FastRun, "pull_back")
+
+    def full(*args):
+        raise torch.OutOfMemoryError("no room")
+
+    if built.scheme == "plain":
+        owner, name = plain.PlainRun, "__init__" if failing == "forward" else "pull_back"
+    monkeypatch.setattr(owner, name, full)
+    try:
+        pull(*(waiting or call(built)))
+    except torch.OutOfMemoryError as error:
+        (note,) = error.__notes__
+        assert note.startswith("softmpm: a call of 21 substeps with ") and "smaller memory_budget" in note
+    else:
+        raise AssertionError("it did fit")
+    del waiting
+    assert living((program.Program, program_adj.ProgramAdj, plain.PlainRun)) == []
+
+
 def test_calls_of_many_lengths_leave_few_programs(living, device):
     """Their memory is bounded by what two calls may keep; those of the last call are there for the next one like it."""
     sizes, lengths = model().sizes(), range(10, 40)

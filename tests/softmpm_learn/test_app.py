@@ -200,10 +200,13 @@ def test_a_wrong_value_says_what_must_hold(overrides, message):
 
 
 def test_a_fault_of_the_program_is_called_so():
-    """Errors that are not meant for people give their type; messages of several lines become one."""
+    """Errors that are not meant for people give their type; messages of several lines become one, and notes follow."""
     assert app.sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
     assert app.sentence(RuntimeError("first\n  second")) == "first second."
     assert app.sentence(RuntimeError()) == "no details."
+    noted = RuntimeError("No memory.")
+    noted.add_note("Buy some")
+    assert app.sentence(noted) == "No memory. Buy some."
 
 
 def test_cuda_without_a_gpu_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):
