@@ -1,12 +1,11 @@
 """A whole closed loop, its gradient included, as one CUDA graph."""
 
-import gc
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import torch
 
-from softmpm.replay import Ledger, close_ledger, open_ledger
+from softmpm.replay import Ledger, close_ledger, open_ledger, uncollected
 from softmpm.watch import NEVER
 
 Result = TypeVar("Result")
@@ -72,16 +71,13 @@ class Graph(Generic[Result]):
         return result
 
     def _record(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
-        graph, ledger, collects = torch.cuda.CUDAGraph(), open_ledger(), gc.isenabled()
-        gc.disable()  # a model that waits for the collector has graphs of its own, and destroying one would end the recording
+        graph, ledger = torch.cuda.CUDAGraph(), open_ledger()
         try:
             torch.cuda.synchronize(self.device)
-            with torch.cuda.graph(graph, stream=stream):
+            with uncollected(), torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
                 self._failed = (torch.cat([words for words, _ in ledger.words]) != NEVER).any()
         finally:
             close_ledger()
-            if collects:
-                gc.enable()
         self._ledger = ledger
         return graph

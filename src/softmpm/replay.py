@@ -1,7 +1,9 @@
 """Launches that are made once and then repeated: one on other tensors each time, or a list on fixed ones as a graph."""
 
+import contextlib
+import gc
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import warp as wp
@@ -13,6 +15,22 @@ from softmpm.model import Model
 def recording(model: Model) -> bool:
     """Whether PyTorch is recording a CUDA graph on the current stream: nothing may wait for the device then."""
     return model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+_recording = threading.RLock()
+
+
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """One recording at a time, and no garbage collected meanwhile: to destroy a graph that waits for the collector would end it."""
+    with _recording:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            yield
+        finally:
+            if collects:
+                gc.enable()
 
 
 class Ledger:
@@ -148,7 +166,7 @@ class Replay:
 
     def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph:
         stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
-        with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
+        with uncollected(), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
             launches(Launcher(self.model, stream))
         assert capture.graph is not None
         return capture.graph

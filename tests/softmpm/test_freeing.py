@@ -281,3 +281,36 @@ def test_a_graph_runs_on_memory_of_its_own():
     for got, first in zip(graph(), want, strict=True):
         assert_relative(got, first, 2e-5)
     assert not any(t.any() for t in others)
+
+
+@pytest.mark.gpu
+def test_garbage_does_not_end_a_recording(monkeypatch):
+    """A graph that nothing but itself refers to waits for the collector, which is made to come at once."""
+    built, launches, threshold = model(device="cuda"), program.Program._launch_all, gc.get_threshold()
+    inputs, weights = busy_inputs(built, control_steps=3), cotangent(built.rest())
+
+    def work():
+        return torch.autograd.grad(
+            dot(weights, run(softmpm.simulate, built, inputs, 7)), list(inputs.values())
+        )
+
+    knot = [softmpm.Graph(work, built.device)]
+    knot.append(knot)
+    want = [found.clone() for found in [knot[0]() for _ in range(3)][-1]]
+
+    def launching(self, launch):
+        nonlocal knot
+        knot = None
+        launches(self, launch)
+
+    monkeypatch.setattr(program.Program, "_launch_all", launching)
+    gc.set_threshold(1)
+    try:
+        other = model(device="cuda")  # which records its own
+        found = torch.autograd.grad(
+            dot(weights, run(softmpm.simulate, other, inputs, 7)), list(inputs.values())
+        )
+    finally:
+        gc.set_threshold(*threshold)
+    for got, wanted in zip(found, want, strict=True):
+        assert_relative(got, wanted, 2e-5)
