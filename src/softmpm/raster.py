@@ -11,7 +11,7 @@ from softmpm.kernels.types import types
 from softmpm.model import Model
 from softmpm.replay import Launcher, hold, note, recording
 from softmpm.state import GridField, State
-from softmpm.step import stream_of
+from softmpm.step import on_its_gpu, stream_of
 from softmpm.watch import NEVER
 
 
@@ -53,6 +53,7 @@ def _sums(model: Model, state: State, watch: Tensor) -> Tensor:
     return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
 
 
+@on_its_gpu
 def rasterize_nodes(model: Model, state: State) -> GridField:
     """Mass (world, *nodes) and velocity (world, *nodes, dim) of what :func:`softmpm.rasterize` sees."""
     watch = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
@@ -71,6 +72,7 @@ def rasterize_nodes(model: Model, state: State) -> GridField:
     return field
 
 
+@on_its_gpu
 def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridField) -> State:
     """Adjoint of :func:`rasterize_nodes`, of x, v and C."""
     launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)

@@ -21,6 +21,7 @@ from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
 from softmpm.replay import hold, note, recording
 from softmpm.state import State
+from softmpm.step import on_its_gpu
 from softmpm.watch import NEVER
 
 
@@ -93,6 +94,7 @@ class _Runner:
             del run  # or its program would be there beside the next one, which has a larger window
 
 
+@on_its_gpu
 def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, solid: Solid, keep: bool):
     """Run from ``start``. Each chunk is launched before the report of the one before it is read.
 
@@ -159,6 +161,7 @@ def _recorded(runner: _Runner, trail: Trail, inside: bool) -> State:
     return _as_state(state)
 
 
+@on_its_gpu
 def rollout_adj(
     model: Model,
     horizon: Horizon,

@@ -4,7 +4,9 @@ Nothing here decides how many substeps there are or what is kept: that is ``roll
 stream and are never recorded on a ``wp.Tape`` by themselves: :func:`softmpm.step` records the explicit adjoint.
 """
 
-from functools import cached_property, lru_cache
+import functools
+from collections.abc import Callable
+from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
 import warp as wp
@@ -20,6 +22,20 @@ from softmpm.model import Model
 from softmpm.state import Low, State
 from softmpm.watch import NEVER
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def on_its_gpu(work: Callable[Concatenate[Model, P], T]) -> Callable[Concatenate[Model, P], T]:
+    """Work for a model, whose GPU is PyTorch's current one meanwhile: Warp makes it so and would leave it so."""
+
+    @functools.wraps(work)
+    def working(model: Model, *args: P.args, **kwargs: P.kwargs) -> T:
+        with torch.cuda.device(model.device.index if model.device.type == "cuda" else -1):
+            return work(model, *args, **kwargs)
+
+    return working
+
 
 def stream_of(device: torch.device) -> wp.Stream | None:
     """PyTorch's current stream as Warp sees it; None on the CPU."""
@@ -28,7 +44,7 @@ def stream_of(device: torch.device) -> wp.Stream | None:
     return _known_stream(device, torch.cuda.current_stream(device).cuda_stream)
 
 
-@lru_cache(maxsize=None)
+@functools.lru_cache(maxsize=None)
 def _known_stream(device: torch.device, handle: int) -> wp.Stream:
     """Made once for each: Warp registers a stream when it is made, and takes it off when it goes."""
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
@@ -66,21 +82,21 @@ class Substep:
             )
         return self._arrays[name]
 
-    @cached_property
+    @functools.cached_property
     def node(self) -> Tensor:
         """Momentum and mass, (world, node, dim + 1)."""
         return self._grid(self.types.node)
 
-    @cached_property
+    @functools.cached_property
     def velocity(self) -> Tensor:
         """(world, node, dim)."""
         return self._grid(self.types.vec)
 
-    @cached_property
+    @functools.cached_property
     def adj_node(self) -> Tensor:
         return self._grid(self.types.node)
 
-    @cached_property
+    @functools.cached_property
     def adj_velocity(self) -> Tensor:
         return self._grid(self.types.vec)
 

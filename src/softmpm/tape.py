@@ -18,7 +18,7 @@ from softmpm.failures import raise_failure
 from softmpm.kernels.types import Wanted, solid_adj_type, types
 from softmpm.model import Model
 from softmpm.state import Params, State
-from softmpm.step import Substep, stream_of
+from softmpm.step import Substep, on_its_gpu, stream_of
 
 
 @dataclass(eq=False)
@@ -87,6 +87,7 @@ def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
     return array
 
 
+@on_its_gpu
 def warp_state(model: Model, state: State | None = None, *, requires_grad: bool = False) -> WarpState:
     """A :class:`WarpState` that holds ``state``, or the rest state if None.
 
@@ -107,11 +108,13 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     )
 
 
+@on_its_gpu
 def torch_state(model: Model, state: WarpState) -> State:
     """The :class:`softmpm.State` that a :class:`WarpState` holds, in new tensors."""
     return Substep(model, None).leave(state.struct(model))
 
 
+@on_its_gpu
 def warp_solid(
     model: Model,
     params: Params | None = None,
@@ -143,6 +146,7 @@ def warp_solid(
     return WarpSolid(owned["mass"], owned["mu"], owned["lam"], owned.get("pull"), Substep(model, struct))
 
 
+@on_its_gpu
 def step(
     model: Model,
     state_in: WarpState,
@@ -186,6 +190,7 @@ def step(
     tape.record_func(lambda: _adjoint(model, state_in, state_out, solid, substep), arrays)
 
 
+@on_its_gpu
 def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
     wanted = Wanted(material=True, activation=solid.pull is not None)
     struct = solid_adj_type(model.spec, wanted)()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from helpers import assert_relative, busy_inputs, busy_scene, gradients
+from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradients
 
 import softmpm
 from softmpm.buffers import SolidAdj
@@ -247,28 +247,29 @@ def test_work_runs_on_the_current_stream():
 
 @pytest.mark.gpu
 def test_a_model_need_not_be_on_the_current_gpu(scheme):
-    """Results are those of the CPU, a failure is seen though its GPU is busy, and nothing comes to lie on the current one."""
+    """Results are the same there, a failure is seen though it is busy, and nothing comes to lie on the current one."""
     if torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
     settings = dict(dtype=torch.float64, scheme=scheme)
-    here, there = (
-        softmpm.build(plain_scene(), device=name, **settings) for name in ("cpu", torch.device("cuda", 1))
-    )
-    before = torch.cuda.memory_allocated(0)
+    here, there = (softmpm.build(busy_scene(2), device=f"cuda:{k}", **settings) for k in (0, 1))
     want, inputs = gradients(softmpm.simulate, here, busy_inputs(here), 10), busy_inputs(there)
-    graph = softmpm.Graph(lambda: gradients(softmpm.simulate, there, inputs, 10), there.device)
-    for found in (gradients(softmpm.simulate, there, inputs, 10), *(graph() for _ in range(3))):
+    before, weights = torch.cuda.memory_allocated(0), cotangent(there.rest())
+
+    def work():
+        return gradients(softmpm.simulate, there, inputs, 10, weights)
+
+    graph = softmpm.Graph(work, there.device)
+    for found in (work(), *(graph() for _ in range(3))):  # without recording, recorded, replayed
         for name, gradient in found.items():
-            assert_relative(gradient.cpu(), want[name], 1e-10, name)
+            assert_relative(gradient.to(here.device), want[name], 1e-10, name)
+    del found, gradient
     start = there.rest()
     start.F[0, 3, 0] *= -1.0
     with torch.cuda.device(1):
-        torch.cuda._sleep(
-            200_000_000
-        )  # what is read too early is the report of the calls above, in which nothing failed
+        torch.cuda._sleep(200_000_000)  # who reads too early reads what the calls above left: nothing failed
     with pytest.raises(softmpm.UnstableError, match="particle 3 .* in the start state"):
         softmpm.simulate(there, start, None, there.params(), substeps=10)
-    assert torch.cuda.current_device() == 0 and torch.cuda.memory_allocated(0) == before
+    assert torch.cuda.current_device() == 0 and torch.cuda.memory_allocated(0) <= before
 
 
 def square() -> softmpm.Scene:
