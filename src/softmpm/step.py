@@ -17,6 +17,7 @@ from softmpm.kernels.boundary import boundary
 from softmpm.kernels.grid import grid
 from softmpm.kernels.solid import collect_pull, collectors
 from softmpm.kernels.transfer import transfer, transfer_adj
+from softmpm.kernels.turn import launch
 from softmpm.kernels.types import Wanted, types
 from softmpm.model import Model
 from softmpm.state import Low, State
@@ -60,10 +61,7 @@ class Substep:
     def __init__(self, model: Model, solid):
         self.model, self.solid, self.stream = model, solid, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
-        for define in (
-            transfer,
-            grid,
-        ):  # all of a module before it is first loaded, so that it is compiled once
+        for define in (transfer, grid):  # all of a module before it is first loaded: it is compiled once
             define(model.spec)
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
@@ -101,9 +99,7 @@ class Substep:
         return self._grid(self.types.vec)
 
     def launch(self, kernel, dim, *inputs) -> None:
-        wp.launch(
-            kernel, dim=dim, inputs=inputs, device=self.model.wp_device, stream=self.stream, record_tape=False
-        )
+        launch(kernel, dim, inputs, device=self.model.wp_device, stream=self.stream)
 
     def to_grid(self, now) -> None:
         """P2G and the grid stage: velocity of the nodes."""
@@ -170,10 +166,7 @@ class Substep:
         if self.model.dtype == torch.float32:
             vectors += [(*lead, d), (*lead, d, d)]
         out = [torch.empty(shape, dtype=self.model.dtype, device=self.model.device) for shape in vectors]
-        low = out[4:] or [
-            torch.empty(0, 0, d, dtype=self.model.dtype),
-            torch.empty(0, 0, d, d, dtype=self.model.dtype),
-        ]
+        low = out[4:] or [out[0].new_empty(0, 0, d), out[0].new_empty(0, 0, d, d)]
         arrays = [view(tensor, t.vec if tensor.ndim == 3 else t.mat) for tensor in (*out[:4], *low)]
         self.launch(
             boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.scale, motion, *arrays

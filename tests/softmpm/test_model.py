@@ -4,7 +4,10 @@ import copy
 import dataclasses
 import itertools
 import logging
+import os
 import pickle
+import subprocess
+import sys
 import threading
 import warnings
 
@@ -15,7 +18,7 @@ import warp as wp
 from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradients
 
 import softmpm
-from softmpm.buffers import SolidAdj
+from softmpm.buffers import SolidAdj, passing
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted, adj_module, solid_types
 from softmpm.scene import CONTACTS
@@ -228,6 +231,62 @@ def test_two_models_in_two_threads_give_what_they_give_alone(device):
                     assert torch.equal(gradient, alone[k][name]), name
                 else:
                     assert_relative(gradient, alone[k][name], 1e-10, name)
+
+
+@pytest.mark.parametrize("scheme", ["plain", "fast"])
+def test_threads_may_all_be_the_first(scheme):
+    """To define, compile and load the same kernels, which nobody has used before in their process."""
+    code = f"""
+import sys, threading, torch, softmpm
+from helpers import busy_inputs, busy_scene, gradients
+sys.setswitchinterval(1e-5)
+model, found, together = softmpm.build(busy_scene(2), device="cpu", scheme="{scheme}"), [], threading.Barrier(3)
+def work():
+    inputs = busy_inputs(model)
+    together.wait()
+    found.append(gradients(softmpm.simulate, model, inputs, 5))
+threads = [threading.Thread(target=work) for _ in range(3)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+assert len(found) == 3
+assert all(torch.equal(one[name], found[0][name]) for one in found for name in one)
+"""
+    path = os.pathsep.join(sys.path)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "settings", [{"scheme": "plain"}, {"scheme": "fast"}, {"deterministic": True}], ids=str
+)
+def test_what_pytorch_takes_unasked_does_not_matter(settings):
+    """Neither its default device nor its default precision."""
+    model = softmpm.build(busy_scene(2), device="cpu", **settings)
+    inputs, weights = busy_inputs(model), cotangent(model.rest())
+    want = gradients(softmpm.simulate, model, inputs, 5, weights)
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            other = softmpm.build(busy_scene(2), device="cpu", **settings)
+            got = gradients(softmpm.simulate, other, inputs, 5, weights)
+            softmpm.rasterize(other, other.rest())
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for name, gradient in got.items():
+        assert torch.equal(gradient, want[name]), name
+
+
+def test_more_bytes_than_warp_counts_are_refused():
+    """From one entry of an axis to the next, where there are two: it would go elsewhere, and say nothing."""
+    for worlds, refused in ((1, False), (2, True)):
+        far = torch.empty(worlds, 2**27, 4, device="meta")
+        if refused:
+            with pytest.raises(ValueError, match=r"2,147,483,648 bytes apart, Warp reaches less than"):
+                passing(far, wp.vec4)
+        else:
+            passing(far, wp.vec4)
 
 
 @pytest.mark.gpu

@@ -3,17 +3,17 @@
 base = ⌊x/dx − ½⌋,  fx = x/dx − base,  H = F − I        both ways in float64, whatever the precision of the scene.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels import failure
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 from softmpm.watch import Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def boundary(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, Scale, Motion = t.real, t.vec, t.mat, t.ivec, t.Scale, t.Motion

@@ -10,15 +10,15 @@ The twins differentiate the branch that was taken; a node held by friction passe
 Source: Stomakhin et al. 2013, "A material point method for snow simulation", section 8.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, solid_types, types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def contact(spec: Spec, k: int) -> SimpleNamespace:
     """Wall number ``k``."""
     t = types(spec.dim, spec.dtype)

@@ -13,16 +13,16 @@ Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012. The twins take τ
           μ̄ = ⟨τ̄, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels.polar import polar
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def elasticity(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat

@@ -1,16 +1,16 @@
 """Failures found on the device, and how they are reported: one 64-bit word per world, see softmpm/watch.py."""
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels.elasticity import elasticity
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, solid_types, types
 from softmpm.watch import KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def report(dim: int, dtype: str) -> SimpleNamespace:
     """How a kernel asks whether its world still runs, and how it says that it failed."""
 
@@ -30,7 +30,7 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
     return SimpleNamespace(running=running, report=write)
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def check(spec: Spec) -> SimpleNamespace:
     """What must hold of a new state: finite, on the grid, and not inverted where the law forbids it."""
     t = types(spec.dim, spec.dtype)

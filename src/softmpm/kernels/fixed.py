@@ -5,17 +5,17 @@ there is a step more: ``give`` keeps b and A and notes their size, ``push`` adds
 ``leave`` keeps what is made of it.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels.native import native, native_module
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def fixed(dim: int) -> SimpleNamespace:
     """In single precision: double has more digits than such sums keep."""
     t, n, s = types(dim, "float32"), native(dim, "float32"), stencil(dim, "float32")

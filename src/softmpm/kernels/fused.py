@@ -14,7 +14,6 @@ A deterministic model adds up in a launch more, ``push`` of fixed.py, between be
 All that is particle- or node-wise is shared with the plain scheme: particle.py, grid.py, failure.py. Adjoint: fused_adj.py.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -25,11 +24,12 @@ from softmpm.kernels.grid import grid
 from softmpm.kernels.native import BLOCK, native, native_module
 from softmpm.kernels.particle import particle
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, solid_types, types
 from softmpm.watch import Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def fused(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned

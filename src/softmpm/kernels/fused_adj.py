@@ -10,7 +10,6 @@ Nodes without mass keep their V and their V̄, as in fused.py.
 A deterministic model adds up in a launch more, ``push`` of fixed.py, between the two.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -23,11 +22,12 @@ from softmpm.kernels.native import BLOCK, native, native_module
 from softmpm.kernels.particle import particle, particle_adj
 from softmpm.kernels.stencil import stencil
 from softmpm.kernels.stencil_adj import stencil_adj
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
 from softmpm.watch import Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t, one, twin = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned

@@ -7,17 +7,17 @@
 Empty nodes get zero in both directions, in the fast scheme nothing (fused.py).
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels.contact import contact
 from softmpm.kernels.spline import spline
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, solid_types, types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, ivec, node_vec, Scale = t.real, t.vec, t.ivec, t.node, t.Scale

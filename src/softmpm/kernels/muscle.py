@@ -7,15 +7,15 @@ with the unit direction d in the rest shape and the pull p = activation · stren
 Source: Spielberg et al. 2021 (Robotica).
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def muscle(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat

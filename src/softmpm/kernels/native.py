@@ -3,12 +3,12 @@
 Everything has a plain form as well, for the CPU, for double precision and for GPUs before sm_90, chosen when it is compiled.
 """
 
-import functools
 from pathlib import Path
 from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 HEADERS = [Path(__file__).with_name(name) for name in ("scatter.h", "fixed.h")]
@@ -37,7 +37,7 @@ def native_module(name: str) -> str:
     return name
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def native(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, node_vec, rows = t.real, t.vec, t.mat, t.ivec, t.aligned, t.rows

@@ -3,7 +3,6 @@
 ``order`` names, for each place in the packed particles, the particle of its world that stands there.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -13,11 +12,12 @@ from softmpm.kernels.boundary import boundary
 from softmpm.kernels.native import native, native_module
 from softmpm.kernels.sorting import sorting
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 from softmpm.watch import Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def packing(dim: int, dtype: str) -> SimpleNamespace:
     t, b, n, s = types(dim, dtype), boundary(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat

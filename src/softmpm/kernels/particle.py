@@ -10,7 +10,6 @@ Lengths in here count in cells: fx = x/dx − base, B and A are per cell. In flo
 loses is kept and added in the next step. Symbols and sources: kernels/transfer.py. Derivation: docs/math/transfer.md.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -18,10 +17,11 @@ import warp as wp
 from softmpm.kernels import failure
 from softmpm.kernels.elasticity import elasticity
 from softmpm.kernels.solid import solid, solid_adj
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, Wanted, solid_adj_type, solid_types, types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def particle(spec: Spec) -> SimpleNamespace:
     t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
     real, vec, mat, ivec, Scale, divide = t.real, t.vec, t.mat, t.ivec, t.Scale, t.divide
@@ -92,7 +92,7 @@ def particle(spec: Spec) -> SimpleNamespace:
     )
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, Scale, divide = t.real, t.vec, t.mat, t.Scale, t.divide

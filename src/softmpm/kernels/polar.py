@@ -15,11 +15,11 @@ Adjoint: F̄ += R [y],  (tr(S) I − S) y = axl(RᵀR̄)                        
 Source: Davenport's q-method (Markley & Mortari 2000) for (R2); the rest is derived.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 NEWTON_STEPS = {"float32": 2, "float64": 3}  # each doubles the digits of a start that has a few
@@ -27,7 +27,7 @@ QUARTIC_STEPS = 40  # an upper bound: at F = I none is taken, elsewhere 3 to 8
 INVERSE_STEPS = 3
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def polar(dim: int, dtype: str) -> SimpleNamespace:
     return _polar2(dtype) if dim == 2 else _polar3(dtype)
 

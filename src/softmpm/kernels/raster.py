@@ -6,7 +6,6 @@ g = p̄_i·(v + C r) + m̄_i
 x̄ = m Σ g ∇w − w Cᵀ p̄_i,   v̄ = m Σ w p̄_i,   C̄ = m Σ w p̄_i rᵀ                          (O1.adj)
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -14,11 +13,12 @@ import warp as wp
 from softmpm.kernels import failure
 from softmpm.kernels.boundary import boundary
 from softmpm.kernels.spline import spline
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 from softmpm.watch import Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def raster(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
     real, vec, mat, node_vec, Scale = t.real, t.vec, t.mat, t.node, t.Scale

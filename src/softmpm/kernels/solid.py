@@ -1,6 +1,5 @@
 """Total stress of one particle: its law plus its muscles, as the scene has them."""
 
-import functools
 from collections.abc import Sequence
 from types import SimpleNamespace
 
@@ -8,10 +7,11 @@ import warp as wp
 
 from softmpm.kernels.elasticity import elasticity
 from softmpm.kernels.muscle import muscle
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def solid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     mat, Solid = t.mat, solid_types(spec).Solid
@@ -55,7 +55,7 @@ def solid(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(rotation=rotation, stress=stress)
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     mat, Solid, SolidAdj = t.mat, solid_types(spec).Solid, solid_adj_type(spec, wanted)
@@ -92,7 +92,7 @@ def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     return SimpleNamespace(stress_adj=stress_adj)
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def sorted_solid(spec: Spec):
     """Kernel that puts the material into the order of the packed particles."""
     Solid, mixed, slots = solid_types(spec).Solid, len(spec.laws) > 1, spec.muscle_slots
@@ -121,7 +121,7 @@ def sorted_solid(spec: Spec):
     return sort
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def sorted_solid_adj(spec: Spec, wanted: Wanted):
     """Twin of :func:`sorted_solid` for what is wanted of the material: adds to the particle what its place found."""
     SolidAdj = solid_adj_type(spec, wanted)
@@ -154,7 +154,7 @@ def collectors(slots: Sequence[int]) -> tuple[int, int, int]:
     return worlds, min(particles, COLLECTORS), count
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def collect_pull(spec: Spec):
     """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
     t = types(spec.dim, spec.dtype)
@@ -191,7 +191,7 @@ PARTS = 256
 """Partial sums of a muscle's pull, each of every 256th particle."""
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def collect_pull_in_order(spec: Spec) -> SimpleNamespace:
     """As :func:`collect_pull`, in an order that is always the same: ``parts`` of each muscle, then their ``total``."""
     t = types(spec.dim, spec.dtype)

@@ -3,7 +3,6 @@
 ``order`` names, for each place in the packed particles, the particle of its world that stands there.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -11,6 +10,7 @@ import warp as wp
 from softmpm.kernels import failure
 from softmpm.kernels.native import WARP, native, native_module
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 from softmpm.watch import Kind
 
@@ -18,7 +18,7 @@ SAMPLES = 50_000
 """Particles of which it is counted whether their cell is another one than that of the particle before."""
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def sorting(dim: int, dtype: str) -> SimpleNamespace:
     t, n, s = types(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, ivec = t.real, t.vec, t.ivec

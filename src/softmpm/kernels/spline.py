@@ -8,15 +8,15 @@ With f the distance from the base node in cells, 0.5 ≤ f < 1.5, along each axi
 Source: Steffen, Kirby, Berzins 2008; Hu et al. 2018, "MLS-MPM".
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def spline(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, ivec, node_vec = t.real, t.vec, t.ivec, t.node

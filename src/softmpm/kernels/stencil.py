@@ -8,16 +8,16 @@ The weights are products, so the sums along z are taken first, then those along 
 factors each. With Σ w v oᵀ the sum that (T2) wants is Σ w v rᵀ = Σ w v oᵀ − (Σ w v) gᵀ, with |g| ≤ ½ without harm to rounding.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels.native import WARP, native
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def stencil(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned

@@ -5,17 +5,17 @@ What a particle's weights are multiplied with is a number s at each of its nodes
     Σ s ∇w,   w₋₁' = g − ½,  w₀' = −2g,  w₊₁' = g + ½                                                (A2), (A5)
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.kernels.native import native
 from softmpm.kernels.stencil import stencil
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import types
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def stencil_adj(dim: int, dtype: str) -> SimpleNamespace:
     t, one = types(dim, dtype), stencil(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned

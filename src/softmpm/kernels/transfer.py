@@ -18,7 +18,6 @@ sum: what adding Δt v' / dx loses is kept and added in the next step.
 Sources: Hu et al. 2018 ("MLS-MPM", Eq. 29), Jiang et al. 2015 ("APIC"); the adjoint as in Hu et al. 2019, rederived.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -26,11 +25,12 @@ import warp as wp
 from softmpm.kernels import failure
 from softmpm.kernels.particle import particle, particle_adj
 from softmpm.kernels.spline import spline
+from softmpm.kernels.turn import once
 from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
 from softmpm.watch import Kind
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def transfer(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     vec, mat, node_vec, Scale, Motion, ivec = t.vec, t.mat, t.node, t.Scale, t.Motion, t.ivec
@@ -115,7 +115,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(p2g=p2g, g2p=g2p)
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.node

@@ -1,11 +1,12 @@
 """What the kernels are specialised for, and the types that follow from it."""
 
-import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import warp as wp
+
+from softmpm.kernels.turn import once
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 LETTER = {"stick": "k", "slip": "l", "separate": "s"}
@@ -64,7 +65,7 @@ def packed_rows(dim: int) -> Rows:
     return Rows(0, dim, 2 * dim, 3 * dim, 3 * dim + dim * dim, 3 * dim + 2 * dim * dim)
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def types(dim: int, dtype: str) -> SimpleNamespace:
     """Scalar, vector, matrix and struct types of one dimension and precision."""
     real: Any = DTYPES[dtype]
@@ -153,7 +154,7 @@ def _struct(name: str, module: str, annotations: dict):
     return wp.struct(type(name, (), {"__annotations__": annotations}), module=module)
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def solid_types(spec: Spec) -> SimpleNamespace:
     """Structs of the material and the walls: only the fields that this scene needs."""
     t = types(spec.dim, spec.dtype)
@@ -184,7 +185,7 @@ def solid_types(spec: Spec) -> SimpleNamespace:
     )
 
 
-@functools.lru_cache(maxsize=None)
+@once
 def solid_adj_type(spec: Spec, wanted: Wanted):
     """Struct of the gradients that are wanted besides those of the start."""
     t = types(spec.dim, spec.dtype)
