@@ -23,9 +23,9 @@ class Exact:
     def __init__(self, model: Model, rows: wp.array, nodes: Sequence[wp.array]):
         f, device = fixed(model.dim), model.device
         self.model, self.rows = model, rows
-        self.fixed = torch.zeros(len(nodes[0]), 4, dtype=torch.int64, device=device)
-        self.largest = torch.zeros(2, model.worlds, 2, device=device)
-        self._none = view(torch.empty(0, 0, device=device), wp.float32)
+        self.fixed = torch.empty(len(nodes[0]), 4, dtype=torch.int64, device=device)
+        self.largest = torch.zeros(2, model.worlds, 2, dtype=torch.float32, device=device)
+        self._none = view(self.largest.new_empty(0, 0), wp.float32)
         largest = [view(part.view(-1), wp.float32) for part in self.largest]
         self._shares, self._sums = [], []
         for part in largest:
@@ -42,6 +42,7 @@ class Exact:
 
     def begin(self, mass: Tensor | None) -> None:
         """Before number 0: the masses (world, particle) that enter the sums, or None."""
+        clear(self.fixed)  # who reads a sum clears it, but a run may have been interrupted
         clear(self.largest)
         if mass is not None:
             self.largest[..., 1] = mass.amax(1)

@@ -173,14 +173,18 @@ class Program:
         stream = stream_of(self.model.device)
         moved = recording(self.model) or self._version != self.arrangement.version
         if moved:
+            self._version, self._given = -1, ()  # until the material has this order too
             self.order.copy_(self.arrangement.order)
             self.origin.copy_(self.arrangement.origin)
-            self._version = self.arrangement.version
         self.calm()
         if self.pull is not None and pull is not None:
             self.pull.copy_(pull)
-        if not self._has(solid) or moved:
+        if not self._has(solid):
+            self._given = ()
             self._sort(stream, solid.mass, solid.mu, solid.lam)
+            given = (solid.mass, solid.mu, solid.lam)
+            self._given = () if any(tensor.requires_grad for tensor in given) else given
+            self._version = self.arrangement.version
         self._take(stream, start)
         if self.exact is not None:
             self.exact.begin(solid.mass)
@@ -195,11 +199,9 @@ class Program:
             self._enter[start.low is not None](stream, *given)
 
     def _has(self, solid: Solid) -> bool:
-        """Whether the material is the one of the run before: the very tensors, which nothing else writes to. Takes note of it."""
+        """Whether the material is the one of the run before: the very tensors, which nothing else writes to."""
         given = (solid.mass, solid.mu, solid.lam)
-        same = bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
-        self._given = () if any(tensor.requires_grad for tensor in given) else given
-        return same
+        return bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
 
     @property
     def packing(self):

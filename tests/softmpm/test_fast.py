@@ -627,30 +627,76 @@ def test_a_failing_call_leaves_the_model_as_it_was(short_chunks, device):
     assert_gradient(pull(*next(calls(built, [2]))), alone(2, device), device)
 
 
-def test_an_interrupted_call_leaves_the_model_as_it_was(budget, short_chunks, monkeypatch, device):
-    """Wherever it was, at a launch that compiles or a buffer that does not fit: the next call is what it is on a fresh model."""
-    want, points = alone(2, device, **budget), 0
-    for point in itertools.count(0, 5):
-        built = model(device=device, **budget)
-        with monkeypatch.context() as patch:
-            steps = itertools.count()
+class Interruption(BaseException):
+    """As Ctrl-C is none of the errors that a program expects."""
 
-            def stops(work, steps=steps, point=point):
-                def stopping(*args, **kwargs):
+
+@pytest.fixture
+def interrupted(monkeypatch):
+    """Does some work again and again, and each time stops it somewhere else: at a launch, which may compile, or at a new buffer."""
+    places = (torch, "empty"), (wp, "launch"), (wp.Launch, "launch"), (replay.Command, "__call__")
+
+    def attempts(make, work, every: int):
+        """What was made for each attempt, once its work was stopped."""
+        for point in itertools.count(0, every):
+            made, steps = make(), itertools.count()
+
+            def stopping(go, steps=steps, point=point):
+                def gone(*args, **kwargs):
                     if next(steps) == point:
-                        raise torch.OutOfMemoryError("no room")
-                    return work(*args, **kwargs)
+                        raise Interruption
+                    return go(*args, **kwargs)
 
-                return stopping
+                return gone
 
-            for owner, name in ((torch, "empty"), (wp, "launch"), (replay.Command, "__call__")):
-                patch.setattr(owner, name, stops(getattr(owner, name)))
-            try:
-                pull(*next(calls(built, [1])))
-                break
-            except torch.OutOfMemoryError:
-                points += 1
-        assert_gradient(pull(*next(calls(built, [2]))), want, device)
+            with monkeypatch.context() as patch:
+                for owner, name in places:
+                    patch.setattr(owner, name, stopping(getattr(owner, name)))
+                try:
+                    work(made)
+                except Interruption:
+                    pass
+                else:
+                    return
+            yield made
+
+    return attempts
+
+
+def test_an_interrupted_call_leaves_the_model_as_it_was(kind, short_chunks, interrupted):
+    """The next call is what it is on a fresh model, and so is the gradient of one that waited."""
+    want = [alone(seed, "cpu", **kind) for seed in (1, 2)]
+
+    def prepared():
+        built = model(**kind)
+        return built, next(calls(built, [1]))
+
+    every, points = 13 if model(**kind).scheme == "fast" else 101, 0  # the plain one launches so much more
+    for built, waiting in interrupted(prepared, lambda made: pull(*next(calls(made[0], [3]))), every):
+        assert_gradient(pull(*waiting), want[0], "cpu")
+        assert_gradient(pull(*next(calls(built, [2]))), want[1], "cpu")
+        points += 1
+    assert points > 2
+
+
+@pytest.mark.parametrize("settings", [{}, {"deterministic": True}], ids=["ordinary", "deterministic"])
+def test_an_interrupted_call_leaves_material_that_comes_again(settings, short_chunks, interrupted, device):
+    """It is sorted once for calls that share it, unless one was stopped before it was."""
+
+    def prepared():
+        built = model(device=device, **settings)
+        return built, built.params(), built.rest()
+
+    def go(made):
+        built, params, start = made
+        return softmpm.simulate(built, start, None, params, substeps=20)
+
+    want = go(prepared())
+    points = 0
+    for made in interrupted(prepared, go, every=1 if device == "cpu" else 5):
+        for got, wanted in zip(go(made), want, strict=True):
+            assert_relative(got, wanted, same_on(device))
+        points += 1
     assert points > 20
 
 
