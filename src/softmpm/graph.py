@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 import torch
 
-from softmpm.replay import Ledger, close_ledger, open_ledger, uncollected
+from softmpm.replay import Ledger, alone, opened_ledger
 from softmpm.watch import NEVER
 
 Result = TypeVar("Result")
@@ -48,11 +48,13 @@ class Graph(Generic[Result]):
             return self.work()
         if not self._warm:
             result = self._run(self._stream)
-            self._warm = (
-                True  # it made what a recording must not: kernels, buffers, an order of the particles
-            )
+            # It made what a recording must not: kernels, buffers, an order of the particles.
+            self._warm = True
             return result
-        self._graph = self._graph or self._record(self._stream)
+        if self._graph is None:
+            self._warm = False  # should it fail, whatever was missing
+            self._graph = self._record(self._stream)
+            self._warm = True
         self._graph.replay()
         if self._failed.item():
             assert self._ledger is not None
@@ -71,13 +73,12 @@ class Graph(Generic[Result]):
         return result
 
     def _record(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
-        graph, ledger = torch.cuda.CUDAGraph(), open_ledger()
-        try:
+        graph = torch.cuda.CUDAGraph()
+        # The stream is entered here as well: where a recording fails, PyTorch does not leave it.
+        with alone(wait=True), torch.cuda.stream(stream), opened_ledger() as ledger:
             torch.cuda.synchronize(self.device)
-            with uncollected(), torch.cuda.graph(graph, stream=stream):
+            with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
                 self._failed = (torch.cat([words for words, _ in ledger.words]) != NEVER).any()
-        finally:
-            close_ledger()
         self._ledger = ledger
         return graph

@@ -1,6 +1,7 @@
 """Launches that are made once and then repeated: one on other tensors each time, or a list on fixed ones as a graph."""
 
 import contextlib
+import functools
 import gc
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -9,6 +10,7 @@ import torch
 import warp as wp
 
 from softmpm.failures import outgrown
+from softmpm.kernels.turn import launch
 from softmpm.model import Model
 
 
@@ -17,20 +19,35 @@ def recording(model: Model) -> bool:
     return model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-_recording = threading.RLock()
+_recording = threading.Lock()
 
 
 @contextlib.contextmanager
-def uncollected() -> Iterator[None]:
-    """One recording at a time, and no garbage collected meanwhile: to destroy a graph that waits for the collector would end it."""
-    with _recording:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            yield
-        finally:
-            if collects:
-                gc.enable()
+def alone(wait: bool) -> Iterator[bool]:
+    """One recording at a time, and no garbage collected meanwhile: to destroy a graph that waits for the collector would end it.
+
+    Yields:
+        Whether it is this one's turn; always, for who waits.
+    """
+    if not _recording.acquire(blocking=wait):
+        yield False
+        return
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield True
+    finally:
+        if collects:
+            gc.enable()
+        _recording.release()
+
+
+@functools.lru_cache(maxsize=None)
+def _recorder(device: torch.device) -> wp.Stream:
+    """Where programs are recorded, one at a time. Of high priority, since those are few: PyTorch hands its streams out again and
+    again, and what another thread launches on one that records would become part of the recording.
+    """
+    return wp.stream_from_torch(torch.cuda.Stream(device, priority=-1))
 
 
 class Ledger:
@@ -57,13 +74,13 @@ _open: list[Ledger] = []
 """The ledger of the graph that PyTorch is recording, which is one at a time; its backward pass runs in another thread."""
 
 
-def open_ledger() -> Ledger:
+@contextlib.contextmanager
+def opened_ledger() -> Iterator[Ledger]:
     _open.append(Ledger())
-    return _open[-1]
-
-
-def close_ledger() -> None:
-    _open.pop()
+    try:
+        yield _open[-1]
+    finally:
+        _open.pop()
 
 
 def note(words: torch.Tensor, outgrow: Callable[[], None] | None = None) -> None:
@@ -92,18 +109,10 @@ class Launcher:
 
     def __call__(self, kernel, dim, *inputs, block_dim: int = 256) -> None:
         collect = self.collected is not None
-        launch = wp.launch(
-            kernel,
-            dim,
-            inputs,
-            device=self.device,
-            stream=self.stream,
-            block_dim=block_dim,
-            record_tape=False,
-            record_cmd=collect,
-        )
+        settings = dict(stream=self.stream, block_dim=block_dim, record_cmd=collect)
+        made = launch(kernel, dim, inputs, self.device, **settings)
         if self.collected is not None:
-            self.collected.append(launch)
+            self.collected.append(made)
 
 
 class Command:
@@ -116,9 +125,9 @@ class Command:
 
     def __init__(self, model: Model, kernel, dim, inputs: Sequence, slots: Sequence):
         self._slots = slots
-        launch = wp.launch(kernel, dim, inputs, device=model.wp_device, record_tape=False, record_cmd=True)
-        assert launch is not None
-        self._launch, self._filling = launch, threading.Lock()
+        made = launch(kernel, dim, inputs, device=model.wp_device, record_cmd=True)
+        assert made is not None
+        self._launch, self._filling = made, threading.Lock()
 
     def __call__(self, stream: wp.Stream | None, *tensors: torch.Tensor) -> None:
         """Launch it on contiguous tensors of the slots' shapes and precision.
@@ -154,19 +163,26 @@ class Replay:
         else:
             if self._graph is None:
                 self._graph = self._record(launches)
-            wp.capture_launch(self._graph, stream=stream)
+            if self._graph is None:
+                launches(Launcher(self.model, stream))
+            else:
+                wp.capture_launch(self._graph, stream=stream)
 
     def _run_list(self, launches: Callable[[Launcher], None]) -> None:
         if self._list is None:
             collected = []
             launches(Launcher(self.model, None, collected))
             self._list = collected  # only now: an interruption, while they compile, would leave a part of it
-        for launch in self._list:
-            launch.launch()
+        for command in self._list:
+            command.launch()
 
-    def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph:
-        stream = wp.stream_from_torch(torch.cuda.Stream(self.model.device))
-        with uncollected(), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-            launches(Launcher(self.model, stream))
-        assert capture.graph is not None
-        return capture.graph
+    def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph | None:
+        """The graph, or None while another thread records, which may be waiting for this one."""
+        with alone(wait=False) as turn:
+            if not turn:
+                return None
+            stream = _recorder(self.model.device)
+            with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
+                launches(Launcher(self.model, stream))
+            assert capture.graph is not None
+            return capture.graph

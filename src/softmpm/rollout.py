@@ -189,7 +189,7 @@ def rollout_adj(
             if adj_pull is not None and part is not None:
                 adj_pull[run.chunk.rows] += part
             if recording(model):
-                note(run.words[: model.worlds])
+                note(run.words[: model.worlds].clone())  # a second backward pass uses them anew
             else:
                 reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
             del run  # or it would keep its memory while the one before runs again
@@ -246,11 +246,20 @@ def short_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[
     except torch.OutOfMemoryError as error:
         if not recording(model):
             forget(model)
-        forward, kept, backward = (f"{size / 2**20:,.1f} MiB" for size in memory(model, horizon)[:3])
-        takes = f"{backward} with its backward pass, {kept} of it kept in between" if gradient else forward
-        saves = "; a smaller memory_budget (softmpm.build) takes time instead" if gradient else ""
-        error.add_note(
-            f"softmpm: a call of {horizon.total} substeps with {model.particle_count:,} particles in {model.worlds} world(s) takes "
-            f"{takes}, by the formula of docs/memory.md. Fewer particles or worlds take less{saves}."
-        )
+        error.add_note(_needs(model, horizon, gradient))
         raise
+
+
+def _needs(model: Model, horizon: Horizon, gradient: bool) -> str:
+    call = f"a call of {horizon.total} substeps with {model.particle_count:,} particles in {model.worlds} world(s)"
+    less = "Fewer particles or worlds take less"
+    try:
+        forward, kept, backward = (f"{size / 2**20:,.1f} MiB" for size in memory(model, horizon)[:3])
+    except ValueError as error:  # the budget is too small for a gradient, which was not asked for
+        return f"softmpm: {call} did not fit; {error} {less}."
+    if not gradient:
+        return f"softmpm: {call} takes {forward}, by the formula of docs/memory.md. {less}."
+    return (
+        f"softmpm: {call} takes {backward} with its backward pass, {kept} of it kept in between, by the formula of docs/memory.md. "
+        f"{less}; a smaller memory_budget (softmpm.build) takes time instead."
+    )

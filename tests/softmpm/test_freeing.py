@@ -208,6 +208,19 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
     assert living((program.Program, program_adj.ProgramAdj, plain.PlainRun)) == []
 
 
+def test_a_call_without_gradient_that_does_not_fit_says_so(monkeypatch):
+    """Also where the budget is too small for any gradient."""
+
+    def full(*args):
+        raise torch.OutOfMemoryError("no room")
+
+    monkeypatch.setattr(arrangement.Arrangement, "judge", full)
+    for settings, note in (({}, "takes 0."), ({"memory_budget": 1000}, "needs at least")):
+        with torch.no_grad(), pytest.raises(torch.OutOfMemoryError) as caught:
+            call(model(**settings))
+        assert note in caught.value.__notes__[0]
+
+
 def test_calls_of_many_lengths_leave_few_programs(living, device):
     """Their memory is bounded by what two calls may keep; those of the last call are there for the next one like it."""
     sizes, lengths = model().sizes(), range(10, 40)
@@ -241,14 +254,11 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     with_graphs = [weakref.ref(made) for made in living((program.Program, program_adj.ProgramAdj))]
     for module in (autograd, program, fast, rollout):
         monkeypatch.setattr(module, "recording", lambda model: True)
-    ledger = replay.open_ledger()
-    try:
+    with replay.opened_ledger() as ledger:
         pull(*call(built))
         assert with_graphs and all(made() is not None for made in with_graphs), (
             "a graph that is destroyed ends the recording"
         )
-    finally:
-        replay.close_ledger()
     del built
     for kind in (softmpm.Model, arrangement.Arrangement, program.Program):
         assert living(kind)

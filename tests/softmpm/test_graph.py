@@ -1,0 +1,68 @@
+"""Recorded loops: what a recording has to itself, what it must not forget, and what follows when it fails."""
+
+import gc
+import threading
+
+import pytest
+import torch
+from helpers import KINDS, busy_inputs, busy_scene, run
+
+import softmpm
+from softmpm import autograd, fast, program, replay, rollout
+from softmpm.watch import NEVER
+
+
+def test_one_records_at_a_time():
+    """Without the collector meanwhile. A second one waits, or finds that it is not its turn."""
+    turns, seen = [], []
+
+    def another():
+        with replay.alone(wait=False) as turn:
+            turns.append(turn)
+        with replay.alone(wait=True) as turn:
+            seen.append(gc.isenabled())
+            turns.append(turn)
+
+    thread = threading.Thread(target=another)
+    with replay.alone(wait=True):
+        assert not gc.isenabled()
+        thread.start()
+        while not turns:
+            thread.join(0.01)
+        assert turns == [False]  # it waits now
+    thread.join()
+    assert turns == [False, True] and seen == [False] and gc.isenabled()
+
+
+@pytest.mark.parametrize("settings", KINDS.values(), ids=KINDS)
+def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, monkeypatch):
+    """Two backward passes through one call inside a recording: what the first one reported is still there at the end."""
+    built = softmpm.build(busy_scene(2), device="cpu", **settings)
+    inputs = busy_inputs(built)
+    run(softmpm.simulate, built, inputs, 5).x.sum().backward()
+    for module in (autograd, fast, program, rollout):
+        monkeypatch.setattr(module, "recording", lambda model: True)
+    with replay.opened_ledger() as ledger:
+        end = run(softmpm.simulate, built, inputs, 5)
+        torch.autograd.grad((end.x[0, 1] * torch.inf).sum(), inputs["v"], retain_graph=True)
+        torch.autograd.grad(end.x.sum(), inputs["v"])
+    forward, first, second = (words.tolist() == [NEVER] for words, _ in ledger.words)
+    assert forward and second and not first
+
+
+def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
+    """What it lacked may be what a call makes that is not recorded, so one of those comes first."""
+    graph, did = softmpm.Graph(lambda: None, torch.device("cpu")), []
+    graph._stream = object()
+
+    def record(self, stream):
+        did.append("record")
+        raise RuntimeError("not now")
+
+    monkeypatch.setattr(softmpm.Graph, "_run", lambda self, stream: did.append("run"))
+    monkeypatch.setattr(softmpm.Graph, "_record", record)
+    for _ in range(2):
+        graph()
+        with pytest.raises(RuntimeError, match="not now"):
+            graph()
+    assert did == ["run", "record", "run", "record"]
