@@ -1,5 +1,6 @@
 """The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
 
+import threading
 from collections.abc import Iterable
 from typing import Any
 
@@ -109,9 +110,15 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     Those of the call before if nothing changed and nothing needs a gradient.
     """
     fixed = isinstance(params, Params) and all(map(_counts_writes, params)) and not recording(model)
-    last = model.__dict__.get("_last_material") if fixed else None
-    if last and all(p is q and p._version == v for p, (q, v) in zip(params, last[0], strict=True)):
-        return last[1]
+    last = vars(model).setdefault(
+        "_last_material", _Last()
+    )  # of this thread: another's may not be there yet on its stream
+    if (
+        fixed
+        and last.given
+        and all(p is q and p._version == v for p, (q, v) in zip(params, last.given, strict=True))
+    ):
+        return last.found
     check_params(model, params)
     if not recording(model):  # else nothing can be read back
         check_bounds(params)
@@ -119,8 +126,16 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     mu, lam = (term.expand(lead).contiguous() for term in lame(params))
     found = mu, lam, (params.density * model.volume).expand(lead).contiguous()
     if fixed:
-        model.__dict__["_last_material"] = [(p, p._version) for p in params], found
+        last.given, last.found = [(p, p._version) for p in params], found
     return found
+
+
+class _Last(threading.local):
+    """Material of the call before, and what was computed from it."""
+
+    def __init__(self):
+        self.given: list[tuple[Tensor, int]] = []
+        self.found: Any = None
 
 
 def _counts_writes(tensor: Any) -> bool:

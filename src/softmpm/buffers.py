@@ -14,11 +14,25 @@ from softmpm.state import Params
 
 def view(tensor: Tensor, dtype) -> wp.array:
     """Warp array on a tensor's memory; vectors and matrices take up its last axes."""
+    _check_reach(tensor)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def _check_reach(tensor: Tensor) -> None:
+    """Warp counts the bytes from one entry of an axis to the next in 32 bits, and would go elsewhere without a word."""
+    if tensor.nbytes < 2**31:
+        return
+    for size, stride in zip(tensor.shape, tensor.stride(), strict=True):
+        if size > 1 and stride * tensor.itemsize >= 2**31:
+            raise ValueError(
+                f"entries along an axis of {tuple(tensor.shape)} lie {stride * tensor.itemsize:,} bytes apart, Warp reaches less than "
+                "2,147,483,648: take fewer nodes, particles or worlds."
+            )
 
 
 def passing(tensor: Tensor, dtype):
     """As :func:`view`, for one launch: cheaper to make, and cannot be a field of a struct."""
+    _check_reach(tensor)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 

@@ -19,7 +19,7 @@ class Report:
         if words.device.type == "cpu":
             self._words = words.clone()
         else:
-            self._words = torch.empty(words.shape, dtype=words.dtype, pin_memory=True)
+            self._words = torch.empty(words.shape, dtype=words.dtype, device="cpu", pin_memory=True)
             self._words.copy_(words, non_blocking=True)
             self._event = torch.cuda.Event()
             # Unasked, PyTorch would take the stream of the current GPU:

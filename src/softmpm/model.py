@@ -90,6 +90,7 @@ class Model:
         worlds, particle_count, muscle_count, dim: Sizes.
         positions: Rest positions X [m], shape (particle, dim).
         volume: Rest volumes V⁰ [m³], shape (particle,).
+        mass: Mass [kg] as the scene gives it, shape (particle,).
         body: Index of each particle's body, shape (particle,).
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
@@ -125,6 +126,9 @@ class Model:
         self.strength = self._tensor([m.strength for m in scene.muscles])
         laws = np.array([self.spec.laws.index(LAWS[type(b.material)]) for b in scene.bodies], dtype=np.int32)
         self.law = torch.from_numpy(np.repeat(laws, sizes)).to(device)
+        # Made now, not when first asked for: that may be while a graph is recorded, which runs nothing.
+        self._params, self._low = self._given(), self._rounded()
+        self.mass = (self._params.density * self.volume).contiguous()
         wp.init()
         self.wp_device = wp.device_from_torch(device)
         self.scale, self.walls = self._scale(), self._walls()
@@ -165,23 +169,16 @@ class Model:
             return state
         return state.with_low(Low(self._low.expand_as(x).clone(), torch.zeros_like(eye)))
 
-    @functools.cached_property
-    def _low(self) -> Tensor:
+    def _rounded(self) -> Tensor:
         """What rounding took off the rest positions [m], shape (particle, dim)."""
         exact = torch.from_numpy(self._exact_positions).to(self.device)
         return (exact - self.positions.double()).to(self.dtype)
-
-    @functools.cached_property
-    def mass(self) -> Tensor:
-        """Mass [kg] as the scene gives it, shape (particle,)."""
-        return (self._params.density * self.volume).contiguous()
 
     def params(self) -> Params:
         """Material of each particle as the scene gives it, shape (particle,) each. Fresh tensors."""
         return Params(*(tensor.clone() for tensor in self._params))
 
-    @functools.cached_property
-    def _params(self) -> Params:
+    def _given(self) -> Params:
         materials = [body.material for body in self.scene.bodies]
         return Params(
             *(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields)

@@ -77,7 +77,13 @@ class WarpSolid:
 
     def raise_failure(self, model: Model, state: WarpState) -> None:
         """Raise :class:`softmpm.UnstableError` if a step so far failed; waits for the device."""
-        raise_failure(model, self.work.watch_words.tolist(), self.work.leave(state.struct(model)))
+        _raise_failure(model, state, self.work)
+
+
+@on_its_gpu
+def _raise_failure(model: Model, state: WarpState, work: Substep) -> None:
+    work.stream = stream_of(model.device)
+    raise_failure(model, work.watch_words.tolist(), work.leave(state.struct(model)))
 
 
 def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
@@ -192,6 +198,7 @@ def step(
 
 @on_its_gpu
 def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
+    solid.work.stream = stream_of(model.device)
     wanted = Wanted(material=True, activation=solid.pull is not None)
     struct = solid_adj_type(model.spec, wanted)()
     struct.mass, struct.mu, struct.lam = solid.mass.grad, solid.mu.grad, solid.lam.grad

@@ -1,5 +1,7 @@
 """The same gradients through ``step`` on a ``wp.Tape`` as through ``simulate``."""
 
+import importlib
+
 import pytest
 import torch
 import warp as wp
@@ -7,6 +9,8 @@ from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, ru
 
 import softmpm
 from softmpm.kernels.types import types
+
+step = importlib.import_module("softmpm.step")  # the package has a function of that name
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -99,3 +103,30 @@ def test_step_advances_like_simulate(device):
         torch.testing.assert_close(
             getattr(softmpm.torch_state(model, second), name), getattr(want, name), rtol=0, atol=1e-13
         )
+
+
+def test_the_adjoint_runs_where_pytorch_works_by_then(monkeypatch):
+    """A tape goes back on the current stream, as PyTorch does, which need not be that of the steps."""
+    model, current, used = softmpm.build(busy_scene(2), device="cpu"), [None], []
+    states = [softmpm.warp_state(model, requires_grad=True) for _ in range(2)]
+    solid, tape = softmpm.warp_solid(model, requires_grad=True), wp.Tape()
+    launch = step.Substep.launch
+
+    def watched(self, *arguments):
+        used.append(self.stream)
+        self.stream = None
+        launch(self, *arguments)
+        self.stream = used[-1]
+
+    monkeypatch.setattr(step.Substep, "launch", watched)
+    for module in (step, softmpm.tape):
+        monkeypatch.setattr(module, "stream_of", lambda device: current[0])
+    for stream, work in (
+        ("one", lambda: softmpm.step(model, *states, solid, tape=tape)),
+        ("another", lambda: tape.backward(grads={states[1].v: wp.ones_like(states[1].v)})),
+        ("a third", lambda: solid.raise_failure(model, states[1])),
+    ):
+        current[0] = stream
+        used.clear()
+        work()
+        assert used and set(used) == {stream}
