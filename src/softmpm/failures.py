@@ -54,6 +54,8 @@ def raise_failure(
     world = min(failed, key=lambda w: words[w])
     substep, kind, particle = decode(words[world])
     substep += first
+    if start is not None:
+        end = _never_ran(end, start, [w for w in failed if decode(words[w])[1] is Kind.START])
     if substep == 0 and start is not None and (inverted := _inverted(model, start, world)) is not None:
         kind, particle = Kind.START, inverted
         advice = "Start from a deformation gradient F that is not inverted."
@@ -108,15 +110,23 @@ def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last:
     )
 
 
+def _never_ran(end: State, start: State, worlds: list[int]) -> State:
+    """These worlds as they were given: the fast scheme cannot hold what is off the grid."""
+    if not worlds:
+        return end
+    given = [tensor.clone() for tensor in end]
+    for tensor, from_start in zip(given, start, strict=True):
+        tensor[worlds] = from_start.detach()[worlds]
+    return State(*given)
+
+
 def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) -> tuple[str, str, str]:
     """What came, what must hold, what to do."""
     dx = model.scene.grid.spacing
     low = 0.5 * dx
     high = tuple((n - 1.5) * dx for n in model.scene.grid.shape)
     box = "a particle must stay in " + " x ".join(f"[{low:.4g}, {h:.4g})" for h in high) + " m"
-    smaller = (
-        "Use a smaller dt (softmpm.stable_dt gives a safe one), a weaker activation, or a softer material."
-    )
+    smaller = "Use a smaller dt (about half of softmpm.stable_dt), a weaker activation, or a softer material."
     x = end.x[world, particle].tolist()
     if kind is Kind.LEFT_GRID or (
         kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))
@@ -132,11 +142,9 @@ def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) ->
     if kind is Kind.INVERTED:
         return f"is inverted, det F = {_det(end, world, particle):.4g}", HOOKEAN, smaller
     bad = [name for name in "xvCF" if not bool(torch.isfinite(getattr(end, name)[world, particle]).all())]
-    return (
-        f"has a value in {', '.join(bad) or 'its norm'} that is not finite",
-        "every value must be finite",
-        smaller,
-    )
+    what = f"has a value in {', '.join(bad)} that is not finite" if bad else "has values too large to square"
+    advice = "Start from other values." if kind is Kind.START else smaller
+    return what, "every value must be finite, and its square", advice
 
 
 def _det(state: State, world: int, particle: int) -> float:

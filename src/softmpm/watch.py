@@ -33,7 +33,8 @@ class UnstableError(RuntimeError):
         substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.
         value: The offending value.
         limit: What it had to keep to.
-        state: State in which every world stopped: at the failure where it failed, at the end elsewhere; None in a backward pass.
+        state: State of every world at the end of the chunk (at most 128 substeps, docs/memory.md) in which one failed; that one
+            stopped where it failed. None in a backward pass.
     """
 
     def __init__(

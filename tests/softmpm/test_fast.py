@@ -700,15 +700,18 @@ def test_an_interrupted_call_leaves_material_that_comes_again(settings, short_ch
     assert points > 20
 
 
-def test_a_failure_in_the_start_is_reported_as_such(device):
-    """Off the grid before the first substep: the fast scheme refuses as the plain one does."""
+@pytest.mark.parametrize("x", [-3.0, -0.05, 2.0])
+def test_a_failure_in_the_start_is_reported_as_such(x, device):
+    """Off the grid before the first substep: the fast scheme refuses as the plain one does, and says where it is."""
+    away = x
 
     def outside(x):
-        x[0, 7] = torch.tensor([-3.0, 0.5])
+        x[0, 7] = torch.tensor([away, 0.5])
 
     errors = [failure(model(device=device, scheme=scheme), x=outside) for scheme in ("fast", "plain")]
     for error in errors:
         assert (error.kind, error.particle, error.world) == ("start", 7, 0)
+        assert f"({away:.4g}, 0.5) m" in str(error) and error.state.x[0, 7, 0] == torch.tensor(away)
     assert str(errors[0]) == str(errors[1])
 
 
