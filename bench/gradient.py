@@ -52,7 +52,7 @@ def measure(
 
 
 def main():
-    args = arguments(__doc__)
+    args = arguments(__doc__, schemes=True)
     device = torch.device(args.device)
     table = Table("Forward and backward [us/substep], float32", device, args.json)
     for dim, particles, nodes in ON_A_CPU if device.type == "cpu" else CASES:
@@ -63,7 +63,7 @@ def main():
             row, sizes = {"dim": dim, "particles": None, "nodes": nodes, "scene": name}, None
             for kind, substeps in substeps_of(particles, device).items():
                 budget = 2**62 if kind == "kept" else plan(Horizon(1, substeps), sizes, 2**62).kept // 5
-                model = softmpm.build(scene, device=device, memory_budget=budget)
+                model = softmpm.build(scene, device=device, memory_budget=budget, scheme=args.scheme)
                 row["particles"], sizes = model.particle_count, model.sizes()
                 figures = measure(
                     model, substeps, args.repeats, materials="materials" in name, turns="turning" in name

@@ -64,7 +64,7 @@ def main():
             faster = (first[1] + first[2]) / (episode + alone)
             apart = max(abs(now - then) / abs(then) for now, then in zip(losses, first[0], strict=True))
             row = {"observer": observer, "precision": precision, "processes": processes}
-            row |= {"worlds": worlds, "particles": worlds * size}
+            row |= {"worlds": worlds, "particles": worlds * size, "seconds": seconds}
             times = {"episode s": episode, "alone s": alone, "shared": first[1] / episode}
             table.add(
                 row | times | {"speed-up": faster, "efficiency": faster / processes, "loss apart": apart}

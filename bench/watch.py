@@ -5,6 +5,7 @@ medians. The second kind of kernel exists only here.
 """
 
 import dataclasses
+import itertools
 import statistics
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from step import CASES
 
 import softmpm
 from softmpm.kernels import failure
+from softmpm.kernels.fused import fused
 from softmpm.kernels.transfer import transfer
 from softmpm.kernels.types import solid_types, types
 
@@ -30,11 +32,22 @@ def unchecked(model: softmpm.Model):
         return True
 
     @wp.func
-    def sound(body: Solid, shape: ivec, p: int, fx: vec, base: ivec, H: mat) -> bool:
+    def sound(
+        body: Solid, corner: ivec, shape: ivec, world: int, p: int, fx: vec, base: ivec, H: mat
+    ) -> bool:
         return True
 
     @wp.func
-    def complain(watch: wp.array(dtype=wp.int64), world: int, p: int, substep: int, fx: vec, H: mat):
+    def complain(
+        watch: wp.array(dtype=wp.int64),
+        shape: ivec,
+        world: int,
+        p: int,
+        substep: int,
+        fx: vec,
+        base: ivec,
+        H: mat,
+    ):
         pass
 
     report_of, check_of = failure.report, failure.check
@@ -42,7 +55,7 @@ def unchecked(model: softmpm.Model):
         running=running, report=report_of(spec.dim, spec.dtype).report
     )
     failure.check = lambda *_: SimpleNamespace(sound=sound, complain=complain)
-    transfer(spec)
+    transfer(spec) if model.scheme == "plain" else fused(spec)
     failure.report, failure.check = report_of, check_of
 
 
@@ -51,10 +64,11 @@ def main():
     device = torch.device(args.device)
     table = Table("Cost of watching for failures, float32", device, args.json)
     substeps = 20 if device.type == "cpu" else 200
-    for dim, particles, nodes in CASES[:-1]:
+    for (dim, particles, nodes), scheme in itertools.product(CASES[:-1], ("plain", "fast")):
         if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
             continue
-        models = [softmpm.build(cube(dim, particles, nodes), device=device) for _ in range(2)]
+        scene = cube(dim, particles, nodes)
+        models = [softmpm.build(scene, device=device, scheme=scheme) for _ in range(2)]
 
         class Unchecked(type(models[1].spec)):
             module = models[1].spec.module + ".unchecked"
@@ -77,6 +91,7 @@ def main():
             {
                 "dim": dim,
                 "particles": particles,
+                "scheme": scheme,
                 "watched us": with_watch,
                 "unwatched us": without,
                 "ratio": ratio,
