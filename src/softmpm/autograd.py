@@ -49,7 +49,7 @@ def simulate(
             activation. Differentiable.
         params: Material of each particle: ``young`` [Pa], ``poisson`` [-], ``density`` [kg/m³], shapes that broadcast
             to (world, particle). Differentiable. Tensors without gradient that come again are taken as unchanged unless
-            PyTorch counted a write, which it does not through ``.data``, NumPy or Warp: hand over others then.
+            PyTorch counted a write, which it does not where ``.data``, NumPy or Warp write into them: hand over others then.
         substeps: Substeps of ``model.scene.dt`` [s] for each row of ``activation``.
 
     Returns:
@@ -109,15 +109,8 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
 
     Those of the call before if nothing changed and nothing needs a gradient.
     """
-    fixed = isinstance(params, Params) and all(map(_counts_writes, params)) and not recording(model)
-    last = vars(model).setdefault(
-        "_last_material", _Last()
-    )  # of this thread: another's may not be there yet on its stream
-    if (
-        fixed
-        and last.given
-        and all(p is q and p._version == v for p, (q, v) in zip(params, last.given, strict=True))
-    ):
+    last, seen = vars(model).setdefault("_last_material", _Last()), _seen(model, params)
+    if seen and seen == last.seen:
         return last.found
     check_params(model, params)
     if not recording(model):  # else nothing can be read back
@@ -125,22 +118,26 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     lead = (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead).contiguous() for term in lame(params))
     found = mu, lam, (params.density * model.volume).expand(lead).contiguous()
-    if fixed:
-        last.given, last.found = [(p, p._version) for p in params], found
+    if seen:
+        last.params, last.seen, last.found = params, seen, found
     return found
 
 
 class _Last(threading.local):
-    """Material of the call before, and what was computed from it."""
+    """Material of this thread's call before: what another one computes may not be there yet, on a stream of its own."""
 
-    def __init__(self):
-        self.given: list[tuple[Tensor, int]] = []
-        self.found: Any = None
+    params: Any = None  # held, so that nothing else takes their names in ``seen``
+    seen: tuple = ()
+    found: Any = None
 
 
-def _counts_writes(tensor: Any) -> bool:
-    """Whether it is a plain tensor without gradient, of which PyTorch counts how often it was written to."""
-    return type(tensor) is Tensor and not tensor.requires_grad and not tensor.is_inference()
+def _seen(model: Model, params: Any) -> tuple:
+    """What would differ if these tensors were others, were written to or given other memory; nothing where that cannot be told."""
+    if recording(model) or torch._C._are_functorch_transforms_active() or not isinstance(params, Params):
+        return ()
+    if not all(type(p) is Tensor and not p.requires_grad and not p.is_inference() for p in params):
+        return ()
+    return tuple((id(p), p._version, p.data_ptr()) for p in params)
 
 
 def rasterize(model: Model, state: State) -> GridField:

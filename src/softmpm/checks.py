@@ -22,7 +22,9 @@ MIXERS = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise ValueError with the first rule that the scene breaks."""
+    """Raise ValueError with the first rule that the scene breaks, TypeError if it is none."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"a model is built from a softmpm.Scene, got {type(scene).__name__}.")
     _check_bodies(scene)
     _check_distinct(scene)
     _check_muscles(scene)
@@ -160,9 +162,11 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
     _check_tensor(model, "activation", activation)
     want = (model.worlds, model.muscle_count)
     if activation.ndim != 3 or activation.shape[1:] != want:
+        rows = activation.ndim == 2 and model.worlds == 1 and len(activation) > 1
+        hint = "one world is activation[:, None]" if rows else "one control step is activation[None]"
         raise ValueError(
             f"activation must have shape (control_step, world, muscle) = (any, {want[0]}, {want[1]}), "
-            f"got {tuple(activation.shape)}; one control step is activation[None]."
+            f"got {tuple(activation.shape)}; {hint}."
         )
     need(
         len(activation) > 0, "activation needs at least one control step, got none; pass None to move freely."

@@ -15,7 +15,7 @@ from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
 from softmpm.memory import CPU_BUDGET, MARGIN, Sizes, longest_chunk, price_of_chunk, window_shape
 from softmpm.scene import FixedCorotated, NeoHookean, Scene
-from softmpm.stability import warn_unstable
+from softmpm.stability import warn_sparse, warn_unstable
 from softmpm.state import Low, Params, State
 
 LAWS = {NeoHookean: "neo_hookean", FixedCorotated: "fixed_corotated"}
@@ -64,6 +64,7 @@ def build(
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     warn_unstable(scene)
+    warn_sparse(scene)
     return Model(scene, _device(device), dtype, int(worlds), memory_budget, scheme, deterministic)
 
 
@@ -71,9 +72,13 @@ def _device(device: str | torch.device | None) -> torch.device:
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
         logger.info("softmpm runs on %s.", device)
-    device = torch.device(device)
-    if device.type not in ("cpu", "cuda"):
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {str(device)!r}.")
+    asked = device
+    try:
+        device = torch.device(device)
+    except (RuntimeError, TypeError):
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be 'cpu', 'cuda' or 'cuda:N', got {str(asked)!r}.")
     if device.type == "cuda":
         if not torch.cuda.is_available():
             raise RuntimeError("device 'cuda' was asked for, but PyTorch sees no GPU here; use device='cpu'.")

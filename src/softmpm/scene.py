@@ -25,7 +25,8 @@ def _numbers(name: str, values: Iterable[float]) -> tuple[float, ...]:
     try:
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be made of plain numbers, got {values!r}.") from error
+        kind = "made of plain numbers" if isinstance(values, Iterable) else "a sequence of numbers"
+        raise TypeError(f"{name} must be {kind}, got {values!r}.") from error
     need(all(math.isfinite(number) for number in numbers), f"{name} must be finite, got {values!r}.")
     return numbers
 

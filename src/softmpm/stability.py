@@ -20,9 +20,12 @@ import numpy as np
 
 from softmpm.scene import Material, Muscle, Scene
 
+APART = 1.75
+"""Cells between particles beyond which they share too few nodes: at 1.5 a body holds, at 2 it comes apart."""
+
 
 class StabilityWarning(UserWarning):
-    """A scene's step is above the largest stable one."""
+    """A scene's step is above the largest stable one, or its particles are so far apart that a body does not hold."""
 
 
 class StableDt(float):
@@ -66,6 +69,19 @@ def warn_unstable(scene: Scene, *, stacklevel: int = 3) -> None:
             StabilityWarning,
             stacklevel=stacklevel,
         )
+
+
+def warn_sparse(scene: Scene, *, stacklevel: int = 3) -> None:
+    """Warn of bodies whose particles are too far apart to hold together."""
+    for b, body in enumerate(scene.bodies):
+        apart = float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim)
+        if len(body.particles) > 1 and apart > APART * scene.grid.spacing:
+            warnings.warn(
+                f"particles of body {b} are {apart / scene.grid.spacing:.3g} cells apart, by their volumes; beyond {APART} a body "
+                f"comes apart. Use a spacing of half a cell, {0.5 * scene.grid.spacing:.3g} m.",
+                StabilityWarning,
+                stacklevel=stacklevel,
+            )
 
 
 class _Group(NamedTuple):

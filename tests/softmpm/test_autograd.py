@@ -219,6 +219,8 @@ def test_material_changed_in_place_is_seen(scheme):
         changed = run(softmpm.simulate, model, inputs, 5)
         assert torch.equal(changed.v, fresh.v) and not torch.equal(changed.v, first.v), name
         first = changed
+    inputs["young"].data = 2 * inputs["young"]
+    assert not torch.equal(run(softmpm.simulate, model, inputs, 5).v, first.v)
 
 
 @pytest.mark.parametrize("name, bad", [("young", -1.0), ("poisson", 0.5), ("density", float("nan"))])

@@ -219,6 +219,8 @@ def test_activation_shape():
             check_activation(MODEL, bad)
     with pytest.raises(ValueError, match="at least one control step"):
         check_activation(MODEL, torch.zeros(0, 2, 4))
+    with pytest.raises(ValueError, match=r"\(any, 1, 4\), got \(5, 4\); one world is activation\[:, None\]"):
+        check_activation(SimpleNamespace(**vars(MODEL) | {"worlds": 1}), torch.zeros(5, 4))
 
 
 @pytest.mark.parametrize("shape", [(2,), (3, 2), (3, 1), (1, 2, 3), (4,), (0,)])

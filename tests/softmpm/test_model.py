@@ -158,13 +158,16 @@ def test_describe_says_what_was_compiled_and_left_out():
 def test_build_refuses_what_cannot_work():
     """Device, precision, worlds and budget are checked, with what came."""
     for wrong, message in (
-        (dict(device="tpu"), "device must be|tpu"),
+        (dict(device="gpu"), "device must be 'cpu', 'cuda' or 'cuda:N', got 'gpu'"),
+        (dict(device="mps"), "device must be .* got 'mps'"),
         (dict(dtype=torch.float16), "float16"),
         (dict(worlds=0), "worlds must be .* got 0"),
         (dict(memory_budget=-1), "memory_budget"),
     ):
         with pytest.raises((ValueError, RuntimeError), match=message):
             softmpm.build(plain_scene(), **({"device": "cpu"} | wrong))
+    with pytest.raises(TypeError, match=r"built from a softmpm.Scene, got dict"):
+        softmpm.build({}, device="cpu")
     if not torch.cuda.is_available():
         with pytest.raises(RuntimeError, match="sees no GPU here; use device='cpu'"):
             softmpm.build(plain_scene(), device="cuda")

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 
+import softmpm
 from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene
 from softmpm.stability import StabilityWarning, stable_dt, warn_unstable
 
@@ -161,6 +162,20 @@ def test_each_particle_has_its_own_muscles():
     assert at(muscle((1, 0), 50.0, (0,)), muscle((1, 0), 50.0, (1, 3))) == one
     assert at(muscle((1, 0), 50.0, (0, 1)), muscle((1, 0), 50.0, (1, 3))) == pytest.approx(twice, rel=1e-13)
     assert twice < one < at()
+
+
+def test_warns_of_particles_too_far_apart():
+    """At one and a half cells a body holds, at two it comes apart: build says so."""
+    for cells, warns in ((0.5, False), (1.5, False), (2.0, True)):
+        block = softmpm.box((8 / 32, 8 / 32), (20 / 32, 20 / 32), spacing=cells / 32)
+        body = Body(block, NeoHookean(density=RHO, young=100.0))
+        made = Scene(grid=Grid(shape=(32, 32), spacing=1 / 32), bodies=[body], dt=1e-5)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            softmpm.build(made, device="cpu")
+        assert [StabilityWarning] * warns == [one.category for one in caught]
+        assert all("particles of body 0 are 2 cells apart" in str(one.message) for one in caught)
+        assert all(one.filename == __file__ for one in caught)
 
 
 def test_warns_only_above():

@@ -4,7 +4,7 @@
     v = W_k(... W_1(exp(−γ Δt) (u + Δt g)))   with the walls W_1 … W_k in the order of the scene     (G2)
     p̄ = exp(−γ Δt) v̄₀ / m,  m̄ = −p̄ · u        v̄₀ being v̄ pulled back through the walls              (G1.adj)
 
-Empty nodes get zero in both directions, in the fast scheme nothing (fused.py).
+Empty nodes get zero in both directions; in the fast scheme they keep what they held (fused.py).
 """
 
 from types import SimpleNamespace

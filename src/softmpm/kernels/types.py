@@ -117,7 +117,7 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
     class Packed:
         """The same in the fast scheme: rows of blocks of 32 particles, sorted by cell (kernels/scatter.h)."""
 
-        # First node of the stencil, its coordinates in 10 (3D) or 16 (2D) bits each:
+        # First node of the stencil, its coordinates in 10 (3D) or 15 (2D) bits each:
         base: wp.array(dtype=wp.int32)
         rows: wp.array(dtype=real)  # fx, fx_low, v, H, C
 
