@@ -73,6 +73,8 @@ class Graph(Generic[Result]):
         return result
 
     def _record(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
+        if torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("a softmpm.Graph is being recorded already: call the inner one's work itself.")
         graph = torch.cuda.CUDAGraph()
         # The stream is entered here as well: where a recording fails, PyTorch does not leave it.
         with alone(wait=True), torch.cuda.stream(stream), opened_ledger() as ledger:

@@ -19,7 +19,7 @@ from softmpm.kernels.types import Wanted
 from softmpm.memory import Plan, memory, plan
 from softmpm.model import Model
 from softmpm.plain import Plain, PlainRun
-from softmpm.replay import hold, note, recording
+from softmpm.replay import alone, hold, note, recording
 from softmpm.state import State
 from softmpm.step import on_its_gpu
 from softmpm.watch import NEVER
@@ -244,8 +244,9 @@ def short_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[
     try:
         yield
     except torch.OutOfMemoryError as error:
-        if not recording(model):
-            forget(model)
+        with alone(wait=False) as turn:  # else a graph that goes may end another's recording
+            if turn and not recording(model):
+                forget(model)
         error.add_note(_needs(model, horizon, gradient))
         raise
 

@@ -378,7 +378,9 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
                     patch.setattr(module, "recording", lambda model: True)
                 yield
 
-        pretended = SimpleNamespace(cat=torch.cat, cuda=MagicMock(graph=blindly))
+        pretended = SimpleNamespace(
+            cat=torch.cat, cuda=MagicMock(graph=blindly, is_current_stream_capturing=bool)
+        )
         monkeypatch.setattr("softmpm.graph.torch", pretended)
     return recorded
 

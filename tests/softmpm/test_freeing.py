@@ -1,6 +1,7 @@
 """Memory goes with the last reference to it: Python is not looking for cycles here, as on a GPU it would do so too late."""
 
 import gc
+import time
 import weakref
 
 import pytest
@@ -205,7 +206,13 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
     else:
         raise AssertionError("it did fit")
     del waiting
-    assert living((program.Program, program_adj.ProgramAdj, plain.PlainRun)) == []
+    for _ in range(100):  # PyTorch's own thread may hold the call for a moment longer
+        left = living((program.Program, program_adj.ProgramAdj, plain.PlainRun))
+        if not left:
+            return
+        del left
+        time.sleep(0.01)
+    raise AssertionError("something is left")
 
 
 def test_a_call_without_gradient_that_does_not_fit_says_so(monkeypatch):

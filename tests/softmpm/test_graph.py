@@ -5,7 +5,7 @@ import threading
 
 import pytest
 import torch
-from helpers import KINDS, busy_inputs, busy_scene, run
+from helpers import KINDS, assert_relative, busy_inputs, busy_scene, run
 
 import softmpm
 from softmpm import autograd, fast, program, replay, rollout
@@ -66,3 +66,20 @@ def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
         with pytest.raises(RuntimeError, match="not now"):
             graph()
     assert did == ["run", "record", "run", "record"]
+
+
+@pytest.mark.gpu
+def test_a_recording_inside_another_is_refused():
+    """It would wait for itself."""
+    model = softmpm.build(busy_scene(2), device="cuda")
+
+    def work():
+        return run(softmpm.simulate, model, inputs, 5).x
+
+    inputs = {name: tensor.detach() for name, tensor in busy_inputs(model).items()}
+    inner = softmpm.Graph(work, model.device)
+    outer = softmpm.Graph(inner, model.device)
+    want = outer()
+    with pytest.raises(RuntimeError, match="being recorded already: call the inner one's work itself"):
+        outer()
+    assert_relative(inner(), want, 2e-5)
