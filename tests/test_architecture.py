@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 SRC = Path(__file__).parents[1] / "src"
-ORDER = """scene state watch silhouette surface shapes checks stability schedule horizon memory
-    kernels.turn kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact kernels.grid
+ORDER = """kernels.turn scene state watch silhouette surface shapes checks stability schedule horizon memory
+    kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact kernels.grid
     kernels.failure kernels.particle kernels.transfer kernels.boundary kernels.raster
     kernels.native kernels.stencil kernels.stencil_adj kernels.fixed kernels.fused kernels.fused_adj kernels.sorting kernels.packing
     description model buffers failures step plain replay between arrangement exact program program_adj fast rollout

@@ -132,7 +132,7 @@ class Model:
         laws = np.array([self.spec.laws.index(LAWS[type(b.material)]) for b in scene.bodies], dtype=np.int32)
         self.law = torch.from_numpy(np.repeat(laws, sizes)).to(device)
         # Made now, not when first asked for: that may be while a graph is recorded, which runs nothing.
-        self._params, self._low = self._given(), self._rounded()
+        self._params, self._low = self._given(), self._rounded() if dtype == torch.float32 else None
         self.mass = (self._params.density * self.volume).contiguous()
         wp.init()
         self.wp_device = wp.device_from_torch(device)
@@ -170,7 +170,7 @@ class Model:
             .clone()
         )
         state = State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye)
-        if self.dtype == torch.float64:
+        if self._low is None:
             return state
         return state.with_low(Low(self._low.expand_as(x).clone(), torch.zeros_like(eye)))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmpm.kernels.turn import launch
 from softmpm.scene import need
 
 wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
@@ -48,7 +49,7 @@ def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
     )
     queries = wp.array((points - low) / unit, dtype=wp.vec3, device="cpu")
     inside = wp.zeros(len(points), dtype=wp.int32, device="cpu")
-    wp.launch(_inside, dim=len(points), inputs=[surface.id, queries], outputs=[inside], device="cpu")
+    launch(_inside, len(points), [surface.id, queries, inside], wp.get_device("cpu"))
     return inside.numpy().astype(bool)
 
 

@@ -700,10 +700,9 @@ def test_an_interrupted_call_leaves_material_that_comes_again(settings, short_ch
     assert points > 20
 
 
-@pytest.mark.parametrize("x", [-3.0, -0.05, 2.0])
-def test_a_failure_in_the_start_is_reported_as_such(x, device):
+@pytest.mark.parametrize("away", [-3.0, -0.05, 2.0])
+def test_a_failure_in_the_start_is_reported_as_such(away, device):
     """Off the grid before the first substep: the fast scheme refuses as the plain one does, and says where it is."""
-    away = x
 
     def outside(x):
         x[0, 7] = torch.tensor([away, 0.5])

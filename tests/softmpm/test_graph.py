@@ -1,6 +1,7 @@
 """Recorded loops: what a recording has to itself, what it must not forget, and what follows when it fails."""
 
 import gc
+import queue
 import threading
 
 import pytest
@@ -14,24 +15,22 @@ from softmpm.watch import NEVER
 
 def test_one_records_at_a_time():
     """Without the collector meanwhile. A second one waits, or finds that it is not its turn."""
-    turns, seen = [], []
+    turns = queue.Queue()
 
     def another():
-        with replay.alone(wait=False) as turn:
-            turns.append(turn)
-        with replay.alone(wait=True) as turn:
-            seen.append(gc.isenabled())
-            turns.append(turn)
+        for wait in (False, True):
+            with replay.alone(wait) as turn:
+                turns.put((turn, gc.isenabled()))
 
-    thread = threading.Thread(target=another)
+    thread = threading.Thread(target=another, daemon=True)
     with replay.alone(wait=True):
-        assert not gc.isenabled()
         thread.start()
-        while not turns:
-            thread.join(0.01)
-        assert turns == [False]  # it waits now
-    thread.join()
-    assert turns == [False, True] and seen == [False] and gc.isenabled()
+        assert turns.get(timeout=10) == (False, False)
+        with pytest.raises(queue.Empty):
+            turns.get(timeout=0.05)
+    assert turns.get(timeout=10) == (True, False)
+    thread.join(timeout=10)
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("settings", KINDS.values(), ids=KINDS)

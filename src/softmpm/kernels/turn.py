@@ -25,7 +25,7 @@ def once(define: Callable[..., T]) -> Callable[..., T]:
     return found
 
 
-def launch(kernel: wp.Kernel, dim, inputs: Sequence, device: wp.Device, **settings):
+def launch(kernel, dim, inputs: Sequence, device: wp.Device, **settings):
     """``wp.launch``, never on a tape; the first of a kernel on a device, which loads it, while no other thread defines or loads."""
     key = kernel, device.alias, settings.get("block_dim")
     if key in _loaded:
