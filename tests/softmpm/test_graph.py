@@ -68,6 +68,7 @@ def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
 
 
 @pytest.mark.gpu
+@pytest.mark.filterwarnings("ignore:The CUDA Graph is empty")  # PyTorch, of the outer one
 def test_a_recording_inside_another_is_refused():
     """It would wait for itself."""
     model = softmpm.build(busy_scene(2), device="cuda")
