@@ -53,7 +53,7 @@ def main():
     table = Table("An iteration of learning in closed loop, float32", device, args.json)
     for cells, period, substeps in CASES if device.type == "cuda" else [(80, 0.0125, 100)]:
         task = task_of(cells, period, substeps)
-        model = softmpm.build(task.scene, device=device)
+        model = softmpm.build(task.scene, device=device, calls=task.control_steps)
         with tempfile.TemporaryDirectory() as folder:
             run = Run(task, model, Settings(), Path(folder))
             whole = median_seconds(lambda run=run: run.loop(None), device, args.repeats + 1)

@@ -1,7 +1,7 @@
 """What does a gradient through a thousand substeps cost with little memory? `python bench/memory.py [--device cuda] [--json FILE]`
 
-Peak memory of one call and its backward pass, what the formula of docs/memory.md says of it, and the median time of both, against
-memory for everything where that fits.
+Peak memory of one call and its backward pass, or of a closed loop of many, what the formula of docs/memory.md says of it, and the
+median time of both, against memory for everything where that fits.
 """
 
 import statistics
@@ -23,14 +23,15 @@ def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
     table = Table("Gradient with little memory, float32", device, args.json)
-    cases = [(64_000, 48, [32, 4, 1, 0.25]), (1_000_000, 96, [60, 5, 3])]
+    cases = [(64_000, 48, 1, [32, 4, 1, 0.25]), (1_000_000, 96, 1, [60, 5, 3]), (64_000, 48, 25, [32, 4, 1])]
     substeps = 1000
     if device.type == "cpu":
-        cases, substeps = [(1_000, 16, [1, 0.01])], 100
-    for particles, nodes, budgets in cases:
+        cases, substeps = [(1_000, 16, 1, [1, 0.01]), (1_000, 16, 5, [1, 0.01])], 100
+    for particles, nodes, calls, budgets in cases:
         for budget in budgets:
-            model = softmpm.build(cube(3, particles, nodes), device=device, memory_budget=round(budget * GIB))
-            horizon = Horizon(1, substeps)
+            scene, limit = cube(3, particles, nodes), round(budget * GIB)
+            model = softmpm.build(scene, device=device, memory_budget=limit, calls=calls)
+            horizon = Horizon(1, substeps // calls)
             chosen = plan(horizon, model.sizes(), model.budget)
             start, params, seconds = turning(model), model.params(), []
             start.v.requires_grad_()
@@ -39,20 +40,23 @@ def main():
                     torch.cuda.reset_peak_memory_stats()
                 sync(device)
                 begin = time.perf_counter()
-                end = softmpm.simulate(model, start, None, params, substeps=substeps)
+                end = start
+                for _ in range(calls):
+                    end = softmpm.simulate(model, end, None, params, substeps=horizon.total)
                 torch.autograd.grad(end.x.sum(), start.v)
                 sync(device)
                 seconds.append(time.perf_counter() - begin)
                 del end
-            peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else 0
+            peak = torch.cuda.max_memory_allocated() / GIB if device.type == "cuda" else "not measured"
             table.add(
                 {
                     "particles": model.particle_count,
+                    "calls": calls,
                     "substeps": substeps,
                     "budget GiB": budget,
                     "chunk": chosen.longest,
                     "states kept": chosen.slots or "all",
-                    "peak GiB": peak / GIB,
+                    "peak GiB": peak,
                     "formula GiB": memory(model, horizon).backward / GIB,
                     "forward and backward s": statistics.median(seconds[WARM:]),
                 }

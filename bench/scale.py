@@ -30,7 +30,7 @@ CASES = [
     ("centroids", "float32", 64, 0.5),
     ("latent", "float32", 64, 0.5),
     ("latent", "float64", 64, 0.05),
-    ("centroids", "float32", 256, 0.5),
+    ("centroids", "float32", 256, 0.1),
 ]
 """Observer, precision, worlds, and seconds of an episode."""
 ON_A_CPU = [("centroids", "float64", 16, 0.025), ("latent", "float64", 16, 0.025)]

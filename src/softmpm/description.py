@@ -43,7 +43,8 @@ def _memory(model, substeps: int) -> str:
         return str(error)
     forward, kept, backward = (f"{size / 2**20:.1f} MiB" for size in found[:3])
     often = "once" if found.runs == 1 else f"{found.runs:.3g} times"
-    return f"{forward} to run; {substeps} substeps with gradient: {kept} kept, {backward} at the peak, each runs forward {often}"
+    steps = f"{model.calls} calls of {substeps} substeps" if model.calls > 1 else f"{substeps} substeps"
+    return f"{forward} to run; {steps} with gradient: {kept} kept, {backward} at the peak, each runs forward {often}"
 
 
 def _sums(model) -> str:

@@ -45,7 +45,7 @@ class Pool:
     """Programs that were made on one arrangement and are not in use.
 
     Those for the shapes of chunks that came last stay. Others, since each length of a call may bring shapes of its own, stay only
-    while all together fit into the budget of a call.
+    while all together fit into the budget.
     """
 
     def __init__(self, model: Model, arrangement: Arrangement, unpacking: Unpacking):

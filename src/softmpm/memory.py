@@ -6,6 +6,8 @@ nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes a
     keep all:  everything inside all chunks, N (S + G) and one S for each; nothing runs twice
     schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
                chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (schedule.py)
+
+In a closed loop one backward pass goes through many calls. Each keeps its own, and they are pulled back one after the other.
 """
 
 import functools
@@ -19,8 +21,11 @@ LONGEST = 128
 """Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
 MANY, LONGEST_OF_MANY = 30_000, 64
 """From so many particles on the host has time enough, and sorting in time is worth more."""
-CPU_BUDGET = 64 * 2**20
-"""Without a budget, what a call on the CPU may keep; on a GPU it is a sixteenth of its memory."""
+CPU_BUDGET, GPU_SHARE = 64 * 2**20, 1 / 16
+"""Without a budget, what a call may keep: bytes on the CPU, a share of a GPU's memory."""
+MOST_CALLS = {"cpu": 64, "cuda": 4}
+"""And several calls together, at most so often as much: 4 GiB on the CPU, a quarter of a GPU's memory. A :class:`softmpm.Graph` of them
+holds its own, beside what the same calls keep outside of it."""
 
 
 MARGIN = {2: 6, 3: 3}
@@ -67,6 +72,8 @@ class Sizes(NamedTuple):
     """Substeps of a chunk, at most."""
     price: int
     """What each chunk costs besides its substeps, in substeps."""
+    calls: int = 1
+    """How many calls share the budget."""
 
 
 class Plan(NamedTuple):
@@ -77,7 +84,7 @@ class Plan(NamedTuple):
     slots: int
     """States between chunks that are kept; 0 if everything is."""
     kept: int
-    """Bytes kept by the forward pass."""
+    """Bytes kept by the forward pass, of one call."""
     recomputed: int
     """Bytes of what the backward pass runs again at a time."""
 
@@ -88,7 +95,7 @@ class Plan(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def plan(horizon, sizes: Sizes, budget: int) -> Plan:
-    """The plan that takes the least time within the budget [B].
+    """The plan that takes the least time within the budget [B] of all calls.
 
     Args:
         horizon: A :class:`softmpm.horizon.Horizon`.
@@ -98,13 +105,13 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     """
     chunks = len(horizon.chunks(sizes.longest))
     everything = horizon.total * (sizes.inside + sizes.nodes) + chunks * sizes.inside
-    if everything <= budget or horizon.total == 0:
+    if sizes.calls * everything <= budget or horizon.total == 0:
         return Plan(sizes.longest, 0, everything, 0)
     best, least = None, math.inf
     for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
         inside = sum((n + 1) * sizes.inside + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
-        slots = min(len(chunks), (budget - inside - sizes.between) // sizes.between)
+        slots = min(len(chunks), (budget - inside - sizes.between) // (sizes.calls * sizes.between))
         if slots < 1:
             continue
         runs = recomputed(len(chunks), slots)
@@ -113,10 +120,10 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
         if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
             best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
     if best is None:
-        smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes
+        smallest = 2 * sizes.inside + sizes.nodes + (1 + sizes.calls) * sizes.between
         raise ValueError(
-            f"a gradient needs at least {smallest:,} bytes for states, memory_budget is {budget:,} bytes: raise it, or make the "
-            "scene smaller."
+            f"a gradient {f'through {sizes.calls} calls ' if sizes.calls > 1 else ''}needs at least {smallest:,} bytes for states, "
+            f"memory_budget is {budget:,} bytes: raise it, or make the scene smaller."
         )
     return best
 
@@ -132,12 +139,12 @@ def _lengths(substeps: int, longest: int) -> list[int]:
 
 
 class Memory(NamedTuple):
-    """Bytes that a call takes at its peak, besides what the model itself holds, and how often it runs."""
+    """Bytes that the calls of one gradient take at their peak, besides what the model itself holds, and how often they run."""
 
     forward: int
     """A call without gradient."""
     kept: int
-    """What a call with gradient keeps until its backward pass."""
+    """What all calls keep until the backward pass."""
     backward: int
     """Peak of the backward pass, kept states included."""
     runs: float
@@ -145,8 +152,8 @@ class Memory(NamedTuple):
 
 
 def memory(model, horizon) -> Memory:
-    """Evaluates the formula of docs/memory.md for one call, all gradients wanted."""
-    real, sizes = model.dtype.itemsize, model.sizes()
+    """Evaluates the formula of docs/memory.md for calls of one length, all gradients wanted."""
+    real, sizes, calls = model.dtype.itemsize, model.sizes(), model.calls
     particles = model.worlds * model.particle_count
     state = particles * real * (2 * model.dim + 2 * model.dim**2)  # x, v, C, F of the end, or their adjoints
     low = state // 2 if real == 4 else 0
@@ -158,14 +165,16 @@ def memory(model, horizon) -> Memory:
         forward = small * _at_once(horizon, sizes.longest)
         handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
         if chosen.keep_all:
-            own = program * len(horizon.chunks(chosen.longest))
+            own = calls * program * len(horizon.chunks(chosen.longest))
         else:
             own = program * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
             # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
             handed += 2 * small if model.device.type == "cuda" else 0
     else:
         forward, handed, own = 2 * sizes.inside, sizes.inside, 0
-    kept = chosen.kept + own + material
+    # Each call but the first holds the end of the one before, which without its inside takes the first slot.
+    starts = (calls - 1) * (state + low - (0 if chosen.keep_all else sizes.between))
+    kept = calls * (chosen.kept + material) + own + starts
     adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes

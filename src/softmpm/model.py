@@ -13,7 +13,16 @@ from softmpm.checks import check_scene, check_whole
 from softmpm.description import describe
 from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import CPU_BUDGET, MARGIN, Sizes, longest_chunk, price_of_chunk, window_shape
+from softmpm.memory import (
+    CPU_BUDGET,
+    GPU_SHARE,
+    MARGIN,
+    MOST_CALLS,
+    Sizes,
+    longest_chunk,
+    price_of_chunk,
+    window_shape,
+)
 from softmpm.scene import FixedCorotated, NeoHookean, Scene
 from softmpm.stability import warn_sparse, warn_unstable
 from softmpm.state import Low, Params, State
@@ -31,6 +40,7 @@ def build(
     memory_budget: int | None = None,
     scheme: str = "auto",
     deterministic: bool = False,
+    calls: int = 1,
 ) -> "Model":
     """Make a scene ready to run.
 
@@ -39,12 +49,14 @@ def build(
         device: Where; None takes CUDA if there is one, and says so in the log.
         dtype: ``torch.float32`` or ``torch.float64``.
         worlds: Number of independent copies of the scene that run in one launch.
-        memory_budget: Most bytes of states that one ``simulate`` call may keep for its backward pass, or run again at a time;
-            None for a sensible choice. ``describe`` says what a call takes in all; see docs/memory.md.
+        memory_budget: Most bytes of states that ``simulate`` may keep for a backward pass, or run again at a time; None for a
+            sensible choice. ``describe`` says what it takes in all; see docs/memory.md.
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
             scheme. The CPU adds in one order anyway. See docs/conventions.md.
+        calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
+            budget. If there are more, they keep more.
 
     Returns:
         The model: immutable, shared by any number of simulations.
@@ -56,6 +68,7 @@ def build(
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
     check_whole("worlds", worlds)
+    check_whole("calls", calls)
     if memory_budget is not None:
         if isinstance(memory_budget, float) and memory_budget.is_integer():
             memory_budget = int(memory_budget)
@@ -65,7 +78,7 @@ def build(
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     warn_unstable(scene)
     warn_sparse(scene)
-    return Model(scene, _device(device), dtype, int(worlds), memory_budget, scheme, deterministic)
+    return Model(scene, _device(device), dtype, int(worlds), memory_budget, scheme, deterministic, int(calls))
 
 
 def _device(device: str | torch.device | None) -> torch.device:
@@ -93,6 +106,7 @@ class Model:
         scene: The scene it was built from.
         device, dtype: Where it runs and in which precision.
         worlds, particle_count, muscle_count, dim: Sizes.
+        calls: How many calls of ``simulate`` share the memory budget.
         positions: Rest positions X [m], shape (particle, dim).
         volume: Rest volumes V⁰ [m³], shape (particle,).
         mass: Mass [kg] as the scene gives it, shape (particle,).
@@ -110,9 +124,10 @@ class Model:
         memory_budget: int | None,
         scheme: str,
         deterministic: bool = False,
+        calls: int = 1,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
-        self.memory_budget = memory_budget
+        self.memory_budget, self.calls = memory_budget, calls
         self.dim = scene.grid.dim
         sizes = [len(body.particles) for body in scene.bodies]
         self.particle_count = sum(sizes)
@@ -224,12 +239,13 @@ class Model:
 
     @property
     def budget(self) -> int:
-        """Bytes that one call may keep for its backward pass."""
+        """Bytes that all calls may keep for a backward pass."""
         if self.memory_budget is not None:
             return self.memory_budget
+        together = min(self.calls, MOST_CALLS[self.device.type])
         if self.device.type == "cpu":
-            return CPU_BUDGET
-        return torch.cuda.get_device_properties(self.device).total_memory // 16
+            return CPU_BUDGET * together
+        return int(torch.cuda.get_device_properties(self.device).total_memory * GPU_SHARE) * together
 
     @functools.cached_property
     def held_nodes(self) -> int:
@@ -252,7 +268,7 @@ class Model:
             nodes = 0
             between = round(particles * real * (1.5 if real == 4 else 1) * (2 * d + 2 * d * d))
         price = 1 if self.device.type == "cpu" else price_of_chunk(particles)
-        return Sizes(inside, nodes, between, longest_chunk(particles), price)
+        return Sizes(inside, nodes, between, longest_chunk(particles), price, self.calls)
 
     def __reduce__(self):
         raise TypeError(
@@ -260,7 +276,7 @@ class Model:
         )
 
     def describe(self, substeps: int = 1000) -> str:
-        """What was compiled for this scene, what was left out, and the memory of ``substeps`` substeps in one call."""
+        """What was compiled for this scene, what was left out, and the memory of calls of so many substeps each."""
         return describe(self, substeps)
 
 

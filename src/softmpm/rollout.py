@@ -252,7 +252,8 @@ def short_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[
 
 
 def _needs(model: Model, horizon: Horizon, gradient: bool) -> str:
-    call = f"a call of {horizon.total} substeps with {model.particle_count:,} particles in {model.worlds} world(s)"
+    calls = f"{model.calls} calls" if gradient and model.calls > 1 else "a call"
+    call = f"{calls} of {horizon.total} substeps with {model.particle_count:,} particles in {model.worlds} world(s)"
     less = "Fewer particles or worlds take less"
     try:
         forward, kept, backward = (f"{size / 2**20:,.1f} MiB" for size in memory(model, horizon)[:3])
@@ -261,6 +262,7 @@ def _needs(model: Model, horizon: Horizon, gradient: bool) -> str:
     if not gradient:
         return f"softmpm: {call} takes {forward}, by the formula of docs/memory.md. {less}."
     return (
-        f"softmpm: {call} takes {backward} with its backward pass, {kept} of it kept in between, by the formula of docs/memory.md. "
-        f"{less}; a smaller memory_budget (softmpm.build) takes time instead."
+        f"softmpm: {call} and the backward pass take {backward}, {kept} of it kept in between, by the formula of docs/memory.md. "
+        f"{less}; a smaller memory_budget (softmpm.build) takes time instead. Calls that one backward pass goes through share it "
+        "where build is told how many there are (calls)."
     )

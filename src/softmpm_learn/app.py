@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import hydra
+import torch
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -163,6 +164,8 @@ def sentence(error: BaseException) -> str:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
     text = in_full(error).strip() or "no details"
+    if isinstance(error, torch.OutOfMemoryError):
+        text += " Settings for that: train.worlds, task.resolution and device.memory."
     return _line(
         text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
     )

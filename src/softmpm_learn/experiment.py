@@ -53,7 +53,7 @@ def run_experiment(conf: RunConf, out: Path, group: Group | None = None) -> None
     with group.together():
         task = make_task(conf.task)
         model = make_model(task, conf, group)
-    logger.info("%s", model.describe(task.control_steps * task.substeps))
+    logger.info("%s", model.describe(task.substeps))
     with contextlib.ExitStack() as held:
         progress = held.enter_context(Progress(conf.train.iterations)) if group.first else None
         stop = held.enter_context(stop_on_signals(insist=group.size == 1))
@@ -82,6 +82,7 @@ def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
         dtype=getattr(torch, conf.device.dtype),
         worlds=len(group.split(conf.train.worlds)),
         memory_budget=None if memory is None else round(1e6 * memory),
+        calls=task.control_steps,
     )
 
 

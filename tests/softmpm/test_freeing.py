@@ -184,6 +184,36 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
         assert_relative(got, want, 0.0 if device == "cpu" else 2e-5)
 
 
+def tensor_bytes() -> int:
+    """Of everything that Python can reach, shared memory once."""
+    storages = (
+        thing.untyped_storage() for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)
+    )
+    return sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_calls_of_a_closed_loop_share_the_budget(kind, monkeypatch):
+    """With memory for one call, a model that is told of six keeps no more than that, one that is not six times as much."""
+    monkeypatch.setattr(memory, "LONGEST", 8)
+    scene, calls, held, adj = busy_scene(2, per_law=400), 6, [], []
+    sizes = softmpm.build(scene, device="cpu", **KINDS[kind]).sizes()
+    budget = 21 * (sizes.inside + sizes.nodes) + 3 * sizes.inside
+    for told in (1, calls):
+        built = softmpm.build(scene, device="cpu", memory_budget=budget, calls=told, **KINDS[kind])
+        start, params, before = built.rest(), built.params(), tensor_bytes()
+        activation = torch.zeros(3, 1, built.muscle_count, dtype=built.dtype)
+        end = start._replace(v=start.v.requires_grad_())
+        for _ in range(calls):
+            end = softmpm.simulate(built, end, activation, params, substeps=7)
+        held.append(tensor_bytes() - before)
+        adj += torch.autograd.grad(end.x.sum(), start.v)
+        del built, end
+        gc.collect()
+    assert held[0] > calls * budget and held[1] < budget
+    assert_relative(adj[1], adj[0], 1e-12 if KINDS[kind].get("dtype") else 1e-5)
+
+
 @pytest.mark.parametrize("failing", ["forward", "backward"])
 def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failing, monkeypatch, device):
     """Also what the calls before left to be used again: it may be what there is no room for."""

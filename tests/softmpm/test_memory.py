@@ -26,20 +26,40 @@ def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
     return substeps + sizes.price * chunks
 
 
+@pytest.mark.parametrize("calls", [1, 5])
 @pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
-def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon):
-    """What is kept and what is run again fit, shorter last chunks included; with more memory it takes no longer."""
-    times = []
-    for budget in np.geomspace(600, 100_000, 20).astype(int):
-        chosen = plan(horizon, SIZES, int(budget))
+def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
+    """What all calls keep and what is run again fit, shorter last chunks included; with more memory it takes no longer."""
+    times, sizes = [], SIZES._replace(calls=calls)
+    for budget in np.geomspace(600 + 200 * calls, 100_000 * calls, 20).astype(int):
+        chosen = plan(horizon, sizes, int(budget))
         if chosen.keep_all:
             break
         shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
         inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
         assert chosen.kept == chosen.slots * SIZES.between and chosen.recomputed == inside + SIZES.between
-        assert chosen.kept + chosen.recomputed <= budget
+        assert calls * chosen.kept + chosen.recomputed <= budget
         times.append(seconds(chosen, horizon, SIZES))
     assert len(times) > 3 and times == sorted(times, reverse=True)
+
+
+def test_calls_share_a_budget():
+    """Five calls keep everything with five times what one needs for that, not with less."""
+    horizon, sizes = Horizon(1, 64), SIZES._replace(calls=5)
+    everything = plan(horizon, SIZES, 10**9).kept
+    assert (
+        plan(horizon, sizes, 5 * everything).keep_all
+        and not plan(horizon, sizes, 5 * everything - 1).keep_all
+    )
+    with pytest.raises(ValueError, match="a gradient through 5 calls needs at least 834 bytes"):
+        plan(horizon, sizes, 833)
+    assert plan(horizon, sizes, 834) == Plan(longest=1, slots=1, kept=104, recomputed=314)
+
+
+def test_without_a_budget_several_calls_may_keep_more():
+    """As much as each alone, on the CPU up to 64 times."""
+    budgets = [softmpm.build(busy_scene(2), device="cpu", calls=calls).budget for calls in (1, 3, 64, 1000)]
+    assert budgets == [2**26, 3 * 2**26, 2**32, 2**32]
 
 
 def test_the_price_of_a_chunk_makes_chunks_longer():

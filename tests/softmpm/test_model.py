@@ -417,8 +417,9 @@ def test_a_budget_is_a_whole_number_of_bytes(budget):
         softmpm.build(busy_scene(2), device="cpu", memory_budget=budget)
     built = softmpm.build(busy_scene(2), device="cpu", memory_budget=1e6, worlds=np.int64(2))
     assert built.budget == 1_000_000 and built.worlds == 2
-    with pytest.raises(ValueError, match="worlds must be a whole number"):
-        softmpm.build(busy_scene(2), device="cpu", worlds=1.0)
+    for name in ("worlds", "calls"):
+        with pytest.raises(ValueError, match=f"{name} must be a whole number"):
+            softmpm.build(busy_scene(2), device="cpu", **{name: 1.0})
 
 
 def test_describe_says_how_often_a_substep_runs():
@@ -432,6 +433,7 @@ def test_describe_says_how_often_a_substep_runs():
     often = [float(line(memory_budget=n).split()[-2]) for n in (200_000, 60_000, 30_000)]
     assert 2 <= often[0] <= often[1] < often[2]
     assert "needs at least" in line(memory_budget=1000)
+    assert "; 8 calls of 100 substeps with gradient: " in line(100, calls=8)
     with pytest.raises(ValueError, match="substeps must be a whole number of at least 1, got 0"):
         line(0)
 

@@ -18,7 +18,8 @@ from hydra.core.global_hydra import GlobalHydra
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
 from softmpm_learn.config import RunConf, check_keys, conf_dir, load, save, to_run
-from softmpm_learn.tasks import TASKS, ArmConf, Resolution
+from softmpm_learn.distributed import Group
+from softmpm_learn.tasks import TASKS, ArmConf, Resolution, make_task
 
 ROOT = Path(__file__).parents[2]
 TINY = [  # the smallest run that has every phase
@@ -207,6 +208,8 @@ def test_a_fault_of_the_program_is_called_so():
     noted = RuntimeError("No memory.")
     noted.add_note("Buy some")
     assert app.sentence(noted) == "No memory. Buy some."
+    full = app.sentence(torch.OutOfMemoryError("CUDA out of memory."))
+    assert full.startswith("CUDA out of memory. Settings for that: train.worlds") and "device.memory" in full
 
 
 def test_cuda_without_a_gpu_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):
@@ -228,6 +231,7 @@ def test_a_run_leaves_everything(finished):
     assert len(rows(folder / "metrics.csv")) == 2
     assert said.splitlines()[-1].endswith(f"rerun {folder / 'run.rrd'}")
     assert "after 2 of 2 iterations: loss" in said and "mm from the goal" in said
+    assert "2 calls of 51 substeps with gradient" in said  # which share the memory
     with softmpm.Recording(folder / "run.h5") as recording:
         assert len(recording.episodes) == 3  # both iterations and the best once more
 
@@ -249,6 +253,13 @@ def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finis
     resumed, whole = (rows(tmp_path / name / "metrics.csv") for name in ("run", "whole"))
     assert resumed == whole and len(whole) == 3
     assert load(tmp_path / "run" / "config.yaml").task.name == "arm"
+
+
+def test_memory_is_for_a_whole_simulation():
+    """What it may keep for its gradient is shared by all control steps."""
+    conf = to_run(composed(*TINY, "device.memory=1"))
+    model = experiment.make_model(make_task(conf.task), conf, Group())
+    assert (model.budget, model.calls) == (1_000_000, 2)
 
 
 def test_resume_changes_nothing_but_what_may_change(tmp_path):
