@@ -17,8 +17,8 @@ SIZES = {
     "3D\n1,000,000": (3, 1_000_000),
 }
 BARS = {
-    "plain, forward": ("step.plain", "us/substep", "#c9c9c9"),
-    "plain, backward": ("gradient.plain", "backward us/substep", "#8f8f8f"),
+    "plain, forward": ("step.plain", "falling us", "#c9c9c9"),
+    "plain, backward": ("gradient.plain", "backward, kept", "#8f8f8f"),
     "fast, forward": ("step", "falling us", "#7fb3e0"),
     "fast, backward": ("gradient", "backward, kept", "#1f5f9e"),
 }

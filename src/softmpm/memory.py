@@ -24,8 +24,8 @@ MANY, LONGEST_OF_MANY = 30_000, 64
 CPU_BUDGET, GPU_SHARE = 64 * 2**20, 1 / 16
 """Without a budget, what a call may keep: bytes on the CPU, a share of a GPU's memory."""
 MOST_CALLS = {"cpu": 64, "cuda": 6}
-"""And several calls together, at most so often as much: 4 GiB on the CPU, three eighths of a GPU's memory. There is room for it twice: a
-:class:`softmpm.Graph` of them holds its own, beside what the same calls keep outside of it."""
+"""And several calls together, at most so often as much: 4 GiB on the CPU, three eighths of a GPU's memory. There is room for it
+twice: a :class:`softmpm.Graph` of them holds its own, beside what the same calls keep outside of it."""
 
 
 MARGIN = {2: 6, 3: 3}
