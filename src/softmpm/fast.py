@@ -45,7 +45,7 @@ class Pool:
     """Programs that were made on one arrangement and are not in use.
 
     Those for the shapes of chunks that came last stay. Others, since each length of a call may bring shapes of its own, stay only
-    while all together fit into the budget.
+    while all together fit into a call's part of the budget.
     """
 
     def __init__(self, model: Model, arrangement: Arrangement, unpacking: Unpacking):
@@ -72,9 +72,9 @@ class Pool:
 
     def _forget(self, keep: bool) -> None:
         """Make room for another program."""
-        shapes = self._free[keep]
+        shapes, part = self._free[keep], self.model.budget // self.model.calls
         for shape in list(shapes)[: -STAY[keep]]:
-            if sum(pair.program.bytes for free in shapes.values() for pair in free) <= self.model.budget:
+            if sum(pair.program.bytes for free in shapes.values() for pair in free) <= part:
                 break
             del shapes[shape]
 

@@ -7,7 +7,8 @@ nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes a
     schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
                chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (schedule.py)
 
-In a closed loop one backward pass goes through many calls. Each keeps its own, and they are pulled back one after the other.
+In a closed loop one backward pass goes through many calls, each of which also holds its start, the end of the one before. They are
+pulled back one after the other.
 """
 
 import functools
@@ -21,8 +22,8 @@ LONGEST = 128
 """Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
 MANY, LONGEST_OF_MANY = 30_000, 64
 """From so many particles on the host has time enough, and sorting in time is worth more."""
-CPU_BUDGET, GPU_SHARE = 64 * 2**20, 1 / 16
-"""Without a budget, what a call may keep: bytes on the CPU, a share of a GPU's memory."""
+CPU_BUDGET, GPU_PART = 64 * 2**20, 16
+"""Without a budget, what a call may keep: bytes on the CPU, one of so many parts of a GPU's memory."""
 MOST_CALLS = {"cpu": 64, "cuda": 6}
 """And several calls together, at most so often as much: 4 GiB on the CPU, three eighths of a GPU's memory. There is room for it
 twice: a :class:`softmpm.Graph` of them holds its own, beside what the same calls keep outside of it."""
@@ -68,6 +69,8 @@ class Sizes(NamedTuple):
     """What is kept of the nodes of all worlds for each substep."""
     between: int
     """State of all worlds between chunks."""
+    start: int
+    """State of all worlds in the user's order, as a call begins."""
     longest: int
     """Substeps of a chunk, at most."""
     price: int
@@ -105,13 +108,15 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     """
     chunks = len(horizon.chunks(sizes.longest))
     everything = horizon.total * (sizes.inside + sizes.nodes) + chunks * sizes.inside
-    if sizes.calls * everything <= budget or horizon.total == 0:
+    others = sizes.calls - 1
+    if sizes.calls * everything + others * sizes.start <= budget or horizon.total == 0:
         return Plan(sizes.longest, 0, everything, 0)
+    room = budget - others * (sizes.start - sizes.between)  # the first state that is kept is the start
     best, least = None, math.inf
     for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
         inside = sum((n + 1) * sizes.inside + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
-        slots = min(len(chunks), (budget - inside - sizes.between) // (sizes.calls * sizes.between))
+        slots = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
         if slots < 1:
             continue
         runs = recomputed(len(chunks), slots)
@@ -120,7 +125,7 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
         if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
             best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
     if best is None:
-        smallest = 2 * sizes.inside + sizes.nodes + (1 + sizes.calls) * sizes.between
+        smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes + others * sizes.start
         raise ValueError(
             f"a gradient {f'through {sizes.calls} calls ' if sizes.calls > 1 else ''}needs at least {smallest:,} bytes for states, "
             f"memory_budget is {budget:,} bytes: raise it, or make the scene smaller."
@@ -172,8 +177,8 @@ def memory(model, horizon) -> Memory:
             handed += 2 * small if model.device.type == "cuda" else 0
     else:
         forward, handed, own = 2 * sizes.inside, sizes.inside, 0
-    # Each call but the first holds the end of the one before, which without its inside takes the first slot.
-    starts = (calls - 1) * (state + low - (0 if chosen.keep_all else sizes.between))
+    # Each call but the first holds its start besides, which is one of the states that are kept if those inside are not.
+    starts = (calls - 1) * (sizes.start - (0 if chosen.keep_all else sizes.between))
     kept = calls * (chosen.kept + material) + own + starts
     adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
     if model.spec.deterministic:

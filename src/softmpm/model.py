@@ -15,7 +15,7 @@ from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
 from softmpm.memory import (
     CPU_BUDGET,
-    GPU_SHARE,
+    GPU_PART,
     MARGIN,
     MOST_CALLS,
     Sizes,
@@ -123,8 +123,8 @@ class Model:
         worlds: int,
         memory_budget: int | None,
         scheme: str,
-        deterministic: bool = False,
-        calls: int = 1,
+        deterministic: bool,
+        calls: int,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
         self.memory_budget, self.calls = memory_budget, calls
@@ -242,10 +242,12 @@ class Model:
         """Bytes that all calls may keep for a backward pass."""
         if self.memory_budget is not None:
             return self.memory_budget
-        together = min(self.calls, MOST_CALLS[self.device.type])
-        if self.device.type == "cpu":
-            return CPU_BUDGET * together
-        return int(torch.cuda.get_device_properties(self.device).total_memory * GPU_SHARE) * together
+        of_one = CPU_BUDGET
+        if self.device.type == "cuda":
+            of_one = torch.cuda.get_device_properties(self.device).total_memory // GPU_PART
+        # What one call would have, and the starts of the others, which are there anyway:
+        least = of_one + (self.calls - 1) * self.sizes().start
+        return max(least, min(self.calls, MOST_CALLS[self.device.type]) * of_one)
 
     @functools.cached_property
     def held_nodes(self) -> int:
@@ -259,16 +261,18 @@ class Model:
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see softmpm/memory.py."""
         real, d, particles = self.dtype.itemsize, self.dim, self.worlds * self.particle_count
+        start = round(
+            particles * real * (1.5 if real == 4 else 1) * (2 * d + 2 * d * d)
+        )  # with what rounding took
         if self.scheme == "fast":
             inside = particles * (4 + real * packed_rows(d).rows)
             nodes = self.worlds * self.held_nodes * 4 * real
             between = inside + 4 * particles  # and their order
         else:
             inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-            nodes = 0
-            between = round(particles * real * (1.5 if real == 4 else 1) * (2 * d + 2 * d * d))
+            nodes, between = 0, start
         price = 1 if self.device.type == "cpu" else price_of_chunk(particles)
-        return Sizes(inside, nodes, between, longest_chunk(particles), price, self.calls)
+        return Sizes(inside, nodes, between, start, longest_chunk(particles), price, self.calls)
 
     def __reduce__(self):
         raise TypeError(

@@ -38,7 +38,7 @@ class DeviceConf:
     threads: int = 1
     """CPU threads of PyTorch; the same number gives the same run to the last bit."""
     memory: float | None = None
-    """Most memory that one simulation may keep for its gradient [MB]; null for a sensible choice."""
+    """Most memory that one simulation may keep for its gradient, in each process [MB]; null for a sensible choice."""
 
     def __post_init__(self):
         for name, value, known in (("name", self.name, DEVICES), ("dtype", self.dtype, DTYPES)):

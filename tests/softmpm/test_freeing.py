@@ -194,23 +194,30 @@ def tensor_bytes() -> int:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_calls_of_a_closed_loop_share_the_budget(kind, monkeypatch):
-    """With memory for one call, a model that is told of six keeps no more than that, one that is not six times as much."""
+    """With memory for one call, a model that is told of six keeps no more than that, one that is not six times as much; and one
+    with memory for six keeps what they need. It is what the formula says.
+    """
     monkeypatch.setattr(memory, "LONGEST", 8)
     scene, calls, held, adj = busy_scene(2, per_law=400), 6, [], []
     sizes = softmpm.build(scene, device="cpu", **KINDS[kind]).sizes()
     budget = 21 * (sizes.inside + sizes.nodes) + 3 * sizes.inside
-    for told in (1, calls):
-        built = softmpm.build(scene, device="cpu", memory_budget=budget, calls=told, **KINDS[kind])
+    for told, enough in ((1, budget), (calls, budget), (calls, calls * (budget + sizes.start))):
+        built = softmpm.build(scene, device="cpu", memory_budget=enough, calls=told, **KINDS[kind])
         start, params, before = built.rest(), built.params(), tensor_bytes()
+        for tensor in params:
+            tensor.requires_grad_()
         activation = torch.zeros(3, 1, built.muscle_count, dtype=built.dtype)
         end = start._replace(v=start.v.requires_grad_())
         for _ in range(calls):
             end = softmpm.simulate(built, end, activation, params, substeps=7)
         held.append(tensor_bytes() - before)
+        if told == calls:
+            assert 0.9 < held[-1] / memory.memory(built, Horizon(3, 7)).kept < 1.15
         adj += torch.autograd.grad(end.x.sum(), start.v)
         del built, end
-    assert held[0] > calls * budget and held[1] < budget
+    assert held[0] > calls * budget and held[1] < budget and held[2] > calls * budget
     assert_relative(adj[1], adj[0], 1e-12 if KINDS[kind].get("dtype") else 1e-5)
+    assert_relative(adj[2], adj[0], 0.0)
 
 
 @pytest.mark.parametrize("failing", ["forward", "backward"])

@@ -1,7 +1,10 @@
 """The plan of what a call keeps, and the formula of its memory."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 from helpers import busy_scene
 
 import softmpm
@@ -9,7 +12,7 @@ from softmpm.horizon import Horizon
 from softmpm.memory import Plan, Sizes, plan, price_of_chunk
 from softmpm.schedule import going_back
 
-SIZES = Sizes(inside=100, nodes=10, between=104, longest=64, price=4)
+SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4)
 
 
 def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
@@ -38,28 +41,38 @@ def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
         shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
         inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
         assert chosen.kept == chosen.slots * SIZES.between and chosen.recomputed == inside + SIZES.between
-        assert calls * chosen.kept + chosen.recomputed <= budget
+        starts = (calls - 1) * (
+            SIZES.start - SIZES.between
+        )  # where the first state that is kept is the user's
+        assert calls * chosen.kept + starts + chosen.recomputed <= budget
         times.append(seconds(chosen, horizon, SIZES))
     assert len(times) > 3 and times == sorted(times, reverse=True)
 
 
 def test_calls_share_a_budget():
-    """Five calls keep everything with five times what one needs for that, not with less."""
+    """Five calls keep everything with five times what one needs for that and four starts, not with less."""
     horizon, sizes = Horizon(1, 64), SIZES._replace(calls=5)
-    everything = plan(horizon, SIZES, 10**9).kept
-    assert (
-        plan(horizon, sizes, 5 * everything).keep_all
-        and not plan(horizon, sizes, 5 * everything - 1).keep_all
-    )
-    with pytest.raises(ValueError, match="a gradient through 5 calls needs at least 834 bytes"):
-        plan(horizon, sizes, 833)
-    assert plan(horizon, sizes, 834) == Plan(longest=1, slots=1, kept=104, recomputed=314)
+    everything = 5 * plan(horizon, SIZES, 10**9).kept + 4 * 130
+    assert plan(horizon, sizes, everything).keep_all and not plan(horizon, sizes, everything - 1).keep_all
+    with pytest.raises(ValueError, match="a gradient through 5 calls needs at least 938 bytes"):
+        plan(horizon, sizes, 937)
+    assert plan(horizon, sizes, 938) == Plan(longest=1, slots=1, kept=104, recomputed=314)
 
 
-def test_without_a_budget_several_calls_may_keep_more():
-    """As much as each alone, on the CPU up to 64 times."""
-    budgets = [softmpm.build(busy_scene(2), device="cpu", calls=calls).budget for calls in (1, 3, 64, 1000)]
-    assert budgets == [2**26, 3 * 2**26, 2**32, 2**32]
+def test_without_a_budget_several_calls_may_keep_more(monkeypatch):
+    """As much as one by one, up to 64 times on the CPU and 6 times on a GPU; but at least all starts and what one has."""
+    built = softmpm.build(busy_scene(2), device="cpu")
+    start = built.sizes().start
+    for calls, want in ((1, 2**26), (3, 3 * 2**26), (1000, 2**32), (10**7, 2**26 + (10**7 - 1) * start)):
+        built.calls = calls
+        assert built.budget == want
+        plan(Horizon(1, 41), built.sizes(), built.budget)
+    gpu = SimpleNamespace(total_memory=16 * 10**9)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
+    built.device = torch.device("cuda")
+    for calls, want in ((1, 10**9), (6, 6 * 10**9), (1000, 6 * 10**9)):
+        built.calls = calls
+        assert built.budget == want
 
 
 def test_the_price_of_a_chunk_makes_chunks_longer():
