@@ -16,18 +16,14 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
+
 from softmpm.schedule import recomputed
 
 LONGEST = 128
 """Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
 MANY, LONGEST_OF_MANY = 30_000, 64
 """From so many particles on the host has time enough, and sorting in time is worth more."""
-CPU_BUDGET, GPU_PART = 64 * 2**20, 16
-"""Without a budget, what a call may keep: bytes on the CPU, one of so many parts of a GPU's memory."""
-MOST_CALLS = {"cpu": 64, "cuda": 6}
-"""And several calls together, at most so often as much: 4 GiB on the CPU, three eighths of a GPU's memory. There is room for it
-twice: a :class:`softmpm.Graph` of them holds its own, beside what the same calls keep outside of it."""
-
 
 MARGIN = {2: 6, 3: 3}
 """Nodes of a window around the particles' stencils, on each side, in 2D and 3D, until they leave it."""
@@ -70,13 +66,26 @@ class Sizes(NamedTuple):
     between: int
     """State of all worlds between chunks."""
     start: int
-    """State of all worlds in the user's order, as a call begins."""
+    """State of all worlds in the user's order, as a call begins or ends, with what rounding took."""
     longest: int
     """Substeps of a chunk, at most."""
     price: int
     """What each chunk costs besides its substeps, in substeps."""
-    calls: int = 1
+    calls: int
     """How many calls share the budget."""
+
+
+def default_budget(device: torch.device, sizes: Sizes) -> int:
+    """Bytes that all calls may keep where nobody says how many.
+
+    For one call a sixteenth of a GPU's memory, or 64 MiB on the CPU. For several as often as much, but at most 6 times, or 64 times on
+    the CPU: a :class:`softmpm.Graph` of them holds its own beside what the same calls keep outside of it, and there must be room for
+    both. The starts are there anyway: they never take what one call would have.
+    """
+    one, most = 64 * 2**20, 64
+    if device.type == "cuda":
+        one, most = torch.cuda.get_device_properties(device).total_memory // 16, 6
+    return max(min(sizes.calls, most) * one, one + (sizes.calls - 1) * sizes.start)
 
 
 class Plan(NamedTuple):
@@ -160,8 +169,7 @@ def memory(model, horizon) -> Memory:
     """Evaluates the formula of docs/memory.md for calls of one length, all gradients wanted."""
     real, sizes, calls = model.dtype.itemsize, model.sizes(), model.calls
     particles = model.worlds * model.particle_count
-    state = particles * real * (2 * model.dim + 2 * model.dim**2)  # x, v, C, F of the end, or their adjoints
-    low = state // 2 if real == 4 else 0
+    state = particles * real * (2 * model.dim + 2 * model.dim**2)  # adjoints of x, v, C, F
     material, pull = 4 * particles * real, particles * model.spec.muscle_slots * real
     chosen = plan(horizon, sizes, model.budget)
     if model.scheme == "fast":
@@ -185,7 +193,7 @@ def memory(model, horizon) -> Memory:
         adjoints += 2 * sizes.nodes
     chunks = len(horizon.chunks(chosen.longest))
     runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.slots) / chunks
-    return Memory(forward + material + state + low, kept, kept + chosen.recomputed + state + adjoints, runs)
+    return Memory(forward + material + sizes.start, kept, kept + chosen.recomputed + state + adjoints, runs)
 
 
 def _shapes(horizon, longest: int) -> int:

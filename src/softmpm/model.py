@@ -13,16 +13,7 @@ from softmpm.checks import check_scene, check_whole
 from softmpm.description import describe
 from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import (
-    CPU_BUDGET,
-    GPU_PART,
-    MARGIN,
-    MOST_CALLS,
-    Sizes,
-    longest_chunk,
-    price_of_chunk,
-    window_shape,
-)
+from softmpm.memory import MARGIN, Sizes, default_budget, longest_chunk, price_of_chunk, window_shape
 from softmpm.scene import FixedCorotated, NeoHookean, Scene
 from softmpm.stability import warn_sparse, warn_unstable
 from softmpm.state import Low, Params, State
@@ -237,17 +228,10 @@ class Model:
             "in one order, or build without it."
         )
 
-    @property
+    @functools.cached_property
     def budget(self) -> int:
         """Bytes that all calls may keep for a backward pass."""
-        if self.memory_budget is not None:
-            return self.memory_budget
-        of_one = CPU_BUDGET
-        if self.device.type == "cuda":
-            of_one = torch.cuda.get_device_properties(self.device).total_memory // GPU_PART
-        # What one call would have, and the starts of the others, which are there anyway:
-        least = of_one + (self.calls - 1) * self.sizes().start
-        return max(least, min(self.calls, MOST_CALLS[self.device.type]) * of_one)
+        return default_budget(self.device, self.sizes()) if self.memory_budget is None else self.memory_budget
 
     @functools.cached_property
     def held_nodes(self) -> int:
@@ -261,9 +245,8 @@ class Model:
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see softmpm/memory.py."""
         real, d, particles = self.dtype.itemsize, self.dim, self.worlds * self.particle_count
-        start = round(
-            particles * real * (1.5 if real == 4 else 1) * (2 * d + 2 * d * d)
-        )  # with what rounding took
+        state = particles * real * (2 * d + 2 * d * d)
+        start = state + state // 2 if real == 4 else state
         if self.scheme == "fast":
             inside = particles * (4 + real * packed_rows(d).rows)
             nodes = self.worlds * self.held_nodes * 4 * real

@@ -261,12 +261,12 @@ def _needs(model: Model, horizon: Horizon, gradient: bool) -> str:
         return f"softmpm: {call} did not fit; {error} {less}."
     if not gradient:
         return f"softmpm: {call} takes {forward}, by the formula of docs/memory.md. {less}."
-    told = (
+    untold = (
         ""
         if model.calls > 1
-        else " If one backward pass goes through several calls, tell build how many, so that they share it."
+        else " Calls of one backward pass share it once build knows how many they are (calls)."
     )
     return (
         f"softmpm: {call} and the backward pass take {backward}, {kept} of it kept in between, by the formula of docs/memory.md. "
-        f"{less}; a smaller memory_budget (softmpm.build) takes time instead.{told}"
+        f"{less}; a smaller memory_budget (softmpm.build) takes time instead.{untold}"
     )

@@ -164,7 +164,7 @@ def sentence(error: BaseException) -> str:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
     text = in_full(error).strip() or "no details"
-    if isinstance(error, torch.OutOfMemoryError) or "memory_budget" in text:
+    if isinstance(error, torch.OutOfMemoryError) or "memory_budget" in text:  # as the simulator calls it
         text += " Settings for that: train.worlds, task.resolution and device.memory."
     return _line(
         text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"

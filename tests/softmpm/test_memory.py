@@ -9,10 +9,10 @@ from helpers import busy_scene
 
 import softmpm
 from softmpm.horizon import Horizon
-from softmpm.memory import Plan, Sizes, plan, price_of_chunk
+from softmpm.memory import Plan, Sizes, default_budget, plan, price_of_chunk
 from softmpm.schedule import going_back
 
-SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4)
+SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4, calls=1)
 
 
 def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
@@ -41,9 +41,7 @@ def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
         shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
         inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
         assert chosen.kept == chosen.slots * SIZES.between and chosen.recomputed == inside + SIZES.between
-        starts = (calls - 1) * (
-            SIZES.start - SIZES.between
-        )  # where the first state that is kept is the user's
+        starts = (calls - 1) * (SIZES.start - SIZES.between)  # the first state that is kept is the user's
         assert calls * chosen.kept + starts + chosen.recomputed <= budget
         times.append(seconds(chosen, horizon, SIZES))
     assert len(times) > 3 and times == sorted(times, reverse=True)
@@ -59,20 +57,13 @@ def test_calls_share_a_budget():
     assert plan(horizon, sizes, 938) == Plan(longest=1, slots=1, kept=104, recomputed=314)
 
 
-def test_without_a_budget_several_calls_may_keep_more(monkeypatch):
-    """As much as one by one, up to 64 times on the CPU and 6 times on a GPU; but at least all starts and what one has."""
-    built = softmpm.build(busy_scene(2), device="cpu")
-    start = built.sizes().start
-    for calls, want in ((1, 2**26), (3, 3 * 2**26), (1000, 2**32), (10**7, 2**26 + (10**7 - 1) * start)):
-        built.calls = calls
-        assert built.budget == want
-        plan(Horizon(1, 41), built.sizes(), built.budget)
+@pytest.mark.parametrize("device, one, most", [("cpu", 2**26, 64), ("cuda", 10**9, 6)])
+def test_without_a_budget_several_calls_may_keep_more(device, one, most, monkeypatch):
+    """So often what one may, up to a limit; but all starts always leave as much as that."""
     gpu = SimpleNamespace(total_memory=16 * 10**9)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
-    built.device = torch.device("cuda")
-    for calls, want in ((1, 10**9), (6, 6 * 10**9), (1000, 6 * 10**9)):
-        built.calls = calls
-        assert built.budget == want
+    for calls, want in ((1, one), (3, 3 * one), (1000, most * one), (10**8, one + (10**8 - 1) * SIZES.start)):
+        assert default_budget(torch.device(device), SIZES._replace(calls=calls)) == want
 
 
 def test_the_price_of_a_chunk_makes_chunks_longer():

@@ -200,7 +200,7 @@ def test_a_wrong_value_says_what_must_hold(overrides, message):
         to_run(composed(*overrides))
 
 
-def test_a_fault_of_the_program_is_called_so(tmp_path):
+def test_a_fault_of_the_program_is_called_so():
     """Errors that are not meant for people give their type; messages of several lines become one, and notes follow."""
     assert app.sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
     assert app.sentence(RuntimeError("first\n  second")) == "first second."
@@ -208,11 +208,14 @@ def test_a_fault_of_the_program_is_called_so(tmp_path):
     noted = RuntimeError("No memory.")
     noted.add_note("Buy some")
     assert app.sentence(noted) == "No memory. Buy some."
+
+
+def test_too_little_memory_names_the_settings_that_help(tmp_path):
+    """Whether the device has no more, or the simulator is allowed no more."""
     full = app.sentence(torch.OutOfMemoryError("CUDA out of memory."))
     assert full.startswith("CUDA out of memory. Settings for that: train.worlds") and "device.memory" in full
-    little = composed(*TINY, "device.memory=0.001")
     with pytest.raises(ValueError, match="memory_budget is 1,000 bytes") as refused:
-        experiment.run_experiment(to_run(little), tmp_path)
+        experiment.run_experiment(to_run(composed(*TINY, "device.memory=0.001")), tmp_path)
     assert "device.memory" in app.sentence(refused.value)
 
 
