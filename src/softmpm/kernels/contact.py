@@ -24,7 +24,10 @@ def contact(spec: Spec, k: int) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, ivec = t.real, t.vec, t.ivec
     Walls = solid_types(spec).Walls
-    stick, slip = spec.contacts[k] == "stick", spec.contacts[k] == "slip"
+    kind = spec.contacts[k]
+    if kind not in ("stick", "slip", "separate"):
+        raise ValueError(f"wall {k} has the contact {kind!r}, which has no response here; add (C4).")
+    stick, slip = kind == "stick", kind == "slip"
     rough = spec.friction
 
     @wp.func

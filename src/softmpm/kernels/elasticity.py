@@ -2,15 +2,19 @@
 
 Everything is written in H = F − I, so that small strains keep their digits in float32. With j = J − 1, R = I + Q:
 
-    neo-Hookean:      τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                        (E1)
-    fixed corotated:  τ = 2μ (H − Q) Fᵀ + λ j (1 + j) I                                             (E2)
+    neo-Hookean:        τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                      (E1)
+    fixed corotated:    τ = μ (S + Sᵀ) + λ j (1 + j) I,  S = (H − Q) Fᵀ                             (E2)
+    barrier corotated:  τ = μ (S + Sᵀ) + λ/4 (J² − J⁻²) I                                           (E3)
 
-Both take Q, which ``rotation`` of the law gives; a neo-Hookean solid needs none. Forward and adjoint of a particle share it.
-Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012. The twins take τ̄ and return (F̄, μ̄, λ̄):
+All take Q, which ``rotation`` of the law gives; a neo-Hookean solid needs none. Forward and adjoint of a particle share it. S is
+symmetric but for rounding; its symmetric part is taken, since the rest would turn a free body.
+Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012; the volumetric term of (E3) is the derivative of λ/8 (J − 1/J)².
+The adjoints take τ̄ and return (F̄, μ̄, λ̄):
 
     (E1): F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
     (E2): F̄ = 2μ (τ̄ F + τ̄ᵀ (F − R)) + λ (2J − 1) tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ τ̄ F,
           μ̄ = ⟨τ̄, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
+    (E3): as (E2), with λ/2 (J + J⁻³) for λ (2J − 1) and λ̄ = tr(τ̄) (J² − J⁻²) / 4
 """
 
 from types import SimpleNamespace
@@ -91,32 +95,70 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         adj.lam = trace * log1p(j)
         return adj
 
-    @wp.func
-    def fixed_corotated(H: mat, Q: mat, mu: real, lam: real) -> mat:
-        j = volume_change(H)
-        F = identity() + H
-        return real(2.0) * mu * (H - Q) * wp.transpose(F) + lam * j * (real(1.0) + j) * identity()
+    def corotated(pressure: wp.Function, pressure_slope: wp.Function) -> tuple[wp.Function, wp.Function]:
+        """Stress and adjoint of a corotated law, τ = μ (S + Sᵀ) + λ p(j) I, from p and ∂p/∂J."""
+
+        @wp.func
+        def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
+            S = (H - Q) * wp.transpose(identity() + H)
+            return mu * (S + wp.transpose(S)) + lam * pressure(volume_change(H)) * identity()
+
+        @wp.func
+        def stress_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
+            F = identity() + H
+            j = volume_change(H)
+            trace = wp.trace(adj_tau)
+            two_mu = real(2.0) * mu
+            adj = ElasticAdj()
+            adj.F = two_mu * (adj_tau * F + wp.transpose(adj_tau) * (H - Q)) + (
+                lam * pressure_slope(j) * trace
+            ) * cofactor(F)
+            adj.F += rotation_adj(H, Q, -two_mu * (adj_tau * F))
+            adj.mu = real(2.0) * wp.ddot(adj_tau, (H - Q) * wp.transpose(F))
+            adj.lam = trace * pressure(j)
+            return adj
+
+        return stress, stress_adj
 
     @wp.func
-    def fixed_corotated_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
-        F = identity() + H
-        j = volume_change(H)
-        trace = wp.trace(adj_tau)
-        two_mu = real(2.0) * mu
-        adj = ElasticAdj()
-        adj.F = two_mu * (adj_tau * F + wp.transpose(adj_tau) * (H - Q)) + (
-            lam * (real(1.0) + real(2.0) * j) * trace
-        ) * cofactor(F)
-        adj.F += rotation_adj(H, Q, -two_mu * (adj_tau * F))
-        adj.mu = real(2.0) * wp.ddot(adj_tau, (H - Q) * wp.transpose(F))
-        adj.lam = trace * j * (real(1.0) + j)
-        return adj
+    def soft_pressure(j: real) -> real:
+        return j * (real(1.0) + j)
+
+    @wp.func
+    def soft_pressure_slope(j: real) -> real:
+        return real(1.0) + real(2.0) * j
+
+    @wp.func
+    def barrier_pressure(j: real) -> real:
+        """(J² − J⁻²) / 4, without cancellation where j is small."""
+        square = (real(1.0) + j) * (real(1.0) + j)
+        return divide(real(0.25) * j * (real(2.0) + j) * (square + real(1.0)), square)
+
+    @wp.func
+    def barrier_pressure_slope(j: real) -> real:
+        J = real(1.0) + j
+        return real(0.5) * (J + divide(real(1.0), J * J * J))
+
+    fixed_corotated, fixed_corotated_adj = corotated(soft_pressure, soft_pressure_slope)
+    barrier_corotated, barrier_corotated_adj = corotated(barrier_pressure, barrier_pressure_slope)
 
     return SimpleNamespace(
         Adj=ElasticAdj,
         identity=identity,
         volume_change=volume_change,
-        rotation={"neo_hookean": no_rotation, "fixed_corotated": rotation},
-        stress={"neo_hookean": neo_hookean, "fixed_corotated": fixed_corotated},
-        stress_adj={"neo_hookean": neo_hookean_adj, "fixed_corotated": fixed_corotated_adj},
+        rotation={
+            "neo_hookean": no_rotation,
+            "fixed_corotated": rotation,
+            "barrier_corotated": rotation,
+        },
+        stress={
+            "neo_hookean": neo_hookean,
+            "fixed_corotated": fixed_corotated,
+            "barrier_corotated": barrier_corotated,
+        },
+        stress_adj={
+            "neo_hookean": neo_hookean_adj,
+            "fixed_corotated": fixed_corotated_adj,
+            "barrier_corotated": barrier_corotated_adj,
+        },
     )

@@ -14,37 +14,49 @@ from softmpm.kernels.types import Spec, Wanted, adj_module, solid_adj_type, soli
 @once
 def solid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    mat, Solid = t.mat, solid_types(spec).Solid
-    laws = elasticity(spec.dim, spec.dtype)
-    first, last = laws.stress[spec.laws[0]], laws.stress[spec.laws[-1]]
-    first_rotation, last_rotation = laws.rotation[spec.laws[0]], laws.rotation[spec.laws[-1]]
-    muscle_stress = muscle(spec.dim, spec.dtype).muscle_stress
-    mixed, slots = len(spec.laws) > 1, spec.muscle_slots
+    real, mat, Solid = t.real, t.mat, solid_types(spec).Solid
+    laws, law_of = elasticity(spec.dim, spec.dtype), _law_of(spec)
+    muscle_stress, slots = muscle(spec.dim, spec.dtype).muscle_stress, spec.muscle_slots
+
+    def rotation_from(k: int) -> wp.Function:
+        """Q by the laws from number ``k`` on."""
+        own, last = laws.rotation[spec.laws[k]], k + 1 == len(spec.laws)
+        others = None if last else rotation_from(k + 1)
+
+        @wp.func
+        def rotation_of(law: int, H: mat) -> mat:
+            if wp.static(not last):
+                if law != k:
+                    return others(law, H)
+            return own(H)
+
+        return rotation_of
+
+    def stress_from(k: int) -> wp.Function:
+        """τ by the laws from number ``k`` on."""
+        own, last = laws.stress[spec.laws[k]], k + 1 == len(spec.laws)
+        others = None if last else stress_from(k + 1)
+
+        @wp.func
+        def stress_of(law: int, H: mat, Q: mat, mu: real, lam: real) -> mat:
+            if wp.static(not last):
+                if law != k:
+                    return others(law, H, Q, mu, lam)
+            return own(H, Q, mu, lam)
+
+        return stress_of
+
+    rotation_of, stress_of = rotation_from(0), stress_from(0)
 
     @wp.func
     def rotation(body: Solid, world: int, p: int, H: mat) -> mat:
         """Q of F, if the law of this particle asks for it."""
-        Q = mat()
-        if wp.static(mixed):
-            if body.law[world, p] == 0:
-                Q = first_rotation(H)
-            else:
-                Q = last_rotation(H)
-        else:
-            Q = first_rotation(H)
-        return Q
+        return rotation_of(law_of(body, world, p), H)
 
     @wp.func
     def stress(body: Solid, world: int, p: int, H: mat, Q: mat) -> mat:
         """Kirchhoff stress τ [Pa]."""
-        tau = mat()
-        if wp.static(mixed):
-            if body.law[world, p] == 0:
-                tau = first(H, Q, body.mu[world, p], body.lam[world, p])
-            else:
-                tau = last(H, Q, body.mu[world, p], body.lam[world, p])
-        else:
-            tau = first(H, Q, body.mu[world, p], body.lam[world, p])
+        tau = stress_of(law_of(body, world, p), H, Q, body.mu[world, p], body.lam[world, p])
         if wp.static(slots > 0):
             for slot in range(slots):
                 k = body.muscle[world, p, slot]
@@ -55,26 +67,51 @@ def solid(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(rotation=rotation, stress=stress)
 
 
+def _law_of(spec: Spec) -> wp.Function:
+    """Index of a particle's law into ``spec.laws``; a scene of one law does not store it."""
+    Solid = solid_types(spec).Solid
+    if len(spec.laws) == 1:
+
+        @wp.func
+        def law_of(body: Solid, world: int, p: int) -> int:
+            return 0
+    else:
+
+        @wp.func
+        def law_of(body: Solid, world: int, p: int) -> int:
+            return body.law[world, p]
+
+    return law_of
+
+
 @once
 def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    mat, Solid, SolidAdj = t.mat, solid_types(spec).Solid, solid_adj_type(spec, wanted)
-    laws, fibres = elasticity(spec.dim, spec.dtype), muscle(spec.dim, spec.dtype)
-    first_adj, last_adj = laws.stress_adj[spec.laws[0]], laws.stress_adj[spec.laws[-1]]
-    muscle_stress_adj, ElasticAdj = fibres.muscle_stress_adj, laws.Adj
-    mixed, slots = len(spec.laws) > 1, spec.muscle_slots
+    real, mat, Solid, SolidAdj = t.real, t.mat, solid_types(spec).Solid, solid_adj_type(spec, wanted)
+    laws, fibres, law_of = elasticity(spec.dim, spec.dtype), muscle(spec.dim, spec.dtype), _law_of(spec)
+    muscle_stress_adj, ElasticAdj, slots = fibres.muscle_stress_adj, laws.Adj, spec.muscle_slots
+
+    def stress_adj_from(k: int) -> wp.Function:
+        """Adjoint of τ by the laws from number ``k`` on."""
+        own, last = laws.stress_adj[spec.laws[k]], k + 1 == len(spec.laws)
+        others = None if last else stress_adj_from(k + 1)
+
+        @wp.func
+        def stress_adj_of(law: int, H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
+            if wp.static(not last):
+                if law != k:
+                    return others(law, H, Q, mu, lam, adj_tau)
+            return own(H, Q, mu, lam, adj_tau)
+
+        return stress_adj_of
+
+    stress_adj_of = stress_adj_from(0)
 
     @wp.func
     def stress_adj(body: Solid, world: int, p: int, H: mat, Q: mat, adj_tau: mat, adj_body: SolidAdj) -> mat:
         """∂L/∂F; adds what is wanted of the material and of the muscles' pull into ``adj_body``."""
-        adj = ElasticAdj()
-        if wp.static(mixed):
-            if body.law[world, p] == 0:
-                adj = first_adj(H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
-            else:
-                adj = last_adj(H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
-        else:
-            adj = first_adj(H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
+        law = law_of(body, world, p)
+        adj = stress_adj_of(law, H, Q, body.mu[world, p], body.lam[world, p], adj_tau)
         adj_F = adj.F
         if wp.static(wanted.material):
             adj_body.mu[world, p] = adj_body.mu[world, p] + adj.mu

@@ -18,7 +18,8 @@ def numpy_stress(law: str, F: np.ndarray, mu=MU, lam=LAM) -> np.ndarray:
     J, eye = np.linalg.det(F), np.eye(len(F))
     if law == "neo_hookean":
         return mu * (F @ F.T - eye) + lam * np.log(J) * eye
-    return 2 * mu * (F - svd_rotation(F)) @ F.T + lam * (J - 1) * J * eye
+    pressure = {"fixed_corotated": (J - 1) * J, "barrier_corotated": (J**2 - J**-2) / 4}[law]
+    return 2 * mu * (F - svd_rotation(F)) @ F.T + lam * pressure * eye
 
 
 def points(dim: int, law: str) -> dict[str, torch.Tensor]:
@@ -36,14 +37,14 @@ def arguments(law: str, dim: int, dtype: str, H: torch.Tensor):
     return (H.to(real), t.mat), (Q, t.mat), (mu, t.real), (lam, t.real)
 
 
-LAWS = ["neo_hookean", "fixed_corotated"]
+LAWS = ["neo_hookean", "fixed_corotated", "barrier_corotated"]
 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("dtype, limit", [("float64", 1e-13), ("float32", 2e-6)])
 def test_stress_is_the_law(law, dim, dtype, limit, device):
-    """τ of (E1) and (E2), at every special point."""
+    """τ of (E1) to (E3), at every special point."""
     given, mat = points(dim, law), types(dim, dtype).mat
     H = torch.stack(list(given.values())).to(device) - torch.eye(dim, dtype=torch.float64, device=device)
     got = (
