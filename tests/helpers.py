@@ -7,7 +7,11 @@ import softmpm
 from softmpm.horizon import Horizon
 from softmpm.memory import plan
 
-LAWS = {"neo_hookean": softmpm.NeoHookean, "fixed_corotated": softmpm.FixedCorotated}
+LAWS = {
+    "neo_hookean": softmpm.NeoHookean,
+    "fixed_corotated": softmpm.FixedCorotated,
+    "barrier_corotated": softmpm.BarrierCorotated,
+}
 KINDS = {
     "single precision": dict(scheme="fast"),
     "double precision": dict(scheme="fast", dtype=torch.float64),

@@ -7,13 +7,24 @@ differentiable in the start, the activation and the material:
     end = softmpm.simulate(model, model.rest(), activation, model.params(), substeps=20)
 """
 
+from softmpm.alarms import Alarms, Failures
 from softmpm.autograd import rasterize, simulate
 from softmpm.graph import Graph
 from softmpm.model import Model, build
 from softmpm.playback import Recording
 from softmpm.recording import Recorder
 from softmpm.rerun_file import to_rerun
-from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm.scene import (
+    BarrierCorotated,
+    Body,
+    FixedCorotated,
+    Grid,
+    Muscle,
+    NeoHookean,
+    Particles,
+    Scene,
+    Wall,
+)
 from softmpm.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import GridField, Low, Params, State
@@ -21,7 +32,10 @@ from softmpm.tape import WarpSolid, WarpState, step, torch_state, warp_solid, wa
 from softmpm.watch import UnstableError
 
 __all__ = [
+    "Alarms",
+    "BarrierCorotated",
     "Body",
+    "Failures",
     "FixedCorotated",
     "Graph",
     "Grid",

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from softmpm.buffers import slot, view
 from softmpm.failures import Report
+from softmpm.kernels.alarm import packed_alarms
 from softmpm.kernels.native import FEW
 from softmpm.kernels.sorting import sorting
 from softmpm.kernels.types import types
@@ -37,6 +38,7 @@ class Arrangement:
 
     Attributes:
         order: Particle at each place, shape (world, particle), int32.
+        neighbours: Places of its neighbours at rest, of the particle at each place; Warp array (world, particle, at most dim).
         origin: First node of the window, shape (world, dim), int32.
         shape: Nodes of the window along each axis.
         version: How often it was renewed.
@@ -57,6 +59,9 @@ class Arrangement:
         self.order = integers(model.worlds, model.particle_count)
         self.origin = integers(model.worlds, model.dim)
         self._key = torch.empty_like(self.order)
+        by_place = integers(model.worlds, *model.neighbours.shape)
+        self.neighbours = view(by_place, wp.int32)
+        self._arrange = self._arranging(by_place)
         self._ends = integers(2, model.worlds, model.dim)
         self._find = self._finding()
         grid = model.scene.grid.shape
@@ -81,6 +86,19 @@ class Arrangement:
         places, found = [slot(model, t.vec) for _ in range(2)], (self._key, *self._ends)
         inputs = (model.scale, up, *places, *(view(tensor, wp.int32) for tensor in found))
         return Command(model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places)
+
+    def _arranging(self, by_place: Tensor) -> list[Command]:
+        """Put the neighbours at rest into the order of the particles."""
+        model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
+        if by_place.shape[2] == 0:
+            return []
+        places, order = view(torch.empty_like(self.order), wp.int32), view(self.order, wp.int32)
+        invert, arrange = sorting(t.dim, model.spec.dtype).invert, packed_alarms(model.spec).arrange
+        given = (order, places, view(model.neighbours, wp.int32), self.neighbours)
+        return [
+            Command(model, invert, self.order.shape, (order, places), ()),
+            Command(model, arrange, self.order.shape, given, ()),
+        ]
 
     def _centring(self) -> Command:
         """Puts the window around that box."""
@@ -108,7 +126,8 @@ class Arrangement:
         self._locate(x)
         key, order = torch.sort(self._key, dim=1, stable=True)
         self.order.copy_(order)
-        self._centre(stream_of(model.device))
+        for command in (self._centre, *self._arrange):
+            command(stream_of(model.device))
         if not recording(model):
             cell = key // 2
             self._fresh = Report(model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from softmpm.alarms import Failures
 from softmpm.buffers import Solid, lame
 from softmpm.checks import (
     check_activation,
@@ -36,7 +37,13 @@ _opaque: Any = torch.compiler.disable
 
 
 def simulate(
-    model: Model, start: State, activation: Tensor | None, params: Params, *, substeps: int
+    model: Model,
+    start: State,
+    activation: Tensor | None,
+    params: Params,
+    *,
+    substeps: int,
+    failures: Failures | None = None,
 ) -> State:
     """Advance a soft robot, differentiably.
 
@@ -51,6 +58,7 @@ def simulate(
             to (world, particle). Differentiable. Tensors without gradient that come again are taken as unchanged unless
             PyTorch counted a write, which it does not where ``.data``, NumPy or Warp write into them: hand over others then.
         substeps: Substeps of ``model.scene.dt`` [s] for each row of ``activation``.
+        failures: Counts the failures of single worlds, whose state is frozen or reset meanwhile; None raises the first.
 
     Returns:
         State after ``control_step * substeps * dt`` seconds, in new tensors.
@@ -58,17 +66,25 @@ def simulate(
     Raises:
         TypeError: ``model`` is something else.
         ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
-        UnstableError: A particle became non-finite, inverted or left the grid; names world, particle, substep and limit.
+        UnstableError: A particle became non-finite, collapsed or left the grid, a body tore, or dt is above the running stable
+            step (:class:`softmpm.Alarms`); names world, particle, substep and limit.
         torch.OutOfMemoryError: With a note on what the call takes. The backward pass may raise it and UnstableError as well.
     """
-    return _simulate(model, start, activation, params, substeps)
+    return _simulate(model, start, activation, params, substeps, failures)
 
 
 @_opaque
-def _simulate(model: Model, start: State, activation: Tensor | None, params: Params, substeps: int) -> State:
+def _simulate(
+    model: Model,
+    start: State,
+    activation: Tensor | None,
+    params: Params,
+    substeps: int,
+    failures: Failures | None,
+) -> State:
     if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
         with torch.inference_mode(False), torch.no_grad():
-            return _simulate(model, start, activation, params, substeps)
+            return _simulate(model, start, activation, params, substeps, failures)
     _check_model(model, "simulate")
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
@@ -87,9 +103,9 @@ def _simulate(model: Model, start: State, activation: Tensor | None, params: Par
     low = start.low or (None, None)
     inputs = (pull, mu, lam, mass, *start)
     needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
-    keep = _Kept() if needed else None
+    call = _Call(needed, failures)
     simulated: Any = _Simulate.apply if needed or _followed(inputs) else _Simulate.forward
-    end = simulated(model, Horizon(control_steps, substeps), keep, *inputs, *low)
+    end = simulated(model, Horizon(control_steps, substeps), call, *inputs, *low)
     state = State(*end[:4])
     return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
 
@@ -181,29 +197,29 @@ def _cast(model: Model, value: Any) -> Any:
     return cast.with_low(value.low) if isinstance(value, State) else cast
 
 
-class _Kept:
-    """Takes what a call keeps from its forward to its backward pass: not tensors, which PyTorch would want to track."""
+class _Call:
+    """What belongs to one call and is no tensor, which PyTorch would want to track; takes what its backward pass needs."""
 
-    trail: Trail | None = None
+    def __init__(self, differentiable: bool, failures: Failures | None):
+        self.differentiable, self.failures = differentiable, failures
+        self.trail: Trail | None = None
 
 
 class _Simulate(torch.autograd.Function):
     @staticmethod
     def forward(*inputs):
         # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
-        model, horizon, keep, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
+        model, horizon, call, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
         start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
-        solid, needed = Solid(mass, mu, lam, pull), keep is not None
+        solid, needed = Solid(mass, mu, lam, pull), call.differentiable
         with short_of_memory(model, horizon, needed):
-            end, trail = rollout(model, horizon, start, pull, solid, needed)
-        if keep is not None:
-            keep.trail = trail
+            end, call.trail = rollout(model, horizon, start, pull, solid, needed, call.failures)
         return (*end, *(end.low or (None, None)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.model, ctx.horizon, keep, *tensors = inputs
-        ctx.trail = None if keep is None else keep.trail
+        ctx.model, ctx.horizon, call, *tensors = inputs
+        ctx.trail = call.trail
         ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place

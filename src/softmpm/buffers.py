@@ -47,11 +47,11 @@ def slot(model: Model, dtype, *size: int):
     return passing(torch.empty(shape, dtype=kind, device="meta"), dtype)
 
 
-def slots_in(struct, names: Sequence[str], model: Model, dtype) -> list:
-    """Make fields of a struct slots."""
+def slots_in(struct, names: Sequence[str], model: Model, dtype, *size: int) -> list:
+    """Make fields of a struct slots, of the size that :func:`slot` takes."""
     held = struct.__ctype__()
     for name in names:
-        setattr(held, name, slot(model, dtype))
+        setattr(held, name, slot(model, dtype, *size))
     return [getattr(held, name) for name in names]  # they lie in the struct's own memory
 
 

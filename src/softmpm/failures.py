@@ -3,12 +3,11 @@
 import torch
 from torch import Tensor
 
+from softmpm.buffers import Solid
+from softmpm.explain import Case
 from softmpm.model import Model
-from softmpm.scene import NeoHookean
 from softmpm.state import State
-from softmpm.watch import NEVER, Kind, UnstableError, decode
-
-HOOKEAN = "a neo-Hookean particle needs det F > 0"
+from softmpm.watch import FROZEN, NEVER, Kind, UnstableError, decode
 
 
 class Report:
@@ -34,48 +33,67 @@ class Report:
 
 def outgrown(words: list[int]) -> bool:
     """Whether a particle left the part of the grid that is in memory."""
-    return any(word != NEVER and decode(word)[1] is Kind.LEFT_WINDOW for word in words)
+    return any(decode(words[world])[1] is Kind.LEFT_WINDOW for world in failed_worlds(words))
 
 
-def raise_failure(
-    model: Model, words: list[int], end: State, first: int = 0, start: State | None = None
-) -> None:
-    """Raise what the kernels reported, if anything.
+def failed_worlds(words: list[int]) -> list[int]:
+    """Worlds whose word reports something."""
+    return [world for world, word in enumerate(words) if word not in (NEVER, FROZEN)]
+
+
+def failure(
+    model: Model,
+    words: list[int],
+    world: int,
+    end: State,
+    *,
+    first: int = 0,
+    start: State | None = None,
+    solid: Solid | None = None,
+    pull: Tensor | None = None,
+    state: State | None = None,
+    before: bool = False,
+) -> UnstableError:
+    """The failure of a world as an error.
 
     Args:
         words: One for each world.
         end: State in which the worlds stopped.
         first: Substep of the call that the kernels counted as 0.
-        start: State of the call before it, if it is at hand: looked at for what was wrong from the beginning.
+        start: State of the call before it, if it is at hand: for worlds that never ran.
+        solid, pull: Material, and activation times strength of each world and muscle [Pa], if they are at hand.
+        state: What the error holds as its state; ``end`` if None.
+        before: Whether the start itself was checked, before any substep.
     """
-    failed = [world for world, word in enumerate(words) if word != NEVER]
-    if not failed:
-        return
-    world = min(failed, key=lambda w: words[w])
     substep, kind, particle = decode(words[world])
     substep += first
     if start is not None:
-        end = _never_ran(end, start, [w for w in failed if decode(words[w])[1] is Kind.START])
-    if substep == 0 and start is not None and (inverted := _inverted(model, start, world)) is not None:
-        kind, particle = Kind.START, inverted
-        advice = "Start from a deformation gradient F that is not inverted."
-        value, limit = f"is inverted, det F = {_det(start, world, particle):.4g}", HOOKEAN
-    else:
-        value, limit, advice = _explain(model, kind, world, particle, end)
+        unmoved = [w for w in failed_worlds(words) if decode(words[w])[1] is Kind.START]
+        end, state = (None if s is None else _never_ran(s, start, unmoved) for s in (end, state))
+        assert end is not None
+    name, value, limit, advice = Case(model, kind, world, particle, end, solid, pull).explain()
     where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
     time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
-    others = f" ({len(failed) - 1} more world(s) failed too.)" if len(failed) > 1 else ""
-    when = "in the start state" if kind is Kind.START else f"at {time}"
-    raise UnstableError(
+    more = len(failed_worlds(words)) - 1
+    others = f" ({more} more world(s) failed too.)" if more else ""
+    when = "in the start state" if kind is Kind.START or before else f"at {time}"
+    return UnstableError(
         f"{where} {value} {when}; {limit}. {advice}{others}",
-        kind=kind,
+        kind=name,
         world=world,
         particle=particle,
         substep=substep,
         value=value,
         limit=limit,
-        state=end,
+        state=end if state is None else state,
     )
+
+
+def raise_failure(model: Model, words: list[int], end: State, **about) -> None:
+    """Raise what the kernels reported first, if anything; ``about`` as for :func:`failure`."""
+    failed = failed_worlds(words)
+    if failed:
+        raise failure(model, words, min(failed, key=lambda world: words[world]), end, **about)
 
 
 def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last: int, total: int) -> None:
@@ -101,7 +119,7 @@ def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last:
     raise UnstableError(
         f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite at substep "
         f"{substep} of {total}, counted from the start of the call; {limit}. {cause}.",
-        kind=kind,
+        kind=kind.name.lower(),
         world=world,
         particle=particle,
         substep=substep,
@@ -118,46 +136,3 @@ def _never_ran(end: State, start: State, worlds: list[int]) -> State:
     for tensor, from_start in zip(given, start, strict=True):
         tensor[worlds] = from_start.detach()[worlds]
     return State(*given)
-
-
-def _explain(model: Model, kind: Kind, world: int, particle: int, end: State) -> tuple[str, str, str]:
-    """What came, what must hold, what to do."""
-    dx = model.scene.grid.spacing
-    low = 0.5 * dx
-    high = tuple((n - 1.5) * dx for n in model.scene.grid.shape)
-    box = "a particle must stay in " + " x ".join(f"[{low:.4g}, {h:.4g})" for h in high) + " m"
-    smaller = "Use a smaller dt (about half of softmpm.stable_dt), a weaker activation, or a softer material."
-    x = end.x[world, particle].tolist()
-    if kind is Kind.LEFT_GRID or (
-        kind is Kind.START and not all(low <= c < h for c, h in zip(x, high, strict=True))
-    ):
-        away = max(max(low - c, c - h) for c, h in zip(x, high, strict=True))
-        thrown = kind is Kind.LEFT_GRID and not away <= dx  # it was on the grid a substep before
-        larger = "Make the grid larger, add walls, or start further inside."
-        return (
-            f"is at {_numbers(x)} m, off the grid",
-            box,
-            f"It was thrown out. {smaller}" if thrown else larger,
-        )
-    if kind is Kind.INVERTED:
-        return f"is inverted, det F = {_det(end, world, particle):.4g}", HOOKEAN, smaller
-    bad = [name for name in "xvCF" if not bool(torch.isfinite(getattr(end, name)[world, particle]).all())]
-    what = f"has a value in {', '.join(bad)} that is not finite" if bad else "has values too large to square"
-    advice = "Start from other values." if kind is Kind.START else smaller
-    return what, "every value must be finite, and its square", advice
-
-
-def _det(state: State, world: int, particle: int) -> float:
-    return torch.linalg.det(state.F[world, particle].double()).item()
-
-
-def _inverted(model: Model, start: State, world: int) -> int | None:
-    """The first neo-Hookean particle of a start that is inverted."""
-    laws = [isinstance(body.material, NeoHookean) for body in model.scene.bodies]
-    hookean = torch.tensor(laws, device=model.device)[model.body]
-    bad = ((torch.linalg.det(start.F[world].double()) <= 0) & hookean).nonzero()
-    return int(bad[0]) if len(bad) else None
-
-
-def _numbers(values) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

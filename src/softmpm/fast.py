@@ -9,6 +9,7 @@ from torch import Tensor
 from softmpm.arrangement import Arrangement
 from softmpm.between import SortedAdj, SortedState, Unpacking
 from softmpm.buffers import Solid, SolidAdj
+from softmpm.checkup import StartCheck
 from softmpm.horizon import Chunk
 from softmpm.kernels.types import Wanted
 from softmpm.memory import LONGEST
@@ -117,11 +118,12 @@ class FastRun:
         pull: Tensor | None,
         solid: Solid,
         keep: bool,
+        frozen: list[int],
     ):
         self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
         self._lease = _Lease(pool, chunk, keep)
         program = self._lease.pair.program
-        program.run(start, pull, solid)
+        program.run(start, pull, solid, frozen)
         self.end = SortedState(pool.unpacking, program.base[-1], program.rows[-1], program.order, self._lease)
         self.words = program.words
 
@@ -143,16 +145,32 @@ class Fast:
         self.model = model
         self._pool: Pool | None = None
         self._unpacking = Unpacking(model)
+        self._start_check: StartCheck | None = None
         self._widened = False  # the window was just put around the start of the chunk that comes next
         # Substeps of the graph that is being recorded since it last renewed the order:
         self._recorded = LONGEST
 
     def run(
-        self, chunk: Chunk, start: State | SortedState, pull: Tensor | None, solid: Solid, keep: bool
+        self,
+        chunk: Chunk,
+        start: State | SortedState,
+        pull: Tensor | None,
+        solid: Solid,
+        keep: bool,
+        frozen: list[int],
     ) -> FastRun:
         renewed = self._arrange(start, chunk)
         assert self._pool is not None
-        return FastRun(self._pool, renewed, chunk, start, pull, solid, keep)
+        return FastRun(self._pool, renewed, chunk, start, pull, solid, keep, frozen)
+
+    def start_check(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
+        """Words of the check of a start, which the next one overwrites."""
+        if self._start_check is None or recording(self.model):
+            check = StartCheck(self.model)
+            if recording(self.model):
+                return check(start, pull, solid)
+            self._start_check = check
+        return self._start_check(start, pull, solid)
 
     def _arrange(self, start: State | SortedState, chunk: Chunk) -> bool:
         """See to it that there is an arrangement fit for use; whether it was made for this start."""

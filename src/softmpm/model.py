@@ -9,16 +9,22 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from softmpm.alarms import Alarms
 from softmpm.checks import check_scene, check_whole
 from softmpm.description import describe
 from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
 from softmpm.memory import MARGIN, Sizes, default_budget, longest_chunk, price_of_chunk, window_shape
-from softmpm.scene import FixedCorotated, NeoHookean, Scene
-from softmpm.stability import warn_sparse, warn_unstable
+from softmpm.neighbours import rest_neighbours
+from softmpm.scene import BarrierCorotated, FixedCorotated, Material, NeoHookean, Scene
+from softmpm.stability import need_stable, warn_sparse
 from softmpm.state import Low, Params, State
 
-LAWS = {NeoHookean: "neo_hookean", FixedCorotated: "fixed_corotated"}
+LAWS = {
+    NeoHookean: "neo_hookean",
+    FixedCorotated: "fixed_corotated",
+    BarrierCorotated: "barrier_corotated",
+}
 
 logger = logging.getLogger("softmpm")
 
@@ -32,6 +38,7 @@ def build(
     scheme: str = "auto",
     deterministic: bool = False,
     calls: int = 1,
+    alarms: Alarms | None = None,
 ) -> "Model":
     """Make a scene ready to run.
 
@@ -48,12 +55,14 @@ def build(
             scheme. The CPU adds in one order anyway. See docs/conventions.md.
         calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
             budget. If there are more, they keep more.
+        alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
 
     Returns:
         The model: immutable, shared by any number of simulations.
 
     Raises:
-        ValueError: The scene breaks a rule; the message says which, what came and what to do.
+        ValueError: The scene breaks a rule, or its dt is above :func:`softmpm.stable_dt`; the message says which, what came and
+            what to do.
     """
     check_scene(scene)
     if dtype not in (torch.float32, torch.float64):
@@ -67,9 +76,14 @@ def build(
         memory_budget = int(memory_budget)
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
-    warn_unstable(scene)
+    alarms = Alarms() if alarms is None else alarms
+    if not isinstance(alarms, Alarms):
+        raise TypeError(f"alarms must be a softmpm.Alarms or None, got {type(alarms).__name__}.")
+    if alarms.step is not None:
+        need_stable(scene, alarms.step)
     warn_sparse(scene)
-    return Model(scene, _device(device), dtype, int(worlds), memory_budget, scheme, deterministic, int(calls))
+    settings = dict(memory_budget=memory_budget, scheme=scheme, deterministic=deterministic)
+    return Model(scene, _device(device), dtype, int(worlds), **settings, calls=int(calls), alarms=alarms)
 
 
 def _device(device: str | torch.device | None) -> torch.device:
@@ -98,6 +112,8 @@ class Model:
         device, dtype: Where it runs and in which precision.
         worlds, particle_count, muscle_count, dim: Sizes.
         calls: How many calls of ``simulate`` share the memory budget.
+        alarms: Limits beyond which a simulation is stopped.
+        neighbours: Neighbours at rest of each particle, -1 for none, shape (particle, at most dim).
         positions: Rest positions X [m], shape (particle, dim).
         volume: Rest volumes V⁰ [m³], shape (particle,).
         mass: Mass [kg] as the scene gives it, shape (particle,).
@@ -116,9 +132,10 @@ class Model:
         scheme: str,
         deterministic: bool,
         calls: int,
+        alarms: Alarms,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
-        self.memory_budget, self.calls = memory_budget, calls
+        self.memory_budget, self.calls, self.alarms = memory_budget, calls, alarms
         self.dim = scene.grid.dim
         sizes = [len(body.particles) for body in scene.bodies]
         self.particle_count = sum(sizes)
@@ -135,7 +152,7 @@ class Model:
         self.muscle_slots = torch.from_numpy(slots).to(device)
         self.fibre = self._tensor([m.direction for m in scene.muscles]).reshape(-1, self.dim)
         self.strength = self._tensor([m.strength for m in scene.muscles])
-        laws = np.array([self.spec.laws.index(LAWS[type(b.material)]) for b in scene.bodies], dtype=np.int32)
+        laws = np.array([self.spec.laws.index(_law(b.material)) for b in scene.bodies], dtype=np.int32)
         self.law = torch.from_numpy(np.repeat(laws, sizes)).to(device)
         # Made now, not when first asked for: that may be while a graph is recorded, which runs nothing.
         self._params, self._low = self._given(), self._rounded() if dtype == torch.float32 else None
@@ -143,6 +160,7 @@ class Model:
         wp.init()
         self.wp_device = wp.device_from_torch(device)
         self.scale, self.walls = self._scale(), self._walls()
+        self.neighbours = self._neighbours()
 
     def _tensor(self, values) -> Tensor:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
@@ -155,7 +173,19 @@ class Model:
         scale.spacing = scale.exact_spacing = scene.grid.spacing
         scale.gravity = t.vec(*(scene.gravity or ()))
         scale.decay = math.exp(-scene.damping * scene.dt)
+        survives = all(body.material.survives_inversion for body in scene.bodies)
+        alarms, least = self.alarms, -math.inf if survives else 0.0
+        scale.collapse = (least if alarms.collapse is None else alarms.collapse) - 1.0
+        scale.gap = math.inf if alarms.gap is None else alarms.gap**2
+        scale.step = math.inf if alarms.step is None else alarms.step**2
         return scale
+
+    def _neighbours(self) -> Tensor:
+        """Neighbours at rest of each particle, -1 for none, shape (particle, dim); without a column if nobody looks at them."""
+        if self.alarms.gap is None:
+            return torch.empty(self.particle_count, 0, dtype=torch.int32, device=self.device)
+        longest = self.alarms.gap * self.scene.grid.spacing
+        return torch.from_numpy(rest_neighbours(self.scene, longest)).to(self.device)
 
     def _walls(self):
         walls, given = solid_types(self.spec).Walls(), self.scene.walls
@@ -280,8 +310,17 @@ def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
     return slots
 
 
+def _law(material: Material) -> str:
+    if type(material) not in LAWS:
+        known = ", ".join(kind.__name__ for kind in LAWS)
+        raise TypeError(
+            f"no kernel has the law {type(material).__name__}; a material must be one of {known}."
+        )
+    return LAWS[type(material)]
+
+
 def _spec(scene: Scene, dtype: torch.dtype, slots: int, fixed_point: bool) -> Spec:
-    laws = {LAWS[type(body.material)] for body in scene.bodies}
+    laws = {_law(body.material) for body in scene.bodies}
     return Spec(
         dim=scene.grid.dim,
         dtype=str(dtype).removeprefix("torch."),

@@ -4,12 +4,13 @@ import torch
 from torch import Tensor
 
 from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj, clear
+from softmpm.checkup import StartCheck, armed, check_end
 from softmpm.horizon import Chunk
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
 from softmpm.state import State
 from softmpm.step import Substep
-from softmpm.watch import NEVER
+from softmpm.watch import FROZEN, NEVER
 
 
 class PlainRun:
@@ -21,7 +22,14 @@ class PlainRun:
     """
 
     def __init__(
-        self, model: Model, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool
+        self,
+        model: Model,
+        chunk: Chunk,
+        start: State,
+        pull: Tensor | None,
+        solid: Solid,
+        keep: bool,
+        frozen: list[int],
     ):
         self.model, self.chunk, self.start, self.pull = model, chunk, start, pull
         self.row = None if pull is None else torch.empty_like(pull[0])
@@ -29,6 +37,7 @@ class PlainRun:
         self._solid = solid  # the structs only see its tensors
         self.states = Motion.empty(model, chunk.length + 1 if keep else 2)
         self.slots = [self.states[i].struct(model) for i in range(len(self.states.base))]
+        self.step.watch_words[frozen] = FROZEN
         self.step.enter(start, self.slots[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
@@ -36,6 +45,8 @@ class PlainRun:
                 self._drive(s)
             self.step.advance(self.slots[now], self.slots[then], s)
         self.end = self.step.leave(self.slots[chunk.length if keep else chunk.length % 2])
+        if armed(model):
+            check_end(model, self.step.solid, self.end, self.step.watch, chunk.length - 1)
         self.words = self.step.watch_words
 
     def _drive(self, s: int) -> None:
@@ -71,5 +82,10 @@ class Plain:
     def __init__(self, model: Model):
         self.model = model
 
-    def run(self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool) -> PlainRun:
-        return PlainRun(self.model, chunk, start, pull, solid, keep)
+    def run(
+        self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool, frozen: list[int]
+    ) -> PlainRun:
+        return PlainRun(self.model, chunk, start, pull, solid, keep, frozen)
+
+    def start_check(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
+        return StartCheck(self.model)(start, pull, solid)

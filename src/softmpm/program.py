@@ -6,6 +6,7 @@ its end.
 """
 
 import functools
+from collections.abc import Sequence
 
 import torch
 import warp as wp
@@ -14,8 +15,10 @@ from torch import Tensor
 from softmpm.arrangement import Arrangement
 from softmpm.between import SortedState
 from softmpm.buffers import Solid, passing, slot, slots_in, view
+from softmpm.checkup import armed
 from softmpm.exact import Exact
 from softmpm.horizon import Chunk
+from softmpm.kernels.alarm import packed_alarms
 from softmpm.kernels.fused import fused
 from softmpm.kernels.native import BLOCK, FEW, VERY_FEW, WARP, padded
 from softmpm.kernels.packing import packing
@@ -26,7 +29,7 @@ from softmpm.model import Model
 from softmpm.replay import Command, Launcher, Replay, recording
 from softmpm.state import State
 from softmpm.step import stream_of
-from softmpm.watch import NEVER
+from softmpm.watch import FROZEN, NEVER
 
 
 class Program:
@@ -168,8 +171,14 @@ class Program:
         warps = -(-self.total // crew)
         return -(-warps * WARP // self.block) * self.block
 
-    def run(self, start: State | SortedState, pull: Tensor | None, solid: Solid) -> None:
-        """All substeps from ``start``; the end is the last of :attr:`base` and :attr:`rows`. Failures are in :attr:`words`."""
+    def run(
+        self, start: State | SortedState, pull: Tensor | None, solid: Solid, frozen: Sequence[int] = ()
+    ) -> None:
+        """All substeps from ``start``; the end is the last of :attr:`base` and :attr:`rows`. Failures are in :attr:`words`.
+
+        Args:
+            frozen: Worlds that stay as they are.
+        """
         stream = stream_of(self.model.device)
         moved = recording(self.model) or self._version != self.arrangement.version
         if moved:
@@ -177,6 +186,8 @@ class Program:
             self.order.copy_(self.arrangement.order)
             self.origin.copy_(self.arrangement.origin)
         self.calm()
+        if frozen:
+            self.words[list(frozen)] = FROZEN
         if self.pull is not None and pull is not None:
             self.pull.copy_(pull)
         if not self._has(solid):
@@ -208,8 +219,8 @@ class Program:
         return packing(self.model.spec.dim, self.model.spec.dtype)
 
     def _launch_all(self, launch: Launcher) -> None:
-        nodes, length, kernels = self.node_arrays, self.chunk.length, fused(self.model.spec)
-        held = len(self.velocity)
+        model, nodes, length = self.model, self.node_arrays, self.chunk.length
+        kernels, held = fused(model.spec), len(self.velocity)
         launch(kernels.clear, held, self.velocity_array, block_dim=BLOCK)
         if self.exact is None:
             launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
@@ -218,12 +229,16 @@ class Program:
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
             if self.exact is not None:
                 now, then = self.exact.sums(s), self.nothing
-            arguments = (self.model.scale, self.model.walls, self.window, now, self.velocity_array, then)
+            arguments = (model.scale, model.walls, self.window, now, self.velocity_array, then)
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
-        survey = sorting(self.types.dim, self.model.spec.dtype).survey
-        arguments = (self.model.scale, self.window, self.model.particle_count, self.packed[-1].base)
+        survey = sorting(self.types.dim, model.spec.dtype).survey
+        arguments = (model.scale, self.window, model.particle_count, self.packed[-1].base)
         launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
+        if armed(model):
+            sizes = (length - 1, model.particle_count, self.total, self.order_flat)
+            given = (model.scale, self.solid(length - 1), self.arrangement.neighbours, *sizes)
+            launch(packed_alarms(model.spec).check, self.total, *given, self.packed[-1], self.watch)
 
     def _begin(self, launch: Launcher) -> None:
         """P2G of the first substep."""

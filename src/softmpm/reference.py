@@ -6,11 +6,12 @@ Derivations and labels: docs/math/.
 
 import itertools
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from softmpm.scene import FixedCorotated, Scene, Wall
+from softmpm.scene import BarrierCorotated, FixedCorotated, Material, NeoHookean, Scene, Wall
 from softmpm.state import GridField, Params, State
 
 
@@ -74,6 +75,59 @@ def fixed_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     return 2 * mu[..., None, None] * (F - polar(F)) @ F.mT + (lam * (J - 1) * J)[..., None, None] * eye
 
 
+def barrier_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Kirchhoff stress τ = 2μ(F − R)Fᵀ + λ/4 (J² − J⁻²) I [Pa] (E3)."""
+    eye, J = torch.eye(F.shape[-1], dtype=F.dtype), _det(F)
+    pressure = lam / 4 * (J**2 - J**-2)
+    return 2 * mu[..., None, None] * (F - polar(F)) @ F.mT + pressure[..., None, None] * eye
+
+
+LAWS = {NeoHookean: neo_hookean, FixedCorotated: fixed_corotated, BarrierCorotated: barrier_corotated}
+
+
+def _law(material: Material) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    if type(material) not in LAWS:
+        raise TypeError(f"the reference has no law {type(material).__name__}; add its stress to LAWS.")
+    return LAWS[type(material)]
+
+
+def tangent(material: Material, F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Stiffness of the law against velocity gradients, A[G] = d/dε τ((I + εG) F) (W3) [Pa].
+
+    Args:
+        material: Whose law it is; its numbers play no part.
+        F: Deformation gradients, shape (..., dim, dim), float64.
+        mu, lam: Lamé's constants [Pa], shape (...).
+
+    Returns:
+        ⟨E_k, A[E_l]⟩ for the symmetric basis of :func:`strains`, shape (..., k, l).
+    """
+    basis = strains(F.shape[-1])
+    with torch.enable_grad():
+        each = F.detach().unsqueeze(-3).expand(*F.shape[:-2], *basis.shape).clone().requires_grad_()
+        tau = _law(material)(each, mu[..., None], lam[..., None])
+        (adj_F,) = torch.autograd.grad((tau * basis).sum(), each)
+    adj_G = adj_F @ F.unsqueeze(-3).mT
+    return torch.einsum("...kij,lij->...kl", adj_G, basis)
+
+
+def muscle_tangent(F: Tensor, direction: Tensor) -> Tensor:
+    """The same for a muscle of unit pull: A[G] = G f fᵀ + f fᵀ Gᵀ with f = F d."""
+    basis, f = strains(F.shape[-1]), (F @ direction[..., None])[..., 0]
+    pulled = basis @ (f[..., :, None] * f[..., None, :]).unsqueeze(-3)
+    return torch.einsum("kij,...lij->...kl", basis, pulled + pulled.mT)
+
+
+def strains(dim: int) -> Tensor:
+    """Orthonormal basis of the symmetric matrices, shape (k, dim, dim), float64."""
+    basis = []
+    for i, j in itertools.combinations_with_replacement(range(dim), 2):
+        strain = torch.zeros(dim, dim, dtype=torch.float64)
+        strain[i, j] = strain[j, i] = 1.0 if i == j else math.sqrt(0.5)
+        basis.append(strain)
+    return torch.stack(basis)
+
+
 def _det(F: Tensor) -> Tensor:
     """det F by its polynomial, whose derivative also exists at det F = 0."""
     if F.shape[-1] == 2:
@@ -92,8 +146,7 @@ def stress(scene: Scene, F: Tensor, mu: Tensor, lam: Tensor, activation: Tensor 
     parts, start = [], 0
     for body in scene.bodies:
         part = slice(start, start + len(body.particles))
-        law = fixed_corotated if isinstance(body.material, FixedCorotated) else neo_hookean
-        parts.append(law(F[:, part], mu[:, part], lam[:, part]))
+        parts.append(_law(body.material)(F[:, part], mu[:, part], lam[:, part]))
         start = part.stop
     tau = torch.cat(parts, 1)
     if activation is not None:
@@ -172,6 +225,8 @@ def respond(wall: Wall, v: Tensor) -> Tensor:
     v_t = v - v_n * n
     if wall.contact == "slip":
         return v_t
+    if wall.contact != "separate":
+        raise ValueError(f"the reference has no contact {wall.contact!r}; add it to respond.")
     if wall.friction > 0:
         squared = (v_t**2).sum(-1, keepdim=True)
         moving = squared > (wall.friction * v_n) ** 2  # not stuck

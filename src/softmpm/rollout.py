@@ -10,19 +10,20 @@ import torch
 from torch import Tensor
 
 from softmpm import schedule
-from softmpm.between import SortedAdj, SortedState
+from softmpm.alarms import Failures
+from softmpm.between import SortedState
 from softmpm.buffers import Solid, SolidAdj
-from softmpm.failures import Report, outgrown, raise_failure, raise_gradient_failure
-from softmpm.fast import Fast, FastRun, fast, forget
+from softmpm.failures import Report, raise_gradient_failure
+from softmpm.fast import FastRun, forget
 from softmpm.horizon import Chunk, Horizon
 from softmpm.kernels.types import Wanted
 from softmpm.memory import Plan, memory, plan
 from softmpm.model import Model
-from softmpm.plain import Plain, PlainRun
+from softmpm.plain import PlainRun
 from softmpm.replay import alone, hold, note, recording
+from softmpm.runner import Runner, as_state
 from softmpm.state import State
 from softmpm.step import on_its_gpu
-from softmpm.watch import NEVER
 
 
 @dataclass
@@ -39,6 +40,8 @@ class Trail:
     """Else the states before some of the chunks, the first of which is the start, until a backward pass takes them."""
     turn: threading.Lock = field(default_factory=threading.Lock)
     """One backward pass at a time."""
+    frozen: dict[int, int] = field(default_factory=dict)
+    """Worlds that failed, and the substep from which they took no part."""
 
     def keep(self, run: FastRun | PlainRun) -> None:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
@@ -51,56 +54,22 @@ class Trail:
         return schedule.kept_first(len(self.chunks), self.plan.slots) if self.plan.slots else ()
 
 
-class _Runner:
-    """Runs the chunks of one call by the model's scheme, from a :class:`State` or what the scheme gave as an end."""
-
-    def __init__(self, model: Model, pull: Tensor | None, solid: Solid):
-        self.model, self.pull, self.solid = model, pull, solid
-        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
-        self.scheme = fast(model, stream) if model.scheme == "fast" else Plain(model)
-
-    def run(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
-        pull = None if self.pull is None else self.pull[chunk.rows]
-        return self.scheme.run(chunk, start, pull, self.solid, keep)
-
-    def settled(self, run: FastRun | PlainRun, report: Report) -> bool:
-        """Whether what ``run`` gave can be used; False if its window was too small, which is mended for the next try.
-
-        Raises:
-            UnstableError: A world failed.
-        """
-        words = report.read()
-        if isinstance(run, FastRun) and isinstance(self.scheme, Fast):
-            *words, cells, near_edge = words
-            if outgrown(words):
-                self.scheme.widen(run)
-                return False
-            run.pool.arrangement.judge(cells, bool(near_edge))
-        if any(word != NEVER for word in words):
-            start = run.start if isinstance(run.start, State) else None
-            raise_failure(self.model, words, _as_state(run.end), run.chunk.first, start)
-        return True
-
-    def settle(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
-        """Run a chunk, and wait until it can be used."""
-        while True:
-            run = self.run(chunk, start, keep)
-            if recording(self.model):
-                words = run.words[: self.model.worlds].clone()  # the backward pass uses them anew
-                note(words, run.pool.arrangement.outgrow if isinstance(run, FastRun) else None)
-                return run
-            if self.settled(run, Report(run.words)):
-                return run
-            del run  # or its program would be there beside the next one, which has a larger window
-
-
 @on_its_gpu
-def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, solid: Solid, keep: bool):
+def rollout(
+    model: Model,
+    horizon: Horizon,
+    start: State,
+    pull: Tensor | None,
+    solid: Solid,
+    keep: bool,
+    failures: Failures | None = None,
+) -> tuple[State, Trail | None]:
     """Run from ``start``. Each chunk is launched before the report of the one before it is read.
 
     Args:
         pull: Activation times strength [Pa], shape (control_step, world, muscle), or None without muscles.
         keep: Whether a backward pass will follow.
+        failures: Takes the failures of single worlds; None raises them.
 
     Returns:
         The end as a :class:`State`, and a :class:`Trail`, or None.
@@ -111,7 +80,9 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
     sizes = model.sizes()
     chosen = plan(horizon, sizes, model.budget) if keep else Plan(sizes.longest, 0, 0, 0)
     trail = Trail(chosen, horizon.chunks(chosen.longest), start)
-    runner, inside = _Runner(model, pull, solid), keep and chosen.keep_all
+    runner, inside = Runner(model, pull, solid, failures), keep and chosen.keep_all
+    trail.frozen = runner.frozen
+    check = runner.check(start)
     if recording(model):
         return _recorded(runner, trail, inside), trail if keep else None
     stays = trail.stays
@@ -122,6 +93,12 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
         if k < len(trail.chunks):
             run = runner.run(trail.chunks[k], state, inside)
             ahead = run, Report(run.words)
+        if check is not None:
+            started, check = runner.passed(start, check), None
+            if not started:
+                k = 0
+                del run, ahead
+                continue
         if before is not None and not runner.settled(*before):
             k, state, before = k - 1, before[0].start, None
             del run, ahead  # what ran ahead of it is void
@@ -133,12 +110,18 @@ def rollout(model: Model, horizon: Horizon, start: State, pull: Tensor | None, s
         if ahead is not None:
             state, k = ahead[0].end, k + 1
         before = ahead
-    return _as_state(state), trail if keep else None
+    return _returned(model, as_state(state), runner), trail if keep else None
 
 
-def _as_state(between: State | SortedState | SortedAdj) -> State:
-    """In the user's order."""
-    return between if isinstance(between, State) else between.state()
+def _returned(model: Model, end: State, runner: Runner) -> State:
+    """The end, with the worlds that failed where the policy puts them."""
+    if runner.failures is None or runner.failures.policy == "freeze" or not runner.frozen:
+        return end
+    worlds, rest = sorted(runner.frozen), model.rest()
+    end = State(*(tensor.clone() for tensor in end)).with_low(end.low)
+    for tensor, at_rest in zip((*end, *(end.low or ())), (*rest, *(rest.low or ())), strict=True):
+        tensor[worlds] = at_rest[worlds]
+    return end
 
 
 def _kept(between: State | SortedState) -> State | SortedState:
@@ -146,7 +129,7 @@ def _kept(between: State | SortedState) -> State | SortedState:
     return between if isinstance(between, State) else between.copy()
 
 
-def _recorded(runner: _Runner, trail: Trail, inside: bool) -> State:
+def _recorded(runner: Runner, trail: Trail, inside: bool) -> State:
     """:func:`rollout` while PyTorch records a graph: nothing is read back."""
     hold(runner.model)
     state: State | SortedState = trail.start
@@ -158,7 +141,7 @@ def _recorded(runner: _Runner, trail: Trail, inside: bool) -> State:
         state = run.end
         if inside:
             trail.keep(run)
-    return _as_state(state)
+    return as_state(state)
 
 
 @on_its_gpu
@@ -181,10 +164,11 @@ def rollout_adj(
     """
     adj_solid = SolidAdj.zeros(model, wanted)
     adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
-    adj: Any = State(*(a.contiguous() for a in adj_end))
-    reports = []
+    adj: Any = State(*(a.contiguous() for a in _without(trail.frozen, adj_end)))
+    reports, runner = [], Runner(model, pull, solid)
+    runner.frozen = trail.frozen
     with trail.turn:
-        for run in _inside_out(trail, _Runner(model, pull, solid)):
+        for run in _inside_out(trail, runner):
             adj, part = run.pull_back(adj, adj_solid, wanted)
             if adj_pull is not None and part is not None:
                 adj_pull[run.chunk.rows] += part
@@ -196,10 +180,20 @@ def rollout_adj(
     for report, last in reports:
         words = report.read()[: model.worlds]
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
-    return _as_state(adj), adj_solid, adj_pull
+    return as_state(adj), adj_solid, adj_pull
 
 
-def _taken(trail: Trail, runner: _Runner) -> dict[int, State | SortedState]:
+def _without(frozen: dict[int, int], adj_end: State) -> State:
+    """The adjoint of the end, zero for worlds that failed."""
+    if not frozen:
+        return adj_end
+    adj = State(*(a.clone() for a in adj_end))
+    for tensor in adj:
+        tensor[sorted(frozen)] = 0
+    return adj
+
+
+def _taken(trail: Trail, runner: Runner) -> dict[int, State | SortedState]:
     """What the forward pass kept; the trail has it no longer, so that each state is free as soon as it is dropped.
 
     A second backward pass finds nothing there, and the chunks run again first.
@@ -218,7 +212,7 @@ def _taken(trail: Trail, runner: _Runner) -> dict[int, State | SortedState]:
     return states
 
 
-def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:
+def _inside_out(trail: Trail, runner: Runner) -> Iterator[FastRun | PlainRun]:
     """Every chunk as a run that kept what is inside, from the last to the first."""
     if trail.plan.keep_all:
         yield from reversed(trail.runs)

@@ -7,7 +7,7 @@ Rules that need the whole scene (particles inside the grid, muscle indices) live
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -113,7 +113,10 @@ class Particles:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Material:
-    """Isotropic elastic solid. Use one of its laws: :class:`NeoHookean` or :class:`FixedCorotated`."""
+    """Isotropic elastic solid. Use one of its laws, the subclasses below."""
+
+    survives_inversion: ClassVar[bool] = False
+    """Whether the stress is defined where det F ≤ 0."""
 
     density: float
     """Rest density ρ₀ [kg/m³]. Differentiable."""
@@ -123,7 +126,10 @@ class Material:
     """Poisson's ratio ν [-], in (-1, 0.5). Differentiable."""
 
     def __post_init__(self):
-        need(type(self) is not Material, "a material needs a law: use NeoHookean or FixedCorotated.")
+        need(
+            type(self) is not Material,
+            "a material needs a law: use NeoHookean, FixedCorotated or BarrierCorotated.",
+        )
         _store_numbers(self, "material", "density", "young", "poisson")
         need(self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
         need(self.young > 0, f"young must be > 0 Pa, got {self.young}.")
@@ -143,9 +149,20 @@ class NeoHookean(Material):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class FixedCorotated(Material):
-    """Fixed corotated solid, τ = 2μ(F − R)Fᵀ + λ(J − 1)J I. Survives inversion; softens below J = 0.5.
+    """Fixed corotated solid, τ = 2μ(F − R)Fᵀ + λ(J − 1)J I. Defined through inversion; softens below J = 0.5.
 
     Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity". Values: as NeoHookean.
+    """
+
+    survives_inversion: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BarrierCorotated(Material):
+    """Fixed corotated solid with a volumetric barrier, τ = 2μ(F − R)Fᵀ + λ/4 (J² − J⁻²) I.
+
+    As FixedCorotated at small strain, but resists the more the more it is compressed, which takes a smaller step: the stiffness
+    λ/2 (J² + J⁻²) is 2 λ at J = 0.5 and 13 λ at J = 0.2. Source: the derivative of λ/8 (J − 1/J)². Values: as NeoHookean.
     """
 
 

@@ -1,15 +1,14 @@
-"""The largest stable step, and the warning of a scene that is above it.
+"""The largest stable step: of a scene at rest, of a stretched one, of one particle in a run.
 
-A particle alone on the grid obeys Ḟ = C, Ċ = −4τ/(ρ dx²) in MLS-MPM, wherever it lies between the nodes.
-Symplectic Euler is stable for an oscillation ω while ω dt ≤ 2; ω² = 4K/(ρ dx²) for strains with τ(ε) = K ε:
+A particle alone on the grid obeys Ḟ = C F, Ċ = −4τ/(ρ dx²) in MLS-MPM, wherever it lies between the nodes.
+Symplectic Euler is stable for an oscillation ω while ω dt ≤ 2; ω² = 4K/(ρ dx²) for the stiffness K of (W3):
 
-    dt ≤ dx · √(ρ / K)                                  (S1)
-    τ(ε) = λ tr(ε) I + 2μ ε + Σ |s| (ε ddᵀ + ddᵀ ε)     (S2)  both laws at F = I, muscles at |a| = 1
+    dt ≤ dx · √(ρ / K)                                                                              (W2)
+    K = largest eigenvalue of A,  A[G] = d/dε τ((I + εG) F) over symmetric G, muscles included       (W3)
 
-K is the largest eigenvalue of (S2); without muscles 2μ + dim·λ, or 2μ where λ < 0. Particles that share
-nodes oscillate no faster than the fastest of them would alone: the grid's kinetic energy is at least
-Σ m dx²/8 |C|², the particles' elastic energy at most Σ V K/2 |ε|². The limit holds at rest and shrinks with
-stretch; half of it leaves room for a stretch of 1.7 (fixed corotated) or 2.5 (neo-Hookean).
+At rest and without muscles K = 2μ + dim·λ, or 2μ where λ < 0. Particles that share nodes oscillate no faster than the fastest of
+them would alone: the grid's kinetic energy is at least Σ m dx²/8 |C|², the particles' elastic energy at most Σ V K/2 |G|². The limit
+shrinks with stretch; half of that at rest leaves room for a stretch of 1.7 (fixed corotated) or 2.5 (neo-Hookean).
 """
 
 import math
@@ -17,15 +16,20 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from softmpm.scene import Material, Muscle, Scene
+from softmpm.checks import check_scene
+from softmpm.reference import lame, muscle_tangent, tangent
+from softmpm.scene import Scene, need
+from softmpm.state import Params
 
 APART = 1.4
 """Cells between particles beyond which they share too few nodes: at 4/3 a body that was stretched springs back, at 3/2 it does not."""
 
 
 class StabilityWarning(UserWarning):
-    """A scene's step is above the largest stable one, or its particles are so far apart that a body does not hold."""
+    """The particles of a scene are so far apart that a body does not hold together."""
 
 
 class StableDt(float):
@@ -44,31 +48,75 @@ class StableDt(float):
         return float(self)
 
 
-def stable_dt(scene: Scene) -> StableDt:
-    """Largest stable step of a scene at rest, its muscles fully active; use about half of it.
+def stable_dt(
+    scene: Scene,
+    params: Params | None = None,
+    stretch: float | Tensor | np.ndarray = 1.0,
+    activation: float = 1.0,
+) -> StableDt:
+    """Largest stable step of a scene. At rest with its muscles fully active, unless told otherwise; use about half of that.
 
     The scene's own ``dt`` plays no part: ``dataclasses.replace(scene, dt=0.5 * stable_dt(scene))``.
+
+    Args:
+        scene: What to simulate.
+        params: Material of each particle, shapes that broadcast to (world, particle); None takes the scene's.
+        stretch: Principal stretch along one axis [-], that of the muscles where there are any, the others being 1. Or the
+            deformation gradient of all particles, shape (dim, dim), or of each, shape (particle, dim, dim).
+        activation: Largest size of the activation [-].
+
+    Raises:
+        ValueError: The scene breaks a rule, the stretch is not positive, or a material is outside its bounds.
     """
-    limits = []
-    for group in _groups(scene):
-        material = scene.bodies[group.body].material
-        muscles = [scene.muscles[m] for m in group.muscles]
-        stiffness = _stiffness(material, muscles, scene.grid.dim)
-        limits.append((scene.grid.spacing * math.sqrt(material.density / stiffness), stiffness, group))
-    dt, stiffness, group = min(limits, key=lambda limit: limit[0])
-    return StableDt(dt, _describe(scene, group, stiffness))
+    check_scene(scene)
+    need(math.isfinite(activation), f"activation must be finite, got {activation}.")
+    with torch.inference_mode(False), torch.device("cpu"):
+        particles = sum(len(body.particles) for body in scene.bodies)
+        given = None if params is None else _rows(params, particles)
+        limits = [
+            (*_limit(scene, group, given, F, activation), group)
+            for group in _groups(scene)
+            for F in _deformations(scene, group, stretch)
+        ]
+    dt, stiffness, particle, group = min(limits, key=lambda limit: limit[0])
+    return StableDt(dt, _describe(scene, group, particle, stiffness, params, (stretch, activation)))
 
 
-def warn_unstable(scene: Scene, *, stacklevel: int = 3) -> None:
-    """Warn when the scene's dt is above :func:`stable_dt`; ``stacklevel`` 3 points at the caller's caller."""
-    limit = stable_dt(scene)
-    if scene.dt > limit:
-        warnings.warn(
-            f"dt = {scene.dt:.4g} s is above the largest stable one, {limit.dt:.4g} s, set by {limit.limit}. "
-            f"Use a dt of about {0.5 * limit:.2g} s, which leaves room for stretch, or a coarser grid.",
-            StabilityWarning,
-            stacklevel=stacklevel,
+def running_limit(
+    scene: Scene, particle: int, mu: float, lam: float, density: float, F: Tensor, pulls: list[float]
+) -> float:
+    """Stable step [s] of one particle alone on the grid, as it is at a moment of a run (W2).
+
+    Args:
+        F: Its deformation gradient, shape (dim, dim).
+        pulls: Activation times strength of each muscle of the scene [Pa].
+    """
+    with torch.inference_mode(False), torch.device("cpu"):
+        F = F.detach().cpu().double()
+        bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
+        A = tangent(
+            scene.bodies[bodies[particle]].material,
+            F,
+            *(torch.tensor(v, dtype=torch.float64) for v in (mu, lam)),
         )
+        for muscle, pull in zip(scene.muscles, pulls, strict=True):
+            if particle in muscle.particles:
+                A = A + pull * muscle_tangent(F, torch.tensor(muscle.direction, dtype=torch.float64))
+        if not bool(torch.isfinite(A).all()):
+            return math.nan
+        K = torch.linalg.eigvalsh(A)[-1].item()
+    return scene.grid.spacing * math.sqrt(density / K) if K > 0 else math.inf
+
+
+def need_stable(scene: Scene, most: float) -> None:
+    """Raise ValueError if the scene's dt is more than ``most`` times :func:`stable_dt`."""
+    limit = stable_dt(scene)
+    need(
+        scene.dt <= most * limit,
+        f"dt = {scene.dt:.4g} s is above the largest stable one, {limit.dt:.4g} s, set by {limit.limit}. "
+        f"Use a dt of about {0.5 * limit:.2g} s, which leaves room for stretch, or a coarser grid; "
+        "build(..., alarms=softmpm.Alarms(step=None)) runs it all the same.",
+    )
 
 
 def warn_sparse(scene: Scene, *, stacklevel: int = 3) -> None:
@@ -87,7 +135,7 @@ def warn_sparse(scene: Scene, *, stacklevel: int = 3) -> None:
 class _Group(NamedTuple):
     """Particles of one body that are in the same muscles."""
 
-    particle: int  # the first of them
+    particles: np.ndarray
     body: int
     muscles: tuple[int, ...]
 
@@ -99,37 +147,86 @@ def _groups(scene: Scene) -> list[_Group]:
         old, place = np.unique(label[muscle.particles], return_inverse=True)
         label[muscle.particles] = len(keys) + place
         keys += [(keys[k][0], (*keys[k][1], m)) for k in old]
-    used, first = np.unique(label, return_index=True)
-    return [_Group(int(particle), *keys[k]) for k, particle in zip(used, first, strict=True)]
+    return [_Group(np.flatnonzero(label == k), *keys[k]) for k in np.unique(label)]
 
 
-def _stiffness(material: Material, muscles: list[Muscle], dim: int) -> float:
-    """K of (S2): the largest eigenvalue of stress against strain, over symmetric strains."""
-    mu = material.young / (2 * (1 + material.poisson))
-    lam = material.young * material.poisson / ((1 + material.poisson) * (1 - 2 * material.poisson))
-    pull = sum(
-        (abs(muscle.strength) * np.outer(muscle.direction, muscle.direction) for muscle in muscles),
-        np.zeros((dim, dim)),
+def _rows(params: Params, particles: int) -> Params:
+    """Material as float64 on the CPU, shape (world, particle) each."""
+    rows = []
+    for name, value in zip(Params._fields, params, strict=True):
+        value = torch.atleast_2d(torch.as_tensor(value, dtype=torch.float64).detach().cpu())
+        need(
+            value.ndim == 2 and value.shape[1] in (1, particles),
+            f"params.{name} must broadcast to (world, {particles}), got shape {tuple(value.shape)}.",
+        )
+        rows.append(value)
+    worlds = max(len(value) for value in rows)
+    return Params(*(value.expand(worlds, particles) for value in rows))
+
+
+def _deformations(scene: Scene, group: _Group, stretch: float | Tensor | np.ndarray) -> list[Tensor]:
+    """Deformation gradients to look at, shape (dim, dim) or (particle of the group, dim, dim)."""
+    dim, given = scene.grid.dim, torch.as_tensor(stretch, dtype=torch.float64).detach().cpu()
+    if given.ndim == 0:
+        need(bool(0 < given < math.inf), f"stretch must be finite and > 0, got {stretch}.")
+        axes = [scene.muscles[m].direction for m in group.muscles] or [(1.0,) + (0.0,) * (dim - 1)]
+        columns = (torch.tensor(axis, dtype=torch.float64)[:, None] for axis in axes)
+        return [torch.eye(dim, dtype=torch.float64) + (given - 1) * column @ column.T for column in columns]
+    if given.ndim == 2:
+        given = given.expand(len(group.particles), dim, dim)
+        return [given[:1]]
+    total = sum(len(body.particles) for body in scene.bodies)
+    need(
+        given.shape == (total, dim, dim),
+        f"stretch must be one number or have shape ({dim}, {dim}) or ({total}, {dim}, {dim}), got {tuple(given.shape)}.",
     )
-    strains = []
-    for i, j in zip(*np.triu_indices(dim), strict=True):
-        strain = np.zeros((dim, dim))
-        strain[i, j] = strain[j, i] = 1.0 if i == j else math.sqrt(0.5)  # of length one
-        strains.append(strain)
-    stresses = [
-        lam * np.trace(strain) * np.eye(dim) + 2 * mu * strain + strain @ pull + pull @ strain
-        for strain in strains
-    ]
-    return float(np.linalg.eigvalsh([[np.vdot(e, t) for t in stresses] for e in strains])[-1])
+    return [given[torch.from_numpy(group.particles)]]
 
 
-def _describe(scene: Scene, group: _Group, stiffness: float) -> str:
+def _limit(
+    scene: Scene, group: _Group, given: Params | None, F: Tensor, activation: float
+) -> tuple[float, float, int]:
+    """Stable step [s] of a group of particles, the stiffness [Pa] that sets it, and the particle."""
+    material, one = scene.bodies[group.body].material, torch.ones(F.shape[:-2], dtype=torch.float64)
+    A_mu, A_lam = tangent(material, F, one, 0 * one), tangent(material, F, 0 * one, one)
+    A_pull = torch.zeros_like(A_mu)
+    for m in group.muscles:
+        pull = abs(activation * scene.muscles[m].strength)
+        A_pull = A_pull + pull * muscle_tangent(
+            F, torch.tensor(scene.muscles[m].direction, dtype=torch.float64)
+        )
+    if given is None:
+        rows = Params(
+            *(torch.tensor([[getattr(material, name)]], dtype=torch.float64) for name in Params._fields)
+        )
+    else:
+        rows = Params(*(value[:, torch.from_numpy(group.particles)] for value in given))
+    mu, lam = (value[..., None, None] for value in lame(rows.young, rows.poisson))
+    K = torch.linalg.eigvalsh(mu * A_mu + lam * A_lam + A_pull)[..., -1]  # (world, particle)
+    K, density = torch.broadcast_tensors(K, rows.density)
+    squared = torch.where(K > 0, density / K, math.inf)
+    world, particle = divmod(int(squared.argmin()), squared.shape[1])
+    dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
+    return dt, K[world, particle].item(), int(group.particles[particle])
+
+
+def _describe(
+    scene: Scene, group: _Group, particle: int, stiffness: float, params: Params | None, loads: tuple
+) -> str:
     material = scene.bodies[group.body].material
-    text = (
-        f"body {group.body} ({type(material).__name__}, young {material.young:.4g} Pa, "
-        f"poisson {material.poisson:.4g}, density {material.density:.4g} kg/m³)"
-    )
+    text = f"body {group.body} ({type(material).__name__}"
+    if params is None:
+        text += f", young {material.young:.4g} Pa, poisson {material.poisson:.4g}, density {material.density:.4g} kg/m³"
+    else:
+        text += f", the given params of particle {particle}"
+    text += ")"
+    stretch, activation = loads
     if group.muscles:
         names = " + ".join(f"muscle {m} ({scene.muscles[m].strength:.4g} Pa)" for m in group.muscles)
-        text += f" under {names} at full activation, as at particle {group.particle}"
+        how = "full activation" if activation == 1.0 else f"activation {activation:.4g}"
+        text += f" under {names} at {how}, as at particle {particle}"
+    if np.ndim(stretch) > 0:
+        text += ", deformed as given"
+    elif stretch != 1.0:
+        text += f", stretched to {stretch:.4g}"
     return f"{text}: stiffness {stiffness:.4g} Pa on cells of {scene.grid.spacing:.4g} m"

@@ -112,7 +112,7 @@ class Substep:
     def advance(self, now, then, substep: int) -> None:
         """One whole substep."""
         self.to_grid(now)
-        arguments = (self.model.scale, self.solid, substep, self._array("velocity"), now, self.watch, then)
+        arguments = (self.model.scale, substep, self._array("velocity"), now, self.watch, then)
         self.launch(transfer(self.model.spec).g2p, self.particles, *arguments)
 
     def adjoint(self, wanted: Wanted, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:

@@ -8,6 +8,8 @@ word is read, and nothing is written out of bounds. Other worlds go on, unchange
 from enum import IntEnum
 
 NEVER = 2**63 - 1
+FROZEN = NEVER - 1
+"""Word of a world that takes no part: it stays as it is, and is no failure."""
 SUBSTEP_SHIFT, KIND_SHIFT = 36, 32
 MAX_SUBSTEP = 2 ** (63 - SUBSTEP_SHIFT) - 1
 
@@ -18,17 +20,20 @@ class Kind(IntEnum):
     START = 0
     NOT_FINITE = 1
     LEFT_GRID = 2
-    INVERTED = 3
     GRADIENT = 4
     LEFT_WINDOW = 5
     """Not the grid but the part of it that is in memory: the call starts again with a larger one."""
+    STEP = 6
+    TORN = 7
+    COLLAPSED = 8
 
 
 class UnstableError(RuntimeError):
-    """A particle became non-finite, inverted or left the grid, or a gradient overflowed.
+    """A particle became non-finite, collapsed or left the grid, a body tore, dt became too large, or a gradient overflowed.
 
     Attributes:
-        kind: One of ``start``, ``not_finite``, ``left_grid``, ``inverted``, ``gradient``.
+        kind: One of ``start``, ``not_finite``, ``left_grid``, ``inverted`` (det F ≤ 0), ``collapsed`` (det F below its limit),
+            ``torn`` (neighbours at rest too far apart), ``step`` (dt above the running stable step), ``gradient``.
         world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite.
         substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.
         value: The offending value.
@@ -41,7 +46,7 @@ class UnstableError(RuntimeError):
         self,
         message: str,
         *,
-        kind: Kind,
+        kind: str,
         world: int,
         particle: int,
         substep: int,
@@ -50,7 +55,7 @@ class UnstableError(RuntimeError):
         state=None,
     ):
         super().__init__(message)
-        self.kind = kind.name.lower()
+        self.kind = kind
         self.world, self.particle, self.substep = world, particle, substep
         self.value, self.limit, self.state = value, limit, state
 

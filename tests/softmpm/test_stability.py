@@ -11,7 +11,7 @@ import pytest
 
 import softmpm
 from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene
-from softmpm.stability import StabilityWarning, stable_dt, warn_unstable
+from softmpm.stability import StabilityWarning, need_stable, stable_dt
 
 DX, RHO = 0.1, 2.0
 
@@ -194,17 +194,18 @@ def test_warns_of_bodies_that_do_not_hold(dim, cells, holds):
     assert max(widths) > 1.005 and (min(widths) < 0.998) == holds
 
 
-def test_warns_only_above():
-    """A scene at its limit builds silently; above it the warning says what limits and which step to take."""
+def test_refuses_only_above():
+    """A scene at its limit builds; above it the error says what limits, which step to take, and how to run it all the same."""
     made = scene(NeoHookean(density=RHO, young=100.0))
     limit = stable_dt(made)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_unstable(dataclasses.replace(made, dt=limit.dt))
-    with pytest.warns(
-        StabilityWarning, match=r"dt = .* above the largest stable one, .* set by body 0 .*Use a dt of about"
+    need_stable(dataclasses.replace(made, dt=limit.dt), 1.0)
+    above = dataclasses.replace(made, dt=1.0001 * limit.dt)
+    with pytest.raises(
+        ValueError, match=r"dt = .* above the largest stable one, .* set by body 0 .*Use a dt of about"
     ):
-        warn_unstable(dataclasses.replace(made, dt=1.0001 * limit.dt))
+        softmpm.build(above, device="cpu")
+    softmpm.build(above, device="cpu", alarms=softmpm.Alarms(step=None))
+    softmpm.build(above, device="cpu", alarms=softmpm.Alarms(step=1.1))
 
 
 def test_is_a_number():

@@ -6,8 +6,8 @@ import warp as wp
 
 from softmpm.kernels.elasticity import elasticity
 from softmpm.kernels.turn import once
-from softmpm.kernels.types import Spec, solid_types, types
-from softmpm.watch import KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
+from softmpm.kernels.types import Spec, types
+from softmpm.watch import FROZEN, KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
 
 
 @once
@@ -27,43 +27,34 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
         )
         wp.atomic_min(watch, world, word)
 
-    return SimpleNamespace(running=running, report=write)
+    @wp.func
+    def ran(watch: wp.array(dtype=wp.int64), world: int, substep: int) -> bool:
+        """Whether the world came through the substeps before ``substep``."""
+        word = watch[world]
+        return word >= wp.int64(substep) << wp.int64(SUBSTEP_SHIFT) and word != wp.int64(FROZEN)
+
+    return SimpleNamespace(running=running, ran=ran, report=write)
 
 
 @once
 def check(spec: Spec) -> SimpleNamespace:
-    """What must hold of a new state: finite, on the grid, and not inverted where the law forbids it."""
+    """What must hold of a new state: finite, on the grid, and not collapsed."""
     t = types(spec.dim, spec.dtype)
-    real, vec, mat, ivec, Solid = t.real, t.vec, t.mat, t.ivec, solid_types(spec).Solid
+    real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
     write, volume_change = report(spec.dim, spec.dtype).report, elasticity(spec.dim, spec.dtype).volume_change
-    dim, mixed = spec.dim, len(spec.laws) > 1
-    hookean = spec.laws.index("neo_hookean") if "neo_hookean" in spec.laws else -1
-    not_finite, left_grid, inverted = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.INVERTED)
+    dim = spec.dim
+    not_finite, left_grid, collapsed = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.COLLAPSED)
     left_window = int(Kind.LEFT_WINDOW)
+    largest = 1.0e12  # of det F, and of a squared distance in cells
 
     @wp.func
-    def allowed(body: Solid, world: int, p: int, H: mat) -> bool:
-        """H is finite, and det F > 0 where the law needs it; a comparison with NaN is false."""
-        if wp.static(not mixed and hookean == 0):
-            return volume_change(H) > real(-1.0)
-        total = real(0.0)
-        for i in range(dim):
-            for j in range(dim):
-                total += H[i, j]
-        if wp.static(mixed):
-            if body.law[world, p] == hookean:
-                return volume_change(H) > real(-1.0)
-        return wp.isfinite(total)
-
-    @wp.func
-    def sound(
-        body: Solid, corner: ivec, shape: ivec, world: int, p: int, fx: vec, base: ivec, H: mat
-    ) -> bool:
+    def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         """The new state may be kept: ``fx`` as it came, ``base`` as it would be, on ``shape`` nodes from ``corner``.
 
-        Without a branch: behind one, a GPU would start late to read what the stress needs.
+        A comparison with NaN is false. Without a branch: behind one, a GPU would start late to read what the stress needs.
         """
-        ok = int(allowed(body, world, p, H)) & int(wp.dot(fx, fx) < real(1.0e12))
+        j = volume_change(H)
+        ok = int(j > scale.collapse) & int(j < real(largest)) & int(wp.dot(fx, fx) < real(largest))
         for axis in range(dim):  # unsigned: below zero is far above as well
             ok &= int(wp.uint32(base[axis] - corner[axis]) <= wp.uint32(shape[axis] - 3))
         return ok != 0
@@ -71,7 +62,7 @@ def check(spec: Spec) -> SimpleNamespace:
     @wp.func
     def complain(
         watch: wp.array(dtype=wp.int64),
-        shape: ivec,
+        scale: Scale,
         world: int,
         p: int,
         substep: int,
@@ -79,15 +70,16 @@ def check(spec: Spec) -> SimpleNamespace:
         base: ivec,
         H: mat,
     ):
-        """Say which rule a state that is not sound breaks; NaN before place before inversion."""
+        """Report the rule that a state breaks; NaN before place before collapse."""
         kind = left_window
         for axis in range(dim):
-            if wp.uint32(base[axis]) > wp.uint32(shape[axis] - 3):
+            if wp.uint32(base[axis]) > wp.uint32(scale.shape[axis] - 3):
                 kind = left_grid
-        if not wp.isfinite(wp.ddot(H, H) + wp.dot(fx, fx)):
+        j = volume_change(H)
+        if not wp.isfinite(wp.ddot(H, H) + wp.dot(fx, fx)) or not j < real(largest):
             kind = not_finite
-        elif wp.static(hookean >= 0) and volume_change(H) <= real(-1.0):
-            kind = inverted
+        elif not j > scale.collapse:
+            kind = collapsed
         write(watch, world, substep, kind, p)
 
     return SimpleNamespace(sound=sound, complain=complain)

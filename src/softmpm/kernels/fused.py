@@ -194,7 +194,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         B = sums.outer - wp.outer(sums.value, g)
         old.low = load_vec(now.rows, i, row_low)
         old.H = load_mat(now.rows, i, row_H)
-        new = moved(scale, body, origin, window.shape, world, p, old, sums.value, B)
+        new = moved(scale, origin, window.shape, old, sums.value, B)
         base = old.base
         if new.sound:
             base = new.base
@@ -215,7 +215,7 @@ def fused(spec: Spec) -> SimpleNamespace:
                 store_mat(then.rows, i, row_H, new.H)
                 store_mat(then.rows, i, row_C, new.C)
                 if not new.sound:
-                    complain(watch, scale.shape, world, order[i], substep, new.fx, new.base, new.H)
+                    complain(watch, scale, world, order[i], substep, new.fx, new.base, new.H)
             else:
                 stay(i, now, then)
         if not last:

@@ -51,17 +51,7 @@ def particle(spec: Spec) -> SimpleNamespace:
         )
 
     @wp.func
-    def moved(
-        scale: Scale,
-        body: Solid,
-        corner: ivec,
-        shape: ivec,
-        world: int,
-        p: int,
-        old: Particle,
-        v: vec,
-        B: mat,
-    ) -> Particle:
+    def moved(scale: Scale, corner: ivec, shape: ivec, old: Particle, v: vec, B: mat) -> Particle:
         """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not sound keeps its base."""
         new = Particle()
         new.v = v
@@ -77,7 +67,7 @@ def particle(spec: Spec) -> SimpleNamespace:
         for axis in range(dim):
             cells[axis] = wp.floor(new.fx[axis] - real(0.5))
             new.base[axis] = old.base[axis] + int(cells[axis])
-        new.sound = sound(body, corner, shape, world, p, new.fx, new.base, new.H)
+        new.sound = sound(scale, corner, shape, new.fx, new.base, new.H)
         if new.sound:
             new.fx = new.fx - cells
         return new

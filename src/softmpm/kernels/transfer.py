@@ -70,7 +70,6 @@ def transfer(spec: Spec) -> SimpleNamespace:
     def g2p(
         # Parameters:
         scale: Scale,
-        body: Solid,
         substep: int,
         # In:
         velocity: wp.array2d(dtype=vec),
@@ -96,9 +95,9 @@ def transfer(spec: Spec) -> SimpleNamespace:
                 share = weight(w, o) * velocity[world, node_index(old.base, o, scale.shape)]
                 v += share
                 B += wp.outer(share, position(o) - old.fx)
-            new = moved(scale, body, ivec(), scale.shape, world, p, old, v, B)
+            new = moved(scale, ivec(), scale.shape, old, v, B)
             if not new.sound:
-                complain(watch, scale.shape, world, p, substep, new.fx, new.base, new.H)
+                complain(watch, scale, world, p, substep, new.fx, new.base, new.H)
                 new.base = old.base
         else:
             new = old

@@ -19,7 +19,7 @@ class Spec:
 
     dim: int
     dtype: str  # "float32" or "float64"
-    laws: tuple[str, ...]  # of "neo_hookean", "fixed_corotated"
+    laws: tuple[str, ...]  # of "neo_hookean", "fixed_corotated", "barrier_corotated"
     muscle_slots: int  # muscles that overlap on one particle, at most; 0 is a passive scene
     contacts: tuple[str, ...]  # of each wall: "stick", "slip" or "separate"
     friction: bool
@@ -94,6 +94,9 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         exact_spacing: wp.float64  # the same, for what must not depend on the precision
         gravity: vec  # g [m/s²]
         decay: real  # exp(-damping Δt) [-]
+        collapse: real  # least det F − 1 [-]
+        gap: real  # square of the largest distance of rest neighbours [cells²]
+        step: real  # square of the largest Δt over the running stable step [-]
 
     class Motion:
         """State of particles as the kernels hold it: nothing small is added to something large and lost."""

@@ -1,0 +1,75 @@
+"""Limits beyond which a simulation is stopped by name, and the failures of single worlds that a caller tolerates."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal, get_args
+
+from softmpm.scene import need
+from softmpm.watch import UnstableError
+
+Policy = Literal["freeze", "reset"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Alarms:
+    """Limits of a healthy simulation. Each is checked on the device; None switches one off.
+
+    Example:
+        >>> softmpm.build(scene, alarms=softmpm.Alarms(step=None))  # any dt, at the caller's risk
+    """
+
+    collapse: float | None = 0.05
+    """Least det F [-] of a particle, checked in every substep. A healthy body stays above 0.1 even under an impact at twice its wave
+    speed; below 0.05 fixed corotated bodies collapse for good. None leaves det F > 0 to the laws that are undefined beyond."""
+    gap: float | None = 1.4
+    """Largest distance of two particles that are neighbours at rest [cells], checked after each chunk. Bodies that were stretched to
+    4/3 cells spring back, those at 3/2 do not: they break for numerical reasons alone (numerical fracture)."""
+    step: float | None = 1.0
+    """Largest ratio of dt and the stable step of a particle alone on the grid with its present deformation, material and activation
+    [-], checked at the start of a call and after each chunk. Particles that share nodes bear 1.1 to 1.6 of it."""
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise TypeError(f"alarm {field.name} must be a number or None, got {value!r}.")
+            need(
+                0.0 < value < math.inf,
+                f"alarm {field.name} must be finite and > 0, got {value}; None switches it off.",
+            )
+            object.__setattr__(self, field.name, float(value))
+        need(
+            self.collapse is None or self.collapse < 1.0,
+            f"alarm collapse must be below 1, the det F at rest, got {self.collapse}.",
+        )
+
+
+class Failures:
+    """Failures of single worlds that are counted instead of raised; give it to :func:`softmpm.simulate`.
+
+    A world that fails stops at the start of the chunk in which it failed, at most 128 substeps before the failure, and takes no part
+    in the rest of the call. It returns in that state (``freeze``) or in the rest state (``reset``), and contributes no gradient. The
+    other worlds are the same as without it, to the last bit where sums have a fixed order.
+
+    Attributes:
+        policy: ``freeze`` or ``reset``.
+        errors: What would have been raised, in the order in which it was found; ``world`` and ``substep`` say where and when.
+    """
+
+    def __init__(self, policy: Policy):
+        need(
+            policy in get_args(Policy),
+            f"policy must be one of {', '.join(get_args(Policy))}, got {policy!r}; without an object of Failures the call raises.",
+        )
+        self.policy: Policy = policy
+        self.errors: list[UnstableError] = []
+
+    def __len__(self) -> int:
+        return len(self.errors)
+
+    @property
+    def worlds(self) -> list[int]:
+        """Worlds that failed, in ascending order, each once."""
+        return sorted({error.world for error in self.errors})

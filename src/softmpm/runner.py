@@ -1,0 +1,141 @@
+"""Runs the chunks of one call by the model's scheme, and decides whether what came out of them can be used."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from softmpm.alarms import Failures
+from softmpm.between import SortedAdj, SortedState
+from softmpm.buffers import Solid
+from softmpm.checkup import armed
+from softmpm.failures import Report, failed_worlds, failure, outgrown
+from softmpm.fast import Fast, FastRun, fast
+from softmpm.horizon import Chunk
+from softmpm.model import Model
+from softmpm.plain import Plain, PlainRun
+from softmpm.replay import note, recording
+from softmpm.state import State
+from softmpm.watch import UnstableError
+
+
+class Runner:
+    """One for each call and backward pass.
+
+    Args:
+        pull: Activation times strength [Pa], shape (control_step, world, muscle), or None without muscles.
+        failures: Takes the failures of worlds, which then stop; None raises them.
+
+    Attributes:
+        frozen: Worlds that take no part from a substep on, that one by world.
+    """
+
+    def __init__(self, model: Model, pull: Tensor | None, solid: Solid, failures: Failures | None = None):
+        self.model, self.pull, self.solid, self.failures = model, pull, solid, failures
+        self.frozen: dict[int, int] = {}
+        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
+        self.scheme = fast(model, stream) if model.scheme == "fast" else Plain(model)
+
+    def run(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
+        """Run a chunk from a :class:`State` or what the scheme gave as an end."""
+        pull = None if self.pull is None else self.pull[chunk.rows]
+        frozen = [world for world, substep in self.frozen.items() if chunk.first >= substep]
+        return self.scheme.run(chunk, start, pull, self.solid, keep, frozen)
+
+    def check(self, start: State) -> Report | None:
+        """Launch the check of the start of the call; see :meth:`passed`."""
+        if not armed(self.model) and self.model.alarms.collapse is None:
+            return None
+        words = self.scheme.start_check(start, self.pull, self.solid)
+        if recording(self.model):
+            note(words.clone())
+            return None
+        return Report(words)
+
+    def passed(self, start: State, report: Report | None) -> bool:
+        """Whether all worlds may start; False if some were frozen instead."""
+        words = [] if report is None else report.read()
+        for world in failed_worlds(words):
+            self._take(
+                failure(
+                    self.model, words, world, start, solid=self.solid, pull=self._strongest(), before=True
+                ),
+                0,
+            )
+        return not failed_worlds(words)
+
+    def _strongest(self) -> Tensor | None:
+        return None if self.pull is None else self.pull.amax(0)
+
+    def settled(self, run: FastRun | PlainRun, report: Report) -> bool:
+        """Whether what ``run`` gave can be used; False if it must run again, with a larger window or without a world that failed.
+
+        Raises:
+            UnstableError: A world failed, and the failures are not taken.
+        """
+        words = report.read()
+        if isinstance(run, FastRun) and isinstance(self.scheme, Fast):
+            *words, cells, near_edge = words
+            if outgrown(words):
+                self.scheme.widen(run)
+                return False
+            run.pool.arrangement.judge(cells, bool(near_edge))
+        if failed_worlds(words):
+            self._take(self._located(run, words), run.chunk.first)
+            return False
+        return True
+
+    def _take(self, error: UnstableError, first: int) -> None:
+        if self.failures is None:
+            raise error
+        self.failures.errors.append(error)
+        self.frozen[error.world] = first
+
+    def _located(self, run: FastRun | PlainRun, words: list[int]) -> UnstableError:
+        """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
+        state, at_end = run.start, as_state(run.end)
+        about = dict(
+            solid=self.solid, start=run.start if isinstance(run.start, State) else None, state=at_end
+        )
+        for s in range(run.chunk.length):
+            one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
+            single, found = self._single(one, state)
+            failed = failed_worlds(found)
+            if failed:
+                pull = None if self.pull is None else self.pull[one.rows][0]
+                world = min(failed, key=lambda w: found[w])
+                return failure(
+                    self.model, found, world, as_state(single.end), first=one.first, pull=pull, **about
+                )
+            state = single.end
+        # Sums in another order may have avoided it; what was reported is true all the same.
+        world = min(failed_worlds(words), key=lambda w: words[w])
+        return failure(
+            self.model, words, world, at_end, first=run.chunk.first, pull=self._strongest(), **about
+        )
+
+    def _single(self, chunk: Chunk, state: Any) -> tuple[FastRun | PlainRun, list[int]]:
+        """A run of one substep, and what it reported."""
+        while True:
+            run = self.run(chunk, state, keep=False)
+            words = run.words.tolist()[: self.model.worlds]
+            if not outgrown(words) or not isinstance(run, FastRun) or not isinstance(self.scheme, Fast):
+                return run, words
+            self.scheme.widen(run)
+
+    def settle(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
+        """Run a chunk, and wait until it can be used."""
+        while True:
+            run = self.run(chunk, start, keep)
+            if recording(self.model):
+                words = run.words[: self.model.worlds].clone()  # the backward pass uses them anew
+                note(words, run.pool.arrangement.outgrow if isinstance(run, FastRun) else None)
+                return run
+            if self.settled(run, Report(run.words)):
+                return run
+            del run  # or its program would be there beside the next one, which has a larger window
+
+
+def as_state(between: State | SortedState | SortedAdj) -> State:
+    """In the user's order."""
+    return between if isinstance(between, State) else between.state()
