@@ -85,12 +85,14 @@ def cotangent(state: softmpm.State, seed=2) -> softmpm.State:
     """Random weights of a linear loss: unlike a square, it sees every direction, a wrong rotation among them."""
     generator = torch.Generator().manual_seed(seed)
     return softmpm.State(
-        *(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state)
+        *(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state[:4])
     )
 
 
 def dot(a, b) -> torch.Tensor:
-    return sum((x * y).sum() for x, y in zip(a, b, strict=True))
+    """⟨a, b⟩ of lists of tensors, or of what is differentiable of states."""
+    pairs = zip(*(s[:4] if isinstance(s, softmpm.State) else s for s in (a, b)), strict=True)
+    return sum((x * y).sum() for x, y in pairs)
 
 
 def gradients(simulate, model_or_scene, inputs, substeps, weights=None) -> dict[str, torch.Tensor]:

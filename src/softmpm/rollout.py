@@ -181,7 +181,8 @@ def rollout_adj(
     """
     adj_solid = SolidAdj.zeros(model, wanted)
     adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
-    adj: Any = State(*(a.contiguous() for a in adj_end))
+    x, v, C, F = (a.contiguous() for a in adj_end[:4])
+    adj: Any = State(x, v, C, F)
     reports = []
     with trail.turn:
         for run in _inside_out(trail, _Runner(model, pull, solid)):
@@ -224,7 +225,8 @@ def _inside_out(trail: Trail, runner: _Runner) -> Iterator[FastRun | PlainRun]:
         yield from reversed(trail.runs)
         return
     states = _taken(trail, runner)
-    hand: State | SortedState = State(*(4 * (torch.empty(0),)))
+    nothing = torch.empty(0)
+    hand: State | SortedState = State(nothing, nothing, nothing, nothing)
     for action, k in schedule.going_back(len(trail.chunks), trail.plan.slots):
         if action == "restore":
             hand = states[k]
