@@ -89,12 +89,14 @@ def cotangent(state: softmpm.State, seed=2) -> softmpm.State:
     """Random weights of a linear loss: unlike a square, it sees every direction, a wrong rotation among them."""
     generator = torch.Generator().manual_seed(seed)
     return softmpm.State(
-        *(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state)
+        *(torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in state[:4])
     )
 
 
 def dot(a, b) -> torch.Tensor:
-    return sum((x * y).sum() for x, y in zip(a, b, strict=True))
+    """⟨a, b⟩ of lists of tensors, or of what is differentiable of states."""
+    pairs = zip(*(s[:4] if isinstance(s, softmpm.State) else s for s in (a, b)), strict=True)
+    return sum((x * y).sum() for x, y in pairs)
 
 
 def gradients(simulate, model_or_scene, inputs, substeps, weights=None) -> dict[str, torch.Tensor]:
@@ -120,3 +122,15 @@ def little_memory(model) -> dict[str, int]:
     budget = 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between
     assert not plan(Horizon(3, 7), sizes, budget).keep_all
     return {"memory_budget": budget}
+
+
+def thrown_out() -> softmpm.State:
+    """A simulation that fails, for a process of its own: one particle leaves the grid at substep 3."""
+    body = softmpm.Body(
+        softmpm.Particles([[0.5, 0.5], [0.7, 0.55]], 0.01), softmpm.NeoHookean(density=1, young=10)
+    )
+    grid = softmpm.Grid(shape=(12, 12), spacing=0.1)
+    model = softmpm.build(softmpm.Scene(grid=grid, bodies=[body], dt=1e-3), device="cpu")
+    start = model.rest()
+    start.v[0, 1, 0] = 100.0
+    return softmpm.simulate(model, start, None, model.params(), substeps=10)

@@ -101,13 +101,12 @@ def _simulate(
     elif model.muscle_count:
         pull = torch.zeros(1, model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
     low = start.low or (None, None)
-    inputs = (pull, mu, lam, mass, *start)
+    inputs = (pull, mu, lam, mass, *start[:4])
     needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     call = _Call(needed, failures)
     simulated: Any = _Simulate.apply if needed or _followed(inputs) else _Simulate.forward
     end = simulated(model, Horizon(control_steps, substeps), call, *inputs, *low)
-    state = State(*end[:4])
-    return state.with_low(Low(*end[4:6])) if model.dtype == torch.float32 else state
+    return State(*end[:4], low=Low(*end[4:6]) if model.dtype == torch.float32 else None)
 
 
 def _followed(tensors: Iterable[Tensor | None]) -> bool:
@@ -193,8 +192,7 @@ def _cast(model: Model, value: Any) -> Any:
         return value
     if isinstance(value, Tensor):
         return value.to(model.dtype) if value.is_floating_point() else value
-    cast = type(value)(*(_cast(model, tensor) for tensor in value))
-    return cast.with_low(value.low) if isinstance(value, State) else cast
+    return type(value)(*(_cast(model, part) for part in value))
 
 
 class _Call:
@@ -210,11 +208,11 @@ class _Simulate(torch.autograd.Function):
     def forward(*inputs):
         # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
         model, horizon, call, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
-        start = State(x, v, C, F).with_low(None if low_x is None else Low(low_x, low_F))
+        start = State(x, v, C, F, None if low_x is None else Low(low_x, low_F))
         solid, needed = Solid(mass, mu, lam, pull), call.differentiable
         with short_of_memory(model, horizon, needed):
             end, call.trail = rollout(model, horizon, start, pull, solid, needed, call.failures)
-        return (*end, *(end.low or (None, None)))
+        return (*end[:4], *(end.low or (None, None)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -253,7 +251,7 @@ class _SimulateBackward(torch.autograd.Function):
         solid = Solid(mass, mu, lam, pull)
         with short_of_memory(model, horizon, gradient=True):
             adj, adj_solid, adj_pull = rollout_adj(model, horizon, trail, pull, solid, adj_end, wanted)
-        return adj_pull, adj_solid.mu, adj_solid.lam, adj_solid.mass, *adj
+        return adj_pull, adj_solid.mu, adj_solid.lam, adj_solid.mass, *adj[:4]
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -99,7 +99,7 @@ class SortedState(Sorted):
         rounds = self._unpacking.model.dtype == torch.float32
         x, v, C, F, *low = self._unpacking.fields(1, 1, 2, 2, *((1, 2) if rounds else ()))
         self._unpacking.leave(self._stream, self.order, self.base, self.rows, x, v, C, F, *low)
-        return State(x, v, C, F).with_low(Low(*low) if low else None)
+        return State(x, v, C, F, Low(*low) if low else None)
 
 
 class SortedAdj(Sorted):
@@ -107,6 +107,6 @@ class SortedAdj(Sorted):
 
     def state(self) -> State:
         """In the user's order, in new tensors."""
-        adj = State(*self._unpacking.fields(1, 1, 2, 2))
-        self._unpacking.leave_adj(self._stream, self.order, self.rows, *adj)
-        return adj
+        x, v, C, F = self._unpacking.fields(1, 1, 2, 2)
+        self._unpacking.leave_adj(self._stream, self.order, self.rows, x, v, C, F)
+        return State(x, v, C, F)

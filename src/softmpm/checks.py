@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from softmpm.scene import Grid, Scene, need
+from softmpm.state import Low, State
 
 SAME_PLACE = 1e-6
 """Two particles nearer than this share of a cell are one particle twice."""
@@ -144,15 +145,20 @@ class Sizes(Protocol):
     def device(self) -> torch.device: ...
 
 
-def check_state(model: Sizes, state: NamedTuple) -> None:
+def check_state(model: Sizes, state: State) -> None:
     """Shape, dtype and device of x, v, C and F, and of the low-order parts if there are any."""
+    if not isinstance(state, State):
+        raise TypeError(f"state must be a softmpm.State, got {type(state).__name__}.")
     lead, d = (model.worlds, model.particle_count), model.dim
     shapes = {"x": (*lead, d), "v": (*lead, d), "C": (*lead, d, d), "F": (*lead, d, d)}
-    for name, value in _fields("state", state, tuple(shapes)):
-        _check_tensor(model, f"state.{name}", value, shapes[name])
-    low = getattr(state, "low", None)
-    for name in () if low is None else ("x", "F"):
-        _check_tensor(model, f"state.low.{name}", getattr(low, name), shapes[name])
+    for name in shapes:
+        _check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
+    if state.low is None:
+        return
+    if not isinstance(state.low, Low):
+        raise TypeError(f"state.low must be a softmpm.Low or None, got {type(state.low).__name__}.")
+    for name in ("x", "F"):
+        _check_tensor(model, f"state.low.{name}", getattr(state.low, name), shapes[name])
 
 
 def check_activation(model: Sizes, activation: Tensor | None) -> None:
@@ -206,9 +212,9 @@ def check_bounds(params: NamedTuple) -> None:
 
 
 @torch.no_grad()
-def check_finite(state: NamedTuple, activation: Tensor | None) -> None:
+def check_finite(state: State, activation: Tensor | None) -> None:
     """All numbers that move are finite. Reads back once: a GPU has to wait."""
-    given = [(f"state.{name}", value) for name, value in _fields("state", state, ("x", "v", "C", "F"))]
+    given = [(f"state.{name}", getattr(state, name)) for name in ("x", "v", "C", "F")]
     given += [] if activation is None else [("activation", activation)]
     # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
     for (name, value), total in zip(given, torch.stack([v.sum() for _, v in given]).tolist(), strict=True):

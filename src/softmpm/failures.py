@@ -110,7 +110,7 @@ def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last:
         return
     back, kind, particle = decode(words[world])
     substep, limit = last - back, "gradients must be finite"
-    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end)
+    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end[:4])
     cause = (
         "It overflowed on the way back: shorten the horizon or scale the loss"
         if given
@@ -132,7 +132,9 @@ def _never_ran(end: State, start: State, worlds: list[int]) -> State:
     """These worlds as they were given: the fast scheme cannot hold what is off the grid."""
     if not worlds:
         return end
-    given = [tensor.clone() for tensor in end]
-    for tensor, from_start in zip(given, start, strict=True):
-        tensor[worlds] = from_start.detach()[worlds]
-    return State(*given)
+    given, start = end.clone(), start.detach()
+    for tensor, from_start in zip(given[:4], start[:4], strict=True):
+        tensor[worlds] = from_start[worlds]
+    for name in () if given.low is None else ("x", "F"):
+        getattr(given.low, name)[worlds] = 0.0 if start.low is None else getattr(start.low, name)[worlds]
+    return given

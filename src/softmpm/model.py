@@ -205,10 +205,8 @@ class Model:
             .expand(*lead, self.dim, self.dim)
             .clone()
         )
-        state = State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye)
-        if self._low is None:
-            return state
-        return state.with_low(Low(self._low.expand_as(x).clone(), torch.zeros_like(eye)))
+        low = None if self._low is None else Low(self._low.expand_as(x).clone(), torch.zeros_like(eye))
+        return State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye, low=low)
 
     def _rounded(self) -> Tensor:
         """What rounding took off the rest positions [m], shape (particle, dim)."""

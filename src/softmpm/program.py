@@ -206,7 +206,7 @@ class Program:
         if isinstance(start, SortedState):
             self._move(stream, start.places(), start.base, start.rows)
         else:
-            given = [tensor.contiguous() for tensor in (*start, *(start.low or ()))]
+            given = [tensor.contiguous() for tensor in (*start[:4], *(start.low or ()))]
             self._enter[start.low is not None](stream, *given)
 
     def _has(self, solid: Solid) -> bool:

@@ -95,7 +95,7 @@ class ProgramAdj:
         if isinstance(adj_end, SortedAdj):
             self._move(stream, adj_end.places(), adj_end.rows)
         else:
-            self._enter(stream, *adj_end)
+            self._enter(stream, *adj_end[:4])
 
     def _launch_all(self, launch: Launcher) -> None:
         clear_nodes, held = fused(self.program.model.spec).clear, len(self.scratch.velocity)

@@ -118,8 +118,8 @@ def _returned(model: Model, end: State, runner: Runner) -> State:
     if runner.failures is None or runner.failures.policy == "freeze" or not runner.frozen:
         return end
     worlds, rest = sorted(runner.frozen), model.rest()
-    end = State(*(tensor.clone() for tensor in end)).with_low(end.low)
-    for tensor, at_rest in zip((*end, *(end.low or ())), (*rest, *(rest.low or ())), strict=True):
+    end = end.clone()
+    for tensor, at_rest in zip((*end[:4], *(end.low or ())), (*rest[:4], *(rest.low or ())), strict=True):
         tensor[worlds] = at_rest[worlds]
     return end
 
@@ -164,7 +164,7 @@ def rollout_adj(
     """
     adj_solid = SolidAdj.zeros(model, wanted)
     adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
-    adj: Any = State(*(a.contiguous() for a in _without(trail.frozen, adj_end)))
+    adj: Any = _without(trail.frozen, adj_end)
     reports, runner = [], Runner(model, pull, solid)
     runner.frozen = trail.frozen
     with trail.turn:
@@ -184,13 +184,11 @@ def rollout_adj(
 
 
 def _without(frozen: dict[int, int], adj_end: State) -> State:
-    """The adjoint of the end, zero for worlds that failed."""
-    if not frozen:
-        return adj_end
-    adj = State(*(a.clone() for a in adj_end))
-    for tensor in adj:
+    """The adjoint of the end, contiguous, and zero for worlds that failed."""
+    x, v, C, F = (a.clone() if frozen else a.contiguous() for a in adj_end[:4])
+    for tensor in (x, v, C, F) if frozen else ():
         tensor[sorted(frozen)] = 0
-    return adj
+    return State(x, v, C, F)
 
 
 def _taken(trail: Trail, runner: Runner) -> dict[int, State | SortedState]:
@@ -218,7 +216,8 @@ def _inside_out(trail: Trail, runner: Runner) -> Iterator[FastRun | PlainRun]:
         yield from reversed(trail.runs)
         return
     states = _taken(trail, runner)
-    hand: State | SortedState = State(*(4 * (torch.empty(0),)))
+    nothing = torch.empty(0)
+    hand: State | SortedState = State(nothing, nothing, nothing, nothing)
     for action, k in schedule.going_back(len(trail.chunks), trail.plan.slots):
         if action == "restore":
             hand = states[k]

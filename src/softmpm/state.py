@@ -1,36 +1,9 @@
 """What moves, and what it is made of, as named tuples of tensors that PyTorch owns."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from torch import Tensor
-
-
-class _StateFields(NamedTuple):
-    x: Tensor
-    v: Tensor
-    C: Tensor
-    F: Tensor
-
-
-class State(_StateFields):
-    """State of every particle of every world.
-
-    Attributes:
-        x: Positions [m], shape (world, particle, dim).
-        v: Velocities [m/s], shape (world, particle, dim).
-        C: Affine velocity [1/s], shape (world, particle, dim, dim).
-        F: Deformation gradient [-], shape (world, particle, dim, dim).
-        low: What rounding to float32 took off ``x`` and ``F``, or None. :func:`softmpm.simulate` returns and takes it, so
-            that a motion of 1e-5 survives being cut into many calls; it carries no gradient. Iteration, ``_replace`` and
-            ``State(x, v, C, F)`` see the four fields only; a state without ``low`` stands for exactly what it holds.
-    """
-
-    low: "Low | None" = None
-
-    def with_low(self, low: "Low | None") -> "State":
-        state = State(*self)
-        state.low = low
-        return state
 
 
 class Low(NamedTuple):
@@ -38,6 +11,51 @@ class Low(NamedTuple):
 
     x: Tensor
     F: Tensor
+
+    def detach(self) -> "Low":
+        """The same parts without their history."""
+        return Low(*(tensor.detach() for tensor in self))
+
+    def clone(self) -> "Low":
+        """The same parts in memory of their own."""
+        return Low(*(tensor.clone() for tensor in self))
+
+    def to(self, *args: Any, **kwargs: Any) -> "Low":
+        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``."""
+        return Low(*(tensor.to(*args, **kwargs) for tensor in self))
+
+
+class State(NamedTuple):
+    """State of every particle of every world; ``state[:4]`` is what is differentiable of it."""
+
+    x: Tensor
+    """Positions [m], shape (world, particle, dim)."""
+    v: Tensor
+    """Velocities [m/s], shape (world, particle, dim)."""
+    C: Tensor
+    """Affine velocity [1/s], shape (world, particle, dim, dim)."""
+    F: Tensor
+    """Deformation gradient [-], shape (world, particle, dim, dim)."""
+    low: Low | None = None
+    """Remainders of rounding ``x`` and ``F`` to float32, or None. :func:`softmpm.simulate` returns and takes them, so that a motion
+    of 1e-5 of a cell survives a division into many calls; they carry no gradient. A state without them stands for exactly its
+    four tensors."""
+
+    def detach(self) -> "State":
+        """The same state without its history, the low-order parts included."""
+        return self._each(lambda part: part.detach())
+
+    def clone(self) -> "State":
+        """The same state in memory of its own, the low-order parts included. Differentiable."""
+        return self._each(lambda part: part.clone())
+
+    def to(self, *args: Any, **kwargs: Any) -> "State":
+        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``."""
+        return self._each(lambda part: part.to(*args, **kwargs))
+
+    def _each(self, change: Callable[[Any], Any]) -> "State":
+        x, v, C, F = (change(tensor) for tensor in self[:4])
+        return State(x, v, C, F, None if self.low is None else change(self.low))
 
 
 class Params(NamedTuple):

@@ -149,12 +149,11 @@ class Substep:
 
     def enter(self, start: State, motion) -> None:
         """From what users hold to what the kernels hold."""
-        t, state = self.types, start
-        low = start.low
+        t, low = self.types, start.low
         if low is None:
-            low = Low(torch.zeros_like(state.x), torch.zeros_like(state.F))
+            low = Low(torch.zeros_like(start.x), torch.zeros_like(start.F))
         arrays = [
-            view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*state, *low)
+            view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*start[:4], *low)
         ]
         kernel = boundary(self.model.dim, self.model.spec.dtype).enter
         self.launch(kernel, self.particles, self.model.scale, *arrays, self.watch, motion)
@@ -171,5 +170,4 @@ class Substep:
         self.launch(
             boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.scale, motion, *arrays
         )
-        state = State(*out[:4])
-        return state.with_low(Low(*out[4:])) if out[4:] else state
+        return State(*out[:4], low=Low(*out[4:]) if out[4:] else None)

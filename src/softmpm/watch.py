@@ -6,6 +6,11 @@ word is read, and nothing is written out of bounds. Other worlds go on, unchange
 """
 
 from enum import IntEnum
+from typing import Any
+
+import torch
+
+from softmpm.state import Low, State
 
 NEVER = 2**63 - 1
 FROZEN = NEVER - 1
@@ -58,6 +63,29 @@ class UnstableError(RuntimeError):
         self.kind = kind
         self.world, self.particle, self.substep = world, particle, substep
         self.value, self.limit, self.state = value, limit, state
+
+    def __reduce__(self):
+        """For pickle and copy, so that a failure in another process arrives whole; the state arrives on the CPU."""
+        about = self.__dict__ | {
+            "state": None if self.state is None else _arrays(self.state.detach().to("cpu"))
+        }
+        return _restored, (type(self), self.args, about)
+
+
+def _restored(kind: type[UnstableError], args: tuple, about: dict[str, Any]) -> UnstableError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(about)
+    if error.state is not None:
+        *tensors, low = error.state
+        x, v, C, F = map(torch.from_numpy, tensors)
+        error.state = State(x, v, C, F, None if low is None else Low(*map(torch.from_numpy, low)))
+    return error
+
+
+def _arrays(state: State) -> tuple:
+    """As NumPy arrays: PyTorch would send tensors as handles on memory of the sender, which may have ended by then."""
+    low = None if state.low is None else tuple(tensor.numpy() for tensor in state.low)
+    return *(tensor.numpy() for tensor in state[:4]), low
 
 
 def decode(word: int) -> tuple[int, Kind, int]:

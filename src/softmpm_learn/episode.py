@@ -51,9 +51,8 @@ class Episode:
 
     def detach(self) -> "Episode":
         """Without anything that a gradient needs, the decisions included."""
-        end = State(*(tensor.detach() for tensor in self.end))
         final, running = self.final.detach(), self.running.detach()
-        return replace(self, final=final, running=running, end=end, decisions=Decisions())
+        return replace(self, final=final, running=running, end=self.end.detach(), decisions=Decisions())
 
 
 @dataclass(frozen=True)

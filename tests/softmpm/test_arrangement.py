@@ -209,14 +209,14 @@ def flight(model, v: torch.Tensor, substeps: int, calls: int = 1, twist: float =
     state, params = model.rest(), model.params()
     turn = torch.zeros_like(state.C)
     turn[..., 0, 1], turn[..., 1, 0] = -twist, twist
-    start = state._replace(v=(state.v + v.to(state.v)).requires_grad_(), C=turn).with_low(state.low)
-    weights = [w / w.abs().max() for w in cotangent(state)]
+    start = state._replace(v=(state.v + v.to(state.v)).requires_grad_(), C=turn)
+    weights = [w / w.abs().max() for w in cotangent(state)[:4]]
 
     def fly():
         end = start
         for _ in range(calls):
             end = softmpm.simulate(model, end, None, params, substeps=substeps)
-        return [t.detach() for t in end], *torch.autograd.grad(dot(weights, end), start.v)
+        return end.detach()[:4], *torch.autograd.grad(dot(weights, end), start.v)
 
     return start, fly
 
@@ -310,7 +310,7 @@ def test_worlds_far_apart_have_windows_of_their_own(watched, device):
         start = rest._replace(x=rest.x + starts.to(rest.x), v=(rest.v + v.to(rest.v)).requires_grad_())
         end = softmpm.simulate(model, start, None, model.params(), substeps=40)
         (gradient,) = torch.autograd.grad(dot(cotangent(end), end), start.v)
-        ends.append(([t.detach().cpu() for t in end], gradient.cpu()))
+        ends.append(([t.detach().cpu() for t in end[:4]], gradient.cpu()))
     assert math.prod(watched.made[-1]) < 0.02 * 420 * 300
     assert len(watched.grown_from) >= 1
     assert_same(*ends, 1e-13)

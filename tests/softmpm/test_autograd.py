@@ -23,7 +23,7 @@ def test_gradcheck_of_every_input(dim, device, scheme):
     inputs = busy_inputs(model)
 
     def function(*tensors):
-        return tuple(run(softmpm.simulate, model, dict(zip(INPUTS, tensors, strict=True)), substeps=3))
+        return tuple(run(softmpm.simulate, model, dict(zip(INPUTS, tensors, strict=True)), substeps=3)[:4])
 
     ordered = tuple(inputs[name] for name in INPUTS)
     repeatable = 0.0 if device == "cpu" else 1e-10  # atomics add in any order on a GPU
@@ -76,11 +76,11 @@ def test_arguments_are_never_changed_and_results_are_fresh(model):
     inputs = busy_inputs(model)
     before = {name: tensor.detach().clone() for name, tensor in inputs.items()}
     first = run(softmpm.simulate, model, inputs, 3)
-    copy = [tensor.detach().clone() for tensor in first]
+    copy = [tensor.detach().clone() for tensor in first[:4]]
     second = run(softmpm.simulate, model, inputs, 4)
     dot(cotangent(second), second).backward()
     assert all(torch.equal(inputs[name], tensor) for name, tensor in before.items())
-    assert all(torch.equal(tensor, kept) for tensor, kept in zip(first, copy, strict=True))
+    assert all(torch.equal(tensor, kept) for tensor, kept in zip(first[:4], copy, strict=True))
 
 
 def test_an_input_changed_in_place_before_backward_raises(model):
@@ -187,7 +187,7 @@ def test_no_grad_keeps_nothing(model):
     """Under no_grad the end has no history."""
     with torch.no_grad():
         end = run(softmpm.simulate, model, busy_inputs(model), 2)
-    assert not any(tensor.requires_grad for tensor in end)
+    assert not any(tensor.requires_grad for tensor in end[:4])
 
 
 def test_rasterize_has_finite_gradients_at_vanishing_mass():

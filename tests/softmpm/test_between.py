@@ -65,7 +65,7 @@ def test_a_state_changes_hands_unchanged(model):
         back = found.state()
         assert back.low is not None and state.low is not None
         for name, got, want in zip(
-            "x v C F low_x low_F".split(), (*back, *back.low), (*state, *state.low), strict=True
+            "x v C F low_x low_F".split(), (*back[:4], *back.low), (*state[:4], *state.low), strict=True
         ):
             assert torch.equal(got, want), name
         assert torch.equal(found.x, state.x)
@@ -76,15 +76,15 @@ def test_an_adjoint_changes_hands_unchanged(model):
     """The same for adjoints, from the scratch of one program to that of another."""
     state, stream, wanted = state_of(model), stream_of(model.device), Wanted(material=False, activation=False)
     generator = torch.Generator().manual_seed(0)
-    adj = softmpm.State(*(torch.randn(t.shape, generator=generator).to(t) for t in state))
+    adj = softmpm.State(*(torch.randn(t.shape, generator=generator).to(t) for t in state[:4]))
     programs = [program_in(model, seed, state.x) for seed in (1, 2)]
     first, second = (ProgramAdj(program, wanted, Scratch(program, wanted)) for program in programs)
-    first._enter(stream, *adj)
+    first._enter(stream, *adj[:4])
     between = SortedAdj(Unpacking(model), first.scratch.adj, programs[0].order)
     second._move(stream, between.places(), between.rows)
     assert not torch.equal(programs[0].order, programs[1].order)
     back = SortedAdj(Unpacking(model), second.scratch.adj, programs[1].order).state()
-    for name, got, want in zip("xvCF", back, adj, strict=True):
+    for name, got, want in zip("xvCF", back[:4], adj[:4], strict=True):
         torch.testing.assert_close(
             got, want, rtol=3e-7, atol=0, msg=name
         )  # x is multiplied by the spacing and back

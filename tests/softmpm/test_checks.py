@@ -189,7 +189,7 @@ def test_good_tensors_pass():
     check_bounds(params())
     check_finite(state(), torch.zeros(1, 2, 4))
     check_finite(state(), None)
-    check_state(MODEL, state().with_low(Low(state().v, state().C)))
+    check_state(MODEL, state(low=Low(state().v, state().C)))
 
 
 @pytest.mark.parametrize("name", ["x", "v", "C", "F"])
@@ -207,9 +207,9 @@ def test_low_order_parts():
     good = Low(state().v, state().C)
     for bad in (good._replace(x=good.x[:1]), good._replace(F=good.F[..., :1])):
         with pytest.raises(ValueError, match=r"state.low.(x|F) must have shape"):
-            check_state(MODEL, state().with_low(bad))
+            check_state(MODEL, state(low=bad))
     with pytest.raises(ValueError, match=r"state.low.F must be torch.float32"):
-        check_state(MODEL, state().with_low(good._replace(F=good.F.double())))
+        check_state(MODEL, state(low=good._replace(F=good.F.double())))
 
 
 def test_activation_shape():
@@ -269,14 +269,13 @@ def test_substeps(substeps):
 @pytest.mark.parametrize("name", ["x", "v", "C", "F", "activation", "young", "poisson", "density"])
 def test_not_finite(name, bad):
     """One bad number anywhere is found and named by its index."""
-    tensors = state()._asdict() | {"activation": torch.zeros(1, 2, 4)} | params()._asdict()
-    tensors = {key: value.clone() for key, value in tensors.items()}
-    tensors[name].view(-1)[-1] = bad
-    index = ", ".join(str(n - 1) for n in tensors[name].shape)
-    start, material = (cls(*(tensors[key] for key in cls._fields)) for cls in (State, Params))
+    start, activation, material = state(), torch.zeros(1, 2, 4), Params(*(p.clone() for p in params()))
+    tensor = (start._asdict() | {"activation": activation} | material._asdict())[name]
+    tensor.view(-1)[-1] = bad
+    index = ", ".join(str(n - 1) for n in tensor.shape)
     check = partial(check_bounds, material)
     if name not in BOUNDS:
-        check = partial(check_finite, start, tensors["activation"])
+        check = partial(check_finite, start, activation)
     with pytest.raises(
         ValueError, match=re.escape(f"{name}[{index}] is {bad:g}" if index else f"{name} is {bad:g}")
     ):

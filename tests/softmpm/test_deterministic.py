@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 import torch
-from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, gradients, run
+from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 import softmpm
 from softmpm import reference
@@ -21,7 +21,7 @@ def everything(model, inputs, substeps=10, weights=None) -> dict[str, torch.Tens
     """The end, and the gradient with respect to each input."""
     end = run(softmpm.simulate, model, inputs, substeps)
     found = gradients(softmpm.simulate, model, inputs, substeps, weights)
-    return {f"end.{name}": t.detach() for name, t in zip("xvCF", end, strict=True)} | found
+    return {f"end.{name}": t.detach() for name, t in zip("xvCF", end[:4], strict=True)} | found
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -43,8 +43,8 @@ def test_state_and_every_gradient_are_the_references(dim, device):
     want_end = run(reference.simulate, model.scene, copies, 10)
     weights = cotangent(want_end)
     want = gradients(reference.simulate, model.scene, copies, 10, weights)
-    got = everything(model, inputs, weights=[w.to(model.device, model.dtype) for w in weights])
-    for name, end in zip("xvCF", want_end, strict=True):
+    got = everything(model, inputs, weights=weights.to(model.device, model.dtype))
+    for name, end in zip("xvCF", want_end[:4], strict=True):
         assert_relative(got[f"end.{name}"].cpu(), end, 2e-6, name)
     for name in INPUTS:
         assert_relative(got[name].cpu(), want[name], 1e-5, name)
@@ -100,7 +100,7 @@ def test_units_follow_the_size_of_the_gradient_in_each_world():
     inputs = busy_inputs(model)
     weights = cotangent(model.rest())
     times = torch.tensor([2.0**40, 2.0**-60])
-    scaled = [w * times.view(2, *(1 for _ in w.shape[1:])) for w in weights]
+    scaled = [w * times.view(2, *(1 for _ in w.shape[1:])) for w in weights[:4]]
     one, other = (gradients(softmpm.simulate, model, inputs, 5, w) for w in (weights, scaled))
     for name in INPUTS:
         factor = (
@@ -179,7 +179,7 @@ def test_an_observers_sums_do_not_depend_on_the_order_either():
     order = torch.randperm(model.particle_count, generator=generator)
     one, other = (
         softmpm.rasterize(model, state),
-        softmpm.rasterize(model, softmpm.State(*(t[:, order] for t in state))),
+        softmpm.rasterize(model, softmpm.State(*(t[:, order] for t in state[:4]))),
     )
     assert torch.equal(one.mass, other.mass) and torch.equal(one.velocity, other.velocity)
     want = softmpm.rasterize(softmpm.build(model.scene, device="cpu"), state)
@@ -223,14 +223,14 @@ def test_two_runs_give_the_same_bits(dim, count):
         generator = torch.Generator().manual_seed(4)
         for _ in range(3):
             generator.manual_seed(4)
-            start = softmpm.State(*(t.detach().requires_grad_() for t in model.rest()))
+            start = softmpm.State(*(t.detach().requires_grad_() for t in model.rest()[:4]))
             activation = torch.rand(5, 2, model.muscle_count, generator=generator).cuda().requires_grad_()
             params = softmpm.Params(*(p.requires_grad_() for p in model.params()))
             end = softmpm.simulate(model, start, activation, params, substeps=20)
-            loss = sum((w * t).sum() for w, t in zip(cotangent(end), end, strict=True))
-            inputs = (*start, activation, *params)
-            field = softmpm.rasterize(model, softmpm.State(*(t.detach() for t in end)))
-            found.append((*end, *torch.autograd.grad(loss, inputs), *field))
+            loss = dot(cotangent(end), end)
+            inputs = (*start[:4], activation, *params)
+            field = softmpm.rasterize(model, end.detach())
+            found.append((*end[:4], *torch.autograd.grad(loss, inputs), *field))
             thrown = softmpm.State(
                 start.x.detach(), start.v.detach() + 5.0, start.C.detach(), start.F.detach()
             )

@@ -109,9 +109,9 @@ def test_more_numbers_than_indices_reach_take_the_plain_scheme():
 def end_and_gradients(built, control_steps: int, substeps: int, seed=1):
     inputs = busy_inputs(built, control_steps=control_steps, seed=seed)
     end = run(softmpm.simulate, built, inputs, substeps)
-    weights = [w / w.abs().max() for w in cotangent(end)]
+    weights = [w / w.abs().max() for w in cotangent(end)[:4]]
     found = torch.autograd.grad(dot(weights, end), list(inputs.values()))
-    return dict(zip((*"xvCF", *(f"gradient of {name}" for name in inputs)), (*end, *found), strict=True))
+    return dict(zip((*"xvCF", *(f"gradient of {name}" for name in inputs)), (*end[:4], *found), strict=True))
 
 
 @pytest.mark.parametrize("control_steps, substeps", [(5, 3), (2, 20)])
@@ -154,8 +154,8 @@ def test_what_new_memory_holds_leaves_no_trace(dim, deterministic, device, monke
         start.v.add_(torch.tensor([0.3, 0.2, 0.1][:dim], device=device))
         inputs = [part.requires_grad_() for part in start[:3]]
         end = softmpm.simulate(built, start, None, built.params(), substeps=1)
-        loss = sum(part.square().sum() for part in end)
-        found.append([*(part.detach() for part in end), *torch.autograd.grad(loss, inputs)])
+        loss = sum(part.square().sum() for part in end[:4])
+        found.append([*end.detach()[:4], *torch.autograd.grad(loss, inputs)])
     for clean, dirty in zip(*found, strict=True):
         assert torch.equal(clean, dirty)
 
@@ -176,7 +176,7 @@ def test_fast_and_plain_agree_in(scene, device):
         end = run(softmpm.simulate, m, inputs, 6)
         wanted = [name for name, tensor in inputs.items() if tensor.requires_grad]
         found = torch.autograd.grad(dot(cotangent(end), end), [inputs[name] for name in wanted])
-        results.append(dict(zip((*"xvCF", *wanted), (*end, *found), strict=False)))
+        results.append(dict(zip((*"xvCF", *wanted), (*end[:4], *found), strict=False)))
     for name, want in results[1].items():
         assert_relative(results[0][name], want, 1e-12, name)
 
@@ -294,11 +294,11 @@ def test_starts_of_any_layout(dtype, device):
     low = built.rest().low
     for parts in (None, None if low is None else softmpm.Low(low.x + 1e-8, low.F + 1e-8)):
         fresh = model(device=device, dtype=dtype, worlds=2)
-        want = softmpm.simulate(fresh, copy.with_low(parts), inputs["activation"], params, substeps=3)
+        want = softmpm.simulate(fresh, copy._replace(low=parts), inputs["activation"], params, substeps=3)
         for name, laid in layouts.items():
-            given = softmpm.State(*map(laid, copy)).with_low(parts and softmpm.Low(*map(laid, parts)))
+            given = softmpm.State(*map(laid, copy[:4]), low=parts and softmpm.Low(*map(laid, parts)))
             got = softmpm.simulate(built, given, laid(inputs["activation"]), params, substeps=3)
-            for field, a, b in zip("xvCF", got, want, strict=True):
+            for field, a, b in zip("xvCF", got[:4], want[:4], strict=True):
                 assert_relative(a, b, same_on(device), f"{field}, {name}")
     one = copy._replace(v=copy.v[:, :1].expand_as(copy.v))  # no memory of its own
     got, want = (
@@ -314,17 +314,17 @@ def test_starts_of_any_layout(dtype, device):
 def test_gradients_of_any_layout(device):
     """Cotangents that are transposed or broadcast, as PyTorch hands them on, give the gradient of their copies."""
     built = model(device=device, worlds=2)
-    weights = [w.transpose(0, 1).contiguous().transpose(0, 1) for w in cotangent(built.rest())]
+    weights = [w.transpose(0, 1).contiguous().transpose(0, 1) for w in cotangent(built.rest())[:4]]
     found = []
     for given in (weights, [w.contiguous() for w in weights]):
         ((end, inputs),) = calls(built, [1])
-        found.append(torch.autograd.grad(end, list(inputs.values()), given))
+        found.append(torch.autograd.grad(end[:4], list(inputs.values()), given))
     ((end, inputs),) = calls(built, [1])
     for one, other in zip(*found, strict=True):
         assert_relative(one, other, same_on(device))
-    total = sum(t.sum() for t in end)
+    total = sum(t.sum() for t in end[:4])
     ones = torch.autograd.grad(total, list(inputs.values()), retain_graph=True)
-    want = torch.autograd.grad(end, list(inputs.values()), [torch.ones_like(t) for t in end])
+    want = torch.autograd.grad(end[:4], list(inputs.values()), [torch.ones_like(t) for t in end[:4]])
     for one, other in zip(ones, want, strict=True):
         assert_relative(one, other, same_on(device))
 
@@ -452,14 +452,14 @@ def test_a_result_outlives_what_runs_after_it(short_chunks, device):
     with torch.no_grad():
         ((bare, _),) = calls(built, [1])
     ((end, _),) = calls(built, [1])
-    copies = [t.detach().clone() for t in (*bare, *end)]
+    copies = [t.detach().clone() for t in (*bare[:4], *end[:4])]
     with torch.no_grad():
         list(calls(built, [2, 3]))
     for other, others in calls(built, [2]):
         pull(other, others)
-    for tensor, copy in zip((*bare, *end), copies, strict=True):
+    for tensor, copy in zip((*bare[:4], *end[:4]), copies, strict=True):
         assert torch.equal(tensor, copy)
-    for one, other in zip(bare, end, strict=True):
+    for one, other in zip(bare[:4], end[:4], strict=True):
         assert_relative(one, other.detach(), same_on(device))
 
 
@@ -533,7 +533,7 @@ def test_a_start_stays_until_nothing_needs_it(device):
     want, later = first.state(), first
     for _ in range(4):
         later = after(later)
-    for got, held in zip(first.state(), want, strict=True):
+    for got, held in zip(first.state()[:4], want[:4], strict=True):
         assert torch.equal(got, held)
 
 
@@ -694,7 +694,7 @@ def test_an_interrupted_call_leaves_material_that_comes_again(settings, short_ch
     want = go(prepared())
     points = 0
     for made in interrupted(prepared, go, every=1 if device == "cpu" else 5):
-        for got, wanted in zip(go(made), want, strict=True):
+        for got, wanted in zip(go(made)[:4], want[:4], strict=True):
             assert_relative(got, wanted, same_on(device))
         points += 1
     assert points > 20

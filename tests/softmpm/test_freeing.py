@@ -322,7 +322,7 @@ def test_a_graph_runs_on_memory_of_its_own():
 
     def work():
         end = run(softmpm.simulate, built["model"], inputs, 20)
-        return *(t.detach() for t in end), *torch.autograd.grad(dot(weights, end), list(inputs.values()))
+        return *end.detach()[:4], *torch.autograd.grad(dot(weights, end), list(inputs.values()))
 
     graph = softmpm.Graph(work, built["model"].device)
     graph()

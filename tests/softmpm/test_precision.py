@@ -27,7 +27,7 @@ def vibrate(dtype, calls=1):
     rest = model.rest()
     v = torch.zeros_like(rest.v)
     v[..., 0] = 1e-5 * torch.cos(2 * torch.pi * (model.positions[:, 0].double() - 0.25)).to(dtype)
-    state = rest._replace(v=v).with_low(rest.low)
+    state = rest._replace(v=v)
     for _ in range(calls):
         state = softmpm.simulate(model, state, None, model.params(), substeps=period // calls)
     return state

@@ -46,7 +46,7 @@ def moved(model: softmpm.Model, by: float, worlds: int = 1) -> softmpm.State:
     """Rest, shifted by ``by`` in the first world and by one more in each further one."""
     rest = model.rest()
     shift = by + torch.arange(worlds)[:, None, None]
-    state = (t.expand(worlds, *t.shape[1:]) for t in rest)
+    state = (t.expand(worlds, *t.shape[1:]) for t in rest[:4])
     return softmpm.State(*state)._replace(x=rest.x + shift)
 
 

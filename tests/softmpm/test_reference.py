@@ -194,7 +194,7 @@ def test_a_quarter_turn_of_the_scene_turns_the_result():
 
     got = reference.simulate(scene, turn(start), None, params, substeps=10)
     want = turn(reference.simulate(scene, start, None, params, substeps=10))
-    for a, b in zip(got, want, strict=True):
+    for a, b in zip(got[:4], want[:4], strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
 
@@ -306,13 +306,17 @@ def test_gradient_of_a_rollout(dim, laws):
     scene = full(dim, laws)
     start, params = shaken(scene, worlds=2, noise=0.3)
     start = start._replace(v=start.v + f64((2.0, -0.5, 0.3)[:dim]))
-    inputs = {**start._asdict(), **params._asdict(), "activation": 0.5 * randn(2, 2, 2, seed=70)}
-    weights = [randn(*t.shape, seed=80 + k) for k, t in enumerate(start)]
+    inputs = {
+        **dict(zip("xvCF", start[:4], strict=True)),
+        **params._asdict(),
+        "activation": 0.5 * randn(2, 2, 2, seed=70),
+    }
+    weights = [randn(*t.shape, seed=80 + k) for k, t in enumerate(start[:4])]
 
     def loss(values):
         s, p = State(*(values[k] for k in "xvCF")), Params(*(values[k] for k in Params._fields))
         end = reference.simulate(scene, s, values["activation"], p, substeps=4)
-        return sum((w * t).sum() for w, t in zip(weights, end, strict=True))
+        return sum((w * t).sum() for w, t in zip(weights, end[:4], strict=True))
 
     leaves = {name: value.clone().requires_grad_() for name, value in inputs.items()}
     gradient = dict(zip(leaves, torch.autograd.grad(loss(leaves), list(leaves.values())), strict=True))
@@ -330,20 +334,20 @@ def test_worlds_do_not_touch():
     """Two worlds in one call are two calls of one, and the start is left as it was."""
     scene = full(2)
     start, params = shaken(scene, worlds=2)
-    activation, before = randn(2, 2, 2, seed=61), [t.clone() for t in start]
+    activation, before = randn(2, 2, 2, seed=61), start.clone()
     both = reference.simulate(scene, start, activation, params, substeps=3)
     for w in range(2):
         part = slice(w, w + 1)
         alone = reference.simulate(
             scene,
-            State(*(t[part] for t in start)),
+            State(*(t[part] for t in start[:4])),
             activation[:, part],
             Params(*(p[part] for p in params)),
             substeps=3,
         )
-        for a, b in zip(both, alone, strict=True):
+        for a, b in zip(both[:4], alone[:4], strict=True):
             torch.testing.assert_close(a[part], b, rtol=0, atol=1e-14)
-    assert all(torch.equal(a, b) for a, b in zip(start, before, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(start[:4], before[:4], strict=True))
 
 
 def test_each_row_drives_its_substeps():
@@ -352,10 +356,10 @@ def test_each_row_drives_its_substeps():
     rows = randn(2, 1, 2, seed=62)
     first = reference.simulate(scene, start, rows[:1], params, substeps=3)
     second = reference.simulate(scene, first, rows[1:], params, substeps=3)
-    for a, b in zip(reference.simulate(scene, start, rows, params, substeps=3), second, strict=True):
+    for a, b in zip(reference.simulate(scene, start, rows, params, substeps=3)[:4], second[:4], strict=True):
         assert torch.equal(a, b)
     idle = reference.simulate(scene, start, torch.zeros_like(rows[:1]), params, substeps=3)
-    for a, b in zip(reference.simulate(scene, start, None, params, substeps=3), idle, strict=True):
+    for a, b in zip(reference.simulate(scene, start, None, params, substeps=3)[:4], idle[:4], strict=True):
         assert torch.equal(a, b)
 
 

@@ -22,10 +22,10 @@ def test_state_and_every_gradient_are_the_references(dim, laws, device, scheme):
     inputs = busy_inputs(model)
     copies = {name: tensor.detach().cpu().requires_grad_() for name, tensor in inputs.items()}
     got, want = run(softmpm.simulate, model, inputs, 10), run(reference.simulate, scene, copies, 10)
-    for name, a, b in zip("xvCF", got, want, strict=True):
+    for name, a, b in zip("xvCF", got[:4], want[:4], strict=True):
         assert_relative(a.cpu(), b, 1e-12, name)
     weights = cotangent(want)
-    found = gradients(softmpm.simulate, model, inputs, 10, [w.to(model.device) for w in weights])
+    found = gradients(softmpm.simulate, model, inputs, 10, weights.to(model.device))
     wanted = gradients(reference.simulate, scene, copies, 10, weights)
     for name in INPUTS:
         assert wanted[name].abs().max() > 0, f"the test does not exercise {name}"
@@ -86,7 +86,7 @@ def test_gradients_at_special_points(dim, law, kind, device, scheme):
     there = {name: tensor.detach().to(model.device).requires_grad_() for name, tensor in inputs.items()}
     weights = cotangent(softmpm.State(*(inputs[n] for n in "xvCF")))
     want = gradients(reference.simulate, scene, inputs, 3, weights)
-    got = gradients(softmpm.simulate, model, there, 3, [w.to(model.device) for w in weights])
+    got = gradients(softmpm.simulate, model, there, 3, weights.to(model.device))
     for name in INPUTS:
         assert torch.isfinite(want[name]).all() and want[name].abs().max() > 0, name
         assert_relative(got[name].cpu(), want[name], 1e-10, name)
@@ -163,11 +163,11 @@ def test_dot_product(device, scheme):
         n: torch.randn(t.shape, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
         for n, t in copies.items()
     }
-    dual = [torch.zeros_like(t, requires_grad=True) for t in end]
+    dual = [torch.zeros_like(t, requires_grad=True) for t in end[:4]]
     pulled = torch.autograd.grad(dot(dual, end), list(copies.values()), create_graph=True)
     pushed = torch.autograd.grad(dot(list(a.values()), pulled), dual)  # J a: linear in the dual
     want = dot(pushed, b)
-    back = gradients(softmpm.simulate, model, inputs, 5, [w.to(model.device) for w in b])
+    back = gradients(softmpm.simulate, model, inputs, 5, b.to(model.device))
     got = sum((a[name] * back[name].cpu()).sum() for name in INPUTS)
     assert abs(got - want) <= 1e-12 * sum((a[name] * back[name].cpu()).abs().sum() for name in INPUTS)
 
@@ -188,7 +188,7 @@ def test_worlds_are_single_runs(device, scheme):
             return part.detach().clone().requires_grad_()
 
         single = {name: alone(name, tensor) for name, tensor in inputs.items()}
-        found = gradients(softmpm.simulate, models[1], single, 6, [w[world : world + 1] for w in weights])
+        found = gradients(softmpm.simulate, models[1], single, 6, [w[world : world + 1] for w in weights[:4]])
         for name in INPUTS:
             assert_relative(
                 alone(name, together[name]).detach(), found[name], 1e-13, f"world {world}, {name}"
