@@ -1,40 +1,40 @@
-"""What does watching for failures cost? `python bench/watch.py [--device cuda]`
+"""What do alarms cost? `python bench/watch.py [--device cuda] [--json bench/results/watch.json]`
 
-The same substeps with the checks of kernels/failure.py and with kernels compiled without them, in turn, in one run: ratio of
-medians. The second kind of kernel exists only here.
+The same substeps with all alarms, without those between chunks (neighbours at rest, running step limit), and with kernels that are
+compiled without the checks of kernels/failure.py as well, one after the other in one run: medians and their ratios. The last kind of
+kernel exists only here. The cube falls or, in every second row, also turns, so that its order is renewed.
 """
 
 import dataclasses
+import functools
 import itertools
 import statistics
 from types import SimpleNamespace
 
 import torch
 import warp as wp
-from common import Table, arguments, cube, median_seconds
+from common import Table, arguments, cube, median_seconds, turning
 from step import CASES
 
 import softmpm
 from softmpm.kernels import failure
 from softmpm.kernels.fused import fused
 from softmpm.kernels.transfer import transfer
-from softmpm.kernels.types import solid_types, types
+from softmpm.kernels.types import types
 
 
 def unchecked(model: softmpm.Model):
     """Replace the checks by functions that say yes, for a specification that differs in its name only."""
     spec = model.spec
-    t, Solid = types(spec.dim, spec.dtype), solid_types(spec).Solid
-    ivec, vec, mat = t.ivec, t.vec, t.mat
+    t = types(spec.dim, spec.dtype)
+    ivec, vec, mat, Scale = t.ivec, t.vec, t.mat, t.Scale
 
     @wp.func
     def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
         return True
 
     @wp.func
-    def sound(
-        body: Solid, corner: ivec, shape: ivec, world: int, p: int, fx: vec, base: ivec, H: mat
-    ) -> bool:
+    def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         return True
 
     report_of, check_of = failure.report, failure.check
@@ -47,44 +47,50 @@ def unchecked(model: softmpm.Model):
     failure.report, failure.check = report_of, check_of
 
 
+def variants(scene: softmpm.Scene, device: torch.device, scheme: str) -> dict[str, softmpm.Model]:
+    """The same model with all alarms, with those of each substep only, and with none."""
+    few = softmpm.Alarms(gap=None, step=None)
+    settings = {"all": None, "substep": few, "none": few}
+    models = {
+        name: softmpm.build(scene, device=device, scheme=scheme, alarms=alarms)
+        for name, alarms in settings.items()
+    }
+
+    class Unchecked(type(models["none"].spec)):
+        module = models["none"].spec.module + ".unchecked"
+
+    models["none"].spec = Unchecked(**dataclasses.asdict(models["none"].spec))
+    unchecked(models["none"])
+    return models
+
+
+@torch.no_grad()
+def run(model: softmpm.Model, start: softmpm.State, substeps: int) -> None:
+    softmpm.simulate(model, start, None, model.params(), substeps=substeps)
+
+
 def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
-    table = Table("Cost of watching for failures, float32", device, args.json)
-    substeps = 20 if device.type == "cpu" else 200
+    table = Table("Cost of alarms, float32", device, args.json)
     for (dim, particles, nodes), scheme in itertools.product(CASES[:-1], ("plain", "fast")):
         if particles > (args.largest or (8_000 if device.type == "cpu" else particles)):
             continue
-        scene = cube(dim, particles, nodes)
-        models = [softmpm.build(scene, device=device, scheme=scheme) for _ in range(2)]
-
-        class Unchecked(type(models[1].spec)):
-            module = models[1].spec.module + ".unchecked"
-
-        models[1].spec = Unchecked(**dataclasses.asdict(models[1].spec))
-        unchecked(models[1])
-        start, params = models[0].rest(), models[0].params()
-        seconds = [[], []]
-        for _ in range(args.repeats):
-            for k, model in enumerate(models):
-
-                def work(model=model, start=start, params=params):
-                    with torch.no_grad():
-                        softmpm.simulate(model, start, None, params, substeps=substeps)
-
-                seconds[k].append(median_seconds(work, device, 3))
-        with_watch, without = (statistics.median(s) / substeps * 1e6 for s in seconds)
-        ratio = statistics.median(a / b for a, b in zip(*seconds, strict=True))
-        table.add(
-            {
-                "dim": dim,
-                "particles": particles,
-                "scheme": scheme,
-                "watched us": with_watch,
-                "unwatched us": without,
-                "ratio": ratio,
-            }
-        )
+        substeps = 64 if device.type == "cpu" else 512 if particles < 500_000 else 256
+        models = variants(cube(dim, particles, nodes), device, scheme)
+        for motion in ("falling", "turning"):
+            start = models["all"].rest() if motion == "falling" else turning(models["all"])
+            seconds = {name: [] for name in models}
+            for _ in range(args.repeats):
+                for name, model in models.items():
+                    work = functools.partial(run, model, start, substeps)
+                    seconds[name].append(median_seconds(work, device, 3))
+            row = {"dim": dim, "particles": particles, "scheme": scheme, "motion": motion}
+            row |= {f"{name} us": statistics.median(s) / substeps * 1e6 for name, s in seconds.items()}
+            for over in ("substep", "none"):
+                ratios = (a / b for a, b in zip(seconds["all"], seconds[over], strict=True))
+                row[f"all / {over}"] = statistics.median(ratios)
+            table.add(row)
 
 
 if __name__ == "__main__":

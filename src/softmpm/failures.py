@@ -69,8 +69,10 @@ def failure(
     substep += first
     if start is not None:
         unmoved = [w for w in failed_worlds(words) if decode(words[w])[1] is Kind.START]
-        end, state = (None if s is None else _never_ran(s, start, unmoved) for s in (end, state))
-        assert end is not None
+        end, state = (
+            _never_ran(end, start, unmoved),
+            None if state is None else _never_ran(state, start, unmoved),
+        )
     name, value, limit, advice = Case(model, kind, world, particle, end, solid, pull).explain()
     where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
     time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"

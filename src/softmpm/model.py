@@ -82,8 +82,8 @@ def build(
     if alarms.step is not None:
         need_stable(scene, alarms.step)
     warn_sparse(scene)
-    settings = dict(memory_budget=memory_budget, scheme=scheme, deterministic=deterministic)
-    return Model(scene, _device(device), dtype, int(worlds), **settings, calls=int(calls), alarms=alarms)
+    where = _device(device)
+    return Model(scene, where, dtype, int(worlds), memory_budget, scheme, deterministic, int(calls), alarms)
 
 
 def _device(device: str | torch.device | None) -> torch.device:

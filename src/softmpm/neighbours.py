@@ -31,7 +31,8 @@ def _within(positions: np.ndarray, longest: float) -> np.ndarray:
     if count == 1:
         return np.full((1, dim), -1)
     nearest = min(2 * dim, count - 1)
-    distance, index = KDTree(positions).query(positions, k=range(2, nearest + 2), workers=-1)
+    found = KDTree(positions).query(positions, k=nearest + 1, workers=-1)
+    distance, index = (np.asarray(part)[:, 1:] for part in found)  # without the particle itself
     spacing = np.median(distance[:, 0])
     own = np.arange(count)[:, None]
     near = (distance <= REACH * spacing) & (distance <= longest)

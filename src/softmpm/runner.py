@@ -1,5 +1,6 @@
 """Runs the chunks of one call by the model's scheme, and decides whether what came out of them can be used."""
 
+import functools
 from typing import Any
 
 import torch
@@ -93,26 +94,20 @@ class Runner:
 
     def _located(self, run: FastRun | PlainRun, words: list[int]) -> UnstableError:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
-        state, at_end = run.start, as_state(run.end)
-        about = dict(
-            solid=self.solid, start=run.start if isinstance(run.start, State) else None, state=at_end
-        )
+        state: Any = run.start
+        at_end, start = as_state(run.end), run.start if isinstance(run.start, State) else None
+        found = functools.partial(failure, self.model, solid=self.solid, start=start, state=at_end)
         for s in range(run.chunk.length):
             one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
-            single, found = self._single(one, state)
-            failed = failed_worlds(found)
-            if failed:
+            single, reported = self._single(one, state)
+            if failed_worlds(reported):
+                world = min(failed_worlds(reported), key=lambda w: reported[w])
                 pull = None if self.pull is None else self.pull[one.rows][0]
-                world = min(failed, key=lambda w: found[w])
-                return failure(
-                    self.model, found, world, as_state(single.end), first=one.first, pull=pull, **about
-                )
+                return found(reported, world, as_state(single.end), first=one.first, pull=pull)
             state = single.end
         # Sums in another order may have avoided it; what was reported is true all the same.
         world = min(failed_worlds(words), key=lambda w: words[w])
-        return failure(
-            self.model, words, world, at_end, first=run.chunk.first, pull=self._strongest(), **about
-        )
+        return found(words, world, at_end, first=run.chunk.first, pull=self._strongest())
 
     def _single(self, chunk: Chunk, state: Any) -> tuple[FastRun | PlainRun, list[int]]:
         """A run of one substep, and what it reported."""
