@@ -1,0 +1,5 @@
+"""The laws that the maps are drawn for."""
+
+import softmpm
+
+LAWS = [softmpm.NeoHookean, softmpm.FixedCorotated]
