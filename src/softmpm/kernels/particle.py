@@ -6,7 +6,8 @@
     v̄ += m Σ w p̄_i,  Ā = Σ w p̄_i rᵀ,  C̄ += m Ā,  τ̄ = −(Δt V⁰ / D) Ā,  m̄ += Σ w (p̄_i·(v + C r) + m̄_i)   (T1.adj)
     v̄' += Δt x̄',  C̄' += Δt H̄' (I + H)ᵀ,  H̄ += H̄' + Δt C'ᵀ H̄',  x̄ += x̄'                              (T3.adj)
 
-Lengths in here count in cells: fx = x/dx − base, B and A are per cell. In float32 fx is a compensated sum: what adding Δt v'/dx
+Lengths in here count in cells: fx = x/dx − base, B and A are per cell. The factors 4/dx and dx on the way of C are chosen together
+(model.py), since their rounding would let a free body spin up or down. In float32 fx is a compensated sum: what adding Δt v'/dx
 loses is kept and added in the next step. Symbols and sources: kernels/transfer.py. Derivation: docs/math/transfer.md.
 """
 
@@ -46,7 +47,7 @@ def particle(spec: Spec) -> SimpleNamespace:
     @wp.func
     def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat, Q: mat) -> mat:
         """A per cell [kg m/s] (T1)."""
-        return scale.spacing * (
+        return scale.width * (
             body.mass[world, p] * C - impulse(scale, body, world, p) * stress(body, world, p, H, Q)
         )
 
@@ -55,7 +56,7 @@ def particle(spec: Spec) -> SimpleNamespace:
         """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not sound keeps its base."""
         new = Particle()
         new.v = v
-        new.C = divide(real(4.0), scale.spacing) * B
+        new.C = scale.rate * B
         new.H = old.H + scale.dt * (new.C + new.C * old.H)
         step = divide(scale.dt, scale.spacing) * v
         if wp.static(rounds):
@@ -113,7 +114,7 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     ) -> ParticleAdj:
         """(T1.adj) of v, C and H from Σ w p̄_i, Σ w m̄_i and B = Σ w p̄_i rᵀ; adds what is wanted into ``adj_body``."""
         m = body.mass[world, p]
-        adj_A = scale.spacing * B
+        adj_A = scale.width * B
         adj = ParticleAdj()
         adj.v = m * adj_mv
         adj.C = m * adj_A
@@ -128,9 +129,7 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
         adj = ParticleAdj()
         adj.fx = adj_new.fx
         adj.v = adj_new.v + divide(scale.dt, scale.spacing) * adj_new.fx
-        adj.C = divide(real(4.0), scale.spacing) * (
-            adj_new.C + scale.dt * (adj_new.H * wp.transpose(identity() + H))
-        )
+        adj.C = scale.rate * (adj_new.C + scale.dt * (adj_new.H * wp.transpose(identity() + H)))
         adj.H = adj_new.H + scale.dt * (wp.transpose(new_C) * adj_new.H)
         return adj
 

@@ -91,6 +91,8 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         shape: ivec  # nodes along each axis
         dt: real  # Δt [s]
         spacing: real  # dx [m]
+        rate: real  # 4 / dx [1/m] and
+        width: real  # dx [m], but for an ulp or so: rate · width is 4 as nearly as can be
         exact_spacing: wp.float64  # the same, for what must not depend on the precision
         gravity: vec  # g [m/s²]
         decay: real  # exp(-damping Δt) [-]
