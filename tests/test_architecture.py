@@ -11,7 +11,7 @@ ORDER = """kernels.turn scene state watch silhouette surface shapes checks refer
     kernels.grid kernels.failure kernels.particle kernels.transfer kernels.boundary kernels.raster kernels.native
     kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed kernels.fused kernels.fused_adj kernels.sorting
     kernels.packing description model buffers explain failures step replay checkup plain between arrangement exact
-    program program_adj fast runner rollout raster autograd graph tape layout playback recording appearance show
+    program program_adj fast runner rollout raster autograd graph warp_arrays tape layout playback recording appearance show
     rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},

@@ -28,7 +28,8 @@ from softmpm.scene import (
 from softmpm.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import GridField, Low, Params, State
-from softmpm.tape import WarpSolid, WarpState, step, torch_state, warp_solid, warp_state
+from softmpm.tape import step
+from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 from softmpm.watch import UnstableError
 
 __all__ = [

@@ -20,7 +20,7 @@ from softmpm.checks import (
 )
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
-from softmpm.model import Model
+from softmpm.model import Model, check_model
 from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.replay import recording
 from softmpm.rollout import Trail, rollout, rollout_adj, short_of_memory
@@ -85,7 +85,7 @@ def _simulate(
     if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
         with torch.inference_mode(False), torch.no_grad():
             return _simulate(model, start, activation, params, substeps, failures)
-    _check_model(model, "simulate")
+    check_model(model, "simulate")
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
@@ -173,17 +173,10 @@ def rasterize(model: Model, state: State) -> GridField:
 
 @_opaque
 def _rasterize(model: Model, state: State) -> GridField:
-    _check_model(model, "rasterize")
+    check_model(model, "rasterize")
     state = _cast(model, state)
     check_state(model, state)
     return GridField(*_Rasterize.apply(model, state.x, state.v, state.C))
-
-
-def _check_model(model: Any, wants: str) -> None:
-    if not isinstance(model, Model):
-        raise TypeError(
-            f"{wants} needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
-        )
 
 
 def _cast(model: Model, value: Any) -> Any:

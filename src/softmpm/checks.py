@@ -179,6 +179,19 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
     )
 
 
+def check_row(model: Sizes, activation: Tensor | None) -> None:
+    """Shape (world, muscle), dtype and device of one row of activation; None is no activation."""
+    if activation is None:
+        return
+    _check_tensor(model, "activation", activation)
+    want = (model.worlds, model.muscle_count)
+    need(
+        activation.shape == want,
+        f"activation must have shape (world, muscle) = {want}, got {tuple(activation.shape)}; "
+        "of several control steps take one row, activation[k].",
+    )
+
+
 def check_params(model: Sizes, params: NamedTuple) -> None:
     """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
     want = (model.worlds, model.particle_count)
@@ -212,10 +225,14 @@ def check_bounds(params: NamedTuple) -> None:
 
 
 @torch.no_grad()
-def check_finite(state: State, activation: Tensor | None) -> None:
+def check_finite(state: State | None, activation: Tensor | None) -> None:
     """All numbers that move are finite. Reads back once: a GPU has to wait."""
-    given = [(f"state.{name}", getattr(state, name)) for name in ("x", "v", "C", "F")]
+    given = (
+        [] if state is None else [(f"state.{name}", getattr(state, name)) for name in ("x", "v", "C", "F")]
+    )
     given += [] if activation is None else [("activation", activation)]
+    if not given:
+        return
     # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
     for (name, value), total in zip(given, torch.stack([v.sum() for _, v in given]).tolist(), strict=True):
         if not math.isfinite(total):

@@ -308,6 +308,14 @@ def _inverse_pair(spacing: float, dtype: torch.dtype) -> tuple[float, float]:
     return min(pairs, key=lambda pair: abs(pair[0] * pair[1] - 4.0))
 
 
+def check_model(model: object, wants: str) -> None:
+    """Raise TypeError unless this is a model; ``wants`` names the function that needs it."""
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"{wants} needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
+        )
+
+
 def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
     """Muscles of each particle, shape (particle, most that overlap on one), filled up with -1."""
     members = np.zeros(particle_count, dtype=np.int64)

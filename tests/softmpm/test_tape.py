@@ -119,7 +119,7 @@ def test_the_adjoint_runs_where_pytorch_works_by_then(monkeypatch):
         self.stream = used[-1]
 
     monkeypatch.setattr(step.Substep, "launch", watched)
-    for module in (step, softmpm.tape):
+    for module in (step, softmpm.tape, softmpm.warp_arrays):
         monkeypatch.setattr(module, "stream_of", lambda device: current[0])
     for stream, work in (
         ("one", lambda: softmpm.step(model, *states, solid, tape=tape)),
