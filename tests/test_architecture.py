@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 SRC = Path(__file__).parents[1] / "src"
-ORDER = """kernels.turn scene state watch silhouette surface shapes checks reference stability alarms neighbours schedule horizon
+ORDER = """kernels.turn validate scene state watch silhouette surface shapes checks check_scene reference stability alarms neighbours schedule horizon
     memory kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle kernels.solid kernels.contact
     kernels.grid kernels.failure kernels.particle kernels.transfer kernels.boundary kernels.raster kernels.native
     kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed kernels.fused kernels.fused_adj kernels.sorting

@@ -20,11 +20,12 @@ from softmpm.checks import (
 )
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
-from softmpm.model import Model, check_model
+from softmpm.model import Model
 from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
 from softmpm.replay import recording
 from softmpm.rollout import Trail, rollout, rollout_adj, short_of_memory
 from softmpm.state import GridField, Low, Params, State
+from softmpm.step import check_model
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
@@ -128,11 +129,12 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     if seen and seen == last.seen:
         return last.found
     check_params(model, params)
+    mass = params.density * model.volume
     if not recording(model):  # else nothing can be read back
-        check_bounds(params)
+        check_bounds(params, mass)
     lead = (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead).contiguous() for term in lame(params))
-    found = mu, lam, (params.density * model.volume).expand(lead).contiguous()
+    found = mu, lam, mass.expand(lead).contiguous()
     if seen:
         last.params, last.seen, last.found = params, seen, found
     return found
@@ -166,7 +168,8 @@ def rasterize(model: Model, state: State) -> GridField:
         ``mass`` [kg] of shape (world, *nodes) and ``velocity`` [m/s] of shape (world, *nodes, dim), zero where there is no mass.
 
     Raises:
-        TypeError, ValueError, UnstableError: As :func:`simulate`, for the model and the state.
+        TypeError, ValueError, UnstableError: As :func:`simulate`, for the model and the state, and in the backward pass for a
+            gradient that is not finite.
     """
     return _rasterize(model, state)
 

@@ -1,131 +1,18 @@
-"""Every rule that needs more than one object: a whole scene, or the tensors that meet a model.
+"""Every rule of the tensors that meet a model.
 
-Each message says what must hold, what came instead and what to do. Rules of one object stand in ``scene.py``.
+Each message says what must hold, what came instead and what to do.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.scene import Grid, Scene, need
 from softmpm.state import Low, State
-
-SAME_PLACE = 1e-6
-"""Two particles nearer than this share of a cell are one particle twice."""
-MOST_WALLS = 64
-"""Each one is compiled into the kernels of the grid, and its numbers are passed with every launch."""
-MIXERS = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
-"""Odd numbers without a pattern, that sums of multiples of them seldom agree modulo 2^64."""
-
-
-def check_scene(scene: Scene) -> None:
-    """Raise ValueError with the first rule that the scene breaks, TypeError if it is none."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"a model is built from a softmpm.Scene, got {type(scene).__name__}.")
-    _check_bodies(scene)
-    _check_distinct(scene)
-    _check_muscles(scene)
-    _check_walls(scene)
-
-
-def _check_bodies(scene: Scene) -> None:
-    grid = scene.grid
-    for b, body in enumerate(scene.bodies):
-        positions = body.particles.positions
-        need(
-            positions.shape[1] == grid.dim,
-            f"body {b} has {positions.shape[1]}D particles, but the grid {grid.shape} has {grid.dim} axes; "
-            "make both 2D or both 3D.",
-        )
-        base = np.floor(positions / grid.spacing - 0.5)  # first of the three nodes that a particle reaches
-        outside = ((base < 0) | (base > np.array(grid.shape) - 3)).any(axis=1)
-        if outside.any():
-            particle = int(np.argmax(outside))
-            raise ValueError(
-                f"body {b} leaves the grid: particle {particle} at {_tuple(positions[particle])} m, and "
-                f"{outside.sum() - 1} more of its {len(positions)}; all must lie in {_room(grid)} m, "
-                "so that the nodes around them exist. Move the body or enlarge the grid."
-            )
-
-
-def _room(grid: Grid) -> str:
-    return " × ".join(f"[{0.5 * grid.spacing:.5g}, {(n - 1.5) * grid.spacing:.5g})" for n in grid.shape)
-
-
-def _check_distinct(scene: Scene) -> None:
-    positions = np.concatenate([body.particles.positions for body in scene.bodies])
-    # An offset that no lattice has keeps two copies, equal up to rounding, on the same side of a bin's edge.
-    bins = np.floor(positions / (SAME_PLACE * scene.grid.spacing) + 0.381966).astype(np.int64)
-    order = _suspects(bins)
-    order = order[np.lexsort(bins[order].T)]
-    twice = (np.diff(bins[order], axis=0) == 0).all(axis=1)
-    if twice.any():
-        first = int(np.argmax(twice))
-        i, j = sorted(order[first : first + 2].tolist())
-        bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
-        raise ValueError(
-            f"particles {i} (body {bodies[i]}) and {j} (body {bodies[j]}) are at the same place, "
-            f"{_tuple(positions[i])} m, and {twice.sum() - 1} more such pairs: bodies must not overlap. "
-            "Move one, or keep only the particles that the other has not."
-        )
-
-
-def _suspects(bins: np.ndarray) -> np.ndarray:
-    """Rows that may equal another one: numbers made of the rows do. To sort these is far quicker than to sort the rows."""
-    mixed = (bins.astype(np.uint64) * np.array(MIXERS[: bins.shape[1]], dtype=np.uint64)).sum(axis=1)
-    ordered = np.sort(mixed)
-    return np.flatnonzero(np.isin(mixed, ordered[1:][ordered[1:] == ordered[:-1]]))
-
-
-def _check_muscles(scene: Scene) -> None:
-    count = sum(len(body.particles) for body in scene.bodies)
-    for m, muscle in enumerate(scene.muscles):
-        low, high = muscle.particles.min(), muscle.particles.max()
-        need(
-            low >= 0 and high < count,
-            f"muscle {m} names particle {low if low < 0 else high}, but the scene's {count} particles are "
-            f"0 to {count - 1}, counted through the bodies in their order.",
-        )
-        _check_axes(f"muscle {m} direction", muscle.direction, scene.grid)
-
-
-def _check_walls(scene: Scene) -> None:
-    grid = scene.grid
-    need(
-        len(scene.walls) <= MOST_WALLS,
-        f"a scene has at most {MOST_WALLS} walls, since each is compiled into its kernels; got {len(scene.walls)}. "
-        "Leave out those that no body reaches.",
-    )
-    for w, wall in enumerate(scene.walls):
-        _check_axes(f"wall {w} normal", wall.normal, grid)
-        # n·x along the grid's edges:
-        reach = np.array(wall.normal) * (np.array(grid.shape) - 1) * grid.spacing
-        low, high = np.minimum(reach, 0.0).sum(), np.maximum(reach, 0.0).sum()
-        need(
-            low <= wall.offset,
-            f"wall {w} covers no node: n·x ≤ {wall.offset:.5g} m, but n·x is {low:.5g} to {high:.5g} m "
-            "on the grid, so it would do nothing. Move it into the grid or leave it out.",
-        )
-        need(
-            wall.offset < high,
-            f"wall {w} covers every node: n·x ≤ {wall.offset:.5g} m, and n·x is {low:.5g} to {high:.5g} m "
-            "on the grid. Its normal must point out of the wall, into the free space.",
-        )
-
-
-def _check_axes(name: str, vector: Sequence[float], grid: Grid) -> None:
-    need(
-        len(vector) == grid.dim,
-        f"{name} needs {grid.dim} numbers, one per axis of the grid, got {_tuple(vector)}.",
-    )
-
-
-def _tuple(values: np.ndarray | Sequence[float]) -> str:
-    return "(" + ", ".join(f"{value:.5g}" for value in values) + ")"
+from softmpm.validate import need
 
 
 class Sizes(Protocol):
@@ -214,14 +101,22 @@ def check_whole(name: str, value: Any) -> None:
 
 
 @torch.no_grad()
-def check_bounds(params: NamedTuple) -> None:
-    """Whether a material can exist. Reads back once: a GPU has to wait."""
-    given = list(_fields("params", params, tuple(BOUNDS)))
+def check_bounds(params: NamedTuple, mass: Tensor) -> None:
+    """Raise ValueError for a material that cannot exist. Reads back once: a GPU has to wait.
+
+    Args:
+        mass: That of the particles [kg], density times volume.
+    """
+    given = [*_fields("params", params, tuple(BOUNDS)), ("mass", mass)]
     ends = torch.stack([end for _, value in given for end in torch.aminmax(value)]).tolist()
-    for (name, value), low, high in zip(given, ends[::2], ends[1::2], strict=True):
+    for (name, value), low, high in zip(given[:-1], ends[:-2:2], ends[1:-2:2], strict=True):
         least, most, rule = BOUNDS[name]
         if not (least < low and high < most):
             _demand(f"params.{name}", value, (value > least) & (value < most), rule)
+    least = torch.finfo(mass.dtype).tiny
+    if not (least <= ends[-2] and ends[-1] < math.inf):
+        rule = f"finite and at least {least:.3g} kg to be exact in {mass.dtype}; change params.density, or the units"
+        _demand("mass = density * volume", mass, (mass >= least) & (mass < math.inf), rule)
 
 
 @torch.no_grad()

@@ -10,7 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.alarms import Alarms
-from softmpm.checks import check_scene, check_whole
+from softmpm.check_scene import check_precision, check_scene
+from softmpm.checks import check_whole
 from softmpm.description import describe
 from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
@@ -76,14 +77,17 @@ def build(
         memory_budget = int(memory_budget)
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
+    if not isinstance(deterministic, (bool, np.bool_)):
+        raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
     alarms = Alarms() if alarms is None else alarms
     if not isinstance(alarms, Alarms):
         raise TypeError(f"alarms must be a softmpm.Alarms or None, got {type(alarms).__name__}.")
+    check_precision(scene, dtype)
     if alarms.step is not None:
         need_stable(scene, alarms.step)
     warn_sparse(scene)
-    where = _device(device)
-    return Model(scene, where, dtype, int(worlds), memory_budget, scheme, deterministic, int(calls), alarms)
+    sizes = dict(worlds=int(worlds), memory_budget=memory_budget, calls=int(calls))
+    return Model(scene, _device(device), dtype, scheme, bool(deterministic), alarms, **sizes)
 
 
 def _device(device: str | torch.device | None) -> torch.device:
@@ -127,12 +131,13 @@ class Model:
         scene: Scene,
         device: torch.device,
         dtype: torch.dtype,
-        worlds: int,
-        memory_budget: int | None,
         scheme: str,
         deterministic: bool,
-        calls: int,
         alarms: Alarms,
+        *,
+        worlds: int,
+        memory_budget: int | None,
+        calls: int,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
         self.memory_budget, self.calls, self.alarms = memory_budget, calls, alarms
@@ -306,14 +311,6 @@ def _inverse_pair(spacing: float, dtype: torch.dtype) -> tuple[float, float]:
     rates = [rate + k * np.spacing(rate) for k in sorted(range(-16, 17), key=abs)]
     pairs = [(float(r), float(real(4.0 / float(r)))) for r in rates]
     return min(pairs, key=lambda pair: abs(pair[0] * pair[1] - 4.0))
-
-
-def check_model(model: object, wants: str) -> None:
-    """Raise TypeError unless this is a model; ``wants`` names the function that needs it."""
-    if not isinstance(model, Model):
-        raise TypeError(
-            f"{wants} needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
-        )
 
 
 def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:

@@ -1,56 +1,19 @@
 """What a person designs: grid, bodies with a material, muscles, walls. Plain SI numbers, checked at once.
 
 A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
-Rules that need the whole scene (particles inside the grid, muscle indices) live in ``checks.py``.
+Rules that need the whole scene (particles inside the grid, muscle indices) live in ``check_scene.py``.
 """
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from softmpm.validate import array, need, need_kind, numbers, read_only, restore, store_numbers, unit
+
 Contact = Literal["stick", "slip", "separate"]
 CONTACTS: tuple[Contact, ...] = ("stick", "slip", "separate")
-
-
-def need(condition: bool, message: str) -> None:
-    """Every rule of a scene: what must hold, what came instead, what to do."""
-    if not condition:
-        raise ValueError(message)
-
-
-def _numbers(name: str, values: Iterable[float]) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError) as error:
-        kind = "made of plain numbers" if isinstance(values, Iterable) else "a sequence of numbers"
-        raise TypeError(f"{name} must be {kind}, got {values!r}.") from error
-    need(all(math.isfinite(number) for number in numbers), f"{name} must be finite, got {values!r}.")
-    return numbers
-
-
-def _store_numbers(owner: object, what: str, *names: str) -> None:
-    """Turn fields into plain floats, so that NumPy scalars compare, hash and print like them."""
-    for name in names:
-        value = getattr(owner, name)
-        if np.ndim(value) != 0 or isinstance(value, (str, bytes, bool)) or value is None:
-            raise TypeError(f"{what} {name} must be one number, got {value!r}.")
-        object.__setattr__(owner, name, _numbers(f"{what} {name}", [value])[0])
-
-
-def _unit(name: str, vector: Sequence[float]) -> tuple[tuple[float, ...], float]:
-    """A vector divided by its length, and that length."""
-    numbers = _numbers(name, vector)
-    length = math.hypot(*numbers)
-    need(length > 0, f"{name} must not be zero, got {tuple(numbers)}.")
-    return tuple(number / length for number in numbers), length
-
-
-def _need_kind(name: str, value: object, kind: type) -> None:
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}, got {type(value).__name__}.")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,13 +27,13 @@ class Grid:
 
     def __post_init__(self):
         need(np.shape(self.shape) in ((2,), (3,)), f"grid shape must have 2 or 3 axes, got {self.shape!r}.")
-        shape = _numbers("grid shape", self.shape)
+        shape = numbers("grid shape", self.shape)
         need(
             all(n.is_integer() and n >= 4 for n in shape),
             f"grid shape needs whole numbers of at least 4 nodes along each axis, got {self.shape}.",
         )
         object.__setattr__(self, "shape", tuple(int(n) for n in shape))
-        _store_numbers(self, "grid", "spacing")
+        store_numbers(self, "grid", "spacing")
         need(self.spacing > 0, f"grid spacing must be > 0 m, got {self.spacing}.")
 
     @property
@@ -83,32 +46,34 @@ class Particles:
     """Material points of a shape at rest."""
 
     positions: np.ndarray
-    """Rest positions X [m], shape (particle, dim)."""
+    """Rest positions X [m], shape (particle, dim); copied, read-only."""
     volume: np.ndarray | float
-    """Rest volume of each particle V⁰ [m³], in 2D [m²] of unit depth; one number or shape (particle,)."""
+    """Rest volume of each particle V⁰ [m³], in 2D [m²] of unit depth; one number or shape (particle,); copied, read-only."""
 
     def __post_init__(self):
-        positions = np.array(self.positions, dtype=np.float64, ndmin=2)
+        positions = np.array(array("positions", self.positions), dtype=np.float64, ndmin=2)
         need(
             positions.ndim == 2 and positions.shape[1] in (2, 3),
             f"positions must have shape (particle, 2) or (particle, 3), got {positions.shape}.",
         )
         need(len(positions) > 0, "a shape has no particles: make it larger or its spacing smaller.")
-        volume = np.asarray(self.volume, dtype=np.float64)
+        volume = array("volume", self.volume).astype(np.float64)
         need(
             volume.shape in ((), (len(positions),)),
             f"volume must be one number or have shape ({len(positions)},), got {volume.shape}.",
         )
-        for name, array in (("positions", positions), ("volume", volume)):
-            if not np.isfinite(array).all():
-                particle = np.argwhere(~np.isfinite(np.atleast_1d(array)))[0][0]
+        for name, values in (("positions", positions), ("volume", volume)):
+            if not np.isfinite(values).all():
+                particle = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0][0]
                 raise ValueError(f"{name} must be finite; particle {particle} is not.")
         need(bool((volume > 0).all()), f"volume must be > 0, got {volume.min()}.")
-        object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "volume", np.broadcast_to(volume, (len(positions),)).copy())
+        object.__setattr__(self, "positions", read_only(positions))
+        object.__setattr__(self, "volume", read_only(np.broadcast_to(volume, (len(positions),)).copy()))
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    __setstate__ = restore
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -130,7 +95,7 @@ class Material:
             type(self) is not Material,
             "a material needs a law: use NeoHookean, FixedCorotated or BarrierCorotated.",
         )
-        _store_numbers(self, "material", "density", "young", "poisson")
+        store_numbers(self, "material", "density", "young", "poisson")
         need(self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
         need(self.young > 0, f"young must be > 0 Pa, got {self.young}.")
         need(
@@ -174,8 +139,8 @@ class Body:
     material: Material
 
     def __post_init__(self):
-        _need_kind("body particles", self.particles, Particles)
-        _need_kind("body material", self.material, Material)
+        need_kind("body particles", self.particles, Particles)
+        need_kind("body material", self.material, Material)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -193,16 +158,18 @@ class Muscle:
     """Stress at full activation, s [Pa]."""
 
     def __post_init__(self):
-        index = np.asarray(self.particles)
+        index = array("muscle particles", self.particles, "biufO", "whole numbers")
         need(index.ndim == 1 and index.size > 0, "a muscle needs a list of particle indices, not empty.")
         need(
             np.issubdtype(index.dtype, np.integer),
             f"muscle particles must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",
         )
         need(len(np.unique(index)) == index.size, "a muscle names a particle twice; give each index once.")
-        object.__setattr__(self, "particles", index.astype(np.int64))
-        object.__setattr__(self, "direction", _unit("muscle direction", self.direction)[0])
-        _store_numbers(self, "muscle", "strength")
+        object.__setattr__(self, "particles", read_only(index.astype(np.int64)))
+        object.__setattr__(self, "direction", unit("muscle direction", self.direction)[0])
+        store_numbers(self, "muscle", "strength")
+
+    __setstate__ = restore
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -226,13 +193,13 @@ class Wall:
             self.contact in CONTACTS,
             f"wall contact must be one of {', '.join(CONTACTS)}, got {self.contact!r}.",
         )
-        _store_numbers(self, "wall", "offset", "friction")
+        store_numbers(self, "wall", "offset", "friction")
         need(self.friction >= 0, f"wall friction must be ≥ 0, got {self.friction}.")
         need(
             self.friction == 0.0 or self.contact == "separate",
             f"a {self.contact} wall has no friction, got {self.friction}; use contact='separate'.",
         )
-        normal, length = _unit("wall normal", self.normal)
+        normal, length = unit("wall normal", self.normal)
         if abs(length - 1.0) > 1e-15:  # a unit normal leaves the offset as it was written
             object.__setattr__(self, "offset", self.offset / length)
         object.__setattr__(self, "normal", normal)
@@ -255,7 +222,7 @@ class Scene:
     """Length of one substep, Δt [s]; see :func:`softmpm.stable_dt`."""
 
     def __post_init__(self):
-        _need_kind("scene grid", self.grid, Grid)
+        need_kind("scene grid", self.grid, Grid)
         for name, kind in (("bodies", Body), ("muscles", Muscle), ("walls", Wall)):
             parts = getattr(self, name)
             if isinstance(parts, kind) or not isinstance(parts, Iterable):
@@ -264,13 +231,13 @@ class Scene:
                 )
             parts = tuple(parts)
             for k, part in enumerate(parts):
-                _need_kind(f"scene {name}[{k}]", part, kind)
+                need_kind(f"scene {name}[{k}]", part, kind)
             object.__setattr__(self, name, parts)
         need(len(self.bodies) > 0, "a scene needs at least one body.")
         dim = self.grid.dim
-        gravity = (0.0,) * dim if self.gravity is None else _numbers("gravity", self.gravity)
+        gravity = (0.0,) * dim if self.gravity is None else numbers("gravity", self.gravity)
         need(len(gravity) == dim, f"gravity needs {dim} numbers, one per axis, got {self.gravity}.")
         object.__setattr__(self, "gravity", gravity)
-        _store_numbers(self, "scene", "damping", "dt")
+        store_numbers(self, "scene", "damping", "dt")
         need(self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
         need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softmpm.scene import Particles, need
+from softmpm.scene import Particles
 from softmpm.silhouette import Inside, coverage, silhouette
 from softmpm.surface import closed_surface, winding_inside
+from softmpm.validate import need
 
 if TYPE_CHECKING:
     import PIL.Image

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from softmpm.scene import need
+from softmpm.validate import need
 
 if TYPE_CHECKING:
     import PIL.Image

@@ -27,6 +27,14 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+def check_model(model: object, wants: str) -> None:
+    """Raise TypeError unless this is a model; ``wants`` names the function that needs it."""
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"{wants} needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
+        )
+
+
 def on_its_gpu(work: Callable[Concatenate[Model, P], T]) -> Callable[Concatenate[Model, P], T]:
     """Work for a model, whose GPU is PyTorch's current one meanwhile: Warp makes it so and would leave it so."""
 

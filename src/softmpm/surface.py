@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from softmpm.kernels.turn import launch
-from softmpm.scene import need
+from softmpm.validate import need
 
 wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
 

@@ -11,10 +11,10 @@ from softmpm.buffers import Motion, Solid, lame, view
 from softmpm.checks import check_bounds, check_finite, check_params, check_row, check_state
 from softmpm.failures import raise_failure
 from softmpm.kernels.types import types
-from softmpm.model import Model, check_model
+from softmpm.model import Model
 from softmpm.replay import recording
 from softmpm.state import Params, State
-from softmpm.step import Substep, on_its_gpu, stream_of
+from softmpm.step import Substep, check_model, on_its_gpu, stream_of
 
 
 @dataclass(eq=False, frozen=True, kw_only=True)
@@ -218,7 +218,7 @@ def warp_solid(
     check_params(model, params)
     check_row(model, activation)
     if not recording(model):
-        check_bounds(params)
+        check_bounds(params, params.density * model.volume)
         check_finite(None, activation)
     return _warp_solid(model, params, activation, requires_grad)
 

@@ -1,5 +1,8 @@
 """Each setting refuses what it cannot mean, in a sentence that names it."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -58,7 +61,12 @@ def scene(**changes) -> Scene:
         (lambda: scene(gravity=(0, np.nan)), "gravity must be finite"),
         (lambda: scene(damping=-1.0), "damping must be ≥ 0"),
         (lambda: scene(dt=0.0), "dt must be > 0 s, got 0"),
-        (lambda: scene(dt=np.nan), "scene dt must be finite"),
+        (lambda: scene(dt=np.nan), "scene dt must be finite, at most 1.8e308, got nan"),
+        (
+            lambda: Grid(shape=(8, 8), spacing=10**400),
+            "grid spacing must be finite, at most 1.8e308, got inf",
+        ),
+        (lambda: scene(gravity=(0, 10**5000)), "gravity must be finite"),
     ],
 )
 def test_refuses_values(make, message):
@@ -83,6 +91,28 @@ def test_refuses_values(make, message):
         (lambda: scene(bodies=scene().bodies[0]), "bodies must be a list of Body, got Body"),
         (lambda: scene(muscles=[None]), r"muscles\[0\] must be a Muscle, got NoneType"),
         (lambda: scene(walls=3), "walls must be a list of Wall, got int"),
+        (lambda: Particles(np.zeros((3, 2)), "a"), "volume must be real numbers, got <U1"),
+        (lambda: Particles("abc", 1.0), "positions must be real numbers, got <U3"),
+        (
+            lambda: Particles([[0, 0], [0]], 1.0),
+            "positions must be an array of real numbers; its rows differ",
+        ),
+        (lambda: Particles(np.zeros((3, 2), complex), 1.0), "positions must be real numbers, got complex128"),
+        (lambda: Particles(np.ma.zeros((3, 2)), 1.0), "positions must not be a masked array"),
+        (lambda: Particles(np.zeros((3, 2)), np.ma.ones(3)), "volume must not be a masked array"),
+        (
+            lambda: Muscle(particles=np.ma.array([0, 1], mask=[0, 1]), direction=(1, 0), strength=1),
+            "muscle particles must not be a masked array",
+        ),
+        (
+            lambda: Muscle(particles=[0], direction="01", strength=1),
+            "direction must be made of plain numbers",
+        ),
+        (lambda: scene(gravity=("0", "-9.8")), "gravity must be made of plain numbers"),
+        (lambda: scene(gravity=(0, 1j)), "gravity must be made of plain numbers"),
+        (lambda: scene(gravity=np.array([0, 1j])), "gravity must be made of plain numbers"),
+        (lambda: NeoHookean(density=np.complex64(1), young=1.0), "material density must be one number"),
+        (lambda: NeoHookean(density=True, young=1.0), "material density must be one number, got True"),
     ],
 )
 def test_refuses_kinds(make, message):
@@ -116,3 +146,17 @@ def test_particles_are_a_copy():
     positions += 1.0
     assert (particles.positions == 0).all() and len(particles) == 3
     assert particles.volume.tolist() == [0.5, 0.5, 0.5]
+
+
+@pytest.mark.parametrize(
+    "again", [lambda o: o, copy.copy, copy.deepcopy, lambda o: pickle.loads(pickle.dumps(o))]
+)
+def test_arrays_cannot_be_written_to(again):
+    """Nothing can be spoiled between the checks and build: a volume of NaN made its particles vanish. Also in copies."""
+    direction = (0.2, 0.7, 0.4)
+    particles = again(Particles(np.zeros((3, 2)), np.ones(3)))
+    muscle = again(Muscle(particles=np.arange(3), direction=direction, strength=1))
+    for values in (particles.positions, particles.volume, muscle.particles):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 7
+    assert muscle.direction == Muscle(particles=[0], direction=direction, strength=1).direction
