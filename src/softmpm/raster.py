@@ -12,7 +12,7 @@ from softmpm.model import Model
 from softmpm.replay import Launcher, hold, note, recording
 from softmpm.state import GridField, State
 from softmpm.step import on_its_gpu, stream_of
-from softmpm.watch import NEVER
+from softmpm.watch import NEVER, Kind, UnstableError
 
 
 def _particles(model: Model, *tensors: Tensor) -> list:
@@ -74,7 +74,11 @@ def rasterize_nodes(model: Model, state: State) -> GridField:
 
 @on_its_gpu
 def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridField) -> State:
-    """Adjoint of :func:`rasterize_nodes`, of x, v and C."""
+    """Adjoint of :func:`rasterize_nodes`, of x, v and C.
+
+    Raises:
+        UnstableError: An adjoint is not finite.
+    """
     launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
     t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.node_count)
     adj_node = passing(field.mass.new_empty(*lead, model.dim + 1), t.node)
@@ -84,4 +88,33 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
     inputs = (passing(model.mass, t.real), *_particles(model, *moving), adj_node)
     lead = (model.worlds, model.particle_count)
     launch(kernels.splat_adj, lead, model.scale, *inputs, *_particles(model, *adj_moving))
+    _raise_gradient_failure(model, adj, adj_moving)
     return State(*adj_moving, F=torch.empty(0))  # nothing: F does not enter
+
+
+def _raise_gradient_failure(model: Model, adj: GridField, adj_moving: list[Tensor]) -> None:
+    """Raise for the first particle whose adjoint is not finite; reads back once."""
+    bad = ~torch.stack([torch.isfinite(tensor).flatten(2).all(-1) for tensor in adj_moving]).all(0)
+    if recording(model):
+        note(torch.where(bad.any(1), 0, NEVER))
+        return
+    if not bool(bad.any()):
+        return
+    world, particle = bad.nonzero()[0].tolist()
+    given = all(bool(torch.isfinite(tensor[world]).all()) for tensor in adj)
+    cause = (
+        "It overflowed on the way back: scale the loss"
+        if given
+        else "The gradient of the loss with respect to the field came in like that: look at the loss"
+    )
+    limit = "gradients must be finite"
+    raise UnstableError(
+        f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite in the backward "
+        f"pass of rasterize; {limit}. {cause}.",
+        kind=Kind.GRADIENT,
+        world=world,
+        particle=particle,
+        substep=0,
+        value="not finite",
+        limit=limit,
+    )

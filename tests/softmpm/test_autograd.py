@@ -265,3 +265,21 @@ def test_it_works_in_inference_mode(scheme):
         end = softmpm.simulate(built, start, None, material, substeps=3)
         found += torch.autograd.grad(dot(cotangent(end), end), start.v)
     assert torch.equal(*found)
+
+
+@pytest.mark.parametrize(
+    "number, cause",
+    [(torch.nan, "look at the loss"), (torch.inf, "look at the loss"), (3e38, "scale the loss")],
+)
+def test_rasterize_stops_gradients_that_are_not_finite(number, cause, device):
+    """As simulate does, with world and particle: a NaN from a loss, or a number that overflows on the way."""
+    model = softmpm.build(busy_scene(2, per_law=4), device=device, worlds=2)
+    rest = model.rest()
+    field = softmpm.rasterize(model, rest._replace(v=rest.v.requires_grad_()))
+    weight = torch.zeros_like(field.velocity)
+    weight[1] = number
+    with pytest.raises(
+        softmpm.UnstableError, match=f"particle 0 .* of world 1 .* of rasterize.*{cause}"
+    ) as caught:
+        (field.velocity * weight).sum().backward()
+    assert (caught.value.kind, caught.value.world, caught.value.particle) == ("gradient", 1, 0)
