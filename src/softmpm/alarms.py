@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
-from softmpm.scene import need
+from softmpm.validate import need
 from softmpm.watch import UnstableError
 
 Policy = Literal["freeze", "reset"]

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
+from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
 from softmpm.buffers import Solid, lame
 from softmpm.checks import (
     check_activation,
@@ -90,6 +91,7 @@ def _simulate(
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
+    refuse_batches((*start[:4], activation, *params))
     check_whole("substeps", substeps)
     if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
@@ -179,6 +181,7 @@ def _rasterize(model: Model, state: State) -> GridField:
     check_model(model, "rasterize")
     state = _cast(model, state)
     check_state(model, state)
+    refuse_batches(state[:3])
     return GridField(*_Rasterize.apply(model, state.x, state.v, state.C))
 
 
@@ -199,7 +202,19 @@ class _Call:
         self.trail: Trail | None = None
 
 
-class _Simulate(torch.autograd.Function):
+class _Function(torch.autograd.Function):
+    """What PyTorch asks of a function beyond its gradient, and must be told that there is none."""
+
+    @staticmethod
+    def vmap(*_):
+        raise RuntimeError(UNAVAILABLE)
+
+    @staticmethod
+    def jvp(*_):
+        raise RuntimeError(FORWARD)
+
+
+class _Simulate(_Function):
     @staticmethod
     def forward(*inputs):
         # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
@@ -220,6 +235,7 @@ class _Simulate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *adj_end):
+        refuse_batches(adj_end)
         wanted = Wanted(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
         about = ctx.model, ctx.horizon, ctx.trail, wanted
         inputs = *about, *ctx.saved_tensors, *adj_end[:4]
@@ -228,7 +244,7 @@ class _Simulate(torch.autograd.Function):
         return None, None, None, *adj, None, None
 
 
-class _SimulateBackward(torch.autograd.Function):
+class _SimulateBackward(_Function):
     """A function of its own, so that a second derivative raises instead of silently losing this term."""
 
     @staticmethod
@@ -258,7 +274,7 @@ class _SimulateBackward(torch.autograd.Function):
         raise RuntimeError(_SECOND)
 
 
-class _Rasterize(torch.autograd.Function):
+class _Rasterize(_Function):
     @staticmethod
     def forward(model, x, v, C):
         return rasterize_nodes(model, State(x, v, C, F=C))
@@ -270,10 +286,11 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, adj_mass, adj_velocity):
+        refuse_batches((adj_mass, adj_velocity))
         return None, *_RasterizeBackward.apply(ctx.model, adj_mass, adj_velocity, *ctx.saved_tensors)
 
 
-class _RasterizeBackward(torch.autograd.Function):
+class _RasterizeBackward(_Function):
     """As :class:`_SimulateBackward`: a second derivative raises."""
 
     @staticmethod

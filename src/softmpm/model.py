@@ -86,8 +86,17 @@ def build(
     if alarms.step is not None:
         need_stable(scene, alarms.step)
     warn_sparse(scene)
-    sizes = dict(worlds=int(worlds), memory_budget=memory_budget, calls=int(calls))
-    return Model(scene, _device(device), dtype, scheme, bool(deterministic), alarms, **sizes)
+    return Model(
+        scene,
+        _device(device),
+        dtype,
+        scheme,
+        bool(deterministic),
+        alarms,
+        worlds=int(worlds),
+        memory_budget=memory_budget,
+        calls=int(calls),
+    )
 
 
 def _device(device: str | torch.device | None) -> torch.device:

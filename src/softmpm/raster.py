@@ -12,7 +12,7 @@ from softmpm.model import Model
 from softmpm.replay import Launcher, hold, note, recording
 from softmpm.state import GridField, State
 from softmpm.step import on_its_gpu, stream_of
-from softmpm.watch import NEVER, Kind, UnstableError
+from softmpm.watch import NEVER, UnstableError
 
 
 def _particles(model: Model, *tensors: Tensor) -> list:
@@ -111,7 +111,7 @@ def _raise_gradient_failure(model: Model, adj: GridField, adj_moving: list[Tenso
     raise UnstableError(
         f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite in the backward "
         f"pass of rasterize; {limit}. {cause}.",
-        kind=Kind.GRADIENT,
+        kind="gradient",
         world=world,
         particle=particle,
         substep=0,

@@ -19,10 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.checks import check_scene
+from softmpm.check_scene import check_scene
 from softmpm.reference import lame, muscle_tangent, tangent
-from softmpm.scene import Scene, need
+from softmpm.scene import Scene
 from softmpm.state import Params
+from softmpm.validate import need
 
 APART = 1.4
 """Cells between particles beyond which they share too few nodes: at 4/3 a body that was stretched springs back, at 3/2 it does not."""

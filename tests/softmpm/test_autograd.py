@@ -283,3 +283,68 @@ def test_rasterize_stops_gradients_that_are_not_finite(number, cause, device):
     ) as caught:
         (field.velocity * weight).sum().backward()
     assert (caught.value.kind, caught.value.world, caught.value.particle) == ("gradient", 1, 0)
+
+
+def batched_gradients(f, v):
+    v = v.clone().requires_grad_()
+    y = f(v)
+    return torch.autograd.grad(y, v, torch.stack([torch.ones_like(y)] * 2), is_grads_batched=True)
+
+
+@pytest.mark.parametrize("name", ["simulate", "rasterize"])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda f, v: torch.vmap(f)(torch.stack([v, v])),
+        lambda f, v: torch.vmap(torch.func.grad(lambda v: f(v).sum()))(torch.stack([v, v])),
+        lambda f, v: torch.func.jacrev(f)(v),
+        lambda f, v: torch.func.jacfwd(f)(v),
+        lambda f, v: torch.func.hessian(lambda v: f(v).sum())(v),
+        lambda f, v: torch.autograd.functional.jacobian(f, v, vectorize=True),
+        batched_gradients,
+    ],
+    ids=["vmap", "vmap of grad", "jacrev", "jacfwd", "hessian", "jacobian", "is_grads_batched"],
+)
+@pytest.mark.filterwarnings(
+    "ignore:.torch.jit.script. is deprecated:DeprecationWarning"
+)  # of PyTorch's own jacfwd
+def test_batches_of_pytorch_lead_to_worlds(model, name, call):
+    """One sentence names worlds=, instead of a tensor without storage somewhere inside."""
+    rest, params = model.rest(), model.params()
+
+    def moved(v):
+        state = rest._replace(v=v)
+        if name == "rasterize":
+            return softmpm.rasterize(model, state).velocity
+        return softmpm.simulate(model, state, None, params, substeps=1).x
+
+    with pytest.raises(RuntimeError, match="softmpm: .* not available; .*build the model with worlds=N"):
+        call(moved, rest.v)
+
+
+def test_batches_of_material_and_activation_lead_to_worlds(model):
+    """As those of the start."""
+    rest, params = model.rest(), model.params()
+    for given, call in (
+        (torch.zeros(3, 1, 1, 2).double(), lambda a: softmpm.simulate(model, rest, a, params, substeps=1).x),
+        (
+            params.young.expand(3, -1),
+            lambda e: softmpm.simulate(model, rest, None, params._replace(young=e), substeps=1).x,
+        ),
+    ):
+        with pytest.raises(RuntimeError, match="build the model with worlds=N instead"):
+            torch.vmap(call)(given)
+
+
+def test_worlds_are_the_rows_of_a_jacobian(model):
+    """What the message recommends: a world for each output gives the rows that a loop gives."""
+    scene, outputs = model.scene, 3
+    many = softmpm.build(scene, device="cpu", dtype=torch.float64, worlds=outputs)
+    v = many.rest().v.requires_grad_()
+    end = softmpm.simulate(many, many.rest()._replace(v=v), None, many.params(), substeps=3)
+    (rows,) = torch.autograd.grad(end.x[range(outputs), range(outputs), 0].sum(), v)
+    v = model.rest().v.requires_grad_()
+    end = softmpm.simulate(model, model.rest()._replace(v=v), None, model.params(), substeps=3)
+    for k in range(outputs):
+        (want,) = torch.autograd.grad(end.x[0, k, 0], v, retain_graph=True)
+        torch.testing.assert_close(rows[k], want[0], rtol=1e-13, atol=1e-16)

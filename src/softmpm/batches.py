@@ -1,0 +1,28 @@
+"""PyTorch's own batches (``torch.vmap``, batched gradients), which the kernels cannot see: refused, since worlds are batches."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+UNAVAILABLE = (
+    "softmpm: torch.vmap and batched gradients (is_grads_batched, vectorize=True, jacrev) are not available; build the model with "
+    "worlds=N instead, which runs a batch of N in one launch, each world with its own start, activation, material and gradient."
+)
+FORWARD = (
+    "softmpm: forward-mode and second derivatives (jvp, jacfwd, hessian) are not available; use reverse mode (backward, "
+    "grad, vjp), and for the rows of a Jacobian build the model with worlds=N, one row in each world."
+)
+
+
+def refuse_batches(tensors: Iterable[Tensor | None]) -> None:
+    """Raise RuntimeError if one of these is a batch under ``torch.vmap`` or batched gradients."""
+    if any(isinstance(tensor, Tensor) and _batched(tensor) for tensor in tensors):
+        raise RuntimeError(UNAVAILABLE)
+
+
+def _batched(tensor: Tensor) -> bool:
+    inner = torch._C._functorch
+    while inner.is_gradtrackingtensor(tensor):
+        tensor = inner.get_unwrapped(tensor)
+    return inner.is_batchedtensor(tensor) or inner.is_legacy_batchedtensor(tensor)
