@@ -24,7 +24,7 @@ def gpu(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Every benchmark in ``bench/``, or those named."""
+    """Time of a substep and of a gradient (``bench/step.py``, ``bench/gradient.py``), or the benchmarks named."""
     session.install("-e", ".[dev]")
     for name in session.posargs or ("step", "gradient"):
         session.run("python", f"bench/{name}.py")

@@ -32,6 +32,8 @@ from softmpm.tape import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 from softmpm.watch import UnstableError
 
+__version__ = "0.1.0"
+
 __all__ = [
     "Alarms",
     "BarrierCorotated",
