@@ -7,12 +7,12 @@ from pathlib import Path
 
 SRC = Path(__file__).parents[1] / "src"
 ORDER = """kernels.turn validate scene state watch silhouette surface shapes checks check_scene reference stability alarms
-    neighbours schedule horizon memory kernels.types kernels.spline kernels.polar kernels.elasticity kernels.muscle
-    kernels.solid kernels.contact kernels.grid kernels.failure kernels.particle kernels.transfer kernels.boundary
-    kernels.raster kernels.native kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed kernels.fused
-    kernels.fused_adj kernels.sorting kernels.packing description model buffers explain failures step replay checkup
-    plain between arrangement exact program program_adj fast runner rollout raster autograd graph warp_arrays tape
-    layout playback recording appearance show rerun_file __main__""".split()
+    neighbours schedule horizon devices memory kernels.types kernels.spline kernels.polar kernels.elasticity
+    kernels.muscle kernels.solid kernels.contact kernels.grid kernels.failure kernels.particle kernels.transfer
+    kernels.boundary kernels.raster kernels.native kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed
+    kernels.fused kernels.fused_adj kernels.sorting kernels.packing description model buffers explain failures step
+    replay checkup plain between arrangement exact batches program program_adj fast runner rollout raster autograd
+    graph warp_arrays tape layout playback recording appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
     "h5py": {"layout", "recording", "playback"},

@@ -1,6 +1,7 @@
 """PyTorch's own batches (``torch.vmap``, batched gradients), which the kernels cannot see: refused, since worlds are batches."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +23,8 @@ def refuse_batches(tensors: Iterable[Tensor | None]) -> None:
 
 
 def _batched(tensor: Tensor) -> bool:
-    inner = torch._C._functorch
+    core: Any = torch._C
+    inner = core._functorch
     while inner.is_gradtrackingtensor(tensor):
         tensor = inner.get_unwrapped(tensor)
     return inner.is_batchedtensor(tensor) or inner.is_legacy_batchedtensor(tensor)

@@ -161,6 +161,8 @@ def _check_tensor(model: Sizes, name: str, value: Tensor, shape: tuple[int, ...]
     """Precision and device are the model's; and the shape, if it is one of particles. Texts are made only when needed."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
+    if value.layout != torch.strided:
+        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; use .to_dense().")
     if value.dtype != model.dtype:
         raise ValueError(
             f"{name} must be {model.dtype} like the model, got {value.dtype}; use .to({model.dtype}), "

@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 
 from softmpm.model import Model
+from softmpm.scene import CONTACTS
 
 FORMAT, VERSION = "softmpm recording", 1
 EPISODE = np.dtype([("iteration", "<i8"), ("attributes", "S4096")])
@@ -39,7 +40,7 @@ STATIC = {  # name: type, axes. p particles, d dim, m muscles, w walls
     "wall_normal": (REAL, "wd"),
     "wall_offset": (REAL, "w"),
     "wall_friction": (REAL, "w"),
-    "wall_contact": (np.dtype("S8"), "w"),
+    "wall_contact": (np.dtype(f"S{max(map(len, CONTACTS))}"), "w"),
     "grid_shape": (INDEX, "d"),
 }
 TABLES = {  # as above; r rows, n the nodes of the grid (dim axes), l the size of the latent

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import torch
 
+from softmpm.devices import memory_of
 from softmpm.schedule import recomputed
 
 LONGEST = 128
@@ -205,3 +206,16 @@ def _at_once(horizon, longest: int) -> int:
     another shape that waits.
     """
     return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))
+
+
+def check_room(model) -> None:
+    """Raise ValueError if the start, the end and the grid of a call alone are more than the device has."""
+    room = memory_of(model.device)
+    per_node = 8 if model.scheme == "fast" else 2 * model.dim + 1
+    per_world = 2 * model.particle_count * 2 * (model.dim + model.dim**2) + model.held_nodes * per_node
+    needed = model.worlds * per_world * model.dtype.itemsize
+    if room is not None and needed > room:
+        raise ValueError(
+            f"a call takes at least {needed:,} bytes for {model.worlds:,} world(s) of {model.particle_count:,} particles and "
+            f"{model.held_nodes:,} nodes, but {model.device} has {room:,}: take fewer worlds, fewer nodes or fewer particles."
+        )

@@ -1,7 +1,6 @@
 """A scene made ready to run: fixed arrays on one device, and what was specialised for it."""
 
 import functools
-import logging
 import math
 
 import numpy as np
@@ -13,9 +12,18 @@ from softmpm.alarms import Alarms
 from softmpm.check_scene import check_precision, check_scene
 from softmpm.checks import check_whole
 from softmpm.description import describe
+from softmpm.devices import device_of
 from softmpm.kernels.native import padded
 from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import MARGIN, Sizes, default_budget, longest_chunk, price_of_chunk, window_shape
+from softmpm.memory import (
+    MARGIN,
+    Sizes,
+    check_room,
+    default_budget,
+    longest_chunk,
+    price_of_chunk,
+    window_shape,
+)
 from softmpm.neighbours import rest_neighbours
 from softmpm.scene import BarrierCorotated, FixedCorotated, Material, NeoHookean, Scene
 from softmpm.stability import need_stable, warn_sparse
@@ -26,8 +34,6 @@ LAWS = {
     FixedCorotated: "fixed_corotated",
     BarrierCorotated: "barrier_corotated",
 }
-
-logger = logging.getLogger("softmpm")
 
 
 def build(
@@ -88,7 +94,7 @@ def build(
     warn_sparse(scene)
     return Model(
         scene,
-        _device(device),
+        device_of(device),
         dtype,
         scheme,
         bool(deterministic),
@@ -97,24 +103,6 @@ def build(
         memory_budget=memory_budget,
         calls=int(calls),
     )
-
-
-def _device(device: str | torch.device | None) -> torch.device:
-    if device is None:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-        logger.info("softmpm runs on %s.", device)
-    asked = device
-    try:
-        device = torch.device(device)
-    except (RuntimeError, TypeError):
-        device = None
-    if device is None or device.type not in ("cpu", "cuda"):
-        raise ValueError(f"device must be 'cpu', 'cuda' or 'cuda:N', got {str(asked)!r}.")
-    if device.type == "cuda":
-        if not torch.cuda.is_available():
-            raise RuntimeError("device 'cuda' was asked for, but PyTorch sees no GPU here; use device='cpu'.")
-        device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
-    return device
 
 
 class Model:
@@ -174,6 +162,7 @@ class Model:
         wp.init()
         self.wp_device = wp.device_from_torch(device)
         self.scale, self.walls = self._scale(), self._walls()
+        check_room(self)
         self.neighbours = self._neighbours()
 
     def _tensor(self, values) -> Tensor:

@@ -32,6 +32,10 @@ class Grid:
             all(n.is_integer() and n >= 4 for n in shape),
             f"grid shape needs whole numbers of at least 4 nodes along each axis, got {self.shape}.",
         )
+        need(
+            all(n < 2**31 for n in shape),
+            f"grid shape must be below 2,147,483,648 nodes along each axis, which 32-bit indices reach, got {self.shape}.",
+        )
         object.__setattr__(self, "shape", tuple(int(n) for n in shape))
         store_numbers(self, "grid", "spacing")
         need(self.spacing > 0, f"grid spacing must be > 0 m, got {self.spacing}.")

@@ -112,7 +112,7 @@ def mesh(source: "str | os.PathLike[str] | trimesh.Trimesh", spacing: float) -> 
     spacing = _spacing(spacing)
     vertices, faces = closed_surface(source)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    count = np.ceil((high - low) / spacing - 1e-9).astype(np.int64)
+    count = _whole(np.ceil((high - low) / spacing - 1e-9))
     positions = _lattice((low + high) / 2, count, spacing)
     inside = winding_inside(vertices, faces, positions)
     return Particles(_not_empty(positions[inside], spacing), spacing**3)
@@ -146,7 +146,18 @@ def _not_empty(positions: np.ndarray, spacing: float) -> np.ndarray:
 
 def _count(extent: np.ndarray, spacing: float) -> np.ndarray:
     """Nearest whole number of cells along each axis; a tie goes up, whatever its rounding."""
-    return np.floor(extent / spacing + 0.5 + 1e-9).astype(np.int64)
+    with np.errstate(over="ignore"):
+        return _whole(np.floor(extent / spacing + 0.5 + 1e-9))
+
+
+def _whole(count: np.ndarray) -> np.ndarray:
+    """As integers, which overflow far above the limit of cells."""
+    need(
+        bool((count <= CELL_LIMIT).all()),
+        f"the shape spans {count.max():.2g} lattice cells along an axis, at most {CELL_LIMIT:.2g} are allowed in all: "
+        "make the spacing larger, and check that all lengths are in metres.",
+    )
+    return count.astype(np.int64)
 
 
 def _lattice(center: np.ndarray, count: np.ndarray, step: np.ndarray | float) -> np.ndarray:

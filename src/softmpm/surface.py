@@ -24,17 +24,24 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
         hasattr(source, "is_watertight") and len(getattr(source, "faces", ())) > 0,
         f"mesh needs a path or a trimesh.Trimesh with faces, got {type(source).__name__}.",
     )
+    vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)
+    size = float(np.ptp(vertices, axis=0).min())
+    need(
+        bool(np.isfinite(vertices).all()) and size > 1e-6 * np.abs(vertices).max(),
+        f"the mesh's vertices must be finite and not lie farther from the origin than a million times its smallest side, got "
+        f"{np.abs(vertices).max():.4g} m and {size:.4g} m: check its units, or move it to the origin with "
+        "apply_translation(-mesh.centroid).",
+    )
     if not source.is_watertight:
-        _, faces = np.unique(np.asarray(source.edges_sorted), axis=0, return_counts=True)
+        _, joined = np.unique(np.asarray(source.edges_sorted), axis=0, return_counts=True)
         raise ValueError(
-            f"the mesh is not closed: {(faces != 2).sum()} of its {len(faces)} edges do not join two faces; "
+            f"the mesh is not closed: {(joined != 2).sum()} of its {len(joined)} edges do not join two faces; "
             "try merge_vertices(), then trimesh.repair.fill_holes, or close it where it was drawn."
         )
     need(
         bool(source.is_winding_consistent) and source.volume != 0,
         "the mesh's faces do not all turn the same way, so it has no inside: try trimesh.repair.fix_normals.",
     )
-    vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)
     return vertices, faces if source.volume > 0 else faces[:, ::-1]  # all faces may turn inwards
 
 

@@ -189,3 +189,23 @@ def test_build_takes_deterministic_as_a_truth_value():
     """A text would be taken as true, "no" among them."""
     with pytest.raises(TypeError, match="deterministic must be True or False, got 'no'"):
         softmpm.build(scene(), device="cpu", deterministic="no")
+
+
+def test_a_model_that_no_memory_holds():
+    """Refused by build with the bytes that it would take, not by PyTorch in the middle of a call."""
+    wide = scene(soft(), grid=Grid(shape=(10**7, 10**7), spacing=DX))
+    for given, settings, said in (
+        (wide, {}, "bytes for 1 world.s. of 2 particles and 100,000,000,000,000 nodes, but cpu has"),
+        (scene(soft()), {"worlds": 10**12}, "bytes for 1,000,000,000,000 world.s. of 2 particles"),
+    ):
+        with pytest.raises(ValueError, match=f"a call takes at least [0-9,]* {said} .*take fewer"):
+            softmpm.build(given, device="cpu", **settings)
+    with pytest.raises(ValueError, match="grid shape must be below 2,147,483,648 nodes along each axis"):
+        Grid(shape=(10**12, 10**12), spacing=DX)
+
+
+def test_the_cpu_has_no_number():
+    """Tensors on "cpu:0" say that they are on "cpu", and a model asked for there takes them."""
+    model = softmpm.build(scene(soft()), device="cpu:0")
+    assert model.device == torch.device("cpu")
+    softmpm.simulate(model, model.rest().to("cpu:0"), None, model.params(), substeps=1)

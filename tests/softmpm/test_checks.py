@@ -161,3 +161,17 @@ def test_a_mass_that_its_precision_cannot_hold(mass, index):
         ValueError, match=r"mass = .* at least 1.18e-38 kg .*torch.float32.*" + re.escape(index)
     ):
         check_bounds(params(), masses)
+
+
+def test_sparse_tensors():
+    """Said in place of an operator that PyTorch has not for them; .to_dense() helps."""
+    for call in (
+        lambda t: check_activation(MODEL, t(torch.zeros(1, 2, 4))),
+        lambda t: check_params(MODEL, params(young=t(torch.ones(2, 3)))),
+        lambda t: check_state(MODEL, state(v=t(state().v))),
+    ):
+        with pytest.raises(
+            TypeError, match=r"must be a dense tensor, got torch.sparse_coo; use .to_dense\(\)"
+        ):
+            call(lambda dense: dense.to_sparse())
+        call(lambda dense: dense.to_sparse().to_dense())

@@ -85,6 +85,13 @@ def test_refuses(make, message):
         make()
 
 
+@pytest.mark.parametrize("make", [lambda: box((0, 0), (1e30, 1e30), 0.1), lambda: ball((0, 0), 1e30, 0.1)])
+def test_sizes_beyond_integers(make):
+    """1e31 cells along an axis overflowed, and the box was called too thin."""
+    with pytest.raises(ValueError, match="the shape spans 1e.31 lattice cells along an axis, at most 2e.08"):
+        make()
+
+
 def test_half_cells_do_not_depend_on_rounding():
     """A side of 2.5 spacings counts three particles, however the quotient is rounded."""
     for scale in (0.1, 0.3, 0.7, 1e-3):

@@ -217,3 +217,20 @@ def test_is_a_number():
     assert stable_dt(dataclasses.replace(made, dt=1.0)) == limit
     for other in (copy.deepcopy(limit), pickle.loads(pickle.dumps(limit))):
         assert other == limit and other.limit == limit.limit
+
+
+@pytest.mark.parametrize(
+    "particles, direction, said",
+    [
+        ([0, 99], (1, 0), "muscle 0 names particle 99, but the scene's"),
+        ([-1], (1, 0), "muscle 0 names particle -1"),
+        ([0], (1, 0, 0), "muscle 0 direction needs 2 numbers"),
+    ],
+)
+def test_a_scene_that_cannot_be_built_has_no_limit(particles, direction, said):
+    """It is asked for before build, and says what build would say."""
+    muscle = Muscle(particles=particles, direction=direction, strength=1.0)
+    body = Body(Particles(np.array([[0.4, 0.4], [0.5, 0.5]]), 0.01), NeoHookean(density=1.0, young=10.0))
+    scene = Scene(grid=Grid(shape=(9, 9), spacing=0.1), bodies=[body], muscles=[muscle], dt=1e-3)
+    with pytest.raises(ValueError, match=said):
+        stable_dt(scene)

@@ -137,3 +137,29 @@ def test_missing_file_and_library(monkeypatch, tmp_path):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match=r"pip install softmpm\[mesh\]"):
         mesh(path, 0.1)
+
+
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (lambda v: np.where(v > 0.4, np.nan, v), "vertices must be finite .* got nan m"),
+        (lambda v: v * 1e30, "lattice cells along an axis, .* all lengths are in metres"),
+        (
+            lambda v: v + 1e30,
+            "million times its smallest side, got 1e.30 m and 0 m: .* move it to the origin",
+        ),
+    ],
+)
+def test_places_that_numbers_do_not_hold(spoil, said):
+    """A mesh with NaN, too large or too far away is refused for what it is."""
+    solid = trimesh.creation.box(bounds=[(-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)])
+    with pytest.raises(ValueError, match=said):
+        mesh(trimesh.Trimesh(spoil(solid.vertices), solid.faces, process=False), 0.1)
+
+
+def test_a_mesh_moved_to_the_origin_is_taken():
+    """As the message recommends."""
+    solid = trimesh.creation.box(bounds=[(1e7, 0, 0), (1e7 + 1, 1, 1)])
+    with pytest.raises(ValueError, match="apply_translation"):
+        mesh(solid, 0.25)
+    assert len(mesh(solid.apply_translation(-solid.centroid), 0.25)) == 64
