@@ -11,8 +11,8 @@ ORDER = """kernels.turn validate scene state watch silhouette surface shapes che
     kernels.muscle kernels.solid kernels.contact kernels.grid kernels.failure kernels.particle kernels.transfer
     kernels.boundary kernels.raster kernels.native kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed
     kernels.fused kernels.fused_adj kernels.sorting kernels.packing description model buffers explain failures step
-    replay checkup plain between arrangement exact batches program program_adj fast runner rollout raster autograd
-    graph warp_arrays tape layout playback recording appearance show rerun_file __main__""".split()
+    replay checkup plain between arrangement exact batches compiling program program_adj fast runner rollout raster
+    autograd graph warp_arrays tape layout playback recording appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
     "h5py": {"layout", "recording", "playback"},
@@ -75,9 +75,12 @@ def test_the_learner_uses_public_names_only():
 
 
 def test_importing_the_simulator_is_light():
-    """``import softmpm`` loads neither rerun, hydra nor matplotlib, and has no side effect on Warp."""
+    """``import softmpm`` loads neither rerun, hydra nor matplotlib nor PyTorch's compiler, and has no side effect on Warp."""
     code = (
-        "import sys, softmpm, warp as wp\n"
+        "import sys, torch\n"
+        "before = 'torch._dynamo' in sys.modules\n"
+        "import softmpm, warp as wp\n"
+        "assert ('torch._dynamo' in sys.modules) == before\n"
         "heavy = {'rerun', 'hydra', 'matplotlib', 'trimesh'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
         "assert wp._src.context.runtime is None"

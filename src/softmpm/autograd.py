@@ -19,6 +19,7 @@ from softmpm.checks import (
     check_state,
     check_whole,
 )
+from softmpm.compiling import opaque
 from softmpm.horizon import Horizon
 from softmpm.kernels.types import Wanted
 from softmpm.model import Model
@@ -32,10 +33,6 @@ _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
     "call backward without create_graph=True."
 )
-
-
-_opaque: Any = torch.compiler.disable
-"""What torch.compile calls instead of tracing it. On inner functions: it would hide the signature of a public one."""
 
 
 def simulate(
@@ -75,7 +72,7 @@ def simulate(
     return _simulate(model, start, activation, params, substeps, failures)
 
 
-@_opaque
+@opaque
 def _simulate(
     model: Model,
     start: State,
@@ -176,7 +173,7 @@ def rasterize(model: Model, state: State) -> GridField:
     return _rasterize(model, state)
 
 
-@_opaque
+@opaque
 def _rasterize(model: Model, state: State) -> GridField:
     check_model(model, "rasterize")
     state = _cast(model, state)
