@@ -17,18 +17,12 @@ from pathlib import Path
 
 import torch
 from common import machine
-from extremes import loads, material, numerics, starts
 from extremes.cells import How, Outcome, Verdict, verdict
 from extremes.laws import LAWS
+from extremes.pages import PAGES
 from extremes.picture import draw
 from extremes.rows import Row
 
-PAGES = {
-    "material": material.ROWS,
-    "loads": loads.ROWS,
-    "starts": starts.ROWS,
-    "numerics": numerics.ROWS,
-}
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
 

@@ -13,7 +13,6 @@ from .cells import BODY, FREE, Case, CriterionError, How, Run, play, short, turn
 from .judges import DENSITIES
 from .rows import Row
 
-
 PRESSURE_WAVE = 1.16
 """Speed of the pressure wave over √(E/ρ) at a Poisson's ratio of 0.3."""
 
