@@ -4,11 +4,13 @@ Each row takes one quantity to its extremes, in every law, in 2D and 3D, and giv
 that do not use the library's alarms, *refused* by name (ValueError), *stopped* by name (UnstableError; the kind is shown), or *silent*:
 a state came back that is not right. Prints a table; ``--json FILE`` writes it, and ``--pictures`` draws it as docs/images/limits_*.png.
 
-``--longest`` bounds the rows whose subject is the length of a run; 1e6 takes ten minutes on a GPU. ``--no-alarms`` switches
-the alarms off: what is right then and stopped with them was stopped without need.
+``--longest`` bounds the rows whose subject is the length of a run. ``--needless`` runs what was refused or stopped once more without
+alarms and counts what is right then.
 """
 
 import argparse
+import dataclasses
+import functools
 import json
 import sys
 import time
@@ -17,7 +19,7 @@ from pathlib import Path
 
 import torch
 from common import machine
-from extremes.cells import How, Outcome, Verdict, verdict
+from extremes.cells import How, Outcome, verdict
 from extremes.laws import LAWS
 from extremes.pages import PAGES
 from extremes.picture import draw
@@ -28,17 +30,20 @@ IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
 def main():
     args = arguments()
-    how = How(args.device, alarms=not args.no_alarms, longest=int(args.longest))
+    how = How(args.device, longest=int(args.longest))
     print(f"Maps of the extremes ({machine(torch.device(args.device))})")
     cells: list[dict] = []
     for page, rows in PAGES.items():
         for row in rows:
             if args.row in (None, row.name):
-                cells += measure(page, row, row.few if args.short else row.values, how)
+                cells += measure(page, row, row.few if args.short else row.values, how, args.needless)
                 if args.json:
                     save(args.json, args.device, cells)
     count = Counter(cell["outcome"] for cell in cells)
     print(", ".join(f"{count[outcome]} {outcome}" for outcome in Outcome), f"of {len(cells)} cells")
+    if args.needless:
+        right = sum(cell.get("without alarms") == Outcome.RIGHT for cell in cells)
+        print(f"{right} that were refused or stopped are right without alarms")
     if args.pictures:
         draw(PAGES, cells, IMAGES)
     sys.exit(1 if count[Outcome.SILENT] and args.strict else 0)
@@ -53,14 +58,14 @@ def arguments() -> argparse.Namespace:
     names = [row.name for rows in PAGES.values() for row in rows]
     parser.add_argument("--row", choices=names, help="one row only")
     parser.add_argument("--longest", type=float, default=1e4, help="most substeps of a run")
-    parser.add_argument("--no-alarms", action="store_true", help="build without alarms")
+    parser.add_argument("--needless", action="store_true", help="repeat what was stopped without alarms")
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a cell is silent")
     parser.add_argument("--json", type=Path, help="write the cells there")
     parser.add_argument("--pictures", action="store_true", help="draw a picture of each page")
     return parser.parse_args()
 
 
-def measure(page: str, row: Row, values: tuple, how: How) -> list[dict]:
+def measure(page: str, row: Row, values: tuple, how: How, needless: bool) -> list[dict]:
     """Cells of a row, printed law by law."""
     print(f"\n{row.name}: {row.title}\n    right: {row.right}")
     found = []
@@ -71,11 +76,14 @@ def measure(page: str, row: Row, values: tuple, how: How) -> list[dict]:
                 if dim not in row.dims(value) or (row.counts_substeps and value > how.longest):
                     continue
                 begin = time.perf_counter()
-                given: Verdict = verdict(lambda law=law, dim=dim, value=value: row.cell(law, dim, value, how))
-                where = {"page": page, "row": row.name, "law": law.__name__, "dim": dim, "value": value}
-                seconds = round(time.perf_counter() - begin, 2)
-                answer = {"outcome": given.outcome, "note": given.note, "detail": given.detail}
-                found.append(where | answer | {"seconds": seconds})
+                given = verdict(functools.partial(row.cell, law, dim, value, how))
+                cell = {"page": page, "row": row.name, "law": law.__name__, "dim": dim, "value": value}
+                cell |= dataclasses.asdict(given) | {"seconds": round(time.perf_counter() - begin, 2)}
+                if needless and given.outcome in (Outcome.REFUSED, Outcome.STOPPED):
+                    bold = dataclasses.replace(how, alarms=False)
+                    other = verdict(functools.partial(row.cell, law, dim, value, bold))
+                    cell["without alarms"] = other.outcome
+                found.append(cell)
                 mark = "" if given.outcome is Outcome.RIGHT else given.outcome + " "
                 line.append(f"{row.label(value)}: {mark if given.note != given.outcome else ''}{given.note}")
             print(f"    {law.__name__:16} {dim}D  " + " | ".join(line), flush=True)

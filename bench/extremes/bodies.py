@@ -116,7 +116,7 @@ def affine(state: softmpm.State, rate: np.ndarray) -> softmpm.State:
     """Velocity ``rate`` (x − centre), ``rate`` [1/s] of shape (dim, dim)."""
     C = torch.as_tensor(rate).to(state.C)
     arm = state.x - state.x.mean(dim=1, keepdim=True)
-    return softmpm.State(state.x, arm @ C.T, C.expand_as(state.C).clone(), state.F).with_low(state.low)
+    return state._replace(v=arm @ C.T, C=C.expand_as(state.C).clone())
 
 
 def deformed(state: softmpm.State, F: np.ndarray) -> softmpm.State:

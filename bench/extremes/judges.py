@@ -13,6 +13,7 @@ where the velocities are, which removes the first-order error of symplectic Eule
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -117,7 +118,7 @@ class Matter:
         reach = NEIGHBOUR * self.volume ** (1 / self.dim)
         found = [
             a + cKDTree(self.rest[a:b]).query_pairs(reach[a], output_type="ndarray")
-            for a, b in zip(first[:-1], first[1:], strict=True)
+            for a, b in pairwise(first)
         ]
         return np.concatenate(found)
 

@@ -46,7 +46,7 @@ def step_of_cloud(law: type, dim: int, value: float, how: How) -> str:
     def start(state: softmpm.State) -> softmpm.State:
         random = np.random.default_rng(0).uniform(-1e-3, 1e-3, state.F.shape)
         H = torch.as_tensor(random + random.swapaxes(-1, -2)).to(state.F)
-        return softmpm.State(state.x, state.v, state.C, state.F + H).with_low(state.low)
+        return state._replace(F=state.F + H)
 
     case = Case(
         scene=bodies.scene(bodies.cloud(law, dim), fraction=value),
@@ -100,8 +100,8 @@ ROUNDING = 0.01
 
 def gradient(law: type, dim: int, value: float, how: How) -> str:
     """Derivative of a random weighting of the end with respect to a factor of E and one of the start's velocity."""
-    scene = bodies.scene(bodies.block(law, dim, side=5 - dim), gravity=False, nodes=16)
-    scene = replace(scene, bodies=[bodies.box([7] * dim, [5 - dim] * dim, law)])
+    body = bodies.box([7] * dim, [5 - dim] * dim, law)
+    scene = bodies.scene(body, gravity=False, nodes=16)
     precise = replace(how, dtype=torch.float64)
     count = int(value)
     got = loss(scene, dim, count, how, torch.ones(2), True)[1]
