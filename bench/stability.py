@@ -2,7 +2,8 @@
 
 Each row takes one quantity to its extremes, in every law, in 2D and 3D, and gives each cell one of four outcomes: *right* by criteria
 that do not use the library's alarms, *refused* by name (ValueError), *stopped* by name (UnstableError; the kind is shown), or *silent*:
-a state came back that is not right. Prints a table; ``--json FILE`` writes it, and ``--pictures`` draws it as docs/images/limits_*.png.
+a state came back that is not right. Prints a table and writes it to ``--json FILE``; ``--draw FILE`` draws such a file, and that of
+bench/running_limit.py beside it, as docs/images/limits_*.png and measures nothing.
 
 ``--longest`` bounds the rows whose subject is the length of a run. ``--needless`` runs what was refused or stopped once more without
 alarms and counts what is right then.
@@ -22,7 +23,7 @@ from common import machine
 from extremes.cells import How, Outcome, verdict
 from extremes.laws import LAWS
 from extremes.pages import PAGES
-from extremes.picture import draw
+from extremes.picture import draw, draw_limit
 from extremes.rows import Row
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
@@ -30,6 +31,10 @@ IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
 def main():
     args = arguments()
+    if args.draw:
+        draw(PAGES, json.loads(args.draw.read_text())["cells"], IMAGES)
+        draw_limit(json.loads(args.draw.with_stem(f"running_{args.draw.stem}").read_text())["rows"], IMAGES)
+        return
     how = How(args.device, longest=int(args.longest))
     print(f"Maps of the extremes ({machine(torch.device(args.device))})")
     cells: list[dict] = []
@@ -44,8 +49,6 @@ def main():
     if args.needless:
         right = sum(cell.get("without alarms") == Outcome.RIGHT for cell in cells)
         print(f"{right} that were refused or stopped are right without alarms")
-    if args.pictures:
-        draw(PAGES, cells, IMAGES)
     sys.exit(1 if count[Outcome.SILENT] and args.strict else 0)
 
 
@@ -61,7 +64,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--needless", action="store_true", help="repeat what was stopped without alarms")
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a cell is silent")
     parser.add_argument("--json", type=Path, help="write the cells there")
-    parser.add_argument("--pictures", action="store_true", help="draw a picture of each page")
+    parser.add_argument("--draw", type=Path, help="draw the cells of this file")
     return parser.parse_args()
 
 

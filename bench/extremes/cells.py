@@ -3,10 +3,9 @@
 *right*: every call returned, and every state that came back passed the criteria of its row.
 *refused*: ``build`` or a call raised ValueError, which names the rule.
 *stopped*: a call raised UnstableError; its kind is the note.
-*silent*: a state came back that fails a criterion. Nothing warned of it by an error.
+*silent*: a state came back that fails a criterion; no error told of it.
 """
 
-import inspect
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -64,18 +63,15 @@ class How:
     """Most substeps of the rows whose subject is the length of a run."""
 
 
-def make(scene: softmpm.Scene, how: How, **options) -> softmpm.Model:
-    """Build; without alarms where the library can switch them off."""
-    known = inspect.signature(softmpm.build).parameters
-    if not how.alarms and "alarms" in known:
-        options["alarms"] = softmpm.Alarms(
-            **dict.fromkeys(inspect.signature(softmpm.Alarms).parameters, False)
-        )
-    options = {"dtype": how.dtype} | options
+NO_ALARMS = softmpm.Alarms(collapse=None, gap=None, step=None)
+
+
+def make(scene: softmpm.Scene, how: How, worlds: int = 1) -> softmpm.Model:
+    alarms = None if how.alarms else NO_ALARMS
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", softmpm.StabilityWarning)  # a warning is no outcome
         try:
-            return softmpm.build(scene, device=how.device, **options)
+            return softmpm.build(scene, device=how.device, dtype=how.dtype, worlds=worlds, alarms=alarms)
         except ValueError as error:
             raise RefusedError(str(error)) from error
 
@@ -191,9 +187,9 @@ class Case:
         return max(1, self.substeps // self.looks)
 
 
-def states(case: Case, how: How, **options) -> Iterator[softmpm.State]:
+def states(case: Case, how: How) -> Iterator[softmpm.State]:
     """The start, and the end of each call."""
-    model = make(case.scene, how, **options)
+    model = make(case.scene, how)
     params = model.params()
     params = params._replace(young=params.young * case.young_factor)
     activation = None

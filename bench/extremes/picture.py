@@ -28,7 +28,11 @@ MEANINGS = {
     Outcome.STOPPED: "stopped by name (UnstableError, its kind)",
     Outcome.SILENT: "silently wrong",
 }
-SHORT = {"NeoHookean": "neo-Hookean", "FixedCorotated": "corotated", "BarrierCorotated": "barrier"}
+SHORT = {
+    "NeoHookean": "neo-Hookean",
+    "FixedCorotated": "fixed corotated",
+    "BarrierCorotated": "barrier corot.",
+}
 LINE, HEAD = 0.235, 0.62
 """Heights of a line of cells and of a row's title [inch]."""
 WIDTH, MARGIN = 10.5, 1.25
@@ -111,6 +115,43 @@ def draw_row(axes: Axes, row: Row, cells: list[dict]) -> None:
     axes.tick_params(length=0, pad=2)
     axes.spines[:].set_visible(False)
     axes.set_title(row.title, loc="left", fontsize=9.5, pad=5, weight="bold")
+
+
+def draw_limit(rows: list[dict], folder: Path) -> None:
+    """Measured over reported step limit against the stretch, and what is reported."""
+    figure, three = plt.subplots(1, 3, figsize=(WIDTH, 3.5), layout="constrained", facecolor="white")
+    panels = {
+        "lone": "20 lone particles: measured / reported",
+        "strip": "held strip: measured / reported",
+        "strip reported / rest": "held strip: reported / that at rest",
+    }
+    for axes, (column, title) in zip(three, panels.items(), strict=True):
+        for law, colour, marker in zip(LAWS, ("#0072B2", "#D55E00", "#009E73"), "osD", strict=True):
+            for dim, style in ((2, "-"), (3, "--")):
+                own = [row for row in rows if row["law"] == law.__name__ and row["dim"] == dim]
+                axes.plot(
+                    [row["stretch"] for row in own],
+                    [row[column] for row in own],
+                    style,
+                    color=colour,
+                    marker=marker,
+                    markersize=4,
+                    label=f"{SHORT[law.__name__]} {dim}D",
+                )
+        axes.set_title(title, fontsize=9.5)
+        axes.set_xlabel("stretch", fontsize=9)
+        axes.set_xscale("log")
+        axes.set_xticks([0.3, 0.5, 1, 2, 4], ["0.3", "0.5", "1", "2", "4"])
+        axes.minorticks_off()
+        axes.set_ylim(0, 2 if column != "strip reported / rest" else None)
+        axes.grid(color="#e6e6e6", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8.5)
+    three[0].axhspan(0.9, 1.0, color="#bfe3d5", zorder=0)
+    three[1].axhspan(1.0, 1.6, color="#bfe3d5", zorder=0)
+    three[0].legend(frameon=False, fontsize=8, ncols=2, loc="lower left")
+    figure.savefig(folder / "limits_step.png", dpi=130)
+    plt.close(figure)
 
 
 NOTES = {"left_grid": "left grid", "not_finite": "not finite"}
