@@ -13,6 +13,7 @@ where the velocities are, which removes the first-order error of symplectic Eule
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -110,8 +111,16 @@ class Matter:
         self.laws = np.repeat([type(body.material).__name__ for body in bodies], sizes)
         self.pulls = [(m.particles, np.array(m.direction), activation * m.strength) for m in scene.muscles]
         self.floor = min((wall.offset for wall in scene.walls), default=0.0)
-        reach = NEIGHBOUR * self.volume.max() ** (1 / self.dim)
-        self.pairs = cKDTree(self.rest).query_pairs(reach, output_type="ndarray")
+        self.pairs = self._neighbours(np.cumsum([0, *sizes]))
+
+    def _neighbours(self, first: np.ndarray) -> np.ndarray:
+        """Pairs of neighbours at rest; bodies have none in others, since those may part."""
+        reach = NEIGHBOUR * self.volume ** (1 / self.dim)
+        found = [
+            a + cKDTree(self.rest[a:b]).query_pairs(reach[a], output_type="ndarray")
+            for a, b in pairwise(first)
+        ]
+        return np.concatenate(found)
 
     def energy(self, state: Exact) -> Energy:
         """Energies, positions and F taken half a substep back, where v and C are."""

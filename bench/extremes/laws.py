@@ -2,4 +2,4 @@
 
 import softmpm
 
-LAWS = [softmpm.NeoHookean, softmpm.FixedCorotated]
+LAWS = [softmpm.NeoHookean, softmpm.FixedCorotated, softmpm.BarrierCorotated]

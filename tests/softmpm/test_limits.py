@@ -1,0 +1,39 @@
+"""At the extremes nothing is silently wrong: a short map, judged without the library's alarms."""
+
+import numpy as np
+import pytest
+import torch
+from bench.extremes.cells import How, Outcome, verdict
+from bench.extremes.judges import DENSITIES, stretches
+from bench.extremes.laws import LAWS
+from bench.extremes.pages import PAGES
+
+from softmpm import reference
+
+ROWS = [row for rows in PAGES.values() for row in rows]
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_nothing_is_silent_at_the_extremes(row, law):
+    """Each cell is right, refused by name or stopped by name; in 3D the most extreme one stands for the others."""
+    cells = [(2, value) for value in row.few] + [(3, row.few[-1])]
+    found = {(dim, value): verdict(lambda d=dim, v=value: row.cell(law, d, v, How())) for dim, value in cells}
+    assert not {cell: each.note for cell, each in found.items() if each.outcome is Outcome.SILENT}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
+def test_the_judges_energies_belong_to_the_stresses(law, dim):
+    """The derivative of the energy along (I + εG)F is τ : G, by central differences."""
+    random = np.random.default_rng(0)
+    F, G = np.eye(dim) + 0.2 * random.standard_normal((5, dim, dim)), random.standard_normal((5, dim, dim))
+    mu, lam, eps = np.full(5, 2.0), np.full(5, 3.0), 1e-6
+
+    def energy(step: float) -> np.ndarray:
+        moved = F + step * G @ F
+        return DENSITIES[law.__name__](stretches(moved), np.linalg.det(moved), mu, lam)
+
+    stress = reference.LAWS[law](*(torch.from_numpy(array) for array in (F, mu, lam))).numpy()
+    slope = (energy(eps) - energy(-eps)) / (2 * eps)
+    assert slope == pytest.approx((stress * G).sum((1, 2)), rel=1e-7, abs=1e-7)
