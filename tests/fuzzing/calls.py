@@ -111,6 +111,8 @@ calls = st.fixed_dictionaries(
         noise=st.tuples(*4 * (st.one_of(st.just(0.0), unit),)),
         material=st.sampled_from(["scene", "scalar", "worlds", "all"]),
         layout=st.sampled_from(["contiguous", "strided", "expanded"]),
+        alarms=st.sampled_from(["all", "all", "none"]),
+        policy=st.sampled_from([None, None, "freeze", "reset"]),
         seed=seeds,
     )
 )
@@ -130,6 +132,8 @@ def with_fault_in_scene(scene: Plan, fault: list | None) -> Plan:
         return scene | {"walls": [wall | {name: value} for wall in scene["walls"]]}
     if name == "strength":
         return scene | {"muscles": [muscle | {name: value} for muscle in scene["muscles"]]}
+    if name == "spacing":
+        value = min(value, 1e100)  # its cube is a volume
     return scene | {name: [0.0, value, 0.0] if name == "gravity" else value}
 
 
@@ -144,7 +148,9 @@ def call_of(plan: Plan, model: softmpm.Model) -> Call:
     dx, dt = model.scene.grid.spacing, model.scene.dt
     sizes = (0.1 * dx, 0.1 * dx / dt, 0.1 / dt, 0.5)
     rest = model.rest()
-    state = softmpm.State(*(t + noise(t, n * s) for t, n, s in zip(rest, call["noise"], sizes, strict=True)))
+    state = softmpm.State(
+        *(t + noise(t, n * s) for t, n, s in zip(rest[:4], call["noise"], sizes, strict=True))
+    )
     shape = {
         "scene": None,
         "scalar": (),
@@ -158,7 +164,7 @@ def call_of(plan: Plan, model: softmpm.Model) -> Call:
     if call["rows"]:
         activation = noise(torch.empty(call["rows"], model.worlds, model.muscle_count), call["activation"])
     layout = _LAYOUTS[call["layout"]]
-    return Call(model, softmpm.State(*map(layout, state)), params, activation, call["substeps"])
+    return Call(model, softmpm.State(*map(layout, state[:4])), params, activation, call["substeps"])
 
 
 _LAYOUTS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {

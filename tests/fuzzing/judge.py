@@ -18,6 +18,9 @@ NAMED = re.compile(
 )
 
 
+ALARMS = {"all": None, "none": softmpm.Alarms(collapse=None, gap=None, step=None)}
+
+
 def judge(plan: Plan) -> Verdict:
     """Verdict of a plan; whatever is not an error of softmpm's documented kinds counts against it."""
     with warnings.catch_warnings(record=True) as caught:
@@ -49,6 +52,7 @@ def model_of(plan: Plan, worlds: int) -> softmpm.Model:
         dtype=special.dtype,
         scheme=special.scheme,
         worlds=worlds,
+        alarms=ALARMS[plan["call"]["alarms"]],
     )
 
 
@@ -77,15 +81,20 @@ def _enters(plan: Plan) -> bool:
 
 def simulated(plan: Plan, call: Call) -> Verdict:
     leaves = _leaves(call)
-    end = softmpm.simulate(call.model, call.state, call.activation, call.params, substeps=call.substeps)
-    for name, tensor, start in zip("xvCF", end, call.state, strict=True):
+    policy = plan["call"]["policy"]
+    failures = softmpm.Failures(policy) if policy else None
+    end = softmpm.simulate(
+        call.model, call.state, call.activation, call.params, substeps=call.substeps, failures=failures
+    )
+    for name, tensor, start in zip("xvCF", end[:4], call.state[:4], strict=True):
         if tensor.shape != start.shape or tensor.dtype != start.dtype:
             return Verdict("silent", f"{name} came back as {tensor.dtype} {tuple(tensor.shape)}")
         if not bool(torch.isfinite(tensor).all()):
             return Verdict("not finite", name)
-    if (wrong := _momentum(plan, call, end)) or (wrong := _worlds(plan, call, end)):
+    wrong = "" if failures else _momentum(call, end)
+    if wrong := wrong or _worlds(plan, call, end):
         return Verdict("silent", wrong)
-    return _differentiated(end, leaves)
+    return _differentiated(end[:4], leaves)
 
 
 def rasterized(plan: Plan, call: Call) -> Verdict:
@@ -124,7 +133,7 @@ def _differentiated(results, leaves: dict[str, torch.Tensor]) -> Verdict:
     return Verdict("ran")
 
 
-def _momentum(plan: Plan, call: Call, end: softmpm.State) -> str:
+def _momentum(call: Call, end: softmpm.State) -> str:
     """The centre of mass of a body that meets no wall obeys gravity and damping."""
     scene, dtype = call.model.scene, call.model.dtype
     if scene.walls:
@@ -159,11 +168,14 @@ def _worlds(plan: Plan, call: Call, end: softmpm.State) -> str:
     def alone(tensor, leading):
         return tensor.detach()[leading].contiguous()
 
-    state = softmpm.State(*(alone(t, slice(-1, None)) for t in call.state))
+    state = softmpm.State(*(alone(t, slice(-1, None)) for t in call.state[:4]))
     params = softmpm.Params(
         *(p[-1:].detach() if p.ndim == 2 and len(p) > 1 else p.detach() for p in call.params)
     )
     activation = None if call.activation is None else alone(call.activation, (slice(None), slice(-1, None)))
-    single = softmpm.simulate(model_of(plan, 1), state, activation, params, substeps=call.substeps)
-    same = all(torch.equal(a, b[-1:].detach()) for a, b in zip(single, end, strict=True))
+    failures = softmpm.Failures(plan["call"]["policy"]) if plan["call"]["policy"] else None
+    single = softmpm.simulate(
+        model_of(plan, 1), state, activation, params, substeps=call.substeps, failures=failures
+    )
+    same = all(torch.equal(a, b[-1:].detach()) for a, b in zip(single[:4], end[:4], strict=True))
     return "" if same else "the last world alone gives other numbers"
