@@ -1,8 +1,8 @@
 """The additive terms of the explicit adjoints, found in their source, and that source with a factor on each of them.
 
-An adjoint is a function whose name, or that of a function around it, ends in ``_adj``, or one of the few in ``ALSO``. Its terms are
-what it assigns, adds, stores, passes to another adjoint or returns, sum by sum, down to the sums inside parentheses and the components
-of vectors. Indices, conditions, zeros and whole structs are no terms.
+An adjoint is a function whose name, or that of a function around it, ends in ``_adj`` or ``_slope``, or one of the few in ``ALSO``.
+Its terms are what it assigns, adds, stores, passes to another adjoint or returns, sum by sum, down to the sums inside parentheses and
+the components of vectors. Indices, conditions, zeros and whole structs are no terms.
 """
 
 import ast
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ALSO = ("slopes", "weight_slope", "pull_back", "collect", "parts", "total")
+ALSO = ("slopes", "pull_back", "collect", "parts", "total")
 """Used by adjoints alone, though their names do not say so."""
 BUILDERS = ("vec", "mat", "triple", "node_vec", "aligned", "pack", "matrix_from_cols", "skew")
 """Calls whose arguments are the components of a value."""
@@ -126,7 +126,7 @@ def _adjoints(node: ast.AST, inside: bool) -> Iterator[ast.FunctionDef]:
         if not isinstance(child, ast.FunctionDef):
             yield from _adjoints(child, inside)
             continue
-        named = child.name.endswith("_adj") or child.name in ALSO
+        named = child.name.endswith(("_adj", "_slope")) or child.name in ALSO
         leaf = not any(
             isinstance(n, (ast.FunctionDef, ast.ClassDef)) for n in ast.walk(child) if n is not child
         )

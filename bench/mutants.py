@@ -8,8 +8,9 @@ adjoints of their own.
 """
 
 import argparse
-import contextlib
+import collections
 import ctypes
+import itertools
 import json
 import mmap
 import multiprocessing
@@ -19,6 +20,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -58,17 +60,59 @@ PATIENCE = 300.0
 """Seconds for the tests of one mutant."""
 
 
-class FirstFailure:
-    """pytest plugin: the first test that failed, and what it said last."""
+class Trials:
+    """pytest plugin: runs the collected tests once as they are, then again for each mutant, up to the first that fails.
 
-    test = message = ""
+    Args:
+        numbers: Of the mutants.
+        report: Takes the number of a mutant, the test that noticed it, and what that said; "" if none did.
+    """
+
+    def __init__(self, numbers: list[int], report: Callable[[int, str, str], None]):
+        self.numbers, self.report, self.failure = numbers, report, ("", "")
 
     def pytest_runtest_logreport(self, report):
-        if report.failed and not self.test:
-            self.test, self.message = report.nodeid, report.longreprtext.strip().splitlines()[-1]
+        if report.failed and not self.failure[0]:
+            self.failure = report.nodeid, report.longreprtext.strip().splitlines()[-1]
 
-    def pytest_collectreport(self, report):
-        self.pytest_runtest_logreport(report)
+    pytest_collectreport = pytest_runtest_logreport
+
+    def pytest_runtestloop(self, session):
+        begin = time.perf_counter()
+        self._run(session)  # compiles and loads every kernel
+        if self.failure[0]:
+            print("without a mutant this test fails:", *self.failure)
+            return True
+        print(f"all tests pass without a mutant, in {time.perf_counter() - begin:.0f} s", flush=True)
+        for number in self.numbers:
+            self.report(number, *self._caught(session, number))
+        return True
+
+    def _run(self, session) -> None:
+        for item, after in itertools.zip_longest(session.items, session.items[1:]):
+            session.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            if self.failure[0]:
+                return
+
+    def _caught(self, session, number: int) -> tuple[str, str]:
+        """In a process of its own, which a mutant may spoil."""
+        context = multiprocessing.get_context("fork")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=self._trial, args=(session, number, theirs))
+        process.start()
+        theirs.close()
+        try:
+            return ours.recv() if ours.poll(PATIENCE) else ("no end", f"after {PATIENCE:.0f} s")
+        except EOFError:
+            return "a crash", "the process died"
+        finally:
+            process.kill()
+            process.join()
+
+    def _trial(self, session, number: int, pipe) -> None:
+        ctypes.c_int.from_address(CELL).value = number
+        self._run(session)
+        pipe.send(self.failure)
 
 
 def instrument(root: Path) -> list[Term]:
@@ -86,36 +130,6 @@ def instrument(root: Path) -> list[Term]:
     return terms
 
 
-def run_tests(tests: list[str]) -> FirstFailure:
-    failure = FirstFailure()
-    options = ["-x", "-q", "-m", "not gpu", "-p", "no:randomly", "-p", "no:cacheprovider", "--tb=short"]
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        pytest.main([*options, *tests], plugins=[failure])
-    return failure
-
-
-def trial(number: int, tests: list[str], pipe) -> None:
-    ctypes.c_int.from_address(CELL).value = number
-    failure = run_tests(tests)
-    pipe.send((failure.test, failure.message))
-
-
-def caught(number: int, tests: list[str]) -> tuple[str, str]:
-    """The test that notices a mutant and its message; nothing if none does."""
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=trial, args=(number, tests, theirs))
-    process.start()
-    theirs.close()
-    try:
-        return ours.recv() if ours.poll(PATIENCE) else ("no end", f"after {PATIENCE:.0f} s")
-    except EOFError:
-        return "a crash", "the process died"
-    finally:
-        process.kill()
-        process.join()
-
-
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--file", default="", help="only files with this in their name")
@@ -126,8 +140,14 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def key(term: Term) -> list:
-    return [term.file, term.function, term.line, term.text]
+def keys(terms: list[Term]) -> list[list]:
+    """Names of terms that outlast changes elsewhere: file, function, text, and which of those alike it is."""
+    alike, found = collections.Counter(), []
+    for term in terms:
+        same = term.file, term.function, term.text
+        found.append([*same, alike[same]])
+        alike[same] += 1
+    return found
 
 
 def chosen(terms: list[Term], args: argparse.Namespace) -> list[int]:
@@ -137,25 +157,18 @@ def chosen(terms: list[Term], args: argparse.Namespace) -> list[int]:
         if args.results.exists()
         else []
     )
-    left = [k for k, term in enumerate(terms) if args.file in term.file and key(term) not in done]
+    left = [k for k, key in enumerate(keys(terms)) if args.file in key[0] and key not in done]
     if args.most is not None and args.most < len(left):
         left = sorted(random.Random(args.seed).sample(left, args.most))
     return left
 
 
-def prepare(root: Path) -> list[str]:
-    """Tests as paths of the copy, all of which pass without a mutant; compiles and loads every kernel."""
-    memory = ctypes.CDLL(None, use_errno=True).mmap
+def prepare(root: Path) -> None:
+    """Let kernels read the number of the mutant, and imports find the copy."""
+    memory = ctypes.CDLL(None).mmap
     memory.restype, memory.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_size_t, *4 * [ctypes.c_int]]
-    fixed = 0x100000  # MAP_FIXED_NOREPLACE
-    got = memory(
-        CELL,
-        mmap.PAGESIZE,
-        mmap.PROT_READ | mmap.PROT_WRITE,
-        mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | fixed,
-        -1,
-        0,
-    )
+    protection, fixed = mmap.PROT_READ | mmap.PROT_WRITE, 0x100000  # MAP_FIXED_NOREPLACE
+    got = memory(CELL, mmap.PAGESIZE, protection, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | fixed, -1, 0)
     assert got == CELL, "the address of the number of the mutant is taken"
     ctypes.c_int.from_address(CELL).value = -1
     sys.path.insert(0, str(root / "src"))
@@ -163,44 +176,35 @@ def prepare(root: Path) -> list[str]:
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR
-    tests = [str(root / test) for test in TESTS]
-    failure = run_tests(tests)
-    if failure.test:
-        sys.exit(f"without a mutant {failure.test} fails: {failure.message}")
-    return tests
 
 
 def main() -> None:
     args = arguments()
     args.results = args.results.absolute()
     with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder).resolve()
-        terms = instrument(root)
+        terms = instrument(Path(folder).resolve())
         if args.list:
             print(*terms, f"{len(terms)} terms", sep="\n")
             return
-        begin, tests = time.perf_counter(), prepare(root)
-        print(
-            f"{len(terms)} terms; all tests pass without a mutant, in {time.perf_counter() - begin:.0f} s",
-            flush=True,
-        )
-        survived = 0
-        for number in chosen(terms, args):
+        survivors, names = [], keys(terms)
+
+        def report(number: int, test: str, message: str) -> None:
             term = terms[number]
-            test, message = caught(number, tests)
             reason = UNCHANGED.get((term.function, term.text), "") if not test else ""
-            result = {
-                "term": key(term),
-                "caught by": test.removeprefix("tests/"),
-                "message": message,
-                "unchanged": reason,
-            }
+            result = {"term": names[number], "caught by": test, "message": message, "unchanged": reason}
             with args.results.open("a") as file:
                 file.write(json.dumps(result) + "\n")
-            survived += not (test or reason)
-            print(f"{term}: {test or (f'cannot be noticed: {reason}' if reason else 'SURVIVED')}", flush=True)
-    print(f"{survived} survived")
-    sys.exit(1 if survived else 0)
+            if not (test or reason):
+                survivors.append(term)
+            print(f"{term}: {test or (f'cannot be noticed, {reason}' if reason else 'SURVIVED')}", flush=True)
+
+        prepare(Path(folder).resolve())
+        numbers = chosen(terms, args)
+        trials = Trials(numbers, report)
+        options = ["-s", "-m", "not gpu", "-p", "no:randomly", "-p", "no:cacheprovider", "-p", "no:terminal"]
+        pytest.main([*options, *TESTS], plugins=[trials])
+        print(f"{len(terms)} terms, {len(numbers)} run now: {len(survivors)} survived", *survivors, sep="\n")
+    sys.exit(1 if survivors or trials.failure[0] else 0)
 
 
 if __name__ == "__main__":

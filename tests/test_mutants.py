@@ -82,6 +82,7 @@ def test_factors_keep_the_source(path):
     [
         ("particle.py", "moved_adj", "scale.dt * (wp.transpose(new_C) * adj_new.H)"),
         ("particle.py", "momentum_adj", "wp.ddot(adj_A, C)"),
+        ("elasticity.py", "soft_pressure_slope", "real(2.0) * j"),
         ("polar.py", "rotation_adj", "c * (adj_R[1, 0] - adj_R[0, 1])"),
         ("contact.py", "slide_adj", "(c * along) * n"),
         ("stencil_adj.py", "sums_adj", "wy[2] * tr"),
