@@ -156,6 +156,31 @@ def test_a_recording_is_read_while_it_is_written(tmp_path):
             assert float(subprocess.run(reader, check=True, capture_output=True).stdout) == k
 
 
+def test_a_live_writer_never_disturbs_a_reader(tmp_path):
+    """Read again and again while another process writes as fast as it can, all that is there is whole."""
+    run_here("reading", tmp_path / "run.h5", "15")
+
+
+def reading(path: Path, times: str) -> None:
+    """Fork a writer, and read what it writes."""
+    model, count = small_model(), 0
+    with softmpm.Recorder(path, model) as recorder:
+        record(recorder, model, 0)
+    child = os.fork()
+    if child == 0:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        write_for_ever(path, model, 1)
+    try:
+        while count < int(times):
+            with softmpm.Recording(path) as recording:
+                assert check(recording, model, 0) == 4 and recording.episodes[-1] >= count
+                assert all(check(recording, model, k) == 3 for k in recording.episodes[-3:-1] if k)
+                count = recording.episodes[-1]
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
 def test_resume_keeps_what_came_before(tmp_path):
     """``resume_before=k`` drops iterations from k on, and what follows is as in a run without a break."""
     model, path, whole = small_model(), tmp_path / "run.h5", tmp_path / "whole.h5"
