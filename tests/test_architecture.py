@@ -11,11 +11,11 @@ ORDER = """kernels.turn scene state watch silhouette surface shapes checks stabi
     kernels.failure kernels.particle kernels.transfer kernels.boundary kernels.raster
     kernels.native kernels.stencil kernels.stencil_adj kernels.fixed kernels.fused kernels.fused_adj kernels.sorting kernels.packing
     description model buffers failures step plain replay between arrangement exact program program_adj fast rollout
-    raster autograd graph tape reference layout layout_checks superblock
-    playback recording appearance show rerun_file __main__""".split()
+    raster autograd graph tape reference layout layout_checks superblock content
+    playback recording_file recording appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
-    "h5py": {"layout", "layout_checks", "recording", "playback"},
+    "h5py": {"layout", "layout_checks", "playback", "recording_file", "recording"},
     "hydra": set(),
     "matplotlib": set(),
 }

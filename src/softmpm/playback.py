@@ -133,7 +133,7 @@ class Recording:
         """What :meth:`softmpm.Recorder.episode` was given for this simulation."""
         row = self._row(iteration)
         try:
-            found = json.loads(self._one_row("episode", row)["attributes"] or b"{}")
+            found = json.loads(bytes(self._one_row("episode", row)["attributes"]) or b"{}")
         except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict):

@@ -203,6 +203,42 @@ def test_resume_keeps_what_came_before(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.h5", "whole.h5"]
 
 
+def test_a_digest_tells_one_recording_from_another(tmp_path):
+    """Equal contents have equal digests, however they came to be; with one a changed file is refused and stays as it is."""
+    model, path = small_model(), tmp_path / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        empty = recorder.digest
+        record(recorder, model, 0)
+        record(recorder, model, 5)
+        before = recorder.digest
+        record(recorder, model, 6, frames=1)
+        assert len({empty, before, recorder.digest}) == 3
+    with softmpm.Recorder(path, model, resume_before=6, resume_digest=before) as recorder:
+        assert recorder.digest == before
+        record(recorder, model, 7)
+        whole = recorder.digest
+    with softmpm.Recorder(tmp_path / "whole.h5", model) as recorder:
+        for iteration in (0, 5, 7):
+            record(recorder, model, iteration)
+        assert recorder.digest == whole
+    for other in (tmp_path / "whole.h5", None):
+        data = other.read_bytes() if other else b""
+        path.write_bytes(data)
+        with pytest.raises(
+            (ValueError, OSError), match=r"run\.h5 (does not hold what was recorded|is not a readable)"
+        ):
+            softmpm.Recorder(path, model, resume_before=6, resume_digest=empty)
+        assert path.read_bytes() == data
+
+
+def test_links_are_not_followed(tmp_path):
+    """A draft that is a link is removed; what it named stays as it was."""
+    (tmp_path / "other").write_bytes(b"precious")
+    (tmp_path / "run.h5.new").symlink_to(tmp_path / "other")
+    softmpm.Recorder(tmp_path / "run.h5", small_model()).close()
+    assert (tmp_path / "other").read_bytes() == b"precious" and not (tmp_path / "run.h5.new").is_symlink()
+
+
 def test_nothing_is_overwritten_by_accident(tmp_path):
     """An existing file needs ``resume_before``, and a file of another scene is never touched."""
     model, path = small_model(), tmp_path / "run.h5"
@@ -326,7 +362,7 @@ class Countdown:
 
     def __call__(self, frame, event, _argument):
         place = (frame.f_code.co_filename, frame.f_lineno)
-        if not place[0].endswith(("recording.py", "layout.py")):
+        if not place[0].endswith(("recording.py", "recording_file.py", "layout.py")):
             return None
         if event == "line" and place not in self.seen:
             if len(self.seen) == self.lines:
