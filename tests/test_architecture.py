@@ -12,10 +12,11 @@ ORDER = """kernels.turn validate scene state watch silhouette surface shapes che
     kernels.boundary kernels.raster kernels.native kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed
     kernels.fused kernels.fused_adj kernels.sorting kernels.packing description model buffers explain failures step
     replay checkup plain between arrangement exact batches compiling program program_adj fast runner rollout raster
-    autograd graph warp_arrays tape layout playback recording appearance show rerun_file __main__""".split()
+    autograd graph warp_arrays tape layout layout_checks superblock content playback recording_file recording
+    appearance show rerun_file __main__""".split()
 OUTSIDE = {
     "rerun": {"rerun_file"},
-    "h5py": {"layout", "recording", "playback"},
+    "h5py": {"layout", "layout_checks", "playback", "recording_file", "recording"},
     "hydra": set(),
     "matplotlib": set(),
 }

@@ -1,29 +1,36 @@
 """Recording: read what a Recorder wrote, while it writes, after it ended or after it was killed.
 
 A recording may come from somebody else, so nothing in it is trusted: only the names in ``layout.py`` are
-read, each must be plain numbers inside this file (no links, no external or virtual data), and none may claim
-more than the file can hold. That keeps a file from reading other files and from filling memory; it cannot
-mend faults of the HDF5 library itself.
+read, after the checks of ``layout_checks.py``. That keeps a file from reading other files and from filling
+memory; it cannot mend faults of the HDF5 library itself.
 """
 
 import json
+import os
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
 from softmpm.layout import FORMAT, PARTS, PER_FRAME, STATIC, TABLES, VERSION, complete
+from softmpm.layout_checks import check_frames, check_shapes, check_values, plain_dataset
+from softmpm.superblock import readable
 
-_SAFE_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
-_BEST_COMPRESSION = 1100  # deflate never exceeds 1032:1
+_DAMAGE = (OSError, RuntimeError, LookupError, TypeError, AttributeError, OverflowError, MemoryError)
+"""As h5py reports what HDF5 cannot read."""
+_ATTEMPTS, _PAUSE = 20, 0.02  # [s]
+_T = TypeVar("_T")
 
 
 class Recording:
     """A recorded run.
 
     Other tools can open the file too: ``h5py.File(path, "r", swmr=True)``; without ``swmr`` HDF5 refuses the
-    file of a run that still writes or was killed.
+    file of a run that still writes or was killed, and with it HDF5 never returns from one that is damaged.
 
     Attributes:
         static: What does not change, by name: ``positions`` (particle, dim) [m], ``volume``, ``body``,
@@ -43,79 +50,76 @@ class Recording:
         self.path = Path(path)
         if not self.path.is_file():
             raise FileNotFoundError(f"there is no recording {self.path}.")
+        self._steadily(self._load)
+
+    def _steadily(self, read: Callable[[], _T]) -> _T:
+        """The result of ``read``; again after a failure while the file changes, because a writer is at work then."""
+        for attempt in range(_ATTEMPTS):
+            before = self._stamp()
+            try:
+                return read()
+            except (OSError, ValueError):
+                time.sleep(_PAUSE)
+                if (
+                    attempt and self._stamp() == before
+                ):  # once may be too soon for the clock of the file system
+                    raise
+        return read()
+
+    def _stamp(self) -> tuple[int, ...]:
+        found = os.stat(self.path)
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+    def _load(self) -> None:
         try:
-            self._file = h5py.File(self.path, "r", swmr=_unclosed(self.path), locking="best-effort")
-        except OSError as error:
+            self._file = h5py.File(readable(self.path), "r", locking="best-effort")
+        except (*_DAMAGE, ValueError) as error:
             raise OSError(f"{self.path} is not a readable recording: {error}.") from error
         try:
-            self._load()
+            self._read_tables()
+        except _DAMAGE as error:
+            self.close()
+            raise OSError(f"{self.path} is damaged: {error}.") from error
         except ValueError:
             self.close()
             raise
-        except Exception as error:  # h5py reports damage as OSError, RuntimeError, KeyError or TypeError
-            self.close()
-            raise OSError(f"{self.path} is damaged: {error}.") from error
 
-    def _load(self) -> None:
+    def _read_tables(self) -> None:
         attributes = self._file.attrs
         if attributes.get("format") != FORMAT.encode():
             raise ValueError(f"{self.path} is an HDF5 file, but no softmpm recording.")
-        version = np.asarray(attributes["version"]).item()
-        if version != VERSION:
-            raise ValueError(f"{self.path} has format version {version}; this softmpm reads {VERSION}.")
-        numbers = (float(np.asarray(attributes[name]).item()) for name in ("dt", "spacing", "share"))
-        self.dt, self.spacing, self.share = numbers
+        if (version := self._number("version")) != VERSION:
+            raise ValueError(f"{self.path} has format version {version:g}; this softmpm reads {VERSION}.")
+        self.dt, self.spacing, self.share = (self._number(name) for name in ("dt", "spacing", "share"))
         self.static = {
             name: self._dataset(f"static/{name}", dtype)[()] for name, (dtype, _) in STATIC.items()
         }
         self._tables = {name: self._dataset(name, dtype) for name, (dtype, _) in TABLES.items()}
-        self._check_shapes()
-        episodes = complete(self._tables["episode"][()])
-        self._attributes = episodes["attributes"]
+        check_shapes(self.path, self.static, self._tables)
+        check_values(self.path, self.static)
+        episodes = complete(self._tables["episode"].fields(["iteration"])[()])
         self._newest = {int(iteration): row for row, iteration in enumerate(episodes["iteration"])}
         self.episodes = tuple(self._newest)
         self._frame = complete(self._tables["frame/index"][()])
-        self.scalars = _by_name(complete(self._tables["scalar"][()]))
+        check_frames(self.path, self._frame, self._tables)
+        self.scalars = self._by_name(complete(self._tables["scalar"][()]))
 
     def _dataset(self, name: str, dtype: np.dtype) -> h5py.Dataset:
-        """The named dataset, if it is what a recording holds under that name and lies wholly in this file."""
-        node = self._file
-        for part in name.split("/"):
-            if not isinstance(node, h5py.Group) or not isinstance(
-                node.get(part, getlink=True), h5py.HardLink
-            ):
-                raise ValueError(f"{self.path}: {name} is missing or leads out of the file.")
-            node = node[part]
-        if not isinstance(node, h5py.Dataset) or node.is_virtual or node.external:
-            raise ValueError(f"{self.path}: {name} is not data of this file.")
-        if node.dtype != dtype:
-            raise ValueError(f"{self.path}: {name} must have type {dtype}, got {node.dtype}.")
-        created = node.id.get_create_plist()
-        filters = {created.get_filter(i)[0] for i in range(created.get_nfilters())}
-        if not filters <= _SAFE_FILTERS:
-            raise ValueError(f"{self.path}: {name} uses HDF5 filters {filters - _SAFE_FILTERS}; refused.")
-        if max(node.nbytes, _chunk_bytes(node)) > _BEST_COMPRESSION * self.path.stat().st_size:
-            raise ValueError(f"{self.path}: {name} claims {node.nbytes} bytes, more than the file can hold.")
-        return node
+        return plain_dataset(self.path, self._file, name, dtype)
 
-    def _check_shapes(self) -> None:
-        """One size for each axis, everywhere."""
-        static = self.static
-        if static["positions"].ndim != 2 or static["positions"].shape[1] not in (2, 3):
-            raise ValueError(f"{self.path}: static/positions must have shape (particle, 2 or 3).")
-        size = {
-            "p": (self.particle_count,),
-            "d": (self.dim,),
-            "n": tuple(int(n) for n in static["grid_shape"]),
-        }
-        size |= {"m": static["muscle"].shape[:1], "w": static["wall_offset"].shape[:1]}
-        size |= {"l": self._tables["latent/value"].shape[1:]}
-        found = {f"static/{name}": (static[name].shape, axes) for name, (_, axes) in STATIC.items()}
-        found |= {name: (self._tables[name].shape[1:], axes[1:]) for name, (_, axes) in TABLES.items()}
-        for name, (got, axes) in found.items():
-            want = sum((size[axis] for axis in axes), ())
-            if got != want:
-                raise ValueError(f"{self.path}: {name} must have shape {want} (without rows), got {got}.")
+    def _number(self, name: str) -> float:
+        value = np.asarray(self._file.attrs[name])
+        if value.size != 1 or value.dtype.kind not in "iuf" or not 0 < float(value.item()) < np.inf:
+            raise ValueError(f"{self.path}: the attribute {name} must be a number > 0, got {value!r:.100}.")
+        return float(value.item())
+
+    def _by_name(self, rows: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        names, first = np.unique(rows["name"], return_index=True)
+        found = {name: rows[rows["name"] == name] for name in names[np.argsort(first)]}
+        try:
+            return {name.decode(): (those["iteration"], those["value"]) for name, those in found.items()}
+        except UnicodeDecodeError as error:
+            raise OSError(f"{self.path} is damaged: the name of a scalar is not UTF-8: {error}.") from error
 
     @property
     def dim(self) -> int:
@@ -127,7 +131,16 @@ class Recording:
 
     def attributes(self, iteration: int) -> dict:
         """What :meth:`softmpm.Recorder.episode` was given for this simulation."""
-        return json.loads(self._attributes[self._row(iteration)] or b"{}")
+        row = self._row(iteration)
+        try:
+            found = json.loads(bytes(self._one_row("episode", row)["attributes"]) or b"{}")
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, dict):
+            raise OSError(
+                f"{self.path} is damaged: the attributes of iteration {iteration} are no JSON object."
+            )
+        return found
 
     def _row(self, iteration: int) -> int:
         if iteration not in self._newest:
@@ -162,11 +175,17 @@ class Recording:
         data = self._tables[table]
         out = np.zeros((len(rows), *data.shape[1:]), data.dtype)
         for k, row in enumerate(rows if out.size else ()):
-            try:
-                data.read_direct(out, np.s_[int(row)], np.s_[k])
-            except (OSError, TypeError, ValueError) as error:
-                raise OSError(f"{self.path} is damaged: row {row} of {table}: {error}.") from error
+            out[k] = self._one_row(table, int(row))
         return out
+
+    def _one_row(self, table: str, row: int) -> np.ndarray:
+        def read() -> np.ndarray:
+            try:
+                return self._tables[table][row]
+            except (*_DAMAGE, ValueError) as error:
+                raise OSError(f"{self.path} is damaged: row {row} of {table}: {error}.") from error
+
+        return self._steadily(read)
 
     def frames(self, iteration: int) -> dict[str, np.ndarray]:
         """All frames of one simulation.
@@ -193,30 +212,3 @@ class Recording:
 
     def __exit__(self, *_) -> None:
         self.close()
-
-
-def _unclosed(path: Path) -> bool:
-    """Whether its writer still writes or was killed. Only such a file is read in the mode for that: on a damaged
-    file this mode would wait for a writer to mend it, for ever.
-
-    Source: HDF5 File Format Specification 3.0, II.A, superblock version 3.
-    """
-    with open(path, "rb") as file:
-        head = file.read(36)
-    version, flags, end = head[8:9], head[11:12], int.from_bytes(head[28:36], "little")
-    if version != b"\x03" or not flags or not flags[0] & 4:
-        return False
-    if path.stat().st_size < end:
-        raise OSError(f"it was cut to {path.stat().st_size} of at least {end} bytes")
-    return True
-
-
-def _chunk_bytes(dataset: h5py.Dataset) -> int:
-    """Memory that reading one number of it takes."""
-    return dataset.dtype.itemsize * int(np.prod(dataset.chunks or (0,), dtype=object))
-
-
-def _by_name(rows: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    names, first = np.unique(rows["name"], return_index=True)
-    found = {name: rows[rows["name"] == name] for name in names[np.argsort(first)]}
-    return {name.decode(): (those["iteration"], those["value"]) for name, those in found.items()}

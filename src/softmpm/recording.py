@@ -6,25 +6,18 @@ writes so that the file is always consistent; and a frame counts only once its r
 followed its data. Layout: ``layout.py``.
 """
 
-import contextlib
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.layout import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, create, put, static_values, tables
+from softmpm.content import Content, Hash
+from softmpm.layout import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
 from softmpm.model import Model
-from softmpm.playback import Recording
+from softmpm.recording_file import begin, open_to_append, put_in_place, room
 from softmpm.state import GridField, State
-
-_OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
-_PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot tear what does not cross a page
-_ROOM_EXTRA = 2**20  # for HDF5's own tables
 
 
 class Recorder:
@@ -45,12 +38,13 @@ class Recorder:
         model: What is simulated.
         resume_before: Keep the simulations and scalars of iterations before this one of an existing file and
             go on after them; without a file, start one.
+        resume_digest: What :attr:`digest` was when these iterations had been recorded; None does not ask.
         every: Record each ``every``-th frame of a simulation only.
         max_particles: Record this many particles, chosen evenly at random, the same in every run; None: all.
 
     Raises:
         FileExistsError: The file exists, and ``resume_before`` was not given.
-        ValueError: The existing file records another scene.
+        ValueError: The existing file records another scene, or has another digest.
         OSError: There is no room on the disk; also from the methods. What was recorded before is safe.
     """
 
@@ -60,6 +54,7 @@ class Recorder:
         model: Model,
         *,
         resume_before: int | None = None,
+        resume_digest: str | None = None,
         every: int = 1,
         max_particles: int | None = None,
     ):
@@ -74,15 +69,27 @@ class Recorder:
         static = static_values(model, max_particles)
         self._particles = torch.from_numpy(static["particle"])
         self._shape = (model.particle_count, model.scene.grid.dim)
+        self._content = Content()
         draft = self.path.with_name(f"{self.path.name}.new")
+        draft.unlink(missing_ok=True)  # of a killed process, or a link
         try:
-            _begin(draft, model, static, self.path, resume_before)
-            _put_in_place(draft, self.path)
+            begin(draft, model, static, self.path, resume_before, self._content)
+            if resume_digest is not None and self.digest != resume_digest:
+                raise ValueError(
+                    f"{self.path} does not hold what was recorded before iteration {resume_before}: it was changed, or is of another "
+                    "run."
+                )
+            put_in_place(draft, self.path)
         finally:
             draft.unlink(missing_ok=True)
-        self._file = _open_to_append(self.path)
+        self._file = open_to_append(self.path)
         self._tables = tables(self._file)
         self._count = {name: len(table) for name, table in self._tables.items()}
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all simulations and scalars recorded so far, for ``resume_digest``."""
+        return self._content.hexdigest()
 
     def episode(self, iteration: int, **attributes) -> "Episode":
         """Begin a simulation, shown under this iteration; ``attributes`` are JSON values to keep with it."""
@@ -90,7 +97,7 @@ class Recorder:
         if len(text) > EPISODE["attributes"].itemsize:
             raise ValueError(f"the attributes of an episode must fit in 4096 bytes of JSON, got {len(text)}.")
         self._write("episode", np.array([(_checked(iteration), text)], EPISODE))
-        return Episode(self, self._count["episode"] - 1)
+        return Episode(self, self._count["episode"] - 1, self._content.episode(int(iteration), text))
 
     def scalars(self, iteration: int, values: dict[str, float]) -> None:
         """Numbers of one iteration, such as its loss."""
@@ -99,6 +106,8 @@ class Recorder:
             if not 0 < len(name) <= SCALAR["name"].itemsize:
                 raise ValueError(f"the name of a scalar must have 1 to 64 bytes, got {name.decode()!r}.")
         self._write("scalar", np.array(rows, SCALAR))
+        for row in rows:
+            self._content.scalar(*row)
 
     def _frame(
         self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]
@@ -106,7 +115,7 @@ class Recorder:
         """One row in each table of a frame; it counts once the last, ``frame/index``, is written."""
         rows = {f"frame/{name}": ("frame/index", one) for name, one in values.items()}
         rows |= {PARTS[name]: (PARTS[name], one) for name, one in parts.items()}
-        with _room(self._file, sum(one.nbytes for _, one in rows.values())):
+        with room(self._file, sum(one.nbytes for _, one in rows.values())):
             for table, (counted, one) in rows.items():
                 put(self._tables[table], self._count[counted], one[None])
         field, latent = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
@@ -116,7 +125,7 @@ class Recorder:
 
     def _write(self, name: str, rows: np.ndarray) -> None:
         self._need_open()
-        with _room(self._file, rows.nbytes):
+        with room(self._file, rows.nbytes):
             put(self._tables[name], self._count[name], rows)
         self._count[name] += len(rows)
 
@@ -137,8 +146,8 @@ class Recorder:
 class Episode:
     """One simulation of a recording; from :meth:`Recorder.episode`."""
 
-    def __init__(self, recorder: Recorder, row: int):
-        self._recorder, self._row, self._calls = recorder, row, 0
+    def __init__(self, recorder: Recorder, row: int, content: Hash):
+        self._recorder, self._row, self._content, self._calls = recorder, row, content, 0
 
     def frame(
         self,
@@ -184,6 +193,7 @@ class Episode:
             size = row["latent/value"] if row["latent/value"] != (0,) else tuple(latent.shape[-1:])
             parts["latent"] = _one_world("latent", latent, world, size)
         recorder._frame(self._row, float(time), values, parts)
+        Content.frame(self._content, float(time), values | parts)
 
     def __enter__(self) -> "Episode":
         return self
@@ -216,81 +226,3 @@ def _one_world(name: str, tensor: Tensor, world: int, shape: tuple[int, ...]) ->
             "so of many control steps it takes one."
         )
     return _numpy(one)
-
-
-def _begin(
-    draft: Path, model: Model, static: dict[str, np.ndarray], path: Path, resume_before: int | None
-) -> None:
-    """Write a recording with what is kept of the one at ``path``."""
-    kept = path.stat().st_size if path.exists() else 0
-    size = sum(values.nbytes for values in static.values()) + kept
-    with h5py.File(draft, "w", **_OPEN, **_PAGES) as file, _room(file, size):
-        create(file, model, static)
-        if kept and resume_before is not None:
-            with Recording(path) as old:
-                _copy(old, file, static, resume_before)
-
-
-def _copy(old: Recording, file: h5py.File, static: dict[str, np.ndarray], before: int) -> None:
-    """Everything of iterations before ``before``."""
-    for name, values in static.items():
-        if not np.array_equal(values, old.static[name]):
-            raise ValueError(f"{old.path} records another scene ({name} differs); record to another path.")
-
-    new = tables(file)
-
-    def extend(name: str, rows: np.ndarray) -> None:
-        put(new[name], len(new[name]), rows)
-
-    for iteration in (i for i in old.episodes if i < before):
-        extend("episode", np.array([(iteration, json.dumps(old.attributes(iteration)).encode())], EPISODE))
-        for row in old.rows(iteration):
-            for name in PER_FRAME:
-                extend(f"frame/{name}", old.read(name, [row])[1])
-            parts = {name: old.read(name, [row])[1] for name in PARTS}
-            at = {name: len(new[PARTS[name]]) if len(values) else -1 for name, values in parts.items()}
-            for name, values in parts.items():
-                if len(values):
-                    extend(PARTS[name], values)
-            time = old.read("time", [row])[1][0]
-            extend(
-                "frame/index", np.array([(len(new["episode"]) - 1, time, at["field"], at["latent"])], FRAME)
-            )
-    for name, (iterations, values) in old.scalars.items():
-        kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]
-        extend("scalar", np.array(kept, SCALAR))
-
-
-@contextlib.contextmanager
-def _room(file: h5py.File, size: int) -> Iterator[None]:
-    """Claim room for ``size`` bytes on the disk, write, and give back the rest.
-
-    HDF5 must not meet a full disk itself: after a write that failed it crashes the process.
-    """
-    handle, end = file.id.get_vfd_handle(), file.id.get_filesize()
-    try:
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(handle, end, size + _ROOM_EXTRA)
-    except OSError as error:
-        os.ftruncate(handle, end)
-        text = f"no room to record ({error.strerror}); what was recorded is safe"
-        raise OSError(error.errno, text, file.filename) from error
-    yield
-    file.flush()
-    os.ftruncate(handle, file.id.get_filesize())
-
-
-def _open_to_append(path: Path) -> h5py.File:
-    """Open straight into reader-safe mode; a kill between "r+" and ``swmr_mode`` locks a file."""
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_libver_bounds(h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
-    access.set_file_locking(True, True)
-    flags = h5py.h5f.ACC_RDWR | h5py.h5f.ACC_SWMR_WRITE
-    return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
-
-
-def _put_in_place(draft: Path, path: Path) -> None:
-    """At every instant there is the old file or the finished new one."""
-    with open(draft, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(draft, path)

@@ -1,6 +1,10 @@
 """What is inside a picture: its silhouette as booleans, and how much of each lattice cell that covers."""
 
 import os
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -11,6 +15,10 @@ if TYPE_CHECKING:
     import PIL.Image
 
 Inside = Literal["dark", "light", "opaque"]
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "WEBP")
+"""Formats that are read. Pillow knows others; for some it starts another program with what the file says."""
+MOST_PIXELS = 2**25
+"""Larger pictures are refused before they are decoded; this many take about 0.7 GB while they are read."""
 
 
 def silhouette(source: Any, inside: Inside, threshold: float) -> np.ndarray:
@@ -18,8 +26,7 @@ def silhouette(source: Any, inside: Inside, threshold: float) -> np.ndarray:
     need(inside in get_args(Inside), f"inside must be one of {', '.join(get_args(Inside))}, got {inside!r}.")
     need(0 < threshold < 1, f"threshold must lie between 0 and 1, got {threshold}.")
     if isinstance(source, (str, os.PathLike)):
-        with _pillow().open(source) as picture:
-            values = _grey(picture, inside)
+        values = _read(source, inside)
     elif hasattr(source, "convert"):
         values = _grey(source, inside)
     else:
@@ -49,6 +56,51 @@ def _overlap(cells: int, pixels: int, width: float) -> np.ndarray:
     left = np.arange(cells)[:, None] * width
     edge = np.arange(pixels)[None, :]
     return np.clip(np.minimum(left + width, edge + 1) - np.maximum(left, edge), 0.0, None) / width
+
+
+def _read(path: "str | os.PathLike[str]", inside: Inside) -> np.ndarray:
+    pillow, name = _pillow(), os.fspath(path)
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"there is no picture file {name!r}.")
+    with _legible(name), warnings.catch_warnings():
+        warnings.simplefilter("ignore", pillow.DecompressionBombWarning)  # the limit here is lower
+        picture = pillow.open(path, formats=FORMATS)
+    with picture:
+        _check_size(picture, name)
+        with _legible(name):
+            picture.load()
+        return _grey(picture, inside)
+
+
+@contextmanager
+def _legible(name: str) -> Iterator[None]:
+    try:
+        yield
+    except (
+        ArithmeticError,
+        EOFError,
+        LookupError,
+        OSError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+        struct.error,
+    ) as error:
+        raise ValueError(
+            f"{name!r} cannot be read as a picture: {error}; it must be a {', '.join(FORMATS)}: open it in a program for pictures "
+            "and save it as PNG."
+        ) from error
+    except _pillow().DecompressionBombError as error:
+        raise ValueError(f"the picture {name!r} is too large: {error}") from error
+
+
+def _check_size(picture: "PIL.Image.Image", name: str) -> None:
+    width, height = picture.size
+    need(
+        width * height <= MOST_PIXELS,
+        f"the picture {name!r} must have at most {MOST_PIXELS} pixels, got {width} x {height}; make it smaller: a silhouette "
+        "needs no more than a few pixels for each particle.",
+    )
 
 
 def _grey(picture: "PIL.Image.Image", inside: Inside) -> np.ndarray:

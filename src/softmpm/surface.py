@@ -5,6 +5,7 @@ answers it on the CPU; trimesh's own test would need rtree.
 """
 
 import os
+import struct
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,21 @@ import warp as wp
 
 from softmpm.kernels.turn import launch
 from softmpm.validate import need
+
+_DAMAGE = (
+    *(
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        BufferError,
+        EOFError,
+        LookupError,
+        MemoryError,
+        OSError,
+    ),
+    *(RuntimeError, SyntaxError, TypeError, ValueError, struct.error),
+)
+"""As the readers of trimesh report a file that they cannot read."""
 
 wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
 
@@ -21,9 +37,10 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(source, (str, os.PathLike)):
         source = _load(source)
     need(
-        hasattr(source, "is_watertight") and len(getattr(source, "faces", ())) > 0,
+        np.ndim(getattr(source, "faces", None)) == 2 and len(source.faces) > 0,
         f"mesh needs a path or a trimesh.Trimesh with faces, got {type(source).__name__}.",
     )
+<<<<<<< HEAD
     vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)
     size = float(np.ptp(vertices, axis=0).min())
     need(
@@ -31,6 +48,12 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
         f"the mesh's vertices must be finite and not lie farther from the origin than a million times its smallest side, got "
         f"{np.abs(vertices).max():.4g} m and {size:.4g} m: check its units, or move it to the origin with "
         "apply_translation(-mesh.centroid).",
+=======
+    need(
+        bool(np.isfinite(source.vertices).all())
+        and 0 <= source.faces.min() <= source.faces.max() < len(source.vertices),
+        "the mesh's vertices must be finite, and its faces made of them.",
+>>>>>>> files
     )
     if not source.is_watertight:
         _, joined = np.unique(np.asarray(source.edges_sorted), axis=0, return_counts=True)
@@ -79,6 +102,14 @@ def _load(path: "str | os.PathLike[str]") -> Any:
         raise FileNotFoundError(f"there is no mesh file {os.fspath(path)!r}.")
     try:
         import trimesh
+
+        return trimesh.load_mesh(path)
     except ImportError as error:
-        raise ImportError("reading a mesh needs trimesh: pip install softmpm[mesh].") from error
-    return trimesh.load_mesh(path)
+        raise ImportError(
+            f"reading the mesh {os.fspath(path)!r} needs the package {error.name or 'trimesh'}: pip install softmpm[mesh]."
+        ) from error
+    except _DAMAGE as error:
+        raise ValueError(
+            f"{os.fspath(path)!r} cannot be read as a mesh: {type(error).__name__}: {error}; open it in a program for meshes and "
+            "save it as STL."
+        ) from error

@@ -1,11 +1,14 @@
 """The bridge from Hydra to plain objects: command line and ``conf/`` in, a run in its folder out."""
 
+import contextlib
 import dataclasses
 import logging
+import logging.handlers
 import os
 import sys
 import time
 import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -22,9 +25,13 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from softmpm_learn.config import RunConf, conf_dir, load, save, to_run, unknown_key
+from softmpm_learn import files
+from softmpm_learn.checkpoint import LockedError
+from softmpm_learn.config import RunConf, conf_dir, to_run, unknown_key
 from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
 from softmpm_learn.experiment import run_experiment
+from softmpm_learn.saved import load
+from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import TASKS
 from softmpm_learn.train import TrainingError
 
@@ -42,18 +49,19 @@ EXPECTED = (
 """Errors whose message is meant for people; any other is a fault of the program."""
 
 
-def main() -> None:
+def main(signals: Signals | None = None) -> None:
     """Entry of ``python -m softmpm_learn``: exit code 0, or 1 after one sentence on what went wrong."""
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))  # the user asks for tracebacks
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints an error its own way, in several lines
-    group = Group()
+    group, signals = Group(), signals or Signals()
     try:
         with joined() as group:
             if not group.first:
+                signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
             register(group.tell(time.time()))
             run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
-            run(lambda config: job(config, group))()
+            run(lambda config: job(config, group, signals))()
     except Exception as error:
         if full:
             raise
@@ -61,7 +69,7 @@ def main() -> None:
             raise SystemExit(1) from None  # the first process says the same
         _give_up(error)
     except KeyboardInterrupt:
-        _interrupted(group, "No iteration had begun.")
+        _end(130, "" if signals.quiet else f"interrupted. {signals.advice}")
 
 
 def register(began: float | None = None) -> None:
@@ -86,7 +94,7 @@ def _run_dir(resume: str | None, fresh: str) -> str:
     return resume
 
 
-def job(config: DictConfig, group: Group) -> None:
+def job(config: DictConfig, group: Group, signals: Signals) -> None:
     """One run. An error ends it with a sentence on stderr and the traceback in its folder, both from where it happened."""
     out = Path(group.tell(HydraConfig.get().runtime.output_dir))
     try:
@@ -98,26 +106,65 @@ def job(config: DictConfig, group: Group) -> None:
                 raise ValueError(
                     f"{out} holds a run already; go on with resume={out}, or choose another folder."
                 )
-        group.once(save, conf, out / "config.yaml")
     except OtherProcessError:
         raise SystemExit(1) from None  # the other process says it
     except Exception as error:
         _give_up(error)
+    with log_file() as begin_log:
+        try:
+            run_experiment(conf, out, group, signals, lambda: begin_log(out / "softmpm_learn.log"))
+        except Exception as error:
+            if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
+                raise SystemExit(1) from None
+            _give_up(error, _left(error, out, group))
+
+
+def _left(error: Exception, out: Path, group: Group) -> str:
+    """Leave the traceback in the folder of the run, unless that is another's; gives a note on where it is, if people need it."""
+    place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
+    if isinstance(error, LockedError):
+        return ""
     try:
-        run_experiment(conf, out, group)
-    except Exception as error:
-        if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
-            raise SystemExit(1) from None
-        place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
-        place.write_text(traceback.format_exc(), encoding="utf-8")
-        _give_up(error, "" if isinstance(error, EXPECTED) else f" The traceback is in {place}.")
-    except KeyboardInterrupt:
-        _interrupted(group, f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}")
+        files.replace(place, "".join(traceback.format_exception(error)).encode())
+    except OSError as other:
+        return "" if isinstance(error, EXPECTED) else f" The traceback could not be saved: {other}"
+    return "" if isinstance(error, EXPECTED) else f" The traceback is in {place}."
+
+
+class _LogFile(logging.FileHandler):
+    """A log file that cannot be written ends the run, as any other file does."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        with files.named("write", Path(self.baseFilename)):
+            raise
+
+
+@contextlib.contextmanager
+def log_file() -> Iterator[Callable[[Path], None]]:
+    """Gives a function that begins the log file; what was logged before it is called, while the folder may be another's, follows."""
+    root = logging.getLogger()
+    early = logging.handlers.MemoryHandler(10**6, flushLevel=logging.CRITICAL + 1, flushOnClose=False)
+    root.addHandler(early)
+
+    def begin(path: Path) -> None:
+        before = files.read(path) if path.exists() else b""
+        files.replace(path, before)  # a file of its own, whatever else had its name
+        early.setTarget(_LogFile(path, encoding="utf-8"))
+        early.flush()
+        early.flushLevel = logging.NOTSET
+
+    try:
+        yield begin
+    finally:
+        root.removeHandler(early)
+        if early.target is not None:
+            early.target.close()
+        early.close()
 
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
     """The configuration of the run to go on with, with what the command line may change of it."""
-    saved = load(Path(str(conf.resume)) / "config.yaml")
+    saved = load(Path(str(conf.resume)))
     for key in (text.partition("=")[0] for text in overrides):
         group, _, name = key.partition(".")
         if group == "device":
@@ -133,10 +180,6 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
 
 def _give_up(error: Exception, more: str = "") -> NoReturn:
     _end(1, f"{sentence(error)}{more}")
-
-
-def _interrupted(group: Group, advice: str) -> NoReturn:
-    _end(130, f"interrupted. {advice}" if group.first else "")
 
 
 def _end(code: int, said: str) -> NoReturn:
@@ -164,6 +207,8 @@ def sentence(error: BaseException) -> str:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
     text = in_full(error).strip() or "no details"
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
     if isinstance(error, torch.OutOfMemoryError) or "memory_budget" in text:  # as the simulator calls it
         text += " Settings for that: train.worlds, task.resolution and device.memory."
     return _line(

@@ -9,14 +9,18 @@ import io
 import logging
 import os
 import struct
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from torch import Tensor
+
+from softmpm_learn import files
 
 NAME, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-FORMAT = 1
+FORMAT = 2
 _MARK = b"sha256="
 _FOOTER = len(_MARK) + 64
 
@@ -25,6 +29,10 @@ logger = logging.getLogger("softmpm_learn")
 
 class CheckpointError(RuntimeError):
     """No checkpoint could be read; says why each one could not."""
+
+
+class LockedError(RuntimeError):
+    """Another run writes to the folder."""
 
 
 def save(folder: Path, content: dict) -> Path:
@@ -37,15 +45,13 @@ def save(folder: Path, content: dict) -> Path:
     torch.save({"format": FORMAT, **content}, buffer)
     body = buffer.getvalue()
     body = body[:-2] + struct.pack("<H", _FOOTER)  # a zip archive ends with the length of its comment
-    path, draft = folder / NAME, folder / (NAME + ".new")
-    with open(draft, "wb") as file:
-        file.write(body + _MARK + hashlib.sha256(body).hexdigest().encode())
-        file.flush()
-        os.fsync(file.fileno())
-    if path.exists() and _intact(path.read_bytes()):
-        os.replace(path, folder / PREVIOUS)
-    os.replace(draft, path)
-    _sync(folder)
+    path = folder / NAME
+    draft = files.draft(path, body + _MARK + hashlib.sha256(body).hexdigest().encode())
+    with files.named("write", path):
+        if path.exists() and _intact(files.read(path)):
+            os.replace(path, folder / PREVIOUS)
+        os.replace(draft, path)
+        _sync(folder)
     return path
 
 
@@ -76,17 +82,23 @@ def load(folder: Path) -> dict:
 def read(path: Path) -> dict:
     """One checkpoint file, verified before it is parsed."""
     try:
-        data = path.read_bytes()
+        data = files.read(path)
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error.strerror}.") from error
+        reason = getattr(error.__cause__, "strerror", error)
+        raise CheckpointError(f"{path} cannot be read: {reason}.") from error
     if not _intact(data):
         raise CheckpointError(f"{path} is damaged: its SHA-256 does not match.")
     try:
+        _check_archive(data)
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        _check_content(content)
     except Exception as error:  # PyTorch raises many kinds, all of which mean this
-        raise CheckpointError(f"{path} is no checkpoint of tensors, numbers and texts: {error}") from error
+        problem = " ".join(str(error).split())
+        raise CheckpointError(f"{path} is no checkpoint of tensors, numbers and texts: {problem}") from error
     if content.get("format") != FORMAT:
-        raise CheckpointError(f"{path} has format {content.get('format')!r}, this version reads {FORMAT}.")
+        raise CheckpointError(
+            f"{path} has format {content.get('format')!r}, this version reads {FORMAT}; the softmpm that wrote it can go on with it."
+        )
     return content
 
 
@@ -95,20 +107,58 @@ def _intact(data: bytes) -> bool:
     return footer == _MARK + hashlib.sha256(body).hexdigest().encode()
 
 
+def _check_archive(data: bytes) -> None:
+    """Raise ValueError for an archive that takes more memory than it has bytes: packed, or with parts that overlap."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise ValueError("its parts are compressed")
+    if (size := sum(entry.file_size for entry in entries)) > len(data):
+        raise ValueError(f"its parts declare {size} bytes, the file has {len(data)}")
+
+
+def _check_content(content: object) -> None:
+    """Raise ValueError for what is no dict, and for tensors that repeat few numbers many times or are not finite."""
+    if not isinstance(content, dict):
+        raise ValueError(f"it holds a {type(content).__name__}")
+    for name, tensor in _tensors(content, ""):
+        if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+            raise ValueError(
+                f"{name} of shape {tuple(tensor.shape)} stores only {tensor.untyped_storage().nbytes()} bytes"
+            )
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise ValueError(f"{name} is not finite")
+
+
+def _tensors(value: object, name: str) -> Iterable[tuple[str, Tensor]]:
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _tensors(item, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, (list, tuple)):
+        for k, item in enumerate(value):
+            yield from _tensors(item, f"{name}[{k}]")
+
+
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """One run at a time in a folder; the lock goes with the process, also if it is killed. No lock on Windows."""
+    """One run at a time in a folder; the lock goes with the process, also if it is killed. No lock on Windows.
+
+    Raises:
+        LockedError: Another run has it.
+    """
     try:
         import fcntl
     except ImportError:
         yield
         return
-    with open(folder / ".lock", "w") as file:
+    with files.opened_for_lock(folder / ".lock") as descriptor:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             message = f"another run is writing to {folder}; choose another folder or wait for it."
-            raise RuntimeError(message) from error
+            raise LockedError(message) from error
         yield
 
 

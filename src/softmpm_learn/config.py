@@ -8,7 +8,6 @@ import dataclasses
 import difflib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
@@ -115,21 +114,3 @@ def unknown_key(key: str, kind: type) -> str:
     start = f"{group}." if group else ""
     hint = f"did you mean {start}{near[0]}?" if near else f"known are {', '.join(start + k for k in known)}."
     return f"there is no setting {key}; {hint}"
-
-
-def load(path: Path) -> RunConf:
-    """Read the ``config.yaml`` that a run left in its folder."""
-    try:
-        saved: Any = OmegaConf.load(path)
-    except FileNotFoundError:
-        raise ValueError(f"{path.parent} holds no run to resume: there is no {path.name} in it.") from None
-    name = OmegaConf.select(saved, "task.name")
-    if name not in TASKS:
-        raise ValueError(f"{path} names the task {name!r}; known are {', '.join(TASKS)}.")
-    task: Any = TASKS[name][0]
-    return to_run(DictConfig(OmegaConf.merge(OmegaConf.structured(RunConf(task=task())), saved)))
-
-
-def save(run: RunConf, path: Path) -> None:
-    """Write the resolved configuration, for people and for ``load``."""
-    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(run)), encoding="utf-8")

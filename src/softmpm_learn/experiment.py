@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from softmpm_learn.objective import Progress as Travel
 from softmpm_learn.objective import Reach
 from softmpm_learn.progress import Progress
 from softmpm_learn.run import Run
-from softmpm_learn.stop import stop_on_signals
+from softmpm_learn.saved import save
+from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import Task, make_task
 from softmpm_learn.train import Result, train
 
@@ -42,12 +44,22 @@ CURVES = {
 logger = logging.getLogger("softmpm_learn")
 
 
-def run_experiment(conf: RunConf, out: Path, group: Group | None = None) -> None:
+def run_experiment(
+    conf: RunConf,
+    out: Path,
+    group: Group | None = None,
+    signals: Signals | None = None,
+    begin: Callable[[], None] = lambda: None,
+) -> None:
     """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next.
 
     Of several processes, the first draws, converts and speaks.
+
+    Args:
+        signals: What asks the run to end, None for nothing.
+        begin: Called in the first process once ``out`` is locked and found to be this run's, before the configuration is saved.
     """
-    group = group or Group()
+    group, signals = group or Group(), signals or Signals()
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(conf.device.threads)
     with group.together():
@@ -56,7 +68,13 @@ def run_experiment(conf: RunConf, out: Path, group: Group | None = None) -> None
     logger.info("%s", model.describe(task.substeps))
     with contextlib.ExitStack() as held:
         progress = held.enter_context(Progress(conf.train.iterations)) if group.first else None
-        stop = held.enter_context(stop_on_signals(insist=group.size == 1))
+        stop = held.enter_context(signals.awaited(insist=group.size == 1))
+
+        def begun() -> None:
+            begin()
+            save(conf, out)
+            signals.advice = f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}"
+
         result = train(
             task,
             model,
@@ -64,11 +82,13 @@ def run_experiment(conf: RunConf, out: Path, group: Group | None = None) -> None
             out,
             progress=(lambda iteration, row: progress(iteration, row["loss"])) if progress else None,
             stop=stop,
+            begin=begun,
             group=group,
         )
     if group.first:
         draw(result, task, out)
         logger.info("%s", farewell(result, task, out))
+        signals.advice = f"The run had ended; everything is in {out}."
 
 
 def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:

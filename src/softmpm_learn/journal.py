@@ -1,6 +1,7 @@
 """What a run leaves on the disk while it goes on: metrics.csv and timing.csv, recording, checkpoint and replay buffer."""
 
 import contextlib
+import logging
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,8 @@ from softmpm_learn import checkpoint
 from softmpm_learn.episode import Frame
 from softmpm_learn.run import Run
 from softmpm_learn.table import Table
+
+logger = logging.getLogger("softmpm_learn")
 
 METRICS = [
     *("loss", "final", "running", "best", "effort"),
@@ -30,20 +33,57 @@ TIMING = ["episode", "learn", "save"]
 class Journal:
     """Goes on where the run is, and begins with a checkpoint of a new one. Of several processes the first keeps it; it shows
     the first of its worlds. Use as a context manager.
+
+    Args:
+        run: The run, as it is after its checkpoint was loaded.
+        out: Its folder.
+        seals: What the checkpoint knows of the other files, see :attr:`seals`; empty for a new run.
+        begin: Called once they are found to be those of the run, before the first checkpoint.
+
+    Raises:
+        ValueError: A file is not the one that the checkpoint knows.
     """
 
-    def __init__(self, run: Run, out: Path):
+    def __init__(self, run: Run, out: Path, seals: dict, begin: Callable[[], None] = lambda: None):
         self.run, self.out = run, out
         self._named = run.learner.replay.ids if run.learner else []
-        self._metrics = Table(out / "metrics.csv", METRICS, rows=run.iteration)
-        self._timing = Table(out / "timing.csv", TIMING, rows=run.iteration)
+        self._metrics = Table(out / "metrics.csv", METRICS, seals.get("metrics.csv"))
+        self._timing = Table(out / "timing.csv", TIMING, seals.get("timing.csv"))
+        self._recorded = seals.get("run.h5")
+        self._recorder = self._open_recorder() if run.settings.train.record_every else None
+        begin()
         if run.iteration == 0:
             self.save()
-        self._recorder: softmpm.Recorder | None = None
-        conf = run.settings.train
-        if conf.record_every:
-            path, done = out / "run.h5", run.iteration
-            self._recorder = softmpm.Recorder(path, run.model, resume_before=done, every=conf.frame_every)
+
+    def _open_recorder(self) -> softmpm.Recorder:
+        """Go on with the recording, if it is the one that the checkpoint knows; begin one where there is none."""
+        path, known = self.out / "run.h5", self._recorded
+        every = self.run.settings.train.frame_every
+        if known is not None and not path.exists():
+            logger.warning("%s is missing; what was recorded up to here is lost, and a new one begins.", path)
+            known = None
+        before, digest = (known["before"], known["sha256"]) if known else (0, None)
+        try:
+            return softmpm.Recorder(
+                path, self.run.model, resume_before=before, resume_digest=digest, every=every
+            )
+        except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise  # no room on the disk
+            raise ValueError(
+                f"{str(error).rstrip('.')}. Move {path} away to go on without what was recorded, or put the right file there."
+            ) from error
+
+    @property
+    def seals(self) -> dict:
+        """What a checkpoint must know of the files beside it."""
+        if self._recorder:
+            self._recorded = {"before": self.run.iteration, "sha256": self._recorder.digest}
+        return {
+            "metrics.csv": self._metrics.seal,
+            "timing.csv": self._timing.seal,
+            "run.h5": self._recorded,
+        }
 
     def add(self, iteration: int, row: dict[str, float], seconds: dict[str, float]) -> None:
         """A row of either table, and the figures to the recording."""
@@ -55,7 +95,7 @@ class Journal:
 
     def save(self) -> None:
         """Write a checkpoint, then drop the simulations that neither it nor the one before names."""
-        checkpoint.save(self.out, self.run.state_dict())
+        checkpoint.save(self.out, self.run.state_dict() | {"seals": self.seals})
         if self.run.learner is not None:
             ids = self.run.learner.replay.ids
             self.run.learner.replay.prune(self._named + ids)

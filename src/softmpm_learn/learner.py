@@ -74,7 +74,7 @@ class Learner:
             "autoencoder": self.autoencoder.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "target": None if self.target is None else self.target.state_dict(),
-            "replay": self.replay.ids,
+            "replay": self.replay.seal,
             "phases": self.phases,
         }
 

@@ -1,11 +1,14 @@
 """Replay: grid velocity of many past simulations, bounded in memory, kept on disk, split by simulation.
 
 Whole simulations are held out for validation: neighbouring pictures of one motion are too alike to test on. Each simulation is
-one HDF5 file that is written once and never changed, so a checkpoint need only name its simulations.
+one HDF5 file that is written once and never changed, so a checkpoint need only name its simulations, each with the SHA-256 of
+its file.
 """
 
+import hashlib
+import io
 import math
-import os
+import re
 from pathlib import Path
 
 import h5py
@@ -13,7 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softmpm_learn import files
+
 SPLITS = ("training", "validation")
+
+
+class ReplayError(ValueError):
+    """A simulation of the replay buffer is missing, damaged or of another run."""
 
 
 class Replay:
@@ -21,19 +30,28 @@ class Replay:
 
     Args:
         folder: Where the files are.
+        shape: That of the pictures of a simulation, (frame, dim, *nodes).
         simulations: Most simulations.
         megabytes: Most memory [MB]; at least the newest simulation stays.
         validation: Share of the simulations held out: every ⌈1/validation⌉-th, by its number, for good.
     """
 
     def __init__(
-        self, folder: Path, *, simulations: int, megabytes: float = math.inf, validation: float = 0.2
+        self,
+        folder: Path,
+        shape: tuple[int, ...],
+        *,
+        simulations: int,
+        megabytes: float = math.inf,
+        validation: float = 0.2,
     ):
-        self.folder = folder
+        self.folder, self.shape = folder, shape
         self.simulations, self.megabytes = simulations, megabytes
         self.hold_out = round(1 / validation)
         self._pictures: dict[int, Tensor] = {}
-        folder.mkdir(parents=True, exist_ok=True)
+        self._sha256: dict[int, str] = {}
+        with files.named("make the folder", folder):
+            folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def ids(self) -> list[int]:
@@ -41,14 +59,22 @@ class Replay:
         return list(self._pictures)
 
     def add(self, number: int, pictures: Tensor) -> None:
-        """Keep the velocities [m/s] of one simulation, shape (frame, dim, *nodes), under a number not used before."""
+        """Keep the velocities [m/s] of one simulation under a number not used before."""
         if self._pictures and number <= self.ids[-1]:
             raise ValueError(f"simulations are numbered upwards: {number} cannot follow {self.ids[-1]}.")
+        if tuple(pictures.shape) != self.shape:
+            raise ValueError(f"the pictures must have shape {self.shape}, got {tuple(pictures.shape)}.")
         pictures = pictures.detach().to("cpu", torch.float32).contiguous()
-        _write(self._path(number), pictures.numpy())
-        self._pictures[number] = pictures
+        data = _packed(pictures.numpy())
+        files.replace(self._path(number), data)
+        self._pictures[number], self._sha256[number] = pictures, hashlib.sha256(data).hexdigest()
         while len(self.ids) > 1 and (len(self.ids) > self.simulations or self.nbytes > 1e6 * self.megabytes):
             del self._pictures[self.ids[0]]
+
+    @property
+    def seal(self) -> dict[int, str]:
+        """For the checkpoint: what :meth:`load` takes, the SHA-256 of each simulation's file by its number."""
+        return {number: self._sha256[number] for number in self.ids}
 
     @property
     def nbytes(self) -> int:
@@ -82,47 +108,73 @@ class Replay:
             [simulations[k][i - ends[k]] for k, i in zip(which.tolist(), drawn.tolist(), strict=True)]
         )
 
-    def load(self, ids: list[int]) -> None:
-        """Hold exactly these simulations, from the folder."""
-        self._pictures = {number: torch.from_numpy(_read(self._path(number))) for number in ids}
+    def load(self, seal: dict[int, str]) -> None:
+        """Hold exactly the simulations of an earlier :attr:`seal`, from the folder.
+
+        Raises:
+            ReplayError: A file is missing, is not the one that was sealed, or does not hold finite pictures of :attr:`shape`; or
+                they are more than the buffer may hold.
+        """
+        size = 4e-6 * math.prod(self.shape)
+        if len(seal) > self.simulations or (len(seal) > 1 and len(seal) * size > self.megabytes):
+            raise ReplayError(
+                f"the checkpoint names {len(seal)} simulations of {size:.3g} MB each; the replay buffer in {self.folder} may have "
+                f"{self.simulations}, and {self.megabytes:g} MB in all."
+            )
+        self._pictures = {number: self._read(number, sha256) for number, sha256 in sorted(seal.items())}
+        self._sha256 = dict(seal)
+
+    def _read(self, number: int, sha256: str) -> Tensor:
+        path = self._path(number)
+        most = 2**20 + 8 * math.prod(self.shape)  # more than the pictures take unpacked
+        try:
+            data = files.read(path, most)
+            if hashlib.sha256(data).hexdigest() != sha256:
+                raise ValueError(
+                    "it is damaged or of another run, its SHA-256 is not the one in the checkpoint"
+                )
+            pictures = _unpacked(data, self.shape)
+        except (OSError, ValueError, RuntimeError, LookupError, TypeError) as error:
+            raise ReplayError(
+                f"{path} is not the simulation that the checkpoint names: {str(error).rstrip('.')}. The run cannot go on without it; "
+                "put the right file there."
+            ) from error
+        return torch.from_numpy(pictures)
 
     def prune(self, keep: list[int]) -> None:
-        """Remove the files of simulations that are not in ``keep``, and what an interrupted write left behind."""
+        """Remove the files of simulations that are not in ``keep``, and drafts of an interrupted write; no other files."""
         names = {self._path(number).name for number in keep}
         for path in self.folder.iterdir():
-            if path.name not in names and path.name.endswith((".h5", ".new")):
+            if path.name not in names and re.fullmatch(r"\d{8}\.h5(\.new)?", path.name):
                 path.unlink()
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:08d}.h5"
 
 
-def _write(path: Path, pictures: np.ndarray) -> None:
-    """Whole or not at all, also after a loss of power."""
-    draft = path.with_name(path.name + ".new")
-    with h5py.File(draft, "w") as file:
+def _packed(pictures: np.ndarray) -> bytes:
+    """An HDF5 file, made in memory: HDF5 must not meet a full disk itself."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
         file.create_dataset(
             "velocity", data=pictures, chunks=True, shuffle=True, compression=1, fletcher32=True
         )
-    descriptor = os.open(draft, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-    os.replace(draft, path)
+    return buffer.getvalue()
 
 
-def _read(path: Path) -> np.ndarray:
+def _unpacked(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     """A file of ours and nothing else: HDF5 could also name other files, or declare more than there is memory for."""
-    try:
-        with h5py.File(path, "r") as file:
-            if not isinstance(file.get("velocity", getlink=True), h5py.HardLink):
-                raise ValueError("no plain dataset 'velocity'")
-            data = file["velocity"]
-            if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external is not None:
-                raise ValueError("its dataset is not plain")
-            if data.dtype != np.float32 or data.nbytes > 1000 * max(path.stat().st_size, 2**20):
-                raise ValueError(f"{data.dtype} of {data.nbytes} bytes is not what this file could hold")
-            return data[()]
-    except (OSError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path} is not a readable simulation of the replay buffer: {error}") from error
+    with h5py.File(io.BytesIO(data), "r") as file:
+        if not isinstance(file.get("velocity", getlink=True), h5py.HardLink):
+            raise ValueError("there is no plain dataset 'velocity'")
+        found = file["velocity"]
+        if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external is not None:
+            raise ValueError("its dataset is not plain")
+        if found.dtype != np.float32 or found.shape != shape:
+            raise ValueError(f"it has {found.dtype} of shape {found.shape}, not float32 of shape {shape}")
+        if math.prod(found.chunks or (0,)) > math.prod(shape):
+            raise ValueError(f"its chunks of {found.chunks} are larger than its pictures")
+        pictures = found[()]
+    if not np.isfinite(pictures).all():
+        raise ValueError("its velocities are not finite")
+    return pictures

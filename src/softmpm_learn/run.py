@@ -1,7 +1,5 @@
 """What a run is made of: observer, policy, design, optimiser and learner, made from settings, saved and restored as one."""
 
-import dataclasses
-import hashlib
 import json
 import math
 from pathlib import Path
@@ -16,6 +14,7 @@ from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.identity import identity
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Centroids, Latent, Observer, Picture, clusters
 from softmpm_learn.policy import Goal, make_policy
@@ -26,8 +25,9 @@ from softmpm_learn.settings import Settings
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
 
-MAY_CHANGE = ("iterations", "record_every", "frame_every")
-"""Settings of TrainConf that a resumed run may have different."""
+
+class SettingsError(ValueError):
+    """A run cannot go on with other settings than its own."""
 
 
 class Run:
@@ -86,6 +86,7 @@ class Run:
         since_last = learning.every * self.settings.train.worlds
         replay = Replay(
             out / "replay",
+            (-(-task.control_steps // learning.frame_every), model.dim, *picture.shape),
             simulations=learning.simulations if learning.replay else since_last,
             megabytes=learning.megabytes,
             validation=learning.validation,
@@ -174,13 +175,16 @@ class Run:
         """Go on from a checkpoint of the same task and settings.
 
         Raises:
-            ValueError: Task or settings are others; names each difference.
+            SettingsError: Task or settings are others; names each difference.
+            ValueError, LookupError, TypeError, AttributeError, RuntimeError: It holds something else than a run.
         """
         theirs, ours = json.loads(content["about"]), json.loads(self.about())
-        changed = [name for name in ours if theirs.get(name) != ours[name]]
+        changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
         if changed:
-            both = "; ".join(f"{name}: {theirs.get(name)} then, {ours[name]} now" for name in changed)
-            raise ValueError(f"this run cannot go on from its checkpoint, made with other settings: {both}.")
+            both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
+            raise SettingsError(
+                f"this run cannot go on from its checkpoint, made with other settings: {both}."
+            )
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])
@@ -189,25 +193,36 @@ class Run:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, self.best = content["iteration"], content["best"]
+        self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        """Raise ValueError for what PyTorch does not compare when it loads: what belongs to a parameter has its shape."""
+        of = [(p.shape, moment.shape) for p in self.parameters for moment in _moments(self.optimizer, p)]
+        of += [(p.shape, safe.shape) for p, safe in zip(self.parameters, self.safe, strict=bool(self.safe))]
+        for want, got in of:
+            if want != got:
+                raise ValueError(
+                    f"something of shape {tuple(got)} belongs to a parameter of shape {tuple(want)}"
+                )
+        if not (
+            isinstance(self.iteration, int)
+            and self.iteration >= 0
+            and self.best["iteration"] < self.iteration
+        ):
+            raise ValueError(
+                f"the iteration is {self.iteration!r}, that of the best loss {self.best['iteration']!r}"
+            )
+        if self.best["iteration"] >= 0:
+            now = self.actor()
+            self.load_actor(self.best)  # compares the shapes
+            self.load_actor(now)
 
     def about(self) -> str:
-        """Task and settings as JSON, one flat level: what a resumed run must share."""
-        flat = {}
-        for group, values in dataclasses.asdict(self.settings).items():
-            names = [n for n in values if not (group == "train" and n in MAY_CHANGE)]
-            flat |= {f"{group}.{name}": values[name] for name in names}
-        flat["task"], flat["dtype"] = self.task.name, str(self.model.dtype)
-        flat["steps"] = [self.task.control_steps, self.task.substeps]
-        flat["scene"] = _digest(self.model)
-        return json.dumps(flat, sort_keys=True)
+        """What a resumed run must share, as JSON."""
+        return json.dumps(identity(self.task, self.model, self.settings), sort_keys=True)
 
 
-def _digest(model: Model) -> str:
-    """A short name of a scene: another one if any of its numbers is."""
-    scene, digest = model.scene, hashlib.sha256()
-    for tensor in (model.positions, model.volume, *model.params()):
-        digest.update(tensor.cpu().numpy().tobytes())
-    for muscle in scene.muscles:
-        digest.update(muscle.particles.tobytes() + repr((muscle.direction, muscle.strength)).encode())
-    digest.update(repr((scene.grid, scene.walls, scene.gravity, scene.damping, scene.dt)).encode())
-    return digest.hexdigest()[:16]
+def _moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> list[Tensor]:
+    """What an optimiser remembers for each number of a parameter."""
+    found = optimizer.state.get(parameter, {})
+    return [value for name, value in found.items() if isinstance(value, Tensor) and name != "step"]

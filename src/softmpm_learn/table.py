@@ -1,35 +1,62 @@
-"""A CSV file that grows by a row for each iteration and can be cut back to where a run resumes."""
+"""A CSV file that grows by a row for each iteration and goes on from where a checkpoint sealed it."""
 
+import hashlib
+import logging
 import math
-import os
 from pathlib import Path
+from typing import TypedDict
+
+from softmpm_learn import files
+
+logger = logging.getLogger("softmpm_learn")
+
+
+class Seal(TypedDict):
+    """What a checkpoint remembers of a file that grows."""
+
+    bytes: int
+    """Length [B] when the checkpoint was written."""
+    sha256: str
+    """Hash of so many bytes."""
 
 
 class Table:
-    """Rows of numbers under fixed column names; the first column is ``iteration``, counted from 0 without gaps.
+    """Rows of numbers under fixed column names; the first column is ``iteration``, counted without gaps.
 
     Numbers are written so that they read back to the last bit; nan becomes an empty cell.
 
     Args:
         path: The file.
         columns: Names after ``iteration``.
-        rows: Keep this many rows of a file that is there; a row cut short by a kill goes with the rest.
+        seal: Go on after what this describes, and drop the rest; None begins a new file. Where the file is missing, a new one begins
+            too, and the log says so.
+
+    Raises:
+        ValueError: The file is not the one that was sealed, or has other columns.
     """
 
-    def __init__(self, path: Path, columns: list[str], rows: int = 0):
+    def __init__(self, path: Path, columns: list[str], seal: Seal | None = None):
         self.path, self.columns = path, columns
-        header = ",".join(["iteration", *columns]) + "\n"
-        kept = [header]
-        if rows:
-            old = path.read_text().splitlines(keepends=True) if path.exists() else []
-            if len(old) < 1 + rows or old[0] != header:
+        header = (",".join(["iteration", *columns]) + "\n").encode()
+        content = header
+        if seal is not None and path.exists():
+            content = files.read(path, seal["bytes"])
+            if len(content) != seal["bytes"] or hashlib.sha256(content).hexdigest() != seal["sha256"]:
                 raise ValueError(
-                    f"{path} should have {rows} rows of {header.strip()}; it has {max(len(old) - 1, 0)}."
+                    f"{path} is damaged or of another run: its first {seal['bytes']} bytes are not those that the checkpoint "
+                    f"knows; put the right file there, or move it away to go on without its rows."
                 )
-            kept = old[: 1 + rows]
-        draft = path.with_name(path.name + ".new")
-        draft.write_text("".join(kept))
-        os.replace(draft, path)
+            if not content.startswith(header):
+                raise ValueError(f"{path} should have the columns {header.decode().strip()}.")
+        elif seal is not None:
+            logger.warning("%s is missing; its rows up to here are lost, and a new one begins.", path)
+        self._hash, self._bytes = hashlib.sha256(content), len(content)
+        files.replace(path, content)
+
+    @property
+    def seal(self) -> Seal:
+        """For the checkpoint: what :class:`Table` goes on from."""
+        return {"bytes": self._bytes, "sha256": self._hash.hexdigest()}
 
     def append(self, iteration: int, values: dict[str, float]) -> None:
         """Add the row of an iteration and force it to the disk; a missing value is an empty cell."""
@@ -37,8 +64,7 @@ class Table:
         if unknown:
             raise ValueError(f"{self.path.name} has no column {', '.join(sorted(unknown))}.")
         cells = [values.get(name, math.nan) for name in self.columns]
-        line = ",".join([str(iteration), *("" if math.isnan(c) else repr(c) for c in cells)])
-        with open(self.path, "a") as file:
-            file.write(line + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        line = ",".join([str(iteration), *("" if math.isnan(c) else repr(c) for c in cells)]) + "\n"
+        files.append(self.path, line.encode())
+        self._hash.update(line.encode())
+        self._bytes += len(line)

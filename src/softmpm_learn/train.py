@@ -24,11 +24,12 @@ from torch import Tensor
 
 import softmpm
 from softmpm import Model
-from softmpm_learn import checkpoint
+from softmpm_learn import checkpoint, files
 from softmpm_learn.distributed import Group, OtherProcessError, in_full
 from softmpm_learn.episode import Episode, run_episode
 from softmpm_learn.journal import TIMING, Journal
-from softmpm_learn.run import Run
+from softmpm_learn.replay import ReplayError
+from softmpm_learn.run import Run, SettingsError
 from softmpm_learn.settings import Settings
 
 logger = logging.getLogger("softmpm_learn")
@@ -65,6 +66,7 @@ def train(
     *,
     progress: Callable[[int, dict[str, float]], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
+    begin: Callable[[], None] = lambda: None,
     group: Group | None = None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
@@ -77,37 +79,65 @@ def train(
         out: Folder for checkpoint.pt, metrics.csv, timing.csv, run.h5 and replay/.
         progress: Called after each iteration with its number and metrics; in the first process only.
         stop: Asked after each iteration; once it says True in any process the run ends, ready to resume.
+        begin: Called once, in the first process only, when the folder is locked and what is in it was found to be of this run.
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
 
     Raises:
         TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
         softmpm_learn.distributed.OtherProcessError: The first process cannot go on, and says why.
-        ValueError: Settings that do not go together, or with the checkpoint.
+        ValueError: Settings that do not go together, or with the checkpoint; a file in ``out`` that is a link, damaged or of another
+            run.
         softmpm_learn.checkpoint.CheckpointError: Every checkpoint in ``out`` is damaged.
+        softmpm_learn.checkpoint.LockedError: Another run writes to ``out``.
     """
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     group = group or Group()
     with contextlib.ExitStack() as held:
-        group.once(lambda: held.enter_context(checkpoint.locked(out)))
+        group.once(lambda: held.enter_context(_entered(out)))
         with group.together():
             run = Run(task, model, settings, out, group)
-        _resume(run, out)
-        journal = group.once(lambda: held.enter_context(Journal(run, out)))
+        seals = _resume(run, out)
+        journal = group.once(lambda: held.enter_context(Journal(run, out, seals, begin)))
         return _loop(run, journal, progress, stop)
 
 
-def _resume(run: Run, out: Path) -> None:
-    """Go on where the checkpoint ends, if there is one; the replay buffer is for the first process."""
+@contextlib.contextmanager
+def _entered(out: Path) -> Iterator[None]:
+    """The folder is there, has no links in it, and no other run writes to it."""
+    with files.named("make the folder", out):
+        out.mkdir(parents=True, exist_ok=True)
+    files.check_folder(out)
+    with checkpoint.locked(out):
+        yield
+
+
+def _resume(run: Run, out: Path) -> dict:
+    """Go on where the checkpoint ends, if there is one; the replay buffer is for the first process. Gives what the checkpoint knows of
+    the other files.
+    """
     group = run.group
     content = group.tell(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
     if content is None:
-        return
-    if content["learner"] and not group.first:
-        content["learner"]["replay"] = []
+        return {}
     with group.together():
-        run.load_state_dict(content)
+        seals = _restore(run, content, out)
     logger.info("Going on after iteration %d of %s.", run.iteration, out)
+    return seals
+
+
+def _restore(run: Run, content: dict, out: Path) -> dict:
+    try:
+        if content["learner"] and not run.group.first:
+            content["learner"]["replay"] = {}
+        run.load_state_dict(content)
+        return dict(content["seals"])
+    except (SettingsError, ReplayError):
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+        text = " ".join(str(error).split())
+        raise checkpoint.CheckpointError(
+            f"the checkpoint in {out} does not hold this run: {text}."
+        ) from error
 
 
 def _loop(run: Run, journal: Journal | None, progress, stop) -> Result:

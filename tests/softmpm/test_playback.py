@@ -152,6 +152,76 @@ def test_harmful_files_are_refused(copy, name, make):
         softmpm.Recording(copy)
 
 
+def declared_only(file, group, leaf, data):
+    chunk = (1, *data.shape[1:])
+    made = group.create_dataset(leaf, (2**14, *data.shape[1:]), data.dtype, chunks=chunk)
+    made[: len(data)] = data
+
+
+def packed(file, group, leaf, data):
+    group.create_dataset(leaf, data=data, chunks=data.shape, compression="gzip")
+
+
+@pytest.mark.parametrize(
+    "make, name", [(declared_only, "frame/x"), (declared_only, "frame/v"), (packed, "static/volume")]
+)
+def test_what_is_declared_must_be_stored(copy, make, name):
+    """Rows that were never written and packed zeros would take memory that the file does not."""
+    replace(copy, name, make)
+    with pytest.raises(ValueError, match=f"{name} (declares|uses HDF5 filters)"):
+        softmpm.Recording(copy)
+
+
+def put(path, table, row, **values) -> None:
+    """Overwrite fields of one row, or of all."""
+    with h5py.File(path, "r+") as file:
+        rows = file[table][()]
+        for name, value in values.items():
+            rows[name][row] = value
+        file[table][()] = rows
+
+
+@pytest.mark.parametrize("text", [b"[1, 2]", b"[" * 4000, b"{", b"\xff", b"7"])
+def test_attributes_that_are_no_object_are_named(copy, text):
+    """A list, brackets without end, half an object, no UTF-8: an error that names the file, also from ``to_rerun``."""
+    put(copy, "episode", 1, attributes=text)
+    with softmpm.Recording(copy) as recording:
+        assert recording.attributes(0) == {}
+        with pytest.raises(OSError, match=r"copy\.h5 is damaged: the attributes of iteration 1"):
+            recording.attributes(1)
+    with pytest.raises(OSError, match=r"copy\.h5 is damaged: the attributes"):
+        softmpm.to_rerun(copy)
+
+
+@pytest.mark.parametrize(
+    "table, values, message",
+    [
+        ("scalar", dict(name=b"\xff\xfe"), "the name of a scalar is not UTF-8"),
+        ("frame/index", dict(field=99), "rows of field beyond the 2"),
+        ("frame/index", dict(latent=-7), "rows of latent beyond"),
+        ("frame/index", dict(time=np.nan), "times in frame/index must be finite"),
+    ],
+)
+def test_rows_that_name_nothing_are_refused(copy, table, values, message):
+    """Names that are no text, rows beyond a table, times that are not finite: refused with the name of the file."""
+    put(copy, table, 0, **values)
+    with pytest.raises((OSError, ValueError), match=rf"copy\.h5.*{message}"):
+        softmpm.Recording(copy)
+
+
+def test_a_scene_that_is_not_finite_is_refused(copy):
+    """Neither nan among the positions nor a step of nan nor a spacing of two numbers reaches a picture."""
+    with h5py.File(copy, "r+") as file:
+        file["static/positions"][3] = np.nan
+    with pytest.raises(ValueError, match=r"copy\.h5: static/positions must be finite"):
+        softmpm.Recording(copy)
+    for value in (np.nan, [1.0, 2.0], "x", -1.0):
+        with h5py.File(copy, "r+") as file:
+            file.attrs["spacing"] = value
+        with pytest.raises(ValueError, match=r"copy\.h5: the attribute spacing must be a number > 0"):
+            softmpm.Recording(copy)
+
+
 @pytest.mark.parametrize("group", ["frame", "static"])
 def test_a_group_of_another_file_is_refused(recorded, copy, group):
     """A whole group cannot come from elsewhere either."""

@@ -157,6 +157,31 @@ def test_a_recording_is_read_while_it_is_written(tmp_path):
             assert float(subprocess.run(reader, check=True, capture_output=True).stdout) == k
 
 
+def test_a_live_writer_never_disturbs_a_reader(tmp_path):
+    """Read again and again while another process writes as fast as it can, all that is there is whole."""
+    run_here("reading", tmp_path / "run.h5", "15")
+
+
+def reading(path: Path, times: str) -> None:
+    """Fork a writer, and read what it writes."""
+    model, count = small_model(), 0
+    with softmpm.Recorder(path, model) as recorder:
+        record(recorder, model, 0)
+    child = os.fork()
+    if child == 0:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        write_for_ever(path, model, 1)
+    try:
+        while count < int(times):
+            with softmpm.Recording(path) as recording:
+                assert check(recording, model, 0) == 4 and recording.episodes[-1] >= count
+                assert all(check(recording, model, k) == 3 for k in recording.episodes[-3:-1] if k)
+                count = recording.episodes[-1]
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
 def test_resume_keeps_what_came_before(tmp_path):
     """``resume_before=k`` drops iterations from k on, and what follows is as in a run without a break."""
     model, path, whole = small_model(), tmp_path / "run.h5", tmp_path / "whole.h5"
@@ -177,6 +202,42 @@ def test_resume_keeps_what_came_before(tmp_path):
         for name, columns in want.scalars.items():
             assert np.array_equal(got.scalars[name], columns)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.h5", "whole.h5"]
+
+
+def test_a_digest_tells_one_recording_from_another(tmp_path):
+    """Equal contents have equal digests, however they came to be; with one a changed file is refused and stays as it is."""
+    model, path = small_model(), tmp_path / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        empty = recorder.digest
+        record(recorder, model, 0)
+        record(recorder, model, 5)
+        before = recorder.digest
+        record(recorder, model, 6, frames=1)
+        assert len({empty, before, recorder.digest}) == 3
+    with softmpm.Recorder(path, model, resume_before=6, resume_digest=before) as recorder:
+        assert recorder.digest == before
+        record(recorder, model, 7)
+        whole = recorder.digest
+    with softmpm.Recorder(tmp_path / "whole.h5", model) as recorder:
+        for iteration in (0, 5, 7):
+            record(recorder, model, iteration)
+        assert recorder.digest == whole
+    for other in (tmp_path / "whole.h5", None):
+        data = other.read_bytes() if other else b""
+        path.write_bytes(data)
+        with pytest.raises(
+            (ValueError, OSError), match=r"run\.h5 (does not hold what was recorded|is not a readable)"
+        ):
+            softmpm.Recorder(path, model, resume_before=6, resume_digest=empty)
+        assert path.read_bytes() == data
+
+
+def test_links_are_not_followed(tmp_path):
+    """A draft that is a link is removed; what it named stays as it was."""
+    (tmp_path / "other").write_bytes(b"precious")
+    (tmp_path / "run.h5.new").symlink_to(tmp_path / "other")
+    softmpm.Recorder(tmp_path / "run.h5", small_model()).close()
+    assert (tmp_path / "other").read_bytes() == b"precious" and not (tmp_path / "run.h5.new").is_symlink()
 
 
 def test_nothing_is_overwritten_by_accident(tmp_path):
@@ -302,7 +363,7 @@ class Countdown:
 
     def __call__(self, frame, event, _argument):
         place = (frame.f_code.co_filename, frame.f_lineno)
-        if not place[0].endswith(("recording.py", "layout.py")):
+        if not place[0].endswith(("recording.py", "recording_file.py", "layout.py")):
             return None
         if event == "line" and place not in self.seen:
             if len(self.seen) == self.lines:

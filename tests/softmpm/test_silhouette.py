@@ -1,12 +1,14 @@
 """Pictures to particles, from arrays, files and Pillow images alike."""
 
 import builtins
+import warnings
 
 import numpy as np
 import PIL.Image
 import pytest
 
 from softmpm.shapes import box, image
+from softmpm.silhouette import MOST_PIXELS
 
 L_SHAPE = np.array([[1, 0, 0], [1, 0, 0], [1, 1, 1]], dtype=bool)  # the top row first
 
@@ -138,9 +140,65 @@ def test_refuses(source, changes, message):
 
 
 def test_missing_file(tmp_path):
-    """A path without a file says so."""
-    with pytest.raises(FileNotFoundError, match="nothing.png"):
-        image(tmp_path / "nothing.png", (0, 0), height=1.0, spacing=0.1)
+    """A path without a file says so, also a folder."""
+    for path in (tmp_path / "nothing.png", tmp_path):
+        with pytest.raises(FileNotFoundError, match=rf"there is no picture file '{path}'\."):
+            image(path, (0, 0), height=1.0, spacing=0.1)
+
+
+def test_only_formats_of_pictures_are_opened(tmp_path, monkeypatch):
+    """PostScript by the name of a PNG would start another program; here it is refused, as is a file of random bytes."""
+    path = tmp_path / "robot.png"
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: pytest.fail("a program was started"))
+    for data in (POSTSCRIPT, bytes(range(256))):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"robot\.png' cannot be read as a picture.* PNG, JPEG"):
+            image(path, (0, 0), height=1.0, spacing=0.1)
+
+
+POSTSCRIPT = b"""%!PS-Adobe-3.0 EPSF-3.0
+%%BoundingBox: 0 0 10 10
+%%EndComments
+showpage
+%%EOF
+"""
+
+
+def test_a_large_picture_is_refused_before_it_is_decoded(tmp_path):
+    """A small file that unpacks to more pixels than the limit: named with its size and the limit, in no time."""
+    path = tmp_path / "large.png"
+    for width in (MOST_PIXELS // 1000 + 1, 10**5, 2 * 10**5):  # the last two are beyond Pillow's own limits
+        PIL.Image.new("1", (width, 1000)).save(path)
+        assert path.stat().st_size < 40_000
+        with pytest.raises(
+            ValueError, match=r"large\.png' (must have at most 33554432 pixels, got \d+ x 1000|is too large)"
+        ):
+            image(path, (0, 0), height=1.0, spacing=0.1)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg", "bmp", "gif", "tiff", "webp"])
+def test_damaged_pictures_are_named(tmp_path, kind):
+    """Cut anywhere or with a flipped bit: it is read, or refused with the name of the file."""
+    path = tmp_path / f"robot.{kind}"
+    PIL.Image.fromarray(np.kron(~L_SHAPE, np.ones((9, 9))).astype(np.uint8) * 255).save(path)
+    whole = path.read_bytes()
+    for place in np.linspace(0, len(whole) - 1, 60).astype(int):
+        for data in (whole[:place], whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :]):
+            path.write_bytes(data)
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "ignore"
+                )  # Pillow warns of notes beside the picture that it cannot read
+                said = refusal(path)
+            assert not said or "leaves no particle" in said or f"robot.{kind}" in said, said
+
+
+def refusal(path) -> str:
+    try:
+        image(path, (0, 0), height=1.0, spacing=0.1)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def test_without_pillow(monkeypatch, tmp_path):

@@ -1,6 +1,9 @@
 """Closed meshes to particles, against boxes, balls and solid angles."""
 
 import builtins
+import contextlib
+import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -139,6 +142,7 @@ def test_missing_file_and_library(monkeypatch, tmp_path):
         mesh(path, 0.1)
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize(
     "spoil, said",
     [
@@ -163,3 +167,29 @@ def test_a_mesh_moved_to_the_origin_is_taken():
     with pytest.raises(ValueError, match="apply_translation"):
         mesh(solid, 0.25)
     assert len(mesh(solid.apply_translation(-solid.centroid), 0.25)) == 64
+=======
+@pytest.mark.parametrize("kind", ["stl", "obj", "glb", "ply", "off"])
+def test_damaged_files_are_named(tmp_path, kind):
+    """Random bytes, cuts and flipped bits: the file is read, or refused in a sentence; never the error of a parser."""
+    path, chance = tmp_path / f"robot.{kind}", np.random.default_rng(0)
+    trimesh.creation.box().export(path)
+    whole = path.read_bytes()
+    for place in np.linspace(0, len(whole) - 1, 25).astype(int):
+        flipped = whole[:place] + bytes([whole[place] ^ 128]) + whole[place + 1 :]
+        for data in (whole[:place], flipped, chance.bytes(place)):
+            path.write_bytes(data)
+            with contextlib.suppress(ValueError, ImportError), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                closed_surface(path)
+
+
+def test_a_missing_part_of_trimesh_is_named(tmp_path, monkeypatch):
+    """Some files need more than trimesh itself: the error says which file, which package, and what installs it."""
+    path = tmp_path / "robot.obj"
+    path.write_bytes(b"\xff\xfe v")
+    monkeypatch.setitem(sys.modules, "charset_normalizer", None)
+    with pytest.raises(
+        ImportError, match=r"robot\.obj' needs the package charset_normalizer: pip install softmpm\[mesh\]"
+    ):
+        closed_surface(path)
+>>>>>>> files

@@ -17,8 +17,9 @@ from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
-from softmpm_learn.config import RunConf, check_keys, conf_dir, load, save, to_run
+from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
+from softmpm_learn.saved import load, save
 from softmpm_learn.tasks import TASKS, ArmConf, Resolution, make_task
 
 ROOT = Path(__file__).parents[2]
@@ -34,8 +35,9 @@ LEFT = (
 
 @pytest.fixture(autouse=True)
 def fresh_hydra(monkeypatch):
-    """Hydra keeps what it has composed; main() also sets an environment variable."""
+    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
     GlobalHydra.instance().clear()
     yield
     GlobalHydra.instance().clear()
@@ -78,7 +80,6 @@ def finished(tmp_path_factory):
     experiment.logger.addHandler(keep)
     experiment.logger.setLevel(logging.INFO)
     conf = to_run(composed(*TINY))
-    save(conf, folder / "config.yaml")
     experiment.run_experiment(conf, folder)
     experiment.logger.removeHandler(keep)
     return folder, "\n".join(said)
@@ -133,8 +134,8 @@ def test_plain_settings_reach_the_run():
 def test_a_saved_configuration_reads_back(tmp_path):
     """``config.yaml`` of a run gives the very same settings again."""
     conf = to_run(composed("task=biped", "task.young=4e4", "policy=linear", "learning=plain", "device=cpu"))
-    save(conf, tmp_path / "config.yaml")
-    assert load(tmp_path / "config.yaml") == conf
+    save(conf, tmp_path)
+    assert load(tmp_path) == conf
 
 
 def test_help_is_worth_reading(monkeypatch, capsys):
@@ -259,7 +260,38 @@ def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finis
     main(monkeypatch, *TINY, "train.iterations=3", f"hydra.run.dir={tmp_path}/whole")
     resumed, whole = (rows(tmp_path / name / "metrics.csv") for name in ("run", "whole"))
     assert resumed == whole and len(whole) == 3
-    assert load(tmp_path / "run" / "config.yaml").task.name == "arm"
+    assert load(tmp_path / "run").task.name == "arm"
+
+
+def test_a_refused_resume_changes_nothing(monkeypatch, capsys, tmp_path, finished):
+    """Refused for another precision, or because another run is writing, the run goes on as if nobody had asked."""
+    shutil.copytree(finished[0], tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
+    asked = (f"resume={tmp_path}/run", "train.iterations=9", "device.dtype=float64")
+    assert "dtype: torch.float32 then, torch.float64 now" in refusal(monkeypatch, capsys, *asked)
+    (tmp_path / "run" / "error.txt").unlink()
+    with checkpoint.locked(tmp_path / "run"):
+        assert "another run is writing" in refusal(monkeypatch, capsys, *asked)
+    assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
+
+
+def test_the_objective_is_part_of_a_run(monkeypatch, capsys, tmp_path, finished):
+    """A weight of the loss that was edited in config.yaml is refused: the numbers after it would be others."""
+    shutil.copytree(finished[0], tmp_path / "run")
+    path = tmp_path / "run" / "config.yaml"
+    path.write_text(path.read_text().replace("effort: 0.001", "effort: 0.5"))
+    said = refusal(monkeypatch, capsys, f"resume={tmp_path}/run")
+    assert "task.objective.terms[0].weight: 0.001 then, 0.5 now" in said
+
+
+def test_the_log_follows_the_run(monkeypatch, tmp_path, finished):
+    """It holds what was said from the start, and what a resumed run says comes after that."""
+    main(monkeypatch, *TINY, f"hydra.run.dir={tmp_path}/run")
+    first = (tmp_path / "run" / "softmpm_learn.log").read_text()
+    assert first.startswith("softmpm model: 2D") and "after 2 of 2 iterations" in first
+    main(monkeypatch, f"resume={tmp_path}/run", "train.iterations=3")
+    log = (tmp_path / "run" / "softmpm_learn.log").read_text()
+    assert log.startswith(first) and "Going on after iteration 2" in log and "after 3 of 3" in log
 
 
 def test_memory_is_for_a_whole_simulation():
@@ -272,7 +304,7 @@ def test_memory_is_for_a_whole_simulation():
 def test_resume_changes_nothing_but_what_may_change(tmp_path):
     """Iterations, recording and device may differ; another key is refused by name."""
     old = RunConf(task=ArmConf(young=4e4))
-    save(old, tmp_path / "config.yaml")
+    save(old, tmp_path)
     new = to_run(composed("task=elephant", "train.iterations=7", "device=cpu"))
     new.resume = str(tmp_path)
     conf = app.resumed(new, [f"resume={tmp_path}", "train.iterations=7", "device=cpu"])
@@ -280,6 +312,20 @@ def test_resume_changes_nothing_but_what_may_change(tmp_path):
     assert conf.resume is None and conf.train.seed == old.train.seed
     with pytest.raises(ValueError, match="may change, not train.seed"):
         app.resumed(new, ["train.seed=3"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_at_start_up_is_answered(tmp_path, number):
+    """While the program is imported, before Hydra or PyTorch is there: one sentence, and the exit code of the signal."""
+    code = (
+        "import os, runpy, signal, sys; sys.path.insert(0, sys.argv[1]); number = int(sys.argv[2])\n"
+        "sys.addaudithook(lambda event, args: event == 'import' and args[0] == 'torch' and os.kill(os.getpid(), number))\n"
+        "runpy.run_module('softmpm_learn', run_name='__main__')"
+    )
+    words = [sys.executable, "-c", code, str(ROOT / "src"), str(int(number))]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 128 + number and not list(tmp_path.iterdir())
+    assert done.stderr == "softmpm_learn: interrupted. No iteration had begun, so nothing is lost.\n"
 
 
 def test_ctrl_c_ends_cleanly_and_saves(tmp_path):
@@ -314,17 +360,15 @@ def test_an_interruption_elsewhere_says_how_to_go_on(monkeypatch, capsys, tmp_pa
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    for name, advice in (
-        ("run_experiment", f"resume={tmp_path}/run"),
-        ("to_run", "No iteration had begun."),
-    ):
-        monkeypatch.setattr(app, name, interrupted)
+    monkeypatch.setattr(experiment, "draw", interrupted)
+    for run, advice in (("run", f"resume={tmp_path}/run"), ("other", "No iteration had begun")):
         with pytest.raises(SystemExit) as caught:
-            main(monkeypatch, *TINY, f"hydra.run.dir={tmp_path}/run")
+            main(monkeypatch, *TINY, f"hydra.run.dir={tmp_path}/{run}")
         said = capsys.readouterr().err
         assert (
             caught.value.code == 130 and "interrupted." in said and advice in said and "Traceback" not in said
         )
+        monkeypatch.setattr(app, "to_run", interrupted)
 
 
 def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_path):

@@ -1,5 +1,7 @@
 import contextlib
+import hashlib
 import os
+import zipfile
 
 import pytest
 import torch
@@ -103,7 +105,7 @@ def test_other_formats_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "FORMAT", 99)
     path = checkpoint.save(tmp_path, content(1.0))
     monkeypatch.undo()
-    with pytest.raises(checkpoint.CheckpointError, match="format 99, this version reads 1"):
+    with pytest.raises(checkpoint.CheckpointError, match="format 99, this version reads 2"):
         checkpoint.read(path)
 
 
@@ -128,3 +130,22 @@ def test_one_run_at_a_time(tmp_path):
         pass
     with checkpoint.locked(tmp_path):
         pass
+
+
+def test_a_checkpoint_takes_no_more_memory_than_it_has_bytes(tmp_path):
+    """Numbers repeated by a stride of 0, compressed parts, and what is not finite are refused although the hash is right."""
+    for name, tensor in (("long", torch.zeros(1).expand(10**9)), ("nan", torch.tensor([1.0, float("nan")]))):
+        path = checkpoint.save(tmp_path, {"list": [{name: tensor}]})
+        with pytest.raises(checkpoint.CheckpointError, match=rf"list\[0\]\.{name} (of shape|is not finite)"):
+            checkpoint.read(path)
+    path = checkpoint.save(tmp_path, {"zeros": torch.zeros(10**6)})
+    with (
+        zipfile.ZipFile(path) as archive,
+        zipfile.ZipFile(tmp_path / "packed", "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for entry in archive.namelist():
+            packed.writestr(entry, archive.read(entry))
+    body = (tmp_path / "packed").read_bytes()[:-2] + (71).to_bytes(2, "little")
+    path.write_bytes(body + b"sha256=" + hashlib.sha256(body).hexdigest().encode())
+    with pytest.raises(checkpoint.CheckpointError, match="its parts are compressed"):
+        checkpoint.read(path)

@@ -15,7 +15,7 @@ def learner(folder, **changes) -> Learner:
     )
     with seeded(0):
         autoencoder = Autoencoder(2, (6, 5), 2, [4])
-    return Learner(conf, autoencoder, Replay(folder, simulations=8, validation=conf.validation))
+    return Learner(conf, autoencoder, Replay(folder, (5, 2, 6, 5), simulations=8, validation=conf.validation))
 
 
 def seen(number: int) -> torch.Tensor:

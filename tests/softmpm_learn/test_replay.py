@@ -1,9 +1,15 @@
+import hashlib
+import math
+import shutil
+
 import h5py
 import numpy as np
 import pytest
 import torch
 
-from softmpm_learn.replay import Replay
+from softmpm_learn.replay import Replay, ReplayError
+
+SHAPE = (3, 2, 5, 4)
 
 
 def pictures(number: int, frames=3) -> torch.Tensor:
@@ -12,7 +18,7 @@ def pictures(number: int, frames=3) -> torch.Tensor:
 
 
 def filled(folder, count: int, **settings) -> Replay:
-    replay = Replay(folder, **({"simulations": 10} | settings))
+    replay = Replay(folder, SHAPE, **({"simulations": 10} | settings))
     for number in range(count):
         replay.add(number, pictures(number))
     return replay
@@ -33,12 +39,11 @@ def test_validation_is_split_off_by_simulation(tmp_path):
 
 
 def test_sampling_is_even_over_pictures(tmp_path):
-    """A simulation with three times the pictures is drawn three times as often."""
-    replay = Replay(tmp_path, simulations=5, validation=0.1)
-    replay.add(0, pictures(0, frames=3))
-    replay.add(1, pictures(1, frames=9))
-    drawn = replay.sample(torch.Generator().manual_seed(0), 4000)[:, 0, 0, 0] >= 100
-    assert abs(drawn.float().mean() - 0.75) < 0.02
+    """Each frame of each simulation is drawn equally often."""
+    replay = filled(tmp_path, 4, validation=0.1)
+    drawn = replay.sample(torch.Generator().manual_seed(0), 4000)[:, 0, 0, 0].long()
+    counts = torch.bincount(100 * (drawn // 100) + drawn % 100)
+    assert (counts > 0).sum() == 12 and (counts[counts > 0] / 4000 - 1 / 12).abs().max() < 0.02
 
 
 def test_memory_is_bounded(tmp_path):
@@ -52,24 +57,29 @@ def test_memory_is_bounded(tmp_path):
 
 def test_comes_back_from_disk_exactly(tmp_path):
     """A replay loaded by ids holds the same bits of the same simulations."""
-    replay = Replay(tmp_path, simulations=10)
+    replay = Replay(tmp_path, SHAPE, simulations=10)
     generator = torch.Generator().manual_seed(0)
     for number in range(4):
         replay.add(number, torch.randn(3, 2, 5, 4, generator=generator))
-    other = Replay(tmp_path, simulations=10)
-    other.load([1, 2, 3])
-    assert other.ids == [1, 2, 3]
+    other = Replay(tmp_path, SHAPE, simulations=10)
+    seal = replay.seal
+    del seal[0]
+    other.load(seal)
+    assert other.ids == [1, 2, 3] and other.seal == seal
     for a, b in zip(replay.split("training")[1:], other.split("training"), strict=True):
         assert torch.equal(a, b)
 
 
 def test_prune_keeps_what_a_checkpoint_may_name(tmp_path):
-    """Eviction leaves the file; prune removes it once it is not named, and what an interrupted write left behind."""
+    """Eviction leaves the file; prune removes it once it is not named, what an interrupted write left, and no other files."""
     replay = filled(tmp_path, 5, simulations=2)
     assert len(list(tmp_path.iterdir())) == 5
     (tmp_path / "00000009.h5.new").write_bytes(b"half a file")
+    others = ["1.h5", "notes.new", "run.h5", "x00000001.h5"]
+    for name in others:
+        (tmp_path / name).write_bytes(b"somebody's")
     replay.prune([2, 3, 4])
-    assert sorted(p.name for p in tmp_path.iterdir()) == [f"0000000{k}.h5" for k in (2, 3, 4)]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [*(f"0000000{k}.h5" for k in (2, 3, 4)), *others]
 
 
 def test_numbers_go_up_and_empty_splits_say_so(tmp_path):
@@ -83,22 +93,58 @@ def test_numbers_go_up_and_empty_splits_say_so(tmp_path):
         replay.split("test")
 
 
-def test_damaged_and_foreign_files_are_refused(tmp_path):
-    """A missing file, a flipped byte, and a file that points elsewhere or declares too much are named, not read."""
-    secret = tmp_path / "secret.h5"
-    with h5py.File(secret, "w") as file:
-        file["velocity"] = np.zeros((3, 2, 5, 4), np.float32)
-    replay = filled(tmp_path / "replay", 4)
-    damaged, linked, huge = (replay.folder / f"0000000{k}.h5" for k in (0, 1, 2))
-    data = bytearray(damaged.read_bytes())
-    where = data.index(b"TREE")  # spoil the compressed data behind the chunk tree
-    data[-20] ^= 1
-    data[where + 600 :: 50] = bytes(b ^ 1 for b in data[where + 600 :: 50])
-    damaged.write_bytes(data)
-    with h5py.File(linked, "w") as file:
-        file["velocity"] = h5py.ExternalLink(str(secret), "velocity")
-    with h5py.File(huge, "w") as file:
-        file.create_dataset("velocity", (10**9, 2, 100, 100), np.float32, chunks=True)
-    for number in (0, 1, 2, 77):
-        with pytest.raises(ValueError, match=f"{number:08d}.h5 is not a readable simulation"):
-            Replay(replay.folder, simulations=5).load([number])
+def sealed(path, **content) -> dict[int, str]:
+    """Write a hostile file, and the seal that its maker would put into a checkpoint."""
+    with h5py.File(path, "w") as file:
+        for name, value in content.items():
+            file[name] = value
+    return {int(path.stem): hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+def test_another_file_than_the_sealed_one_is_refused(tmp_path):
+    """A missing file, one flipped bit anywhere, the file of another simulation: named, before HDF5 sees it."""
+    replay = filled(tmp_path, 2)
+    seal, whole = replay.seal, (tmp_path / "00000000.h5").read_bytes()
+    for place in range(0, len(whole), 97):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1
+        (tmp_path / "00000000.h5").write_bytes(spoilt)
+        with pytest.raises(
+            ReplayError, match=r"00000000\.h5 is not the simulation that the checkpoint names"
+        ):
+            Replay(tmp_path, SHAPE, simulations=5).load(seal)
+    shutil.copy(tmp_path / "00000001.h5", tmp_path / "00000000.h5")
+    with pytest.raises(ReplayError, match=r"00000000\.h5 .* damaged or of another run"):
+        Replay(tmp_path, SHAPE, simulations=5).load(seal)
+    with pytest.raises(ReplayError, match=r"00000077\.h5: No such file"):
+        Replay(tmp_path, SHAPE, simulations=5).load({77: ""})
+
+
+def test_hostile_files_are_refused(tmp_path):
+    """A file with the right hash that points elsewhere, declares too much, has another shape or no finite numbers is not read."""
+    with h5py.File(tmp_path / "secret.h5", "w") as file:
+        file["velocity"] = np.zeros(SHAPE, np.float32)
+    path = tmp_path / "00000000.h5"
+    for message, content in {
+        "no plain dataset": {"velocity": h5py.ExternalLink(str(tmp_path / "secret.h5"), "velocity")},
+        "float64 of shape": {"velocity": np.zeros(SHAPE)},
+        r"shape \(3, 2, 5, 5\)": {"velocity": np.zeros((3, 2, 5, 5), np.float32)},
+        r"shape \(\)": {"velocity": np.float32(1)},
+        "not finite": {"velocity": np.full(SHAPE, np.nan, np.float32)},
+    }.items():
+        with pytest.raises(ReplayError, match=rf"00000000\.h5 .*{message}"):
+            Replay(tmp_path, SHAPE, simulations=5).load(sealed(path, **content))
+    with h5py.File(path, "w") as file:
+        file.create_dataset("velocity", (10**6, 2, 5, 4), np.float32, chunks=True)
+    with pytest.raises(ReplayError, match=r"shape \(1000000, 2, 5, 4\)"):
+        Replay(tmp_path, SHAPE, simulations=5).load({0: hashlib.sha256(path.read_bytes()).hexdigest()})
+
+
+def test_limits_of_memory_hold_when_loading(tmp_path):
+    """More simulations than the buffer may hold, by number or by megabytes, are refused before a file is opened."""
+    seal = filled(tmp_path, 4).seal
+    size = 4e-6 * math.prod(SHAPE)
+    for limits in (dict(simulations=3), dict(simulations=9, megabytes=3.5 * size)):
+        with pytest.raises(ReplayError, match="names 4 simulations"):
+            Replay(tmp_path, SHAPE, **limits).load(seal)
+    Replay(tmp_path, SHAPE, simulations=4, megabytes=4 * size).load(seal)

@@ -8,11 +8,13 @@ import sys
 import weakref
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import softmpm
 from softmpm_learn import checkpoint, train
+from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 from softmpm_learn.table import Table
 
@@ -151,6 +153,112 @@ def test_falls_back_to_the_previous_checkpoint(task, model, settings, tmp_path):
     (out / checkpoint.NAME).write_bytes(b"spoilt")
     train.train(task, model, small, out)
     assert_same(out, tmp_path / "small")
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "timing.csv", "run.h5", "replay/00000002.h5"])
+@pytest.mark.parametrize("harm", ["flipped bit", "of another run", "empty"])
+def test_files_that_are_not_those_of_the_checkpoint_are_refused(task, model, settings, tmp_path, name, harm):
+    """A damaged file or that of another run is named; with the right one in its place the run goes on to the same end."""
+    conf = copy_of(settings, train=dict(record_every=1, iterations=3))
+    for seed, run in enumerate(("run", "other")):
+        train.train(task, model, copy_of(conf, train=dict(seed=seed)), tmp_path / run)
+    path, right = tmp_path / "run" / name, (tmp_path / "run" / name).read_bytes()
+    if harm == "flipped bit":
+        flip(path)
+    else:
+        path.write_bytes((tmp_path / "other" / name).read_bytes() if harm == "of another run" else b"")
+    began = []
+    with pytest.raises(ValueError, match=f"{path}"):
+        train.train(task, model, conf, tmp_path / "run", begin=lambda: began.append(1))
+    assert not began
+    path.write_bytes(right)
+    longer = copy_of(conf, train=dict(iterations=5))
+    train.train(task, model, longer, tmp_path / "run")
+    train.train(task, model, longer, tmp_path / "whole")
+    assert_same(tmp_path / "run", tmp_path / "whole")
+
+
+def test_what_was_moved_away_is_begun_anew(task, model, settings, unbroken, tmp_path, caplog):
+    """Tables and recording are not needed to go on: without them the rest is the same, and the log says what is lost."""
+    conf = copy_of(settings, train=dict(record_every=1, iterations=3))
+    train.train(task, model, conf, tmp_path / "run")
+    (tmp_path / "run" / "run.h5").write_bytes(b"spoilt")
+    with pytest.raises(ValueError, match=r"Move .*run\.h5 away to go on"):
+        train.train(task, model, copy_of(conf, train=dict(iterations=5)), tmp_path / "run")
+    for name in ("run.h5", "metrics.csv", "timing.csv"):
+        (tmp_path / "run" / name).rename(tmp_path / name)
+    train.train(task, model, copy_of(conf, train=dict(iterations=5)), tmp_path / "run")
+    assert rows(tmp_path / "run") == rows(unbroken)[3:]
+    for name in ("run.h5", "metrics.csv", "timing.csv"):
+        assert f"{name} is missing" in caplog.text
+    with softmpm.Recording(tmp_path / "run" / "run.h5") as recording:
+        assert list(recording.episodes) == [3, 4, 5]
+
+
+def test_a_recording_outlives_a_part_that_records_nothing(task, model, settings, tmp_path):
+    """What was recorded before is the run's own afterwards too."""
+    for iterations, every in ((2, 1), (3, 0), (4, 1)):
+        conf = copy_of(settings, train=dict(iterations=iterations, record_every=every))
+        train.train(task, model, conf, tmp_path)
+    with softmpm.Recording(tmp_path / "run.h5") as recording:
+        assert list(recording.episodes) == [0, 1, 3, 4]
+
+
+@pytest.mark.parametrize("change", ["objective", "regions", "body_length", "goal"])
+def test_another_task_does_not_resume(task, model, settings, unbroken, change):
+    """Whatever of a task reaches the numbers is part of the run, not its scene alone."""
+    other = {
+        "objective": Progress(terms=(Effort(0.5),)),
+        "regions": task.regions | {"left": np.arange(11)},
+        "body_length": 0.5,
+        "goal": None,
+    }
+    with pytest.raises(ValueError, match=rf"task\.{change}.* then, .* now"):
+        train.train(dataclasses.replace(task, **{change: other[change]}), model, settings, unbroken)
+
+
+def test_a_checkpoint_of_something_else_is_refused(task, model, settings, tmp_path):
+    """With a hash that is right, but another shape, a part that is missing or of another kind: named, in a sentence."""
+    train.train(task, model, copy_of(settings, train=dict(iterations=2)), tmp_path)
+    good = checkpoint.load(tmp_path)
+    moments = good["optimizer"]["state"]
+    bad = [
+        {"iteration": -1},
+        {"iteration": "2"},
+        {"seals": 7},
+        {"best": {"loss": 0.0, "iteration": 1}},
+        {"safe": [torch.zeros(3)]},
+        {"policy": {}},
+        {"learner": None},
+        {"about": "[]"},
+        {"optimizer": good["optimizer"] | {"state": {k: v | {"exp_avg": torch.zeros(1)} for k, v in moments.items()}}},
+    ]  # fmt: skip
+    for change in bad:
+        checkpoint.save(tmp_path, good | change)
+        with pytest.raises(checkpoint.CheckpointError, match=f"the checkpoint in {tmp_path} does not hold"):
+            train.train(task, model, settings, tmp_path)
+    checkpoint.save(tmp_path, good)
+    assert train.train(task, model, settings, tmp_path).finished
+
+
+@pytest.mark.parametrize("name", [".lock", "metrics.csv.new", "checkpoint.pt", "replay"])
+def test_a_folder_with_links_is_refused(task, model, settings, tmp_path, name):
+    """Before anything is opened, written or removed where the link leads."""
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "00000000.h5").write_bytes(b"precious")
+    (tmp_path / "run").mkdir()
+    target = tmp_path / "other" if name == "replay" else tmp_path / "other" / "00000000.h5"
+    (tmp_path / "run" / name).symlink_to(target)
+    with pytest.raises(ValueError, match=f"{name} is a link"):
+        train.train(task, model, settings, tmp_path / "run")
+    assert (tmp_path / "other" / "00000000.h5").read_bytes() == b"precious"
+    assert len(list((tmp_path / "other").iterdir())) == 1
 
 
 def test_stops_when_asked_and_goes_on(task, model, settings, unbroken, tmp_path):

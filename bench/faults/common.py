@@ -1,0 +1,219 @@
+"""What the fault scripts share: the smallest run that has every phase, forked children to run it in, tables of outcomes."""
+
+import argparse
+import collections
+import contextlib
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+import softmpm
+from softmpm_learn import app, checkpoint, experiment
+
+TINY = [
+    *("task=arm", "experiment=smoke", "task.seconds=0.025", "task.control_period=0.0125", "device=cpu"),
+    *("task.young=1e3", "task.strength=50", "task.safety=0.8"),  # so soft that two substeps will do
+    *("learning.epochs=1", "learning.batches=1", "learning.simulations=2", "train.iterations=4"),
+]
+LIMIT = 60.0
+"""A child that lives longer [s] counts as hung; an undisturbed one takes about a second."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a child ended."""
+
+    code: int
+    """Exit code; minus the signal that killed it."""
+    said: str
+    """Its stdout and stderr."""
+    hung: bool
+
+
+def forked(work: Callable[[], None], during: Callable[[int], None] = lambda pid: None, limit=LIMIT) -> Ended:
+    """Run ``work`` in a child, and ``during`` with its process id meanwhile in this process."""
+    with tempfile.TemporaryFile() as said:
+        pid = os.fork()
+        if pid == 0:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+            os._exit(_code_of(work))
+        during(pid)
+        end = time.monotonic() + limit
+        while (found := os.waitpid(pid, os.WNOHANG)) == (0, 0) and time.monotonic() < end:
+            time.sleep(0.005)
+        hung = found == (0, 0)
+        if hung:
+            os.kill(pid, signal.SIGKILL)
+            found = os.waitpid(pid, 0)
+        said.seek(0)
+        text = said.read().decode(errors="replace")
+    return Ended(os.waitstatus_to_exitcode(found[1]), text, hung)
+
+
+def _code_of(work: Callable[[], None]) -> int:
+    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+    code = 0
+    try:
+        work()
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 1
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        code = 70
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return code
+
+
+def program(*arguments: str, pictures: bool = False) -> Callable[[], None]:
+    """``python -m softmpm_learn`` with these arguments, for a child."""
+
+    def work() -> None:
+        if not pictures:
+            experiment.draw, experiment.convert = lambda *_: None, lambda *_: "nothing"
+        GlobalHydra.instance().clear()
+        sys.argv = ["softmpm_learn", *arguments]
+        app.main()
+
+    return work
+
+
+def fresh(folder: Path) -> Callable[[], None]:
+    """The smallest run, into this folder."""
+    return program(*TINY, f"hydra.run.dir={folder}")
+
+
+def resume(folder: Path, *more: str) -> Callable[[], None]:
+    """Go on with the run in this folder."""
+    return program(f"resume={folder}", *more)
+
+
+@contextlib.contextmanager
+def workshop() -> Iterator[Path]:
+    """An empty folder, removed at the end; one thread, so that equal runs have equal bits."""
+    torch.set_num_threads(1)
+    folder = Path(tempfile.mkdtemp(prefix="faults-"))
+    here = os.getcwd()
+    os.chdir(folder)
+    try:
+        yield folder
+    finally:
+        os.chdir(here)
+        shutil.rmtree(folder)
+
+
+def fingerprint(folder: Path) -> dict[str, object]:
+    """What two equal runs have equal, to the bit: metrics, checkpoint, replay buffer and recorded numbers."""
+    saved = checkpoint.load(folder)
+    found: dict[str, object] = {"metrics.csv": (folder / "metrics.csv").read_bytes()}
+    found |= {f"checkpoint {k}": v for k, v in _flat(saved)}
+    for path in sorted((folder / "replay").iterdir()):
+        found[path.name] = path.read_bytes()
+    with softmpm.Recording(folder / "run.h5") as recording:
+        for iteration in recording.episodes:
+            for name, values in recording.frames(iteration).items():
+                found[f"episode {iteration} {name}"] = values.tobytes()
+        for name, columns in recording.scalars.items():
+            found[f"scalar {name}"] = tuple(column.tobytes() for column in columns)
+    return found
+
+
+def _flat(value: object, path: str = "") -> Iterable[tuple[str, object]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flat(item, f"{path}.{key}")
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            yield from _flat(item, f"{path}[{k}]")
+    else:
+        yield path, (value.numpy().tobytes() if isinstance(value, torch.Tensor) else repr(value))
+
+
+def killed_run(folder: Path, rows: int = 3) -> None:
+    """A run killed by SIGKILL once metrics.csv has so many rows."""
+
+    def kill(pid: int) -> None:
+        metrics = folder / "metrics.csv"
+        while not (metrics.exists() and metrics.read_text().count("\n") > rows):
+            time.sleep(0.002)
+        os.kill(pid, signal.SIGKILL)
+
+    ended = forked(fresh(folder), kill)
+    assert ended.code == -signal.SIGKILL, ended.said
+
+
+def same(folder: Path, whole: dict[str, object]) -> str:
+    """``same``, or the first thing that differs."""
+    found = fingerprint(folder)
+    for name in whole.keys() | found.keys():
+        if whole.get(name) != found.get(name):
+            return f"differs: {name}"
+    return "same"
+
+
+def unclear(said: str) -> bool:
+    """Whether an error says too little: a traceback, a fault of the program, a bare number of an error."""
+    words = ("Traceback", "fault of the program", "[Errno", "ModuleNotFoundError")
+    return any(word in said for word in words)
+
+
+class Table:
+    """Outcomes of trials, counted by kind."""
+
+    def __init__(self, title: str, bad: Iterable[str]):
+        self.title, self.bad = title, tuple(bad)
+        self.counts: dict[str, collections.Counter] = {}
+        self.details: list[str] = []
+
+    def add(self, row: str, outcome: str, detail: str = "") -> None:
+        """One trial of a row; ``outcome`` is a column."""
+        self.counts.setdefault(row, collections.Counter())[outcome] += 1
+        if outcome in self.bad:
+            self.details.append(f"{row}: {outcome}: {detail.strip()[-600:]}")
+
+    def total(self, outcome: str | None = None) -> int:
+        return sum(c.total() if outcome is None else c[outcome] for c in self.counts.values())
+
+    @property
+    def failures(self) -> int:
+        """Trials with a bad outcome."""
+        return sum(self.total(outcome) for outcome in self.bad)
+
+    def __str__(self) -> str:
+        columns = list(dict.fromkeys([*(o for c in self.counts.values() for o in c), *self.bad]))
+        width = max(map(len, [*self.counts, "total"]))
+        lines = [f"{self.title}: {self.total()} trials, {self.failures} bad"]
+        lines += ["  ".join([" " * width, "trials", *columns])]
+        for row, count in [*self.counts.items(), ("total", None)]:
+            cells = [self.total(c) if count is None else count[c] for c in columns]
+            trials = self.total() if count is None else count.total()
+            numbers = [f"{n:>{len(c)}}" for n, c in zip([trials, *cells], ["trials", *columns], strict=True)]
+            lines.append("  ".join([f"{row:<{width}}", *numbers]))
+        return "\n".join([*lines, *self.details])
+
+
+def damaged(data: bytes, chance: random.Random) -> bytes:
+    """The bytes with one bit flipped."""
+    spoilt = bytearray(data)
+    spoilt[chance.randrange(len(spoilt))] ^= 1 << chance.randrange(8)
+    return bytes(spoilt)
+
+
+def report(main: Callable[[float], Table]) -> None:
+    """Print the table of a script, and end with exit code 1 if a trial had a bad outcome."""
+    parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__)
+    parser.add_argument("--short", action="store_true", help="one trial of ten")
+    table = main(0.1 if parser.parse_args().short else 1.0)
+    print(table)
+    raise SystemExit(1 if table.failures else 0)

@@ -1,0 +1,50 @@
+"""Digest of what a recording holds, the same for equal contents however HDF5 stores them.
+
+A run that goes on can tell by it that a file is its own: it holds the same simulations, frames and numbers, to the bit.
+"""
+
+import hashlib
+import struct
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+
+class Hash(Protocol):
+    """Of :mod:`hashlib`."""
+
+    def update(self, data: bytes, /) -> None: ...
+
+    def hexdigest(self) -> str: ...
+
+
+class Content:
+    """SHA-256 of each simulation and of each scalar, fed in the order in which they are recorded."""
+
+    def __init__(self):
+        self._episodes: dict[int, Hash] = {}
+        self._scalars: dict[bytes, Hash] = {}
+
+    def episode(self, iteration: int, attributes: bytes) -> Hash:
+        """Begin a simulation, in the place of an earlier one of this iteration; for :meth:`frame`."""
+        self._episodes[iteration] = hashlib.sha256(attributes)
+        return self._episodes[iteration]
+
+    @staticmethod
+    def frame(episode: Hash, time: float, values: Mapping[str, np.ndarray]) -> None:
+        """Add one frame to its simulation."""
+        episode.update(struct.pack("<d", time))
+        for name in sorted(values):
+            episode.update(name.encode() + np.ascontiguousarray(values[name], "<f4").tobytes())
+
+    def scalar(self, iteration: int, name: bytes, value: float) -> None:
+        """Add one number."""
+        self._scalars.setdefault(name, hashlib.sha256()).update(struct.pack("<qd", iteration, value))
+
+    def hexdigest(self) -> str:
+        """One digest of all."""
+        whole = hashlib.sha256()
+        for key, part in [*sorted(self._episodes.items()), *sorted(self._scalars.items())]:
+            whole.update(f"{key!r} {part.hexdigest()}\n".encode())
+        return whole.hexdigest()

@@ -1,0 +1,69 @@
+"""Identity of a run as one flat level of JSON: what a resumed run must share, or its numbers would be others."""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator
+from enum import Enum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softmpm import Model
+from softmpm_learn.settings import Settings
+
+if TYPE_CHECKING:
+    from softmpm_learn.tasks.task import Task
+
+MAY_CHANGE = ("iterations", "record_every", "frame_every")
+"""Settings of TrainConf that a resumed run may have different."""
+
+
+def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object]:
+    """Settings, task and scene by name; arrays by a short digest."""
+    flat: dict[str, object] = {}
+    for group, values in dataclasses.asdict(settings).items():
+        names = [n for n in values if not (group == "train" and n in MAY_CHANGE)]
+        flat |= {f"{group}.{name}": values[name] for name in names}
+    for field in dataclasses.fields(task):
+        if field.name != "scene":
+            flat |= dict(_described(f"task.{field.name}", getattr(task, field.name)))
+    flat["dtype"] = str(model.dtype)
+    flat["scene"] = _digest(model)
+    return flat
+
+
+def _described(name: str, value: object) -> Iterator[tuple[str, object]]:
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(repr((value.dtype.str, value.shape)).encode() + value.tobytes())
+        yield name, digest.hexdigest()[:16]
+    elif dataclasses.is_dataclass(value):
+        yield name, type(value).__name__
+        for field in dataclasses.fields(value):
+            yield from _described(f"{name}.{field.name}", getattr(value, field.name))
+    elif isinstance(value, dict):
+        for key in value:
+            yield from _described(f"{name}.{key}", value[key])
+    elif isinstance(value, (list, tuple)):
+        yield name, len(value)
+        for k, item in enumerate(value):
+            yield from _described(f"{name}[{k}]", item)
+    elif isinstance(value, Enum) or value is None or isinstance(value, (str, bool)):
+        yield name, getattr(value, "name", value)
+    elif isinstance(value, (int, float, np.number)):
+        yield name, value.item() if isinstance(value, np.number) else value
+    else:
+        raise TypeError(
+            f"{name} must be made of numbers, texts, arrays and dataclasses, got {type(value).__name__}."
+        )
+
+
+def _digest(model: Model) -> str:
+    """A short name of a scene: another one if any of its numbers is."""
+    scene, digest = model.scene, hashlib.sha256()
+    for tensor in (model.positions, model.volume, *model.params()):
+        digest.update(tensor.cpu().numpy().tobytes())
+    for muscle in scene.muscles:
+        digest.update(muscle.particles.tobytes() + repr((muscle.direction, muscle.strength)).encode())
+    digest.update(repr([(len(body.particles), body.material) for body in scene.bodies]).encode())
+    digest.update(repr((scene.grid, scene.walls, scene.gravity, scene.damping, scene.dt)).encode())
+    return digest.hexdigest()[:16]
