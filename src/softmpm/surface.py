@@ -40,20 +40,17 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
         np.ndim(getattr(source, "faces", None)) == 2 and len(source.faces) > 0,
         f"mesh needs a path or a trimesh.Trimesh with faces, got {type(source).__name__}.",
     )
-<<<<<<< HEAD
     vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)
+    need(
+        0 <= faces.min() <= faces.max() < len(vertices),
+        f"the mesh's faces must be made of its {len(vertices)} vertices, got vertex {faces.max()}.",
+    )
     size = float(np.ptp(vertices, axis=0).min())
     need(
         bool(np.isfinite(vertices).all()) and size > 1e-6 * np.abs(vertices).max(),
         f"the mesh's vertices must be finite and not lie farther from the origin than a million times its smallest side, got "
         f"{np.abs(vertices).max():.4g} m and {size:.4g} m: check its units, or move it to the origin with "
         "apply_translation(-mesh.centroid).",
-=======
-    need(
-        bool(np.isfinite(source.vertices).all())
-        and 0 <= source.faces.min() <= source.faces.max() < len(source.vertices),
-        "the mesh's vertices must be finite, and its faces made of them.",
->>>>>>> files
     )
     if not source.is_watertight:
         _, joined = np.unique(np.asarray(source.edges_sorted), axis=0, return_counts=True)

@@ -142,7 +142,6 @@ def test_missing_file_and_library(monkeypatch, tmp_path):
         mesh(path, 0.1)
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize(
     "spoil, said",
     [
@@ -167,7 +166,8 @@ def test_a_mesh_moved_to_the_origin_is_taken():
     with pytest.raises(ValueError, match="apply_translation"):
         mesh(solid, 0.25)
     assert len(mesh(solid.apply_translation(-solid.centroid), 0.25)) == 64
-=======
+
+
 @pytest.mark.parametrize("kind", ["stl", "obj", "glb", "ply", "off"])
 def test_damaged_files_are_named(tmp_path, kind):
     """Random bytes, cuts and flipped bits: the file is read, or refused in a sentence; never the error of a parser."""
@@ -192,4 +192,3 @@ def test_a_missing_part_of_trimesh_is_named(tmp_path, monkeypatch):
         ImportError, match=r"robot\.obj' needs the package charset_normalizer: pip install softmpm\[mesh\]"
     ):
         closed_surface(path)
->>>>>>> files
