@@ -1,5 +1,7 @@
 """Scenes and comparisons that several tests share."""
 
+import dataclasses
+
 import numpy as np
 import torch
 
@@ -52,6 +54,21 @@ def busy_scene(
         dt=dt,
     )
     return softmpm.Scene(**(settings | changes))
+
+
+def bar(law="neo_hookean", spacing=1 / 64, **changes) -> softmpm.Scene:
+    """A free bar of 1/2 × 1/8 m, a muscle along each half, on cells of 1/32 m."""
+    shape = softmpm.box((0.25, 0.45), (0.75, 0.575), spacing=spacing)
+    x = shape.positions[:, 0]
+    halves = [np.flatnonzero(x < 0.5), np.flatnonzero(x >= 0.5)]
+    settings = dict(
+        grid=softmpm.Grid(shape=(33, 33), spacing=1 / 32),
+        bodies=[softmpm.Body(shape, LAWS[law](density=1.0, young=100.0, poisson=0.3))],
+        muscles=[softmpm.Muscle(particles=half, direction=(1.0, 0.0), strength=30.0) for half in halves],
+        dt=1.0,
+    )
+    scene = softmpm.Scene(**(settings | changes))
+    return dataclasses.replace(scene, dt=0.4 * softmpm.stable_dt(scene))
 
 
 def busy_inputs(model: softmpm.Model, control_steps=2, seed=1) -> dict[str, torch.Tensor]:

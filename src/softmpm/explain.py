@@ -15,9 +15,8 @@ from softmpm.state import State
 from softmpm.watch import Kind
 
 GRID = "Make the grid larger, add walls, or start further inside."
-GENTLER = (
-    "Use a smaller dt (about half of softmpm.stable_dt), a weaker activation or load, or a stiffer material"
-)
+GENTLER = "Use a stiffer material, or a weaker activation or load"
+FINER = "a smaller dt (about half of softmpm.stable_dt)"
 
 
 @dataclass
@@ -70,7 +69,7 @@ class Case:
 
     def _left_grid(self) -> tuple[str, str, str, str]:
         thrown = self._away() > self._spacing  # it was on the grid a substep before
-        advice = f"It was thrown out. {GENTLER}." if thrown else GRID
+        advice = f"It was thrown out. Use {FINER}. {GENTLER}." if thrown else GRID
         x = ", ".join(f"{c:.4g}" for c in self.end.x[self.world, self.particle].tolist())
         return "left_grid", f"is at ({x}) m, off the grid", self._box(), advice
 
@@ -81,7 +80,11 @@ class Case:
         law = type(self.model.scene.bodies[int(self.model.body[self.particle])].material).__name__
         if inverted:
             limit += f"; the stress of {law} {'is not meant for' if self._survives() else 'does not exist beyond'} 0"
-        advice = f"{GENTLER}; softmpm.BarrierCorotated resists compression"
+        advice = (
+            f"{GENTLER}, or {FINER}" if inverted else GENTLER
+        )  # a body that collapses step by step does so at any dt
+        if law != "BarrierCorotated":
+            advice += "; softmpm.BarrierCorotated resists compression"
         if self._survives():
             advice += "; alarms=softmpm.Alarms(collapse=None) lets it invert"
         what = "is inverted" if inverted else "has collapsed"
@@ -97,8 +100,7 @@ class Case:
         limit = (
             f"neighbours must stay within {most:.4g} cells, since a body breaks beyond (numerical fracture)"
         )
-        advice = "Use a stiffer material, a weaker activation or load, or particles nearer together"
-        return "torn", value, limit, advice + " (a smaller spacing of the shape on the same grid)."
+        return "torn", value, limit, f"{GENTLER}."
 
     def _step(self) -> tuple[str, str, str, str]:
         scene, most = self.model.scene, self.model.alarms.step or 1.0
@@ -116,7 +118,7 @@ class Case:
         what = (
             f"has a value in {', '.join(bad)} that is not finite" if bad else "has values too large to square"
         )
-        return "not_finite", what, "every value must be finite, and its square", f"{GENTLER}."
+        return "not_finite", what, "every value must be finite, and its square", f"Use {FINER}. {GENTLER}."
 
     @property
     def _spacing(self) -> float:

@@ -6,26 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import LAWS
+from helpers import LAWS, bar
 
 import softmpm
 from softmpm import reference
 from softmpm.stability import running_limit
-
-
-def bar(law="neo_hookean", spacing=1 / 64, **changes) -> softmpm.Scene:
-    """A free bar of 1/2 × 1/8 m, a muscle along each half, on cells of 1/32 m."""
-    shape = softmpm.box((0.25, 0.45), (0.75, 0.575), spacing=spacing)
-    x = shape.positions[:, 0]
-    halves = [np.flatnonzero(x < 0.5), np.flatnonzero(x >= 0.5)]
-    settings = dict(
-        grid=softmpm.Grid(shape=(33, 33), spacing=1 / 32),
-        bodies=[softmpm.Body(shape, LAWS[law](density=1.0, young=100.0, poisson=0.3))],
-        muscles=[softmpm.Muscle(particles=half, direction=(1.0, 0.0), strength=30.0) for half in halves],
-        dt=1.0,
-    )
-    scene = softmpm.Scene(**(settings | changes))
-    return dataclasses.replace(scene, dt=0.4 * softmpm.stable_dt(scene))
 
 
 def run(model, start=None, activation=None, substeps=100, **options):
