@@ -60,7 +60,7 @@ def alarm(spec: Spec) -> SimpleNamespace:
             alpha = wp.ddot(G, A)
             pivot = alpha - limit - beta * beta / pivot
             if pivot > real(0.0):
-                return True
+                return wp.isfinite(pivot)
             A = A - alpha * G - beta * before
             beta = wp.sqrt(wp.ddot(A, A))
             before = G
