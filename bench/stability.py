@@ -33,7 +33,10 @@ def main():
     args = arguments()
     if args.draw:
         draw(PAGES, json.loads(args.draw.read_text())["cells"], IMAGES)
-        draw_limit(json.loads(args.draw.with_stem(f"running_{args.draw.stem}").read_text())["rows"], IMAGES)
+        draw_limit(
+            json.loads(args.draw.with_name(args.draw.name.replace(".", ".running.", 1)).read_text())["rows"],
+            IMAGES,
+        )
         return
     how = How(args.device, longest=int(args.longest))
     print(f"Maps of the extremes ({machine(torch.device(args.device))})")

@@ -23,9 +23,9 @@ COLOURS = {
     Outcome.SILENT: "#c4453a",
 }
 MEANINGS = {
-    Outcome.RIGHT: "right (number: least det F)",
-    Outcome.REFUSED: "refused by name (ValueError)",
-    Outcome.STOPPED: "stopped by name (UnstableError, its kind)",
+    Outcome.RIGHT: "right (least det F)",
+    Outcome.REFUSED: "refused by name",
+    Outcome.STOPPED: "stopped by name (UnstableError, its kind; * right without alarms)",
     Outcome.SILENT: "silently wrong",
 }
 SHORT = {
@@ -94,7 +94,7 @@ def draw_row(axes: Axes, row: Row, cells: list[dict]) -> None:
         axes.text(
             column + 0.5,
             line + 0.52,
-            NOTES.get(cell["note"], cell["note"]),
+            NOTES.get(cell["note"], cell["note"]) + "*" * (cell.get("without alarms") == Outcome.RIGHT),
             ha="center",
             va="center",
             fontsize=7.5,
