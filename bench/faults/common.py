@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import logging
+import math
 import os
 import random
 import resource
@@ -17,6 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -25,7 +27,7 @@ from hydra.core.global_hydra import GlobalHydra
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
 from softmpm_learn.config import RunConf, conf_dir, to_run
-from softmpm_learn.stop import Signals
+from softmpm_learn.stop import SIGNALS, Signals
 
 TINY = [
     *("task=arm", "experiment=smoke", "task.seconds=0.025", "task.control_period=0.0125", "device=cpu"),
@@ -51,21 +53,28 @@ class Ended:
 
 def forked(work: Callable[[], None], during: Callable[[int], None] = lambda pid: None, limit=LIMIT) -> Ended:
     """Run ``work`` in a child, and ``during`` with its process id meanwhile in this process."""
-    with tempfile.TemporaryFile() as said:
-        pid = os.fork()
-        if pid == 0:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
-            os._exit(_code_of(work))
-        during(pid)
-        end = time.monotonic() + limit
-        while (found := os.wait4(pid, os.WNOHANG))[0] == 0 and time.monotonic() < end:
-            time.sleep(0.005)
-        hung = found[0] == 0
-        if hung:
-            os.kill(pid, signal.SIGKILL)
-            found = os.wait4(pid, 0)
-        said.seek(0)
+    ears, mouth = os.pipe()  # holds 64 kB; a file would be subject to a limit on the size of files
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the child answers them
+    pid = os.fork()
+    if pid == 0:
+        code = 70
+        try:
+            os.dup2(mouth, 1)
+            os.dup2(mouth, 2)
+            code = _code_of(work)
+        finally:
+            os._exit(code)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    os.close(mouth)
+    during(pid)
+    end = time.monotonic() + limit
+    while (found := os.wait4(pid, os.WNOHANG))[0] == 0 and time.monotonic() < end:
+        time.sleep(0.005)
+    hung = found[0] == 0
+    if hung:
+        os.kill(pid, signal.SIGKILL)
+        found = os.wait4(pid, 0)
+    with os.fdopen(ears, "rb") as said:
         text = said.read().decode(errors="replace")
     here = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     megabytes = (found[2].ru_maxrss - here) * 1024 / 1e6
@@ -94,6 +103,7 @@ def program(*arguments: str) -> Callable[[], None]:
         GlobalHydra.instance().clear()
         signals = Signals()
         signals.install()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         sys.argv = ["softmpm_learn", *arguments]
         app.main(signals)
 
@@ -243,6 +253,14 @@ class Table:
         return "\n".join([*lines, *self.details])
 
 
+T = TypeVar("T")
+
+
+def some(trials: list[T], share: float) -> list[T]:
+    """So many of them, always the same; all for a share of 1."""
+    return trials if share == 1.0 else random.Random(0).sample(trials, math.ceil(len(trials) * share))
+
+
 def damaged(data: bytes, chance: random.Random) -> bytes:
     """The bytes with one bit flipped."""
     spoilt = bytearray(data)
@@ -250,10 +268,14 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
     return bytes(spoilt)
 
 
-def report(main: Callable[[float], Table]) -> None:
-    """Print the table of a script, and end with exit code 1 if a trial had a bad outcome."""
+def report(*rounds: Callable[[float], Table]) -> None:
+    """Print the tables of some scripts, and end with exit code 1 if a trial had a bad outcome."""
     parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__)
-    parser.add_argument("--short", action="store_true", help="one trial of ten")
-    table = main(0.1 if parser.parse_args().short else 1.0)
-    print(table)
-    raise SystemExit(1 if table.failures else 0)
+    parser.add_argument("--share", type=float, default=1.0, help="share of the trials, 1 for all")
+    share = parser.parse_args().share
+    failures = 0
+    for main in rounds:
+        table = main(share)
+        print(table, flush=True)
+        failures += table.failures
+    raise SystemExit(1 if failures else 0)

@@ -2,7 +2,7 @@
 
 It must be refused with the file's name, or say what is lost, or end with the numbers of an undisturbed run.
 
-    python -m bench.faults.corruption [--short]
+    python -m bench.faults.corruption [--share 0.1]
 """
 
 import random
@@ -24,12 +24,9 @@ def main(share: float = 1.0) -> common.Table:
     table = common.Table("corrupted run folders", ["silently different", "unclear", "hang"])
     with common.workshop() as folder:
         whole = prepare(folder)
-        for name in FILES:
-            trials = harms(folder, name)
-            for kind, data in (
-                trials if share == 1.0 else random.Random(name).sample(trials, round(22 * share))
-            ):
-                table.add(name, *outcome(folder, name, kind, data, whole))
+        trials = [(name, kind, data) for name in FILES for kind, data in harms(folder, name)]
+        for name, kind, data in common.some(trials, share):
+            table.add(name, *outcome(folder, name, kind, data, whole))
     return table
 
 

@@ -3,13 +3,12 @@
 Nothing may be written or deleted outside the folder, no variable of the environment may leak into it, nothing may hang or fill the
 memory, and each refusal names the file.
 
-    python -m bench.faults.hostile [--short]
+    python -m bench.faults.hostile [--share 0.1]
 """
 
 import hashlib
 import io
 import os
-import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -60,12 +59,12 @@ def main(share: float = 1.0) -> common.Table:
     with common.workshop() as folder:
         ended = common.forked(common.fresh(folder / "run"))
         assert ended.code == 0, ended.said
-        for kind, name, harm in sample(share):
+        for kind, name, harm in common.some(trials(), share):
             table.add(kind, *outcome(folder, name, harm))
     return table
 
 
-def sample(share: float) -> list[tuple[str, str, Callable[[Path, Path], None]]]:
+def trials() -> list[tuple[str, str, Callable[[Path, Path], None]]]:
     found = [("link to a file", name, symbolic(name)) for name in LINKED]
     found += [("link to nothing", name, dangling(name)) for name in LINKED]
     found += [("hard link", name, hard(name)) for name in LINKED if not name.startswith("replay")]
@@ -73,7 +72,7 @@ def sample(share: float) -> list[tuple[str, str, Callable[[Path, Path], None]]]:
     found += [("link to a folder", "replay", linked_replay)]
     found += [("config.yaml", name, edited(*texts)) for name, texts in TEXTS.items()]
     found += [("bomb", work.__name__, work) for work in BOMBS]
-    return found if share == 1.0 else random.Random(0).sample(found, round(len(found) * share))
+    return found
 
 
 def outcome(folder: Path, name: str, harm: Callable[[Path, Path], None]) -> tuple[str, str]:

@@ -3,7 +3,7 @@
 Kills come just before a file operation or at a random time, in forked children and in real processes; signals at a random time,
 pictures included, must be answered by a sentence.
 
-    python -m bench.faults.kills [--short]
+    python -m bench.faults.kills [--share 0.1]
 """
 
 import os
@@ -30,7 +30,7 @@ def main(share: float = 1.0) -> common.Table:
     table, chance = common.Table("kills, signals and full disks", BAD), random.Random(0)
 
     def times(count: int) -> range:
-        return range(max(1, round(count * share)))
+        return range(round(count * share))
 
     with common.workshop() as folder:
         began = time.monotonic()
