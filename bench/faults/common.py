@@ -3,8 +3,13 @@
 import argparse
 import collections
 import contextlib
+import dataclasses
+import functools
+import logging
+import math
 import os
 import random
+import resource
 import shutil
 import signal
 import sys
@@ -13,12 +18,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.config import RunConf, conf_dir, to_run
+from softmpm_learn.stop import SIGNALS, Signals
 
 TINY = [
     *("task=arm", "experiment=smoke", "task.seconds=0.025", "task.control_period=0.0125", "device=cpu"),
@@ -38,27 +47,38 @@ class Ended:
     said: str
     """Its stdout and stderr."""
     hung: bool
+    megabytes: float = 0.0
+    """Memory that it took beyond that of this process."""
 
 
 def forked(work: Callable[[], None], during: Callable[[int], None] = lambda pid: None, limit=LIMIT) -> Ended:
     """Run ``work`` in a child, and ``during`` with its process id meanwhile in this process."""
-    with tempfile.TemporaryFile() as said:
-        pid = os.fork()
-        if pid == 0:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
-            os._exit(_code_of(work))
-        during(pid)
-        end = time.monotonic() + limit
-        while (found := os.waitpid(pid, os.WNOHANG)) == (0, 0) and time.monotonic() < end:
-            time.sleep(0.005)
-        hung = found == (0, 0)
-        if hung:
-            os.kill(pid, signal.SIGKILL)
-            found = os.waitpid(pid, 0)
-        said.seek(0)
+    ears, mouth = os.pipe()  # holds 64 kB; a file would be subject to a limit on the size of files
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the child answers them
+    pid = os.fork()
+    if pid == 0:
+        code = 70
+        try:
+            os.dup2(mouth, 1)
+            os.dup2(mouth, 2)
+            code = _code_of(work)
+        finally:
+            os._exit(code)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    os.close(mouth)
+    during(pid)
+    end = time.monotonic() + limit
+    while (found := os.wait4(pid, os.WNOHANG))[0] == 0 and time.monotonic() < end:
+        time.sleep(0.005)
+    hung = found[0] == 0
+    if hung:
+        os.kill(pid, signal.SIGKILL)
+        found = os.wait4(pid, 0)
+    with os.fdopen(ears, "rb") as said:
         text = said.read().decode(errors="replace")
-    return Ended(os.waitstatus_to_exitcode(found[1]), text, hung)
+    here = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    megabytes = (found[2].ru_maxrss - here) * 1024 / 1e6
+    return Ended(os.waitstatus_to_exitcode(found[1]), text, hung, megabytes)
 
 
 def _code_of(work: Callable[[], None]) -> int:
@@ -76,27 +96,56 @@ def _code_of(work: Callable[[], None]) -> int:
     return code
 
 
-def program(*arguments: str, pictures: bool = False) -> Callable[[], None]:
-    """``python -m softmpm_learn`` with these arguments, for a child."""
+def program(*arguments: str) -> Callable[[], None]:
+    """``python -m softmpm_learn`` with these arguments, for a child; with pictures and everything."""
 
     def work() -> None:
-        if not pictures:
-            experiment.draw, experiment.convert = lambda *_: None, lambda *_: "nothing"
         GlobalHydra.instance().clear()
+        signals = Signals()
+        signals.install()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         sys.argv = ["softmpm_learn", *arguments]
-        app.main()
+        app.main(signals)
 
     return work
 
 
-def fresh(folder: Path) -> Callable[[], None]:
+def fresh(folder: Path, *more: str) -> Callable[[], None]:
     """The smallest run, into this folder."""
-    return program(*TINY, f"hydra.run.dir={folder}")
+    conf = _composed(*TINY, *more)
+    return _training(lambda: conf, folder)
 
 
-def resume(folder: Path, *more: str) -> Callable[[], None]:
+def resume(folder: Path, iterations: int = 4) -> Callable[[], None]:
     """Go on with the run in this folder."""
-    return program(f"resume={folder}", *more)
+    asked = dataclasses.replace(_composed(*TINY, f"train.iterations={iterations}"), resume=str(folder))
+    overrides = [f"resume={folder}", f"train.iterations={iterations}"]
+    return _training(lambda: app.resumed(asked, overrides), folder)
+
+
+@functools.cache
+def _composed(*overrides: str) -> RunConf:
+    """What Hydra makes of them; most of the time of a child would go into that."""
+    app.register()
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        return to_run(compose("config", list(overrides)))
+
+
+def _training(conf: Callable[[], RunConf], folder: Path) -> Callable[[], None]:
+    """As :func:`softmpm_learn.app.job`, without pictures."""
+
+    def work() -> None:
+        experiment.draw, experiment.convert = lambda *_: None, lambda *_: "nothing"
+        logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout, force=True)
+        try:
+            with app.log_file() as begin:
+                experiment.run_experiment(conf(), folder, begin=lambda: begin(folder / "softmpm_learn.log"))
+        except Exception as error:
+            print(f"softmpm_learn: {app.sentence(error)}", file=sys.stderr)
+            raise SystemExit(1) from None
+
+    return work
 
 
 @contextlib.contextmanager
@@ -116,6 +165,7 @@ def workshop() -> Iterator[Path]:
 def fingerprint(folder: Path) -> dict[str, object]:
     """What two equal runs have equal, to the bit: metrics, checkpoint, replay buffer and recorded numbers."""
     saved = checkpoint.load(folder)
+    del saved["seals"]["timing.csv"]  # of the clock
     found: dict[str, object] = {"metrics.csv": (folder / "metrics.csv").read_bytes()}
     found |= {f"checkpoint {k}": v for k, v in _flat(saved)}
     for path in sorted((folder / "replay").iterdir()):
@@ -203,6 +253,14 @@ class Table:
         return "\n".join([*lines, *self.details])
 
 
+T = TypeVar("T")
+
+
+def some(trials: list[T], share: float) -> list[T]:
+    """So many of them, always the same; all for a share of 1."""
+    return trials if share == 1.0 else random.Random(0).sample(trials, math.ceil(len(trials) * share))
+
+
 def damaged(data: bytes, chance: random.Random) -> bytes:
     """The bytes with one bit flipped."""
     spoilt = bytearray(data)
@@ -210,10 +268,14 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
     return bytes(spoilt)
 
 
-def report(main: Callable[[float], Table]) -> None:
-    """Print the table of a script, and end with exit code 1 if a trial had a bad outcome."""
+def report(*rounds: Callable[[float], Table]) -> None:
+    """Print the tables of some scripts, and end with exit code 1 if a trial had a bad outcome."""
     parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__)
-    parser.add_argument("--short", action="store_true", help="one trial of ten")
-    table = main(0.1 if parser.parse_args().short else 1.0)
-    print(table)
-    raise SystemExit(1 if table.failures else 0)
+    parser.add_argument("--share", type=float, default=1.0, help="share of the trials, 1 for all")
+    share = parser.parse_args().share
+    failures = 0
+    for main in rounds:
+        table = main(share)
+        print(table, flush=True)
+        failures += table.failures
+    raise SystemExit(1 if failures else 0)

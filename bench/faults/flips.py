@@ -1,6 +1,6 @@
 """One bit flipped in the recording of a killed run, or the recording cut short: it is read at once or refused at once.
 
-python -m bench.faults.flips [--short]
+python -m bench.faults.flips [--share 0.1]
 """
 
 import random

@@ -34,11 +34,16 @@ def begin(
     resumed = resume_before is not None and path.exists()
     kept = path.stat().st_size if resumed else 0
     size = sum(values.nbytes for values in static.values()) + kept
-    with h5py.File(draft, "x", **_OPEN, **_PAGES) as file, room(file, size):
-        create(file, model, static)
-        if resumed:
-            with Recording(path) as old:
-                _copy(old, file, static, resume_before or 0, content)
+    try:
+        with h5py.File(draft, "x", **_OPEN, **_PAGES) as file, room(file, size):
+            create(file, model, static)
+            if resumed:
+                with Recording(path) as old:
+                    _copy(old, file, static, resume_before or 0, content)
+    except RuntimeError as error:  # HDF5 cannot close a file for which there is no room
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
 
 
 def _copy(
@@ -89,7 +94,8 @@ def room(file: h5py.File, size: int) -> Iterator[None]:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(handle, end, size + _ROOM_EXTRA)
     except OSError as error:
-        os.ftruncate(handle, end)
+        with contextlib.suppress(OSError):  # there may not even be room for that; the first error counts
+            os.ftruncate(handle, end)
         text = f"no room to record ({error.strerror}); what was recorded is safe"
         raise OSError(error.errno, text, file.filename) from error
     yield

@@ -37,7 +37,7 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(source, (str, os.PathLike)):
         source = _load(source)
     need(
-        np.ndim(getattr(source, "faces", None)) == 2 and len(source.faces) > 0,
+        np.ndim(getattr(source, "faces", ())) == 2 and len(source.faces) > 0,
         f"mesh needs a path or a trimesh.Trimesh with faces, got {type(source).__name__}.",
     )
     vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)

@@ -182,9 +182,7 @@ class Run:
         changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
         if changed:
             both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
-            raise SettingsError(
-                f"this run cannot go on from its checkpoint, made with other settings: {both}."
-            )
+            raise SettingsError(f"made with other settings: {both}")
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])

@@ -393,11 +393,28 @@ def test_a_full_disk_is_an_error_and_nothing_is_lost(tmp_path):
     run_here("filling", tmp_path, "60000 61000 100000 123456")
 
 
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="needs posix_fallocate to claim room")
+def test_a_full_disk_at_the_start_is_an_error(tmp_path):
+    """Without room for the beginning the file is named, and no draft stays."""
+    run_here("starting", tmp_path, "")
+
+
 def filling(folder: Path, rooms: str) -> None:
     """Record until the file meets a limit of the system on its size."""
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     for room in rooms.split():
         fill(folder / f"{room}.h5", int(room))
+
+
+def starting(folder: Path, _: str) -> None:
+    """Begin a recording where not even its beginning has room."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    model = small_model()
+    for room in (1000, 4000, 20000):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+        with pytest.raises(OSError, match=r"no room to record .*run\.h5\.new"):
+            softmpm.Recorder(folder / "run.h5", model)
+        assert not list(folder.iterdir())
 
 
 def fill(path: Path, room: int) -> None:

@@ -16,9 +16,9 @@ import torch
 
 import softmpm
 from softmpm_learn import checkpoint, distributed, train
-from softmpm_learn.config import load
 from softmpm_learn.distributed import Group, OtherProcessError
 from softmpm_learn.experiment import make_model
+from softmpm_learn.saved import load
 from softmpm_learn.settings import Settings
 from softmpm_learn.tasks import make_task
 
@@ -232,7 +232,7 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
     left = {path.name for path in out.iterdir()}
     films = {"run.h5", "run.rrd"} if importlib.util.find_spec("rerun") else {"run.h5"}
     assert left >= films | {"loss.png", "latent.png", "robot.png"} and "error.txt" not in left
-    conf = load(out / "config.yaml")
+    conf = load(out)
     task, one = make_task(conf.task), tmp_path / "one"
     train.train(task, make_model(task, conf, Group()), conf.settings, one)
     for row, want in zip(figures(out), figures(one), strict=True):
