@@ -42,7 +42,15 @@ INTEGERS = (
 )
 """Calls that give integers."""
 STRUCTS = (
-    *("moved_adj", "momentum_adj", "gather_adj", "slope_adj", "node_velocity_adj", "muscle_stress_adj", "placed"),
+    *(
+        "moved_adj",
+        "momentum_adj",
+        "gather_adj",
+        "slope_adj",
+        "node_velocity_adj",
+        "muscle_stress_adj",
+        "placed",
+    ),
     "stress_adj_of",
 )
 """Calls that give structs, which no number multiplies; their fields are terms where they are used."""
