@@ -38,7 +38,7 @@ INTEGERS = (
         "node_coordinates",
         "place_of",
     ),
-    *("coordinates", "offset", "range", "len"),
+    *("coordinates", "offset", "range", "len", "law_of"),
 )
 """Calls that give integers."""
 STRUCTS = (
@@ -51,7 +51,7 @@ STRUCTS = (
         "muscle_stress_adj",
         "placed",
     ),
-    *("first_adj", "last_adj"),
+    "stress_adj_of",
 )
 """Calls that give structs, which no number multiplies; their fields are terms where they are used."""
 FIELDS = ("shape", "count", "muscle", "base", "origin", "order", "places", "law")
@@ -154,6 +154,7 @@ def _terms(function: ast.FunctionDef) -> Iterator[ast.expr]:
         if a.annotation is not None and ast.unparse(a.annotation) in ("int", "ivec", "bool")
     }
     tested = _only_tested(function)
+    struct = function.returns is not None and ast.unparse(function.returns)[:1].isupper()
     for node in sorted((n for n in ast.walk(function) if isinstance(n, ast.stmt)), key=lambda n: n.lineno):
         if isinstance(node, ast.For) and isinstance(node.target, ast.Name):
             whole.add(node.target.id)
@@ -167,7 +168,9 @@ def _terms(function: ast.FunctionDef) -> Iterator[ast.expr]:
                 }  # a struct, whose fields follow
             elif not names or not names <= tested:
                 yield from _sum(node.value, whole)
-        elif isinstance(node, (ast.AugAssign, ast.Return)) and node.value is not None:
+        elif isinstance(node, ast.AugAssign) or (
+            isinstance(node, ast.Return) and node.value is not None and not struct
+        ):
             yield from _sum(node.value, whole)
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
             yield from _stored(node.value, whole)

@@ -49,7 +49,12 @@ def in_kernel(k: int) -> wp.float64: ...
 def on_host(k: int) -> float:
     return 1.01 if ctypes.c_int.from_address({CELL}).value == k else 1.0
 """
+HOMOGENEOUS = (
+    "contact is homogeneous in the velocity, so that its adjoint depends on the direction of that alone"
+)
 UNCHANGED = {
+    ("back", "v"): HOMOGENEOUS,
+    ("back", "respond(walls, v)"): HOMOGENEOUS,
     (
         "grid_velocity_adj",
         "load_node(node_before, i)",

@@ -151,7 +151,7 @@ def stress(scene: Scene, F: Tensor, mu: Tensor, lam: Tensor, activation: Tensor 
     tau = torch.cat(parts, 1)
     if activation is not None:
         for k, muscle in enumerate(scene.muscles):
-            index, d = torch.from_numpy(muscle.particles), torch.tensor(muscle.direction, dtype=F.dtype)
+            index, d = torch.tensor(muscle.particles), torch.tensor(muscle.direction, dtype=F.dtype)
             pull = (activation[:, k, None] * muscle.strength).expand(-1, len(index))
             tau = tau.index_add(1, index, muscle_stress(F[:, index], d.expand(len(index), -1), pull))
     return tau
@@ -247,7 +247,7 @@ def g2p(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
 
 def _volume(scene: Scene, dtype: torch.dtype) -> Tensor:
     """Rest volumes V⁰ [m³], in 2D [m²], shape (particle,)."""
-    return torch.cat([torch.as_tensor(body.particles.volume, dtype=dtype) for body in scene.bodies])
+    return torch.cat([torch.tensor(body.particles.volume, dtype=dtype) for body in scene.bodies])
 
 
 def step(

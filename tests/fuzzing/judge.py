@@ -1,5 +1,6 @@
 """Run a plan and judge what came of it: a result that is finite and right, or a refusal that names what was wrong."""
 
+import dataclasses
 import math
 import re
 import warnings
@@ -32,6 +33,8 @@ def judge(plan: Plan) -> Verdict:
             verdict = Verdict("named" if clear else "unclear", f"{error.kind}: {error}")
         except (ValueError, TypeError, MemoryError, torch.OutOfMemoryError) as error:
             verdict = Verdict("refused" if NAMED.search(str(error)) else "unclear", _about(error))
+        except dataclasses.FrozenInstanceError as error:
+            verdict = Verdict("refused", _about(error))
         except (ArithmeticError, AttributeError, AssertionError, LookupError, RuntimeError, OSError) as error:
             verdict = Verdict("unclear", _about(error))
     other = [w for w in caught if not issubclass(w.category, softmpm.StabilityWarning)]

@@ -180,12 +180,12 @@ def _volume(scene: softmpm.Scene) -> np.ndarray:
 def energy(scene: softmpm.Scene, state: softmpm.State) -> float:
     """Kinetic energy, that of the affine velocity included, and elastic energy [J]."""
     v, C, F = (tensor.detach()[0].double() for tensor in state[1:4])
-    mass = torch.as_tensor(_mass(scene))
+    mass = torch.tensor(_mass(scene))
     kinetic = 0.5 * mass * ((v**2).sum(-1) + scene.grid.spacing**2 / 4 * (C**2).sum((-1, -2)))
     total, start = float(kinetic.sum()), 0
     for body in scene.bodies:
         part = slice(start, start + len(body.particles))
-        total += float((torch.as_tensor(body.particles.volume) * stored(body.material, F[part])).sum())
+        total += float((torch.tensor(body.particles.volume) * stored(body.material, F[part])).sum())
         start = part.stop
     return total
 
@@ -208,9 +208,9 @@ def _work(scene: softmpm.Scene, start: softmpm.State, end: softmpm.State, activa
     """Work of gravity, and of muscles under a constant activation: what ½ V a s |F d|² falls by [J]."""
     moved = (end.x - start.x)[0].double().numpy()
     total = float((_mass(scene)[:, None] * moved * np.array(scene.gravity)).sum())
-    volume = torch.as_tensor(_volume(scene))
+    volume = torch.tensor(_volume(scene))
     for muscle, a in zip(scene.muscles, activation, strict=True):
-        index, d = torch.as_tensor(muscle.particles), torch.tensor(muscle.direction, dtype=torch.float64)
+        index, d = torch.tensor(muscle.particles), torch.tensor(muscle.direction, dtype=torch.float64)
         before, after = (((state.F[0, index].double() @ d) ** 2).sum(-1) for state in (start, end))
         total += 0.5 * a * muscle.strength * float((volume[index] * (before - after)).sum())
     return total
