@@ -15,9 +15,9 @@ from softmpm.checks import (
     check_activation,
     check_bounds,
     check_finite,
+    check_horizon,
     check_params,
     check_state,
-    check_whole,
 )
 from softmpm.compiling import opaque
 from softmpm.horizon import Horizon
@@ -88,8 +88,8 @@ def _simulate(
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
-    refuse_batches((*start[:4], activation, *params))
-    check_whole("substeps", substeps)
+    refuse_batches((*start[:4], activation, *(params if isinstance(params, tuple) else ())))
+    check_horizon(activation, substeps)
     if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
     mu, lam, mass = _material(model, params)

@@ -32,6 +32,10 @@ class Sizes(Protocol):
     def device(self) -> torch.device: ...
 
 
+MOST_SUBSTEPS = 100_000_000
+"""Of one call: its chunks are listed beforehand."""
+
+
 def check_state(model: Sizes, state: State) -> None:
     """Shape, dtype and device of x, v, C and F, and of the low-order parts if there are any."""
     if not isinstance(state, State):
@@ -76,6 +80,16 @@ def check_row(model: Sizes, activation: Tensor | None) -> None:
         activation.shape == want,
         f"activation must have shape (world, muscle) = {want}, got {tuple(activation.shape)}; "
         "of several control steps take one row, activation[k].",
+    )
+
+
+def check_horizon(activation: Tensor | None, substeps: int) -> None:
+    """A whole number of substeps for each control step, not too many in all."""
+    check_whole("substeps", substeps)
+    total = substeps * (1 if activation is None else len(activation))
+    need(
+        total <= MOST_SUBSTEPS,
+        f"a call has at most {MOST_SUBSTEPS:,} substeps, got {total:,}; call simulate several times, each from the end before.",
     )
 
 

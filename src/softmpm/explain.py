@@ -64,6 +64,13 @@ class Case:
                 limit,
                 "Start from a deformation gradient F that is not inverted and less compressed.",
             )
+        if not self._neighbours():
+            return (
+                kind,
+                "has values too large to square",
+                "every value must be finite, and its square",
+                "Start from other values.",
+            )
         _, value, limit, _ = self._torn()
         return kind, value, limit, "Start from positions nearer to the rest shape."
 
@@ -91,10 +98,10 @@ class Case:
         return "inverted" if inverted else "collapsed", f"{what}, det F = {det:.4g}", limit, advice + "."
 
     def _torn(self) -> tuple[str, str, str, str]:
-        x, rows = self.end.x[self.world].double(), self.model.neighbours[self.particle].tolist()
-        others = [q for q in rows if q >= 0]
-        gaps = [(x[q] - x[self.particle]).norm().item() / self._spacing for q in others]
-        gap, other = max(zip(gaps, others, strict=True))
+        x = self.end.x[self.world].double()
+        gap, other = max(
+            ((x[q] - x[self.particle]).norm().item() / self._spacing, q) for q in self._neighbours()
+        )
         most = self.model.alarms.gap
         value = f"is {gap:.4g} cells away from particle {other}, its neighbour at rest"
         limit = (
@@ -119,6 +126,9 @@ class Case:
             f"has a value in {', '.join(bad)} that is not finite" if bad else "has values too large to square"
         )
         return "not_finite", what, "every value must be finite, and its square", f"Use {FINER}. {GENTLER}."
+
+    def _neighbours(self) -> list[int]:
+        return [q for q in self.model.neighbours[self.particle].tolist() if q >= 0]
 
     @property
     def _spacing(self) -> float:

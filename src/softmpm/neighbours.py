@@ -4,8 +4,10 @@ import numpy as np
 
 from softmpm.scene import Scene
 
-REACH = 1.5
-"""Neighbours are nearer than this many spacings of their body: the axis neighbours of a lattice, not the diagonal ones in 3D."""
+REACH = 1.25
+"""Neighbours are nearer than this many spacings of their body: the axis neighbours of a lattice, not the diagonal ones."""
+ROOM = 1.25
+"""They may at least stretch by this factor before they are too far apart: pairs that are nearly so at rest are no neighbours."""
 
 
 def rest_neighbours(scene: Scene, longest: float) -> np.ndarray:
@@ -14,11 +16,11 @@ def rest_neighbours(scene: Scene, longest: float) -> np.ndarray:
     Each pair of neighbours is listed once. Bodies have no neighbours in others, since those may part.
 
     Args:
-        longest: Largest distance at rest [m]; pairs farther apart are no neighbours.
+        longest: Largest distance that neighbours may have in a run [m].
     """
     parts, first = [], 0
     for body in scene.bodies:
-        found = _within(body.particles.positions, longest)
+        found = _within(body.particles.positions, longest / ROOM)
         parts.append(np.where(found < 0, -1, found + first))
         first += len(body.particles)
     return np.concatenate(parts).astype(np.int32)

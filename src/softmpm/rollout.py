@@ -24,6 +24,7 @@ from softmpm.replay import alone, hold, note, recording
 from softmpm.runner import Runner, as_state
 from softmpm.state import State
 from softmpm.step import on_its_gpu
+from softmpm.watch import NEVER
 
 
 @dataclass
@@ -110,17 +111,21 @@ def rollout(
         if ahead is not None:
             state, k = ahead[0].end, k + 1
         before = ahead
-    return _returned(model, as_state(state), runner), trail if keep else None
+    return _returned(model, as_state(state), start, runner), trail if keep else None
 
 
-def _returned(model: Model, end: State, runner: Runner) -> State:
+def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
     """The end, with the worlds that failed where the policy puts them."""
-    if runner.failures is None or runner.failures.policy == "freeze" or not runner.frozen:
+    if runner.failures is None or not runner.frozen:
         return end
-    worlds, rest = sorted(runner.frozen), model.rest()
-    end = end.clone()
-    for tensor, at_rest in zip((*end[:4], *(end.low or ())), (*rest[:4], *(rest.low or ())), strict=True):
-        tensor[worlds] = at_rest[worlds]
+    reset = runner.failures.policy == "reset"
+    # Worlds that never ran return as they were given: the fast scheme cannot hold what is off the grid.
+    worlds = sorted(world for world, substep in runner.frozen.items() if reset or substep == 0)
+    there, end = model.rest() if reset else start.detach(), end.clone()
+    for tensor, wanted in zip(end[:4], there[:4], strict=True):
+        tensor[worlds] = wanted[worlds]
+    for name in () if end.low is None else ("x", "F"):
+        getattr(end.low, name)[worlds] = 0.0 if there.low is None else getattr(there.low, name)[worlds]
     return end
 
 
@@ -179,8 +184,18 @@ def rollout_adj(
             del run  # or it would keep its memory while the one before runs again
     for report, last in reports:
         words = report.read()[: model.worlds]
+        for world in trail.frozen:
+            words[world] = NEVER
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
-    return as_state(adj), adj_solid, adj_pull
+    adj = as_state(adj)
+    found = (*adj[:4], adj_solid.mass, adj_solid.mu, adj_solid.lam)
+    for world in trail.frozen:  # a state off the grid has no adjoint
+        for tensor in found:
+            if tensor is not None:
+                tensor[world] = 0
+        if adj_pull is not None:
+            adj_pull[:, world] = 0
+    return adj, adj_solid, adj_pull
 
 
 def _without(frozen: dict[int, int], adj_end: State) -> State:

@@ -81,10 +81,14 @@ class Runner:
                 self.scheme.widen(run)
                 return False
             run.pool.arrangement.judge(cells, bool(near_edge))
-        if failed_worlds(words):
+        if self._failed(words):
             self._take(self._located(run, words), run.chunk.first)
             return False
         return True
+
+    def _failed(self, words: list[int]) -> list[int]:
+        """Worlds that failed and were not frozen before: a start off the grid is reported each time."""
+        return [world for world in failed_worlds(words) if world not in self.frozen]
 
     def _take(self, error: UnstableError, first: int) -> None:
         if self.failures is None:
@@ -100,13 +104,13 @@ class Runner:
         for s in range(run.chunk.length):
             one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
             single, reported = self._single(one, state)
-            if failed_worlds(reported):
-                world = min(failed_worlds(reported), key=lambda w: reported[w])
+            if self._failed(reported):
+                world = min(self._failed(reported), key=lambda w: reported[w])
                 pull = None if self.pull is None else self.pull[one.rows][0]
                 return found(reported, world, as_state(single.end), first=one.first, pull=pull)
             state = single.end
         # Sums in another order may have avoided it; what was reported is true all the same.
-        world = min(failed_worlds(words), key=lambda w: words[w])
+        world = min(self._failed(words), key=lambda w: words[w])
         return found(words, world, at_end, first=run.chunk.first, pull=self._strongest())
 
     def _single(self, chunk: Chunk, state: Any) -> tuple[FastRun | PlainRun, list[int]]:

@@ -76,6 +76,7 @@ class Substep:
         self.watch_words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         self.watch = view(self.watch_words, wp.int64)
         self._arrays = {}
+        self.last = 0  # number of the substep that was launched last
 
     def _grid(self, dtype) -> Tensor:
         return torch.empty(*self.nodes, dtype._length_, dtype=self.model.dtype, device=self.model.device)
@@ -119,6 +120,7 @@ class Substep:
 
     def advance(self, now, then, substep: int) -> None:
         """One whole substep."""
+        self.last = substep
         self.to_grid(now)
         arguments = (self.model.scale, substep, self._array("velocity"), now, self.watch, then)
         self.launch(transfer(self.model.spec).g2p, self.particles, *arguments)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from softmpm.buffers import Motion, Solid, lame, view
 from softmpm.checks import check_bounds, check_finite, check_params, check_row, check_state
+from softmpm.checkup import armed, check_end
 from softmpm.failures import raise_failure
 from softmpm.kernels.types import types
 from softmpm.model import Model
@@ -104,15 +105,23 @@ class WarpSolid:
         return {name: getattr(self, name) for name in names[: 4 if self.model.muscle_count else 3]}
 
     def raise_failure(self, model: Model, state: WarpState) -> None:
-        """Raise :class:`softmpm.UnstableError` if a step so far failed; waits for the device."""
+        """Raise :class:`softmpm.UnstableError` if a step so far failed. Waits for the device.
+
+        Checks ``state``, which the last step gave, for torn bodies and the running step limit as well.
+        """
         check_own(model, "raise_failure", solid=self, state=state)
-        _raise_failure(model, state, self.work)
+        mass, mu, lam = (wp.to_torch(array) for array in (self.mass, self.mu, self.lam))
+        pull = None if self.pull is None else wp.to_torch(self.pull)
+        _raise_failure(model, state, self.work, Solid(mass, mu, lam, pull), pull)
 
 
 @on_its_gpu
-def _raise_failure(model: Model, state: WarpState, work: Substep) -> None:
+def _raise_failure(model: Model, state: WarpState, work: Substep, given: Solid, pull: Tensor | None) -> None:
     work.stream = stream_of(model.device)
-    raise_failure(model, work.watch_words.tolist(), work.leave(state.struct(model)))
+    end = work.leave(state.struct(model))
+    if armed(model):
+        check_end(model, work.solid, end, work.watch, work.last)
+    raise_failure(model, work.watch_words.tolist(), end, solid=given, pull=pull)
 
 
 def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
@@ -122,12 +131,11 @@ def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
     return array
 
 
-def check_own(model: Model, wants: str, solid: WarpSolid | None = None, **states: WarpState) -> None:
+def check_own(model: Model, wants: str, **given: WarpState | WarpSolid) -> None:
     """Raise unless these are the model's own: the kernels trust shapes and types."""
     check_model(model, wants)
-    given = [(name, held, WarpState, "warp_state") for name, held in states.items()]
-    given += [] if solid is None else [("solid", solid, WarpSolid, "warp_solid")]
-    for name, held, kind, make in given:
+    for name, held in given.items():
+        kind, make = (WarpSolid, "warp_solid") if name == "solid" else (WarpState, "warp_state")
         if not isinstance(held, kind):
             raise TypeError(
                 f"{name} must be a softmpm.{kind.__name__}, as softmpm.{make} gives it, got {type(held).__name__}."

@@ -16,6 +16,7 @@ def kicked(scheme, device, worlds=3, kick=400.0, dtype=torch.float32):
     model = softmpm.build(bar(), device=device, worlds=worlds, scheme=scheme, dtype=dtype)
     start = model.rest()
     start.v[:, :, 1] = torch.linspace(0.1, 0.3, worlds, dtype=dtype, device=model.device)[:, None]
+    start.v[..., 0] = start.x[..., 0] - 0.5  # it vibrates
     bad = start.clone()
     bad.v[1, 5, 0] = kick
     return model, start, bad
@@ -68,6 +69,19 @@ def test_a_failed_world_gives_no_gradient(budget, scheme, device):
         assert (got[1] == 0).all() and want[1].abs().max() > 0
         torch.testing.assert_close(got[[0, 2]], want[[0, 2]], rtol=1e-4, atol=1e-5 * want.abs().max().item())
     assert failures.worlds == [1]
+
+
+def test_a_start_off_the_grid_comes_back_as_it_was(scheme, device):
+    """It is counted once, returns unchanged, and has no gradient, whatever its kernels would make of it."""
+    model, start, _ = kicked(scheme, device)
+    start.x[1, 4] = 1e15
+    start.v.requires_grad_()
+    failures = softmpm.Failures("freeze")
+    end = simulate(model, start, failures=failures)
+    assert failures.worlds == [1] and [error.kind for error in failures.errors] == ["start"]
+    assert torch.equal(end.x[1], start.x[1]) and torch.isfinite(end.F).all()
+    (grad,) = torch.autograd.grad(end.F.sum() + end.v.sum(), start.v)
+    assert (grad[1] == 0).all() and grad[0].abs().max() > 0
 
 
 def test_every_world_may_fail_at_a_time_of_its_own(scheme, device):

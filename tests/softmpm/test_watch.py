@@ -87,7 +87,7 @@ def test_a_value_that_is_not_finite_is_reported_where_it_arises(device):
     """Stress overflows in float32: the particle is named, with what is not finite."""
     model = single(device=device)
     start = model.rest()
-    start.F[0, 0] *= 1e18
+    start.F[0, 0] *= 1e25
     error = fails(model, start)
     assert (error.kind, error.particle, error.substep) == ("not_finite", 0, 0)
     assert "not finite" in str(error)

@@ -12,8 +12,8 @@ Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012; the volumetric te
 The adjoints take τ̄ and return (F̄, μ̄, λ̄):
 
     (E1): F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
-    (E2): F̄ = 2μ (τ̄ F + τ̄ᵀ (F − R)) + λ (2J − 1) tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ τ̄ F,
-          μ̄ = ⟨τ̄, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
+    (E2): F̄ = 2μ T (2F − R) + λ (2J − 1) tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,  T = (τ̄ + τ̄ᵀ) / 2,
+          μ̄ = ⟨T, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
     (E3): as (E2), with λ/2 (J + J⁻³) for λ (2J − 1) and λ̄ = tr(τ̄) (J² − J⁻²) / 4
 """
 
@@ -108,13 +108,12 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
             F = identity() + H
             j = volume_change(H)
             trace = wp.trace(adj_tau)
+            T = real(0.5) * (adj_tau + wp.transpose(adj_tau))
             two_mu = real(2.0) * mu
             adj = ElasticAdj()
-            adj.F = two_mu * (adj_tau * F + wp.transpose(adj_tau) * (H - Q)) + (
-                lam * pressure_slope(j) * trace
-            ) * cofactor(F)
-            adj.F += rotation_adj(H, Q, -two_mu * (adj_tau * F))
-            adj.mu = real(2.0) * wp.ddot(adj_tau, (H - Q) * wp.transpose(F))
+            adj.F = two_mu * (T * (F + H - Q)) + (lam * pressure_slope(j) * trace) * cofactor(F)
+            adj.F += rotation_adj(H, Q, -two_mu * (T * F))
+            adj.mu = real(2.0) * wp.ddot(T, (H - Q) * wp.transpose(F))
             adj.lam = trace * pressure(j)
             return adj
 

@@ -203,7 +203,9 @@ def fused(spec: Spec) -> SimpleNamespace:
         A = affine_momentum(scale, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
         b = m * new.v - A * g
         first = held + first_node(base, origin, window.shape)
-        if place == total or not alive:  # a world that stopped leaves the nodes empty, so that its adjoint is zero
+        if (
+            place == total or not alive
+        ):  # a world that stopped leaves the nodes empty, so that its adjoint is zero
             first = -1
             b = vec()
             A = mat()
