@@ -38,7 +38,7 @@ class Arrangement:
 
     Attributes:
         order: Particle at each place, shape (world, particle), int32.
-        neighbours: Places of its neighbours at rest, of the particle at each place; Warp array (world, particle, at most dim).
+        neighbours: Places of the neighbours at rest of the particle at each place; Warp array (world, particle, at most dim).
         origin: First node of the window, shape (world, dim), int32.
         shape: Nodes of the window along each axis.
         version: How often it was renewed.
@@ -88,7 +88,7 @@ class Arrangement:
         return Command(model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places)
 
     def _arranging(self, by_place: Tensor) -> list[Command]:
-        """Put the neighbours at rest into the order of the particles."""
+        """See :meth:`place_neighbours`."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         if by_place.shape[2] == 0:
             return []
@@ -126,13 +126,17 @@ class Arrangement:
         self._locate(x)
         key, order = torch.sort(self._key, dim=1, stable=True)
         self.order.copy_(order)
-        for command in (self._centre, *self._arrange):
-            command(stream_of(model.device))
+        self._centre(stream_of(model.device))
         if not recording(model):
             cell = key // 2
             self._fresh = Report(model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])
         self.stale = False
         self.version += 1
+
+    def place_neighbours(self) -> None:
+        """Put the neighbours at rest into the present order."""
+        for command in self._arrange:
+            command(stream_of(self.model.device))
 
     def grown(self, x: Tensor) -> "Arrangement":
         """Another one with a larger window."""

@@ -2,6 +2,7 @@
 
 import threading
 import weakref
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from torch import Tensor
@@ -118,7 +119,7 @@ class FastRun:
         pull: Tensor | None,
         solid: Solid,
         keep: bool,
-        frozen: list[int],
+        frozen: Sequence[int] = (),
     ):
         self.pool, self.renewed, self.chunk, self.start = pool, renewed, chunk, start
         self._lease = _Lease(pool, chunk, keep)
@@ -157,7 +158,7 @@ class Fast:
         pull: Tensor | None,
         solid: Solid,
         keep: bool,
-        frozen: list[int],
+        frozen: Sequence[int] = (),
     ) -> FastRun:
         renewed = self._arrange(start, chunk)
         assert self._pool is not None

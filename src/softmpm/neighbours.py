@@ -6,7 +6,7 @@ from softmpm.scene import Scene
 
 REACH = 1.25
 """Neighbours are nearer than this many spacings of their body: the axis neighbours of a lattice, not the diagonal ones."""
-ROOM = 1.25
+ROOM = 1.35
 """They may at least stretch by this factor before they are too far apart: pairs that are nearly so at rest are no neighbours."""
 
 

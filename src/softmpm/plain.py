@@ -1,5 +1,7 @@
 """The plain scheme: three kernels for each substep, launched one by one, any precision, any device."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -29,7 +31,7 @@ class PlainRun:
         pull: Tensor | None,
         solid: Solid,
         keep: bool,
-        frozen: list[int],
+        frozen: Sequence[int] = (),
     ):
         self.model, self.chunk, self.start, self.pull = model, chunk, start, pull
         self.row = None if pull is None else torch.empty_like(pull[0])
@@ -37,7 +39,7 @@ class PlainRun:
         self._solid = solid  # the structs only see its tensors
         self.states = Motion.empty(model, chunk.length + 1 if keep else 2)
         self.slots = [self.states[i].struct(model) for i in range(len(self.states.base))]
-        self.step.watch_words[frozen] = FROZEN
+        self.step.watch_words[list(frozen)] = FROZEN
         self.step.enter(start, self.slots[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
@@ -83,7 +85,13 @@ class Plain:
         self.model = model
 
     def run(
-        self, chunk: Chunk, start: State, pull: Tensor | None, solid: Solid, keep: bool, frozen: list[int]
+        self,
+        chunk: Chunk,
+        start: State,
+        pull: Tensor | None,
+        solid: Solid,
+        keep: bool,
+        frozen: Sequence[int] = (),
     ) -> PlainRun:
         return PlainRun(self.model, chunk, start, pull, solid, keep, frozen)
 

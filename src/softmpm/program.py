@@ -185,6 +185,7 @@ class Program:
             self._version, self._given = -1, ()  # until the material has this order too
             self.order.copy_(self.arrangement.order)
             self.origin.copy_(self.arrangement.origin)
+            self.arrangement.place_neighbours()
         self.calm()
         if frozen:
             self.words[list(frozen)] = FROZEN

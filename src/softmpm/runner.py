@@ -92,7 +92,10 @@ class Runner:
 
     def _take(self, error: UnstableError, first: int) -> None:
         if self.failures is None:
-            raise error
+            try:
+                raise error
+            finally:
+                del error  # else it would refer to itself, through this frame, and hold what the frame holds
         self.failures.errors.append(error)
         self.frozen[error.world] = first
 

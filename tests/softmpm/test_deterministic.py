@@ -83,7 +83,7 @@ def test_the_order_of_the_particles_leaves_no_trace(dim, monkeypatch):
 
 def test_what_ran_before_leaves_no_trace(device):
     """The order follows from where a chunk starts, not from the one kept from other calls."""
-    model = build(2, device=device)
+    model = build(2, device=device, alarms=softmpm.Alarms(gap=None))
     inputs = busy_inputs(model, control_steps=7)
     first = everything(model, inputs, substeps=40)  # more than a chunk holds
     moved = {name: t.detach().clone() for name, t in inputs.items()}

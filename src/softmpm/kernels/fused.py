@@ -203,12 +203,12 @@ def fused(spec: Spec) -> SimpleNamespace:
         A = affine_momentum(scale, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
         b = m * new.v - A * g
         first = held + first_node(base, origin, window.shape)
-        if (
-            place == total or not alive
-        ):  # a world that stopped leaves the nodes empty, so that its adjoint is zero
+        if place == total:
             first = -1
+        if not alive:  # a world that stopped leaves the nodes empty, so that its adjoint is zero
             b = vec()
             A = mat()
+            m = real(0.0)
         # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
         if place < total:
             if alive:
