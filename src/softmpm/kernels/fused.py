@@ -205,10 +205,6 @@ def fused(spec: Spec) -> SimpleNamespace:
         first = held + first_node(base, origin, window.shape)
         if place == total:
             first = -1
-        if not alive:  # a world that stopped leaves the nodes empty, so that its adjoint is zero
-            b = vec()
-            A = mat()
-            m = real(0.0)
         # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
         if place < total:
             if alive:
