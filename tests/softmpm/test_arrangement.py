@@ -13,7 +13,7 @@ import torch
 from helpers import LAWS, assert_relative, cotangent, dot
 
 import softmpm
-from softmpm import arrangement, autograd, fast, program, rollout
+from softmpm import arrangement, autograd, fast, program, rollout, runner
 from softmpm.arrangement import STALE_FEW, Arrangement
 from softmpm.memory import MARGIN
 
@@ -374,7 +374,7 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
         @contextlib.contextmanager
         def blindly(*_, **__):
             with monkeypatch.context() as patch:
-                for module in (arrangement, autograd, fast, program, rollout):
+                for module in (arrangement, autograd, fast, program, rollout, runner):
                     patch.setattr(module, "recording", lambda model: True)
                 yield
 

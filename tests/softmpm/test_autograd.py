@@ -166,11 +166,15 @@ def test_no_other_derivative_is_lost(name, scheme):
         return run(softmpm.simulate, model, inputs | {name: tensor}, 2).v
 
     for _ in range(2):
-        with torch.no_grad(), forward_ad.dual_level(), pytest.raises(NotImplementedError, match="jvp"):
+        with (
+            torch.no_grad(),
+            forward_ad.dual_level(),
+            pytest.raises((NotImplementedError, RuntimeError), match="jvp"),
+        ):
             end(forward_ad.make_dual(inputs[name], torch.ones_like(inputs[name])))
         with torch.no_grad(), pytest.raises(RuntimeError):
             torch.vmap(end)(torch.stack([inputs[name]] * 2))
-        with pytest.raises(NotImplementedError, match="jvp"):
+        with pytest.raises((NotImplementedError, RuntimeError), match="jvp"):
             torch.func.jvp(end, (inputs[name],), (torch.ones_like(inputs[name]),))
         end(inputs[name])
 

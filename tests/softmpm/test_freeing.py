@@ -9,7 +9,7 @@ import torch
 from helpers import KINDS, assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory, run
 
 import softmpm
-from softmpm import arrangement, autograd, fast, memory, plain, program, program_adj, replay, rollout
+from softmpm import arrangement, autograd, fast, memory, plain, program, program_adj, replay, rollout, runner
 from softmpm.between import SortedState
 from softmpm.horizon import Horizon
 from softmpm.memory import plan
@@ -137,7 +137,7 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
     (smaller,) = living(arrangement.Arrangement)
     smaller.left = True
     del smaller
-    outgrown, make = rollout.outgrown, program.Program.__init__
+    outgrown, make = runner.outgrown, program.Program.__init__
 
     def left_once(words) -> bool:
         seen.append(words)
@@ -147,7 +147,7 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
         others.append(sum(one.arrangement is not window for one in living(program.Program)))
         make(self, model, window, *args)
 
-    monkeypatch.setattr(rollout, "outgrown", left_once)
+    monkeypatch.setattr(runner, "outgrown", left_once)
     monkeypatch.setattr(program.Program, "__init__", making)
     pull(*call(built))
     assert len(seen) > report and others and max(others) <= 1
@@ -295,7 +295,7 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     pull(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
     with_graphs = [weakref.ref(made) for made in living((program.Program, program_adj.ProgramAdj))]
-    for module in (autograd, program, fast, rollout):
+    for module in (autograd, program, fast, rollout, runner):
         monkeypatch.setattr(module, "recording", lambda model: True)
     with replay.opened_ledger() as ledger:
         pull(*call(built))

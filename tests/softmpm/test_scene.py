@@ -34,7 +34,7 @@ def scene(**changes) -> Scene:
         (lambda: Particles(np.zeros((3, 2)), [1, 1, np.inf]), "volume must be finite; particle 2 is not"),
         (lambda: Particles(np.zeros((3, 2)), np.nan), "volume must be finite; particle 0 is not"),
         (lambda: Particles(np.zeros((2, 2)), [1.0, 0.0]), "volume must be > 0, got 0"),
-        (lambda: Material(**SOFT), "use NeoHookean or FixedCorotated"),
+        (lambda: Material(**SOFT), "use NeoHookean, FixedCorotated or BarrierCorotated"),
         (lambda: NeoHookean(density=0.0, young=1.0), "density must be > 0"),
         (lambda: NeoHookean(density=np.nan, young=1.0), "density must be finite"),
         (lambda: NeoHookean(density=1.0, young=-1.0), "young must be > 0 Pa, got -1"),

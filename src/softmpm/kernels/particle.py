@@ -114,7 +114,7 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
     ) -> ParticleAdj:
         """(T1.adj) of v, C and H from Σ w p̄_i, Σ w m̄_i and B = Σ w p̄_i rᵀ; adds what is wanted into ``adj_body``."""
         m = body.mass[world, p]
-        adj_A = scale.width * B
+        adj_A = scale.spacing * B
         adj = ParticleAdj()
         adj.v = m * adj_mv
         adj.C = m * adj_A
@@ -125,11 +125,16 @@ def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
 
     @wp.func
     def moved_adj(scale: Scale, H: mat, new_C: mat, adj_new: ParticleAdj) -> ParticleAdj:
-        """(T3.adj): adjoints of x and H before, and in ``v`` and ``C`` those of v' and B."""
+        """(T3.adj): adjoints of x and H before, and in ``v`` and ``C`` those of v' and B.
+
+        With 4/dx and dx as they are: the paired factors cost registers, which spill, and change an adjoint by 1e-7.
+        """
         adj = ParticleAdj()
         adj.fx = adj_new.fx
         adj.v = adj_new.v + divide(scale.dt, scale.spacing) * adj_new.fx
-        adj.C = scale.rate * (adj_new.C + scale.dt * (adj_new.H * wp.transpose(identity() + H)))
+        adj.C = divide(real(4.0), scale.spacing) * (
+            adj_new.C + scale.dt * (adj_new.H * wp.transpose(identity() + H))
+        )
         adj.H = adj_new.H + scale.dt * (wp.transpose(new_C) * adj_new.H)
         return adj
 
