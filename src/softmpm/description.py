@@ -28,6 +28,7 @@ def describe(model, substeps: int) -> str:
         f"  gravity    {has(spec.gravity)}",
         f"  damping    {has(spec.damping)}",
         "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
+        f"  alarms     {_alarms(model)}",
         f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
         f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
         f"  sums       {_sums(model)}",
@@ -45,6 +46,16 @@ def _memory(model, substeps: int) -> str:
     often = "once" if found.runs == 1 else f"{found.runs:.3g} times"
     steps = f"{model.calls} calls of {substeps} substeps" if model.calls > 1 else f"{substeps} substeps"
     return f"{forward} to run; {steps} with gradient: {kept} kept, {backward} at the peak, each runs forward {often}"
+
+
+def _alarms(model) -> str:
+    alarms = model.alarms
+    texts = {
+        "det F below": alarms.collapse,
+        "neighbours at rest farther apart than, in cells,": alarms.gap,
+        "dt over its running limit above": alarms.step,
+    }
+    return "; ".join(f"{what} {limit:g}" for what, limit in texts.items() if limit is not None) or "off"
 
 
 def _sums(model) -> str:
