@@ -13,7 +13,13 @@ import pytest
 import softmpm
 
 ROOT = Path(__file__).parents[1]
-IMPORTED_AS = {"warp-lang": "warp", "rerun-sdk": "rerun", "hydra-core": "hydra", "pillow": "PIL"}
+IMPORTED_AS = {
+    "warp-lang": "warp",
+    "rerun-sdk": "rerun",
+    "hydra-core": "hydra",
+    "pillow": "PIL",
+    "charset-normalizer": "trimesh",
+}
 
 
 @pytest.fixture(scope="module")
