@@ -19,8 +19,8 @@ class Alarms:
     """
 
     collapse: float | None = 0.05
-    """Least det F [-] of a particle, checked in every substep. A healthy body stays above 0.1 even under an impact at twice its wave
-    speed; below 0.05 fixed corotated bodies collapse for good. None leaves det F > 0 to the laws that are undefined beyond."""
+    """Least det F [-] of a particle, checked in every substep. Bodies that recover stay above 0.1 (docs/limits.md); below 0.05
+    fixed corotated bodies collapse for good. None leaves det F > 0 to the laws that are undefined beyond."""
     gap: float | None = 1.4
     """Largest distance of two particles that are neighbours at rest [cells], checked after each chunk. Bodies that were stretched to
     4/3 cells spring back, those at 3/2 do not: they break for numerical reasons alone (numerical fracture)."""

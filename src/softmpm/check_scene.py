@@ -1,6 +1,6 @@
 """Every rule that needs a whole scene: bodies in the grid, muscles in the bodies, walls in reach, values in the precision.
 
-Each message says what must hold, what came instead and what to do. Rules of one object stand in ``scene.py``.
+Each message names the rule, the value received and a remedy. Rules of one object stand in ``scene.py``.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Every rule of the tensors that meet a model.
 
-Each message says what must hold, what came instead and what to do.
+Each message names the rule, the value received and a remedy.
 """
 
 import math

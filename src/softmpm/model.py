@@ -68,8 +68,8 @@ def build(
         The model: immutable, shared by any number of simulations.
 
     Raises:
-        ValueError: The scene breaks a rule, or its dt is above :func:`softmpm.stable_dt`; the message says which, what came and
-            what to do.
+        ValueError: The scene breaks a rule, or its dt is above :func:`softmpm.stable_dt`; the message names the rule, the value
+            received and a remedy.
     """
     check_scene(scene)
     if dtype not in (torch.float32, torch.float64):

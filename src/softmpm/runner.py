@@ -1,4 +1,4 @@
-"""Runs the chunks of one call by the model's scheme, and decides whether what came out of them can be used."""
+"""Runner of the chunks of one call: runs them by the model's scheme, accepts or repeats them, and locates failures."""
 
 import functools
 from typing import Any
@@ -69,7 +69,7 @@ class Runner:
         return None if self.pull is None else self.pull.amax(0)
 
     def settled(self, run: FastRun | PlainRun, report: Report) -> bool:
-        """Whether what ``run`` gave can be used; False if it must run again, with a larger window or without a world that failed.
+        """Accept a run; False if the chunk must be repeated, with a larger window or without a world that failed.
 
         Raises:
             UnstableError: A world failed, and the failures are not taken.
