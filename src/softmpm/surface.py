@@ -5,7 +5,6 @@ answers it on the CPU; trimesh's own test would need rtree.
 """
 
 import os
-import struct
 from typing import Any
 
 import numpy as np
@@ -13,21 +12,6 @@ import warp as wp
 
 from softmpm.kernels.turn import launch
 from softmpm.validate import need
-
-_DAMAGE = (
-    *(
-        ArithmeticError,
-        AssertionError,
-        AttributeError,
-        BufferError,
-        EOFError,
-        LookupError,
-        MemoryError,
-        OSError,
-    ),
-    *(RuntimeError, SyntaxError, TypeError, ValueError, struct.error),
-)
-"""As the readers of trimesh report a file that they cannot read."""
 
 wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
 
@@ -105,7 +89,7 @@ def _load(path: "str | os.PathLike[str]") -> Any:
         raise ImportError(
             f"reading the mesh {os.fspath(path)!r} needs the package {error.name or 'trimesh'}: pip install softmpm[mesh]."
         ) from error
-    except _DAMAGE as error:
+    except Exception as error:  # a damaged file meets any error of trimesh's readers, their own mistakes too
         raise ValueError(
             f"{os.fspath(path)!r} cannot be read as a mesh: {type(error).__name__}: {error}; open it in a program for meshes and "
             "save it as STL."
