@@ -6,6 +6,7 @@ The old file stays until the new one is whole; room on the disk is claimed befor
 import contextlib
 import json
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from softmpm.playback import Recording
 _OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
 _PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot tear what does not cross a page
 _ROOM_EXTRA = 2**20  # for HDF5's own tables
+_PATIENCE = 10.0  # seconds that a reader may take to open a file
 
 
 def begin(
@@ -71,11 +73,11 @@ def _copy(
                 extend(f"frame/{name}", rows)
             for name, rows in parts.items():
                 extend(PARTS[name], rows)
-            time = old.read("time", [row])[1][0]
+            when = old.read("time", [row])[1][0]
             extend(
-                "frame/index", np.array([(len(new["episode"]) - 1, time, at["field"], at["latent"])], FRAME)
+                "frame/index", np.array([(len(new["episode"]) - 1, when, at["field"], at["latent"])], FRAME)
             )
-            Content.frame(episode, time, values | parts)
+            Content.frame(episode, when, values | parts)
     for name, (iterations, values) in old.scalars.items():
         kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]
         extend("scalar", np.array(kept, SCALAR))
@@ -104,12 +106,23 @@ def room(file: h5py.File, size: int) -> Iterator[None]:
 
 
 def open_to_append(path: Path) -> h5py.File:
-    """Open straight into reader-safe mode; a kill between "r+" and ``swmr_mode`` locks a file."""
+    """Open straight into reader-safe mode; a kill between "r+" and ``swmr_mode`` locks a file.
+
+    Readers hold a lock while they open the file: waited for.
+    """
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_libver_bounds(h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
     access.set_file_locking(True, True)
     flags = h5py.h5f.ACC_RDWR | h5py.h5f.ACC_SWMR_WRITE
-    return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
+    end = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
+        except BlockingIOError as error:
+            if time.monotonic() > end:
+                text = "cannot record: another program has had the file open for a while; close it"
+                raise BlockingIOError(error.errno, text, os.fspath(path)) from error
+            time.sleep(0.01)
 
 
 def put_in_place(draft: Path, path: Path) -> None:

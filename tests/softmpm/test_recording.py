@@ -182,6 +182,28 @@ def reading(path: Path, times: str) -> None:
         os.waitpid(child, 0)
 
 
+def test_a_writer_waits_for_readers_that_open_the_file(tmp_path):
+    """They hold a lock for a moment, which a writer that begins or resumes then would take for an error."""
+    run_here("opening", tmp_path / "run.h5", "200")
+
+
+def opening(path: Path, times: str) -> None:
+    """Fork a reader that opens the file all the time, and resume again and again."""
+    model = small_model()
+    with softmpm.Recorder(path, model) as recorder:
+        record(recorder, model, 0)
+    child = os.fork()
+    while child == 0:
+        with softmpm.Recording(path):
+            pass
+    try:
+        for _ in range(int(times)):
+            softmpm.Recorder(path, model, resume_before=1).close()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
 def test_resume_keeps_what_came_before(tmp_path):
     """``resume_before=k`` drops iterations from k on, and what follows is as in a run without a break."""
     model, path, whole = small_model(), tmp_path / "run.h5", tmp_path / "whole.h5"
