@@ -6,6 +6,8 @@ import pytest
 from fuzzing.calls import simulations
 from fuzzing.judge import judge
 from fuzzing.legal import judged
+from fuzzing.warp_way import steps
+from fuzzing.worker import Worker
 from hypothesis import HealthCheck, given, settings
 
 short = settings(
@@ -29,4 +31,20 @@ def test_a_call_is_right_or_refused_by_name(plan):
 def test_a_sensible_scene_runs(seed):
     """At 0.95 of the stable step, with no more energy than it had and was given."""
     verdict = judged(seed)
+    assert verdict.good, verdict
+
+
+@pytest.fixture(scope="module")
+def worker():
+    """A crash would end the tests."""
+    worker = Worker()
+    yield worker
+    worker.stop()
+
+
+@short
+@given(plan=steps)
+def test_the_warp_way_in_is_right_or_refused_by_name(worker, plan):
+    """``step`` is ``simulate`` to the last bit, and refuses arrays, tensors and models that do not belong together."""
+    verdict = worker.judge(json.loads(json.dumps(plan)))
     assert verdict.good, verdict
