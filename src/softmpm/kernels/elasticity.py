@@ -15,6 +15,12 @@ The adjoints take τ̄ and return (F̄, μ̄, λ̄):
     (E2): F̄ = 2μ T (2F − R) + λ (2J − 1) tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,  T = (τ̄ + τ̄ᵀ) / 2,
           μ̄ = ⟨T, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
     (E3): as (E2), with λ/2 (J + J⁻³) for λ (2J − 1) and λ̄ = tr(τ̄) (J² − J⁻²) / 4
+
+``bound`` of a law is at least the stiffness K of (W3), from the square s² of the largest principal stretch or more, and J:
+
+    (E1): K ≤ 2μ s² + d max(λ, 0),    (E2), (E3): K ≤ 2μ max(2s² − s, 0) + d max(λ J p', 0)          (E4)
+
+in d dimensions, with the slope p' = dp/dJ of the law's pressure λ p. At rest they are K itself.
 """
 
 from types import SimpleNamespace
@@ -95,8 +101,12 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         adj.lam = trace * log1p(j)
         return adj
 
-    def corotated(pressure: wp.Function, pressure_slope: wp.Function) -> tuple[wp.Function, wp.Function]:
-        """Stress and adjoint of a corotated law, τ = μ (S + Sᵀ) + λ p(j) I, from p and ∂p/∂J."""
+    @wp.func
+    def neo_hookean_bound(square: real, j: real, mu: real, lam: real) -> real:
+        return real(2.0) * mu * square + real(dim) * wp.max(lam, real(0.0))
+
+    def corotated(pressure: wp.Function, pressure_slope: wp.Function) -> tuple[wp.Function, ...]:
+        """Stress, adjoint and bound of a corotated law, τ = μ (S + Sᵀ) + λ p(j) I, from p and ∂p/∂J."""
 
         @wp.func
         def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
@@ -117,7 +127,13 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
             adj.lam = trace * pressure(j)
             return adj
 
-        return stress, stress_adj
+        @wp.func
+        def bound(square: real, j: real, mu: real, lam: real) -> real:
+            shape = wp.max(real(2.0) * square - wp.sqrt(square), real(0.0))
+            volume = wp.max(lam * (real(1.0) + j) * pressure_slope(j), real(0.0))
+            return real(2.0) * mu * shape + real(dim) * volume
+
+        return stress, stress_adj, bound
 
     @wp.func
     def soft_pressure(j: real) -> real:
@@ -138,8 +154,10 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         J = real(1.0) + j
         return real(0.5) * (J + divide(real(1.0), J * J * J))
 
-    fixed_corotated, fixed_corotated_adj = corotated(soft_pressure, soft_pressure_slope)
-    barrier_corotated, barrier_corotated_adj = corotated(barrier_pressure, barrier_pressure_slope)
+    fixed_corotated, fixed_corotated_adj, fixed_bound = corotated(soft_pressure, soft_pressure_slope)
+    barrier_corotated, barrier_corotated_adj, barrier_bound = corotated(
+        barrier_pressure, barrier_pressure_slope
+    )
 
     return SimpleNamespace(
         Adj=ElasticAdj,
@@ -159,5 +177,10 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
             "neo_hookean": neo_hookean_adj,
             "fixed_corotated": fixed_corotated_adj,
             "barrier_corotated": barrier_corotated_adj,
+        },
+        bound={
+            "neo_hookean": neo_hookean_bound,
+            "fixed_corotated": fixed_bound,
+            "barrier_corotated": barrier_bound,
         },
     )

@@ -16,7 +16,7 @@ def solid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, mat, Solid = t.real, t.mat, solid_types(spec).Solid
     laws, law_of = elasticity(spec.dim, spec.dtype), _law_of(spec)
-    muscle_stress, slots = muscle(spec.dim, spec.dtype).muscle_stress, spec.muscle_slots
+    muscle_stress, slots, dim = muscle(spec.dim, spec.dtype).muscle_stress, spec.muscle_slots, spec.dim
 
     def rotation_from(k: int) -> wp.Function:
         """Q by the laws from number ``k`` on."""
@@ -46,7 +46,21 @@ def solid(spec: Spec) -> SimpleNamespace:
 
         return stress_of
 
-    rotation_of, stress_of = rotation_from(0), stress_from(0)
+    def bound_from(k: int) -> wp.Function:
+        """Bound of the stiffness by the laws from number ``k`` on."""
+        own, last = laws.bound[spec.laws[k]], k + 1 == len(spec.laws)
+        others = None if last else bound_from(k + 1)
+
+        @wp.func
+        def bound_of(law: int, square: real, j: real, mu: real, lam: real) -> real:
+            if wp.static(not last):
+                if law != k:
+                    return others(law, square, j, mu, lam)
+            return own(square, j, mu, lam)
+
+        return bound_of
+
+    rotation_of, stress_of, bound_of = rotation_from(0), stress_from(0), bound_from(0)
 
     @wp.func
     def rotation(body: Solid, world: int, p: int, H: mat) -> mat:
@@ -64,7 +78,28 @@ def solid(spec: Spec) -> SimpleNamespace:
                     tau += muscle_stress(H, body.fibre[k], body.pull[world, k])
         return tau
 
-    return SimpleNamespace(rotation=rotation, stress=stress)
+    @wp.func
+    def stiffness_bound(body: Solid, world: int, p: int, H: mat) -> real:
+        """At least the stiffness K of (W3) [Pa], at a small part of its price; K itself at rest."""
+        F = laws.identity() + H
+        B = F * wp.transpose(F)
+        square = real(0.0)  # of the largest stretch, at most the largest sum of a row
+        for i in range(dim):
+            row = real(0.0)
+            for k in range(dim):
+                row += wp.abs(B[i, k])
+            square = wp.max(square, row)
+        law = law_of(body, world, p)
+        K = bound_of(law, square, laws.volume_change(H), body.mu[world, p], body.lam[world, p])
+        if wp.static(slots > 0):
+            for slot in range(slots):
+                k = body.muscle[world, p, slot]
+                if k >= 0:
+                    f = F * body.fibre[k]
+                    K += real(2.0) * wp.max(body.pull[world, k], real(0.0)) * wp.dot(f, f)
+        return K
+
+    return SimpleNamespace(rotation=rotation, stress=stress, stiffness_bound=stiffness_bound)
 
 
 def _law_of(spec: Spec) -> wp.Function:

@@ -7,6 +7,7 @@ import warp as wp
 from blocks import apply, special_deformations
 from test_polar import svd_rotation
 
+from softmpm import BarrierCorotated, FixedCorotated, NeoHookean, reference
 from softmpm.kernels.elasticity import elasticity
 from softmpm.kernels.muscle import muscle
 from softmpm.kernels.types import types
@@ -148,3 +149,23 @@ def test_muscle_stress_and_its_adjoint(dim, device):
     torch.testing.assert_close(
         adj, torch.cat([want[0].flatten(1), want[1][:, None]], 1), rtol=1e-12, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("lam", [-1.5, 0.0, 5.0])
+def test_the_bound_of_the_stiffness(law, dim, lam, device):
+    """(E4) is nowhere below the largest eigenvalue of the tangent, and equals it at rest."""
+    material = {"neo_hookean": NeoHookean, "fixed_corotated": FixedCorotated}.get(law, BarrierCorotated)
+    rng, real = np.random.default_rng(5), types(dim, "float64").real
+    stretch = np.concatenate([np.ones((1, dim)), np.exp(rng.uniform(np.log(0.1), np.log(5.0), (400, dim)))])
+    F = torch.from_numpy(stretch[..., None] * np.eye(dim))
+    moduli = [torch.full((len(F),), value, dtype=torch.float64) for value in (MU, lam)]
+    K = torch.linalg.eigvalsh(reference.tangent(material(density=1.0, young=1.0), F, *moduli))[:, -1].clamp(
+        min=0.0
+    )
+    square, j = torch.from_numpy((stretch**2).max(1)), torch.from_numpy(stretch.prod(1) - 1.0)
+    given = [(tensor.to(device), real) for tensor in (square, j, *moduli)]
+    got = apply(elasticity(dim, "float64").bound[law], real, (), *given).cpu()
+    assert (got >= K * (1 - 1e-12)).all()
+    torch.testing.assert_close(got[0], K[0], rtol=1e-12, atol=0)
