@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
 from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
-from softmpm.buffers import Solid, lame
+from softmpm.buffers import Solid, lame, masses
 from softmpm.checks import (
     check_activation,
     check_bounds,
@@ -120,7 +120,7 @@ def _followed(tensors: Iterable[Tensor | None]) -> bool:
 
 
 def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
-    """μ, λ [Pa] and mass [kg], (world, particle) each, of ``params`` that were checked.
+    """μ, λ [Pa] and mass [model.mass_unit], (world, particle) each, of ``params`` that were checked.
 
     Those of the call before if nothing changed and nothing needs a gradient.
     """
@@ -128,12 +128,11 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     if seen and seen == last.seen:
         return last.found
     check_params(model, params)
-    mass = params.density * model.volume
     if not recording(model):  # else nothing can be read back
-        check_bounds(params, mass)
+        check_bounds(params, params.density * model.volume, model.mass_unit)
     lead = (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead).contiguous() for term in lame(params))
-    found = mu, lam, mass.expand(lead).contiguous()
+    found = mu, lam, masses(model, params).expand(lead).contiguous()
     if seen:
         last.params, last.seen, last.found = params, seen, found
     return found

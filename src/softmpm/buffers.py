@@ -69,6 +69,12 @@ def lame(params: Params) -> tuple[Tensor, Tensor]:
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
+def masses(model: Model, params: Params) -> Tensor:
+    """Mass of the particles in units of ``model.mass_unit``: exactly one in a uniform body, so that sums of it are not biased."""
+    mass = params.density * model.volume
+    return mass / model.mass_unit  # a tensor: by a number a GPU would multiply with the reciprocal
+
+
 @dataclass
 class Motion:
     """State of all particles as the kernels hold it (kernels/types.py); shapes (..., world, particle, dim[, dim])."""
@@ -141,7 +147,10 @@ class MotionAdj:
 
 @dataclass
 class Solid:
-    """Material of all particles: tensors (world, particle), and the pull of the muscles (world, muscle) [Pa]."""
+    """Material of all particles: tensors (world, particle), and the pull of the muscles (world, muscle) [Pa].
+
+    Mass is in units of ``model.mass_unit``, volume in [m³] per unit of mass; μ and λ are in [Pa].
+    """
 
     mass: Tensor
     mu: Tensor
@@ -161,7 +170,7 @@ class Solid:
         """The struct with what the scene alone decides; μ, λ, mass and pull are open."""
         t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
         lead = (model.worlds, model.particle_count)
-        solid.volume = view(model.volume.expand(lead), t.real)
+        solid.volume = view(model.specific_volume.expand(lead), t.real)
         if len(model.spec.laws) > 1:
             solid.law = view(model.law.expand(lead), wp.int32)
         if model.spec.muscle_slots:

@@ -46,6 +46,7 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
             + ("use dtype=torch.float64, or other units." if dtype == torch.float32 else "use other units."),
         )
 
+    heaviest = max(b.material.density * float(np.max(b.particles.volume)) for b in scene.bodies)
     within("dt", scene.dt, least, most)
     within("grid spacing", scene.grid.spacing, least, most)
     for b, body in enumerate(scene.bodies):
@@ -58,6 +59,18 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
         for value in ends:
             within(f"the smallest or largest volume [m³] of body {b}", value, least, most)
             within(f"the smallest or largest mass [kg] of body {b}", material.density * value, least, most)
+            within(
+                f"the smallest mass of body {b} over the largest of all",
+                material.density * value / heaviest,
+                least,
+                most,
+            )
+            within(
+                f"the smallest or largest volume of body {b} per unit of mass [m³/kg]",
+                value / heaviest,
+                least,
+                most,
+            )
     for m, muscle in enumerate(scene.muscles):
         within(f"strength of muscle {m}", muscle.strength, -most, most)
     for axis, gravity in enumerate(scene.gravity or ()):

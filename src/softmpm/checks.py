@@ -115,22 +115,25 @@ def check_whole(name: str, value: Any) -> None:
 
 
 @torch.no_grad()
-def check_bounds(params: NamedTuple, mass: Tensor) -> None:
+def check_bounds(params: NamedTuple, mass: Tensor, unit: Tensor) -> None:
     """Raise ValueError for a material that cannot exist. Reads back once: a GPU has to wait.
 
     Args:
         mass: That of the particles [kg], density times volume.
+        unit: In which the kernels count it [kg], shape ().
     """
     given = [*_fields("params", params, tuple(BOUNDS)), ("mass", mass)]
-    ends = torch.stack([end for _, value in given for end in torch.aminmax(value)]).tolist()
-    for (name, value), low, high in zip(given[:-1], ends[:-2:2], ends[1:-2:2], strict=True):
+    found = [end for _, value in given for end in torch.aminmax(value)]
+    *ends, lightest, heaviest, one = torch.stack([*found, unit]).tolist()
+    for (name, value), low, high in zip(given[:-1], ends[::2], ends[1::2], strict=True):
         least, most, rule = BOUNDS[name]
         if not (least < low and high < most):
             _demand(f"params.{name}", value, (value > least) & (value < most), rule)
-    least = torch.finfo(mass.dtype).tiny
-    if not (least <= ends[-2] and ends[-1] < math.inf):
-        rule = f"finite and at least {least:.3g} kg to be exact in {mass.dtype}; change params.density, or the units"
-        _demand("mass = density * volume", mass, (mass >= least) & (mass < math.inf), rule)
+    real = torch.finfo(mass.dtype)
+    least, most = max(one, 1.0) * real.tiny, min(one, 1.0) * real.max  # in both units
+    if not (least <= lightest and heaviest <= most):
+        rule = f"in [{least:.3g}, {most:.3g}] kg to be exact in {mass.dtype}; change params.density, or the units"
+        _demand("mass = density * volume", mass, (mass >= least) & (mass <= most), rule)
 
 
 @torch.no_grad()

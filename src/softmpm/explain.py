@@ -168,5 +168,5 @@ class Case:
             return float("nan")
         mu, lam, mass = (tensor[self.world, p].item() for tensor in (solid.mu, solid.lam, solid.mass))
         pulls = [0.0] * model.muscle_count if self.pull is None else self.pull[self.world].tolist()
-        density = mass / model.volume[p].item()
+        density = mass / model.specific_volume[p].item()
         return running_limit(model.scene, p, mu, lam, density, self.end.F[self.world, p], pulls)

@@ -118,6 +118,8 @@ class Model:
         positions: Rest positions X [m], shape (particle, dim).
         volume: Rest volumes V⁰ [m³], shape (particle,).
         mass: Mass [kg] as the scene gives it, shape (particle,).
+        mass_unit: Mass of the heaviest particle [kg], in which the kernels count, shape ().
+        specific_volume: Rest volume per unit of mass [m³/kg], shape (particle,).
         body: Index of each particle's body, shape (particle,).
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
@@ -159,6 +161,8 @@ class Model:
         # Made now, not when first asked for: that may be while a graph is recorded, which runs nothing.
         self._params, self._low = self._given(), self._rounded() if dtype == torch.float32 else None
         self.mass = (self._params.density * self.volume).contiguous()
+        self.mass_unit = self.mass.max()
+        self.specific_volume = self.volume / self.mass_unit
         wp.init()
         self.wp_device = wp.device_from_torch(device)
         self.scale, self.walls = self._scale(), self._walls()

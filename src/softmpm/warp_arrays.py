@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import Motion, Solid, lame, view
+from softmpm.buffers import Motion, Solid, lame, masses, view
 from softmpm.checks import check_bounds, check_finite, check_params, check_row, check_state
 from softmpm.checkup import armed, check_end
 from softmpm.failures import raise_failure
@@ -78,7 +78,7 @@ class WarpSolid:
     model: Model
     """The model that it was made for, and works with."""
     mass: wp.array
-    """m_p [kg], (world, particle)."""
+    """m_p in units of ``model.mass_unit``, (world, particle)."""
     mu: wp.array
     """Lamé's μ [Pa], (world, particle)."""
     lam: wp.array
@@ -226,7 +226,7 @@ def warp_solid(
     check_params(model, params)
     check_row(model, activation)
     if not recording(model):
-        check_bounds(params, params.density * model.volume)
+        check_bounds(params, params.density * model.volume, model.mass_unit)
         check_finite(None, activation)
     return _warp_solid(model, params, activation, requires_grad)
 
@@ -235,7 +235,7 @@ def warp_solid(
 def _warp_solid(model: Model, params: Params, activation: Tensor | None, requires_grad: bool) -> WarpSolid:
     real, lead = types(model.spec.dim, model.spec.dtype).real, (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead) for term in lame(Params(*(p.expand(lead) for p in params))))
-    mass = (params.density * model.volume).expand(lead)
+    mass = masses(model, params).expand(lead)
     pull = None
     if model.muscle_count:
         if activation is None:

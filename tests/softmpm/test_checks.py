@@ -22,6 +22,7 @@ from softmpm.state import Low, Params, State
 MODEL = SimpleNamespace(
     dim=2, worlds=2, particle_count=3, muscle_count=4, dtype=torch.float32, device=torch.device("cpu")
 )
+ONE = torch.tensor(1.0)
 
 
 def state(**changes) -> State:
@@ -46,7 +47,7 @@ def test_good_tensors_pass():
         check_params(MODEL, params(young=torch.ones(shape)))
     check_whole("substeps", 1)
     check_whole("substeps", np.int64(20))
-    check_bounds(params(), torch.ones(2, 3))
+    check_bounds(params(), torch.ones(2, 3), ONE)
     check_finite(state(), torch.zeros(1, 2, 4))
     check_finite(state(), None)
     check_state(MODEL, state(low=Low(state().v, state().C)))
@@ -133,7 +134,7 @@ def test_not_finite(name, bad):
     tensor = (start._asdict() | {"activation": activation} | material._asdict())[name]
     tensor.view(-1)[-1] = bad
     index = ", ".join(str(n - 1) for n in tensor.shape)
-    check = partial(check_bounds, material, torch.ones(2, 3))
+    check = partial(check_bounds, material, torch.ones(2, 3), ONE)
     if name not in BOUNDS:
         check = partial(check_finite, start, activation)
     with pytest.raises(
@@ -149,7 +150,7 @@ def test_impossible_materials(name, bad):
     """A material outside its bounds is refused, also where it requires gradients."""
     tensors = params(**{name: torch.tensor([0.3, 0.3, bad], requires_grad=True)})
     with pytest.raises(ValueError, match=rf"params.{name} must be .*{name}\[2\] is {bad:g}"):
-        check_bounds(tensors, torch.ones(2, 3))
+        check_bounds(tensors, torch.ones(2, 3), ONE)
 
 
 @pytest.mark.parametrize("mass, index", [(1e-39, "[1, 2]"), (0.0, "[1, 2]"), (torch.inf, "[1, 2]")])
@@ -158,9 +159,16 @@ def test_a_mass_that_its_precision_cannot_hold(mass, index):
     masses = torch.ones(2, 3)
     masses[1, 2] = mass
     with pytest.raises(
-        ValueError, match=r"mass = .* at least 1.18e-38 kg .*torch.float32.*" + re.escape(index)
+        ValueError, match=r"mass = .* in \[1.18e-38, 3.4e\+38\] kg .*torch.float32.*" + re.escape(index)
     ):
-        check_bounds(params(), masses)
+        check_bounds(params(), masses, ONE)
+
+
+@pytest.mark.parametrize("mass, unit", [(1e-30, 1e10), (1e30, 1e-10)])
+def test_a_mass_that_its_precision_cannot_hold_in_units_of_the_heaviest(mass, unit):
+    """Kernels count mass in units of the scene's heaviest particle: what fits in kilograms may not fit there."""
+    with pytest.raises(ValueError, match=r"mass = .*to be exact in torch.float32"):
+        check_bounds(params(), torch.full((2, 3), mass), torch.tensor(unit))
 
 
 def test_sparse_tensors():

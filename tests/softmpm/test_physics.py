@@ -1,9 +1,13 @@
 """Laws that the simulation must keep whatever the scene."""
 
+import dataclasses
+
 import numpy as np
+import pytest
 import torch
 
 import softmpm
+from softmpm.buffers import masses
 
 
 def block(dim=2, law=softmpm.NeoHookean, cells=3, dx=0.1, shape=None, lower=None, **scene):
@@ -134,3 +138,28 @@ def test_damping_is_a_rate():
             model, rest._replace(v=rest.v + 0.4), None, model.params(), substeps=round(0.1 / dt)
         )
         torch.testing.assert_close(end.v, torch.full_like(end.v, 0.4 * np.exp(-0.5)), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_turning_body_gains_no_spin_by_rounding(dim, scheme, device):
+    """In float32, 4,000 substeps: within 3e-6. Rounded weights in 3D gave 1.5e-5, a mass of 0.4 kg in 2D 4e-6, always upwards."""
+    spacing = 0.04
+    corner = np.full(dim, 4.5 * spacing)
+    particles = softmpm.box(corner, corner + 4 * spacing, spacing / 2)
+    body = softmpm.Body(particles, softmpm.NeoHookean(density=1000.0, young=1e6))
+    scene = softmpm.Scene(grid=softmpm.Grid(shape=(14,) * dim, spacing=spacing), bodies=[body], dt=1.0)
+    scene = dataclasses.replace(scene, dt=0.5 * softmpm.stable_dt(scene))
+    model = softmpm.build(scene, device=device, scheme=scheme)
+    start = model.rest()
+    start.C[..., 0, 1], start.C[..., 1, 0] = -1.5, 1.5
+    start.v[:] = (start.C @ (start.x - start.x.mean(1, keepdim=True))[..., None])[..., 0]
+    end = softmpm.simulate(model, start, None, model.params(), substeps=4000)
+
+    def spin(state):
+        x, low, v, C = (tensor[0].double() for tensor in (state.x, state.low.x, state.v, state.C))
+        arm = x + low - (x + low).mean(0)
+        affine = spacing**2 / 4 * (C[:, 1, 0] - C[:, 0, 1])
+        return (arm[:, 0] * v[:, 1] - arm[:, 1] * v[:, 0] + affine).sum().item()
+
+    assert abs(spin(end) / spin(start) - 1) < 3e-6
+    assert torch.equal(masses(model, model.params()), torch.ones_like(model.mass))

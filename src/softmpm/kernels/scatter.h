@@ -17,13 +17,16 @@ constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 // Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
 
+// g^2, rounded so that the weights made of it are exact and add up to one, see spline.py.
+template <typename T> CUDA_CALLABLE inline T square(T g) { return (g * g + T(0.5)) - T(0.5); }
+
 // Weights of the three nodes along an axis.
 template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
 {
-    T low = T(0.5) - g, high = T(0.5) + g;
-    w[0] = T(0.5) * low * low;
-    w[1] = T(0.75) - g * g;
-    w[2] = T(0.5) * high * high;
+    T outer = T(0.125) + T(0.5) * square(g);
+    w[0] = outer - T(0.5) * g;
+    w[1] = T(0.75) - square(g);
+    w[2] = outer + T(0.5) * g;
 }
 
 #if defined(__CUDA_ARCH__)
@@ -53,20 +56,16 @@ template <> CUDA_CALLABLE inline void add(float* p, float x, float y, float z, f
 }
 #endif
 
-// w(o, g) = level + bend (g - peak)^2, for the o that a lane owns
+// w(o, g) = level + bend g^2 + lean g, for the o that a lane owns
 struct Weight {
-    float level, bend, peak;
+    float level, bend, lean;
     CUDA_CALLABLE inline explicit Weight(int o)
-        : level(o == 0 ? 0.75f : 0.0f)
+        : level(o == 0 ? 0.75f : 0.125f)
         , bend(o == 0 ? -1.0f : 0.5f)
-        , peak(-0.5f * float(o))
+        , lean(0.5f * float(o))
     {
     }
-    CUDA_CALLABLE inline float operator()(float g) const
-    {
-        float d = g - peak;
-        return level + bend * d * d;
-    }
+    CUDA_CALLABLE inline float operator()(float g) const { return level + bend * square(g) + lean * g; }
 };
 
 // Where this lane's particle stands among those of its warp, sorted by their first nodes; lanes without a particle, which come last,

@@ -5,6 +5,9 @@ With f the distance from the base node in cells, 0.5 ≤ f < 1.5, along each axi
     w₀ = ½ (3/2 − f)²,  w₁ = ¾ − (f − 1)²,  w₂ = ½ (f − ½)²      (S1)
     w₀' = f − 3/2,      w₁' = 2 − 2f,       w₂' = f − ½           (S2)
 
+Of g = f − 1 only the square is rounded: Σ w = 1 and Σ w (o − f) = 0 hold to the last bit. Otherwise a body whose particles keep their
+place along an axis, as one that turns about it, would gain or lose momentum in every substep alike.
+
 Source: Steffen, Kirby, Berzins 2008; Hu et al. 2018, "MLS-MPM".
 """
 
@@ -26,13 +29,14 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
     def weights(fx: vec) -> table:
         w = table()
         for axis in range(dim):
-            f = fx[axis]
-            a = real(1.5) - f
-            b = f - real(1.0)
-            c = f - real(0.5)
-            w[0, axis] = real(0.5) * a * a
-            w[1, axis] = real(0.75) - b * b
-            w[2, axis] = real(0.5) * c * c
+            g = fx[axis] - real(1.0)
+            square = (g * g + real(0.5)) - real(
+                0.5
+            )  # a multiple of the precision at 1/2: the weights are exact in it
+            outer = real(0.125) + real(0.5) * square
+            w[0, axis] = outer - real(0.5) * g
+            w[1, axis] = real(0.75) - square
+            w[2, axis] = outer + real(0.5) * g
         return w
 
     @wp.func

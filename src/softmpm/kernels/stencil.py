@@ -33,9 +33,9 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def weights(g: real) -> triple:
-        low = real(0.5) - g
-        high = real(0.5) + g
-        return triple(real(0.5) * low * low, real(0.75) - g * g, real(0.5) * high * high)
+        square = (g * g + real(0.5)) - real(0.5)  # rounded as in spline.py
+        outer = real(0.125) + real(0.5) * square
+        return triple(outer - real(0.5) * g, real(0.75) - square, outer + real(0.5) * g)
 
     @wp.func
     def particle_of(thread: int, crew: int, total: int) -> int:

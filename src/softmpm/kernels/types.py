@@ -164,10 +164,12 @@ def solid_types(spec: Spec) -> SimpleNamespace:
     """Structs of the material and the walls: only the fields that this scene needs."""
     t = types(spec.dim, spec.dtype)
     solid = dict(
-        mass=wp.array2d(dtype=t.real),  # m_p [kg], (world, particle)
+        mass=wp.array2d(
+            dtype=t.real
+        ),  # m_p [m₀], in units of the heaviest particle's mass, (world, particle)
         mu=wp.array2d(dtype=t.real),  # Lamé's μ [Pa], (world, particle)
         lam=wp.array2d(dtype=t.real),  # Lamé's λ [Pa], (world, particle)
-        volume=wp.array2d(dtype=t.real),  # V⁰ [m³], (world, particle)
+        volume=wp.array2d(dtype=t.real),  # V⁰ / m₀ [m³/kg], (world, particle)
     )
     if len(spec.laws) > 1:
         solid["law"] = wp.array2d(dtype=wp.int32)  # index into spec.laws, (world, particle)

@@ -6,6 +6,7 @@ import warp as wp
 from blocks import apply
 
 from softmpm.kernels.spline import spline
+from softmpm.kernels.stencil import stencil as stencil_sums
 from softmpm.kernels.types import types
 
 
@@ -77,3 +78,31 @@ def test_slopes_are_the_derivative(dim):
         step[axis] = h
         ahead, behind = stencil(dim, fx + step, "cpu")[0], stencil(dim, fx - step, "cpu")[0]
         torch.testing.assert_close(slope[..., axis], (ahead - behind) / (2 * h), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("block", ["spline", "stencil"])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_nothing_is_gained_by_rounding(block, dtype, device):
+    """Of the weights along an axis Σ w = 1 and Σ w o = g are no sums of rounded numbers, but exact, and none is negative."""
+    real, kind = types(2, dtype).real, getattr(torch, dtype)
+    triple = wp.types.vector(3, real)
+    if block == "stencil":
+        along = stencil_sums(2, dtype).weights
+    else:
+        weights, vec = spline(2, dtype).weights, types(2, dtype).vec
+
+        @wp.func
+        def along(g: real) -> triple:
+            w = weights(vec(g + real(1.0), real(1.0)))
+            return triple(w[0, 0], w[1, 0], w[2, 0])
+
+    fx = 0.5 + torch.rand(5000, generator=torch.Generator().manual_seed(2), dtype=kind)
+    ends = torch.tensor([0.5, 1.0, 1.5], dtype=kind)
+    near = [torch.nextafter(ends, towards * torch.ones(3, dtype=kind)) for towards in (1.0, 0.0, 2.0)]
+    fx = torch.cat([fx, ends, *near])
+    g = fx[(fx >= 0.5) & (fx < 1.5)] - 1
+    w = apply(along, triple, (3,), (g.to(device), real)).cpu()
+    assert torch.equal((w[:, 0] + w[:, 2]) + w[:, 1], torch.ones_like(g))
+    assert torch.equal(w[:, 2] - w[:, 0], g)
+    assert (w >= 0).all()
+    torch.testing.assert_close(w[:, 1], 0.75 - g * g, rtol=0, atol=torch.finfo(kind).eps / 2)

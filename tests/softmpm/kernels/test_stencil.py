@@ -269,6 +269,26 @@ def test_scatter_keeps_mass_and_momentum(dim, device):
     np.testing.assert_allclose(total[:dim], momentum, rtol=0, atol=LIMIT * COUNT)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_scatter_gains_nothing_by_rounding(dim, axis, device):
+    """In float32, of one particle that lies anywhere along an axis: Σ m and Σ m o are exact."""
+    bench, axis = Bench(dim, device, "float32"), axis % dim
+    bench.g[:] = -0.5  # there the weights are 1/2, 1/2 and 0: products with them are exact
+    bench.g[:, axis] = (
+        bench.rng.uniform(0.5, 1.5, COUNT).astype(np.float32).astype(float) - 1
+    )  # as the kernels have it
+    first, shape = bench.array(bench.first, wp.int32), bench.t.ivec(*bench.shape)
+    for p in range(COUNT):
+        bench.b, bench.A, bench.m = 0 * bench.b, 0 * bench.A, (np.arange(COUNT) == p).astype(float)
+        node = bench.array(0 * bench.node, bench.t.aligned)
+        bench.launch(bench.kernels.spread, 2 * WARP, node, shape, WARP, COUNT, first, *bench.particles())
+        mass = node.numpy()[:, dim].astype(float)
+        place = np.unravel_index(np.arange(len(mass)), bench.shape)[axis] - bench.base[p, axis] - 1
+        assert mass.sum() == 1.0
+        assert (mass * place).sum() == np.float32(bench.g[p, axis])
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_base_is_packed_and_unpacked(dim, device):
     """Every axis alone and together, from the first node to the last base that a grid of 2^bits nodes has; all distinct."""

@@ -7,7 +7,7 @@ from helpers import assert_relative, busy_inputs, busy_scene
 
 import softmpm
 from softmpm import reference
-from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj, lame
+from softmpm.buffers import Motion, MotionAdj, Solid, SolidAdj, lame, masses
 from softmpm.kernels.solid import COLLECTORS, collect_pull, collectors
 from softmpm.kernels.types import Wanted
 from softmpm.step import Substep
@@ -28,9 +28,7 @@ class Bench:
         params = softmpm.Params(*(inputs[name].detach() for name in softmpm.Params._fields))
         mu, lam = lame(params)
         pull = (inputs["activation"].detach()[0] * self.model.strength).contiguous()
-        solid = Solid(
-            (params.density * self.model.volume).contiguous(), mu.contiguous(), lam.contiguous(), pull
-        )
+        solid = Solid(masses(self.model, params).contiguous(), mu.contiguous(), lam.contiguous(), pull)
         self.step = Substep(self.model, solid.struct(self.model))
         self.motion, self.end = Motion.empty(self.model), Motion.empty(self.model)
         self.now, self.then = self.motion.struct(self.model), self.end.struct(self.model)
@@ -42,7 +40,7 @@ class Bench:
         return torch.randn(like.shape, generator=generator, dtype=torch.float64)
 
     def reference_p2g(self):
-        c, volume = self.cpu, self.model.volume.cpu()
+        c, volume = self.cpu, self.model.specific_volume.cpu()
         mu, lam = reference.lame(c["young"], c["poisson"])
         mass = c["density"] * volume
         tau = reference.stress(self.scene, c["F"], mu, lam, c["activation"][0])
@@ -158,7 +156,7 @@ def test_p2g_adj(bench):
     assert_relative(adj.v.cpu(), want["v"], LIMIT, "v")
     assert_relative(adj.C.cpu(), want["C"], LIMIT, "C")
     assert_relative(adj.H.cpu(), want["F"], LIMIT, "F")
-    assert_relative(adj_solid.mass.cpu() * model.volume.cpu(), want["density"], LIMIT, "density")
+    assert_relative(adj_solid.mass.cpu() * model.specific_volume.cpu(), want["density"], LIMIT, "density")
     young, poisson = (c[n].detach().requires_grad_() for n in ("young", "poisson"))
     by_lame = torch.autograd.grad(
         reference.lame(young, poisson), (young, poisson), (adj_solid.mu.cpu(), adj_solid.lam.cpu())
