@@ -16,6 +16,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+import tqdm
 from fuzzing.verdict import GOOD
 from fuzzing.worker import Worker, verdict_of
 
@@ -82,15 +83,14 @@ def main() -> None:
         print(json.dumps(plan), verdict_of(plan), sep="\n")
         return
     counts, bad, worker = collections.Counter(), [], Worker()
-    for seed in range(args.seed, args.seed + args.count):
+    for seed in tqdm.trange(args.seed, args.seed + args.count, unit="case", smoothing=0.1):
         plan = plan_of(seed)
         verdict = worker.judge(plan)
         counts[plan["way"], verdict.kind] += 1
         if not verdict.good:
             bad.append({"verdict": verdict.kind, "words": verdict.words, "plan": plan})
-            print(
-                f"{seed} {plan['way']} {plan.get('fault', '')}: {verdict.kind}, {verdict.words}"[:300],
-                flush=True,
+            tqdm.tqdm.write(
+                f"{seed} {plan['way']} {plan.get('fault', '')}: {verdict.kind}, {verdict.words}"[:300]
             )
     worker.stop()
     rows = table(counts)

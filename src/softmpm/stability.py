@@ -203,7 +203,14 @@ def _limit(
     else:
         rows = Params(*(value[:, torch.from_numpy(group.particles)] for value in given))
     mu, lam = (value[..., None, None] for value in lame(rows.young, rows.poisson))
-    K = torch.linalg.eigvalsh(mu * A_mu + lam * A_lam + A_pull)[..., -1]  # (world, particle)
+    A = mu * A_mu + lam * A_lam + A_pull
+    need(
+        bool(torch.isfinite(A).all()),
+        f"the stiffness of body {group.body} is beyond what a number holds; use a smaller young's modulus, strength of its muscles "
+        f"or activation, got young {rows.young.max():.4g} Pa and an active stress of up to "
+        f"{max((abs(activation * scene.muscles[m].strength) for m in group.muscles), default=0.0):.4g} Pa.",
+    )
+    K = torch.linalg.eigvalsh(A)[..., -1]  # (world, particle)
     K, density = torch.broadcast_tensors(K, rows.density)
     squared = torch.where(K > 0, density / K, math.inf)
     world, particle = divmod(int(squared.argmin()), squared.shape[1])

@@ -234,3 +234,12 @@ def test_a_scene_that_cannot_be_built_has_no_limit(particles, direction, said):
     scene = Scene(grid=Grid(shape=(9, 9), spacing=0.1), bodies=[body], muscles=[muscle], dt=1e-3)
     with pytest.raises(ValueError, match=said):
         stable_dt(scene)
+
+
+def test_a_stiffness_beyond_all_numbers_is_named():
+    """Instead of an error of the eigenvalue solver."""
+    pull = muscle((1, 0), 1e308)
+    with pytest.raises(
+        ValueError, match=r"stiffness of body 0 is beyond .* active stress of up to 1e\+308 Pa"
+    ):
+        stable_dt(scene(NeoHookean(density=1.0, young=10.0), muscles=[pull, pull]))
