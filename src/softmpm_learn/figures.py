@@ -3,6 +3,7 @@
 matplotlib is imported where it is used and without pyplot, so that nothing global changes.
 """
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softmpm import Scene
+from softmpm_learn.files import replace
 
 VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """What each latent feature is set to in ``latent_figure``, the others being 0."""
@@ -23,6 +25,13 @@ def _figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def _save(figure: Any, path: Path, dpi: int) -> None:
+    """Whole or not at all: a run that is killed leaves the picture of the iteration before."""
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=dpi, format="png")
+    replace(Path(path), picture.getvalue())
 
 
 def loss_figure(
@@ -51,7 +60,7 @@ def loss_figure(
         if place == len(names) - 1:
             axes.set_xlabel("iteration")
             axes.xaxis.get_major_locator().set_params(integer=True)
-    figure.savefig(path, dpi=120)
+    _save(figure, path, dpi=120)
 
 
 def latent_figure(path: Path, fields: np.ndarray) -> None:
@@ -83,7 +92,7 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
             if column == 0:
                 panel.set_ylabel(f"feature {feature + 1}", fontsize=8)
     figure.supxlabel("red: to the left, down; blue: to the right, up; a scale for each feature", fontsize=7)
-    figure.savefig(path, dpi=120)
+    _save(figure, path, dpi=120)
 
 
 def _moving(fields: np.ndarray) -> np.ndarray:
@@ -134,7 +143,7 @@ def robot_figure(
     parts[0].supxlabel("m; muscles are red where they pull, blue where they push", fontsize=7)
     if design:
         _draw_design(parts[1], scene, design)
-    figure.savefig(path, dpi=130)
+    _save(figure, path, dpi=130)
 
 
 def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]]) -> None:

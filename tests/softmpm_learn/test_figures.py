@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 import softmpm
@@ -136,3 +137,19 @@ def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
             progress(k, loss=1.5)
     shown = capsys.readouterr().err
     assert "10/10" in shown and "loss 1.5" in shown
+
+
+def test_a_picture_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+    """A run that ends while it draws leaves the picture before, and no half of one."""
+    path = tmp_path / "loss.png"
+    loss_figure(path, {"loss": ([0, 1], [2.0, 1.0])})
+    before = path.read_bytes()
+
+    def broken(self, target, **_):
+        target.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Figure, "savefig", broken)
+    with pytest.raises(KeyboardInterrupt):
+        loss_figure(path, {"loss": ([0, 1, 2], [2.0, 1.0, 0.5])})
+    assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["loss.png"]
