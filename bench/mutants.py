@@ -207,9 +207,13 @@ def main() -> None:
         numbers = chosen(terms, args)
         trials = Trials(numbers, report)
         options = ["-s", "-m", "not gpu", "-p", "no:randomly", "-p", "no:cacheprovider", "-p", "no:terminal"]
+        options += ["--ignore=tests/softmpm/kernels/test_compiled.py"]  # factors take registers
         pytest.main([*options, *TESTS], plugins=[trials])
+        if trials.failure[0]:
+            print("no mutant ran")
+            sys.exit(1)
         print(f"{len(terms)} terms, {len(numbers)} run now: {len(survivors)} survived", *survivors, sep="\n")
-    sys.exit(1 if survivors or trials.failure[0] else 0)
+    sys.exit(1 if survivors else 0)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import os
 import struct
 import zipfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -77,6 +77,15 @@ def load(folder: Path) -> dict:
             logger.warning("%s Falling back to %s.", problem, path.name)
         return content
     raise CheckpointError(" ".join(problems))
+
+
+def simulations(folder: Path) -> list[int]:
+    """Numbers of the simulations of the replay buffer that a checkpoint of a folder names, the newest or the one before."""
+    named = set()
+    for path in (folder / NAME, folder / PREVIOUS):
+        with suppress(CheckpointError):
+            named |= set((read(path)["learner"] or {"replay": {}})["replay"])
+    return sorted(named)
 
 
 def read(path: Path) -> dict:

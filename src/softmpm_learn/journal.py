@@ -54,6 +54,10 @@ class Journal:
         begin()
         if run.iteration == 0:
             self.save()
+        elif (
+            run.learner is not None
+        ):  # the run may have been killed before it dropped what it no longer needs
+            run.learner.replay.prune(checkpoint.simulations(out))
 
     def _open_recorder(self) -> softmpm.Recorder:
         """Go on with the recording, if it is the one that the checkpoint knows; begin one where there is none."""

@@ -425,8 +425,13 @@ def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path)
 
 def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):
     """The folder holds what the last two checkpoints name, and no more."""
-    train.train(task, model, copy_of(settings, learning=dict(simulations=2)), tmp_path)
-    assert sorted(p.stem for p in (tmp_path / "replay").iterdir()) == ["00000002", "00000003", "00000004"]
+    folder, small = tmp_path / "replay", copy_of(settings, learning=dict(simulations=2))
+    train.train(task, model, small, tmp_path)
+    kept = ["00000002.h5", "00000003.h5", "00000004.h5"]
+    assert sorted(p.name for p in folder.iterdir()) == kept
+    (folder / "00000000.h5").write_bytes(b"a kill before the last one was removed")
+    train.train(task, model, small, tmp_path)
+    assert sorted(p.name for p in folder.iterdir()) == kept
 
 
 def test_control_only(task, model, settings, tmp_path):
