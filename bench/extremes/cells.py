@@ -146,12 +146,15 @@ def passive(run: Run) -> None:
 
 
 def falls_freely(run: Run) -> None:
-    """Centre of mass on the discrete law of free fall, within 1e-3 cells."""
+    """Centre of mass on the discrete law of free fall, within 1e-3 cells for 10,000 substeps.
+
+    Beyond, rounding lets the momentum wander by √n of n substeps, and so the place by n √n.
+    """
     scene, n = run.matter.scene, run.substeps
     velocity = run.matter.momentum(run.start) / run.matter.mass.sum()
     way = n * scene.dt * velocity + 0.5 * scene.dt**2 * n * (n + 1) * np.array(scene.gravity)
     off = run.matter.center(run.now) - run.matter.center(run.start) - way
-    if not np.linalg.norm(off) <= FLIGHT * run.matter.dx:
+    if not np.linalg.norm(off) <= FLIGHT * max(1.0, n / 1e4) ** 1.5 * run.matter.dx:
         raise CriterionError(f"off {short(np.linalg.norm(off) / run.matter.dx)}")
 
 
