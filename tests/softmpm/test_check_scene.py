@@ -159,6 +159,14 @@ def soft(**changes) -> Body:
         (lambda: scene(soft(), dt=1e-50), "dt of 1e-50 is 0 in torch.float32"),
         (lambda: scene(soft(density=1e-40)), "density of body 0 of 1e-40 is"),
         (lambda: scene(soft(density=1e-37)), "smallest or largest mass [kg] of body 0 of 1e-39 is"),
+        (
+            lambda: scene(soft(density=1e-35), soft(density=1e10)),
+            "smallest mass of body 0 over the largest of all of",
+        ),
+        (
+            lambda: scene(soft(density=9e37)),
+            "smallest or largest volume of body 0 per unit of mass [m³/kg] of 5.5",
+        ),
         (lambda: scene(soft(density=1e39)), "density of body 0 of 1e+39 is inf"),
         (lambda: scene(soft(young=1e-50)), "young of body 0 of 1e-50 is 0"),
         (lambda: scene(soft(poisson=0.49999999)), "poisson of body 0 of 0.49999999 is 0.5"),

@@ -1,5 +1,6 @@
 """A recording holds what was given, survives every end of its writer, and goes on after it."""
 
+import fcntl
 import importlib.util
 import math
 import os
@@ -18,6 +19,7 @@ import torch
 from helpers import busy_scene
 
 import softmpm
+from softmpm import recording_file
 from softmpm.recording import strain
 
 ROOT = Path(__file__).parents[2]
@@ -185,6 +187,19 @@ def reading(path: Path, times: str) -> None:
 def test_a_writer_waits_for_readers_that_open_the_file(tmp_path):
     """They hold a lock for a moment, which a writer that begins or resumes then would take for an error."""
     run_here("opening", tmp_path / "run.h5", "200")
+
+
+def test_a_file_that_stays_locked_is_named(tmp_path, monkeypatch):
+    """A writer does not wait for ever for a program that holds the file; once it is closed, it opens."""
+    path = tmp_path / "run.h5"
+    with softmpm.Recorder(path, small_model()) as recorder:
+        record(recorder, small_model(), 0)
+    monkeypatch.setattr(recording_file, "_PATIENCE", 0.05)
+    with open(path, "rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(BlockingIOError, match="another program has had the file open"):
+            recording_file.open_to_append(path)
+    recording_file.open_to_append(path).close()
 
 
 def opening(path: Path, times: str) -> None:

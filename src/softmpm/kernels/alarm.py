@@ -73,9 +73,8 @@ def alarm(spec: Spec) -> SimpleNamespace:
         """(W2), as K ≤ s² ρ₀ dx² / Δt²."""
         reach = scale.spacing / scale.dt
         limit = scale.step * body.mass[world, p] / body.volume[world, p] * reach * reach
-        if (
-            not stiffness_bound(body, world, p, H) > limit
-        ):  # so nearly all particles of a scene at half its stable step
+        # Nearly all particles of a scene at half its stable step need no more than this:
+        if not stiffness_bound(body, world, p, H) > limit:
             return True
         return not stiffer(body, world, p, H, limit)
 

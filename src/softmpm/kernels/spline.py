@@ -30,9 +30,8 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
         w = table()
         for axis in range(dim):
             g = fx[axis] - real(1.0)
-            square = (g * g + real(0.5)) - real(
-                0.5
-            )  # a multiple of the precision at 1/2: the weights are exact in it
+            # A multiple of the precision at 1/2, in which the weights are exact:
+            square = (g * g + real(0.5)) - real(0.5)
             outer = real(0.125) + real(0.5) * square
             w[0, axis] = outer - real(0.5) * g
             w[1, axis] = real(0.75) - square

@@ -164,9 +164,7 @@ def solid_types(spec: Spec) -> SimpleNamespace:
     """Structs of the material and the walls: only the fields that this scene needs."""
     t = types(spec.dim, spec.dtype)
     solid = dict(
-        mass=wp.array2d(
-            dtype=t.real
-        ),  # m_p [m₀], in units of the heaviest particle's mass, (world, particle)
+        mass=wp.array2d(dtype=t.real),  # m_p / m₀, m₀ that of the heaviest particle, (world, particle)
         mu=wp.array2d(dtype=t.real),  # Lamé's μ [Pa], (world, particle)
         lam=wp.array2d(dtype=t.real),  # Lamé's λ [Pa], (world, particle)
         volume=wp.array2d(dtype=t.real),  # V⁰ / m₀ [m³/kg], (world, particle)
