@@ -3,17 +3,17 @@
 Everything is written in H = F − I, so that small strains keep their digits in float32. With j = J − 1, R = I + Q:
 
     neo-Hookean:        τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                      (E1)
-    fixed corotated:    τ = μ (S + Sᵀ) + λ j (1 + j) I,  S = (H − Q) Fᵀ                             (E2)
-    barrier corotated:  τ = μ (S + Sᵀ) + λ/4 (J² − J⁻²) I                                           (E3)
+    fixed corotated:    τ = 2μ S + λ j (1 + j) I,  S = (H − Q) Fᵀ = U + U Hᵀ,  U = H − Q            (E2)
+    barrier corotated:  τ = 2μ S + λ/4 (J² − J⁻²) I                                                 (E3)
 
 All take Q, which ``rotation`` of the law gives; a neo-Hookean solid needs none. Forward and adjoint of a particle share it. S is
-symmetric but for rounding; its symmetric part is taken, since the rest would turn a free body.
+symmetric but for rounding, which would turn a free body: the half below the diagonal stands for both.
 Sources: Hu et al. 2019 ("ChainQueen"), Stomakhin et al. 2012; the volumetric term of (E3) is the derivative of λ/8 (J − 1/J)².
 The adjoints take τ̄ and return (F̄, μ̄, λ̄):
 
     (E1): F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
     (E2): F̄ = 2μ T (2F − R) + λ (2J − 1) tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,  T = (τ̄ + τ̄ᵀ) / 2,
-          μ̄ = ⟨T, 2 (F − R) Fᵀ⟩,  λ̄ = tr(τ̄) j (1 + j)
+          μ̄ = 2 ⟨T F, F − R⟩,  λ̄ = tr(τ̄) j (1 + j)
     (E3): as (E2), with λ/2 (J + J⁻³) for λ (2J − 1) and λ̄ = tr(τ̄) (J² − J⁻²) / 4
 
 ``bound`` of a law is at least the stiffness K of (W3), from the square s² of the largest principal stretch or more, and J:
@@ -106,12 +106,16 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
         return real(2.0) * mu * square + real(dim) * wp.max(lam, real(0.0))
 
     def corotated(pressure: wp.Function, pressure_slope: wp.Function) -> tuple[wp.Function, ...]:
-        """Stress, adjoint and bound of a corotated law, τ = μ (S + Sᵀ) + λ p(j) I, from p and ∂p/∂J."""
+        """Stress, adjoint and bound of a corotated law, τ = 2μ S + λ p(j) I, from p and ∂p/∂J."""
 
         @wp.func
         def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
-            S = (H - Q) * wp.transpose(identity() + H)
-            return mu * (S + wp.transpose(S)) + lam * pressure(volume_change(H)) * identity()
+            U = H - Q
+            S = U + U * wp.transpose(H)
+            for i in range(dim):
+                for k in range(i):
+                    S[k, i] = S[i, k]
+            return real(2.0) * mu * S + lam * pressure(volume_change(H)) * identity()
 
         @wp.func
         def stress_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> ElasticAdj:
@@ -119,11 +123,12 @@ def elasticity(dim: int, dtype: str) -> SimpleNamespace:
             j = volume_change(H)
             trace = wp.trace(adj_tau)
             T = real(0.5) * (adj_tau + wp.transpose(adj_tau))
+            TF = T * F
             two_mu = real(2.0) * mu
             adj = ElasticAdj()
-            adj.F = two_mu * (T * (F + H - Q)) + (lam * pressure_slope(j) * trace) * cofactor(F)
-            adj.F += rotation_adj(H, Q, -two_mu * (T * F))
-            adj.mu = real(2.0) * wp.ddot(T, (H - Q) * wp.transpose(F))
+            adj.F = two_mu * (TF + T * (H - Q)) + (lam * pressure_slope(j) * trace) * cofactor(F)
+            adj.F += rotation_adj(H, Q, -two_mu * TF)
+            adj.mu = real(2.0) * wp.ddot(TF, H - Q)
             adj.lam = trace * pressure(j)
             return adj
 

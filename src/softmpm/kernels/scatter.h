@@ -7,7 +7,7 @@
 // with g the distance from the middle node in cells, -1/2 <= g < 1/2. Both scatters have this form: momentum and mass of the
 // forward step, and the adjoint of the nodes' velocity (m = 0). Particles are sorted by cell, so neighbours in a warp mostly
 // share their nodes. The warp therefore turns the sum around: its lanes, or the first of them, have a particle each and write its
-// (b, A, m, g) to shared memory in the order of the cells, in 3D the weights along z in place of g_z; then three groups of nine lanes
+// (b, A, m, g, g^2) to shared memory in the order of the cells, in 3D two weights along z in place of g_z; then three groups of nine lanes
 // own the nodes, walk through a third of the particles each, add up in registers while the cell stays the same, and send one 16-byte
 // reduction per node and cell. Lanes 27 to 31 own nothing.
 namespace softmpm {
@@ -56,7 +56,7 @@ template <> CUDA_CALLABLE inline void add(float* p, float x, float y, float z, f
 }
 #endif
 
-// w(o, g) = level + bend g^2 + lean g, for the o that a lane owns
+// w(o, g) = level + bend g^2 + lean g, for the o that a lane owns, with the square of above
 struct Weight {
     float level, bend, lean;
     CUDA_CALLABLE inline explicit Weight(int o)
@@ -65,7 +65,7 @@ struct Weight {
         , lean(0.5f * float(o))
     {
     }
-    CUDA_CALLABLE inline float operator()(float g) const { return level + bend * square(g) + lean * g; }
+    CUDA_CALLABLE inline float operator()(float g, float square) const { return level + bend * square + lean * g; }
 };
 
 // Where this lane's particle stands among those of its warp, sorted by their first nodes; lanes without a particle, which come last,
@@ -116,9 +116,9 @@ template <class Sink> struct Owner<3, Sink> {
         q[1] = make_float4(A.data[0][0], A.data[1][0], A.data[2][0], g[0]);
         q[2] = make_float4(A.data[0][1], A.data[1][1], A.data[2][1], g[1]);
         q[3] = make_float4(A.data[0][2], A.data[1][2], A.data[2][2], wz[0]);
-        q[4] = make_float4(wz[1], wz[2], __int_as_float(first), 0.0f);
+        q[4] = make_float4(wz[2], square(g[0]), square(g[1]), __int_as_float(first));
     }
-    CUDA_CALLABLE static inline int first(const float4* q) { return __float_as_int(q[4].z); }
+    CUDA_CALLABLE static inline int first(const float4* q) { return __float_as_int(q[4].w); }
 
     CUDA_CALLABLE inline Owner(Sink node, const wp::vec_t<3, int>& shape, int ox, int oy, int start)
         : wx(ox)
@@ -134,7 +134,7 @@ template <class Sink> struct Owner<3, Sink> {
     }
     CUDA_CALLABLE inline void take(const float4* q)
     {
-        float w = wx(q[1].w) * wy(q[2].w), w0 = w * q[3].w, w1 = w * q[4].x, w2 = w * q[4].y, m = q[0].w;
+        float w = wx(q[1].w, q[4].y) * wy(q[2].w, q[4].z), w0 = w * q[3].w, w2 = w * q[4].x, w1 = w - w0 - w2, m = q[0].w;
         float x = q[0].x + q[1].x * fx + q[2].x * fy, y = q[0].y + q[1].y * fx + q[2].y * fy, z = q[0].z + q[1].z * fx + q[2].z * fy;
         float x0 = x - q[3].x, y0 = y - q[3].y, z0 = z - q[3].z, x2 = x + q[3].x, y2 = y + q[3].y, z2 = z + q[3].z;
         // In each branch, not behind them: sums that are handed on and added to at once take no copies.
@@ -183,7 +183,7 @@ template <class Sink> struct Owner<2, Sink> {
     {
         q[0] = make_float4(b[0], b[1], m, __int_as_float(first));
         q[1] = make_float4(A.data[0][0], A.data[1][0], A.data[0][1], A.data[1][1]);
-        q[2] = make_float4(g[0], g[1], 0.0f, 0.0f);
+        q[2] = make_float4(g[0], g[1], square(g[0]), square(g[1]));
     }
     CUDA_CALLABLE static inline int first(const float4* q) { return __float_as_int(q[0].w); }
 
@@ -207,7 +207,7 @@ template <class Sink> struct Owner<2, Sink> {
             x = y = mass = 0.0f;
             current = next;
         }
-        float w = wx(q[2].x) * wy(q[2].y);
+        float w = wx(q[2].x, q[2].z) * wy(q[2].y, q[2].w);
         x += w * (q[0].x + q[1].x * fx + q[1].z * fy);
         y += w * (q[0].y + q[1].y * fx + q[1].w * fy);
         mass += w * q[0].z;
