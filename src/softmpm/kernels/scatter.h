@@ -134,7 +134,7 @@ template <class Sink> struct Owner<3, Sink> {
     }
     CUDA_CALLABLE inline void take(const float4* q)
     {
-        float w = wx(q[1].w, q[4].y) * wy(q[2].w, q[4].z), w0 = w * q[3].w, w2 = w * q[4].x, w1 = w - w0 - w2, m = q[0].w;
+        float w = wx(q[1].w, q[4].y) * wy(q[2].w, q[4].z), w0 = w * q[3].w, w2 = w * q[4].x, w1 = w - (w0 + w2), m = q[0].w;
         float x = q[0].x + q[1].x * fx + q[2].x * fy, y = q[0].y + q[1].y * fx + q[2].y * fy, z = q[0].z + q[1].z * fx + q[2].z * fy;
         float x0 = x - q[3].x, y0 = y - q[3].y, z0 = z - q[3].z, x2 = x + q[3].x, y2 = y + q[3].y, z2 = z + q[3].z;
         // In each branch, not behind them: sums that are handed on and added to at once take no copies.
