@@ -13,8 +13,8 @@ from common import Table, arguments, cube, sync, turning
 from step import CASES, ON_A_CPU, VARIANTS
 
 import softmpm
-from softmpm.horizon import Horizon
-from softmpm.memory import plan
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import plan
 
 GRADIENTS = VARIANTS | {"neo-Hookean, materials": {}, "neo-Hookean, turning": {}}
 

@@ -11,8 +11,8 @@ import torch
 from common import Table, arguments, cube, sync, turning
 
 import softmpm
-from softmpm.horizon import Horizon
-from softmpm.memory import memory, plan
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import memory, plan
 
 GIB = 2**30
 WARM = 2

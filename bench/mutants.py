@@ -31,9 +31,9 @@ TESTS = (
     "tests/softmpm/test_adjoint_terms.py",
     "tests/softmpm/test_rollout.py",
     "tests/softmpm/test_autograd.py",
-    "tests/softmpm/test_tape.py",
-    "tests/softmpm/test_deterministic.py",
-    "tests/softmpm/test_between.py",
+    "tests/softmpm/test_warp_api.py",
+    "tests/softmpm/schemes/fast/test_deterministic.py",
+    "tests/softmpm/schemes/fast/test_sorted_state.py",
     "tests/softmpm/kernels",
 )
 """In the order in which they run."""

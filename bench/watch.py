@@ -1,8 +1,8 @@
 """What do alarms cost? `python bench/watch.py [--device cuda] [--json bench/results/watch.json]`
 
 The same substeps with all alarms, without those between chunks (neighbours at rest, running step limit), and with kernels that are
-compiled without the checks of kernels/failure.py as well, one after the other in one run: medians and their ratios. The last kind of
-kernel exists only here. The cube falls or, in every second row, also turns, so that its order is renewed.
+compiled without the checks of kernels/physics/status.py as well, one after the other in one run: medians and their ratios. The last
+kind of kernel exists only here. The cube falls or, in every second row, also turns, so that its order is renewed.
 """
 
 import dataclasses
@@ -17,10 +17,10 @@ from common import Table, arguments, cube, median_seconds, turning
 from step import CASES
 
 import softmpm
-from softmpm.kernels import failure
-from softmpm.kernels.fused import fused
-from softmpm.kernels.transfer import transfer
-from softmpm.kernels.types import types
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.physics import status
+from softmpm.kernels.plain.transfer import transfer
+from softmpm.kernels.structs import types
 
 
 def unchecked(model: softmpm.Model):
@@ -37,14 +37,12 @@ def unchecked(model: softmpm.Model):
     def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         return True
 
-    report_of, check_of = failure.report, failure.check
-    failure.report = lambda *_: SimpleNamespace(
-        running=running, report=report_of(spec.dim, spec.dtype).report
-    )
+    report_of, check_of = status.report, status.check
+    status.report = lambda *_: SimpleNamespace(running=running, report=report_of(spec.dim, spec.dtype).report)
     # Nobody complains of a state that is sound:
-    failure.check = lambda *_: SimpleNamespace(sound=sound, complain=check_of(spec).complain)
+    status.check = lambda *_: SimpleNamespace(sound=sound, complain=check_of(spec).complain)
     transfer(spec) if model.scheme == "plain" else fused(spec)
-    failure.report, failure.check = report_of, check_of
+    status.report, status.check = report_of, check_of
 
 
 def variants(scene: softmpm.Scene, device: torch.device, scheme: str) -> dict[str, softmpm.Model]:

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 import softmpm
-from softmpm.horizon import Horizon
-from softmpm.memory import plan
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import plan
 
 LAWS = {
     "neo_hookean": softmpm.NeoHookean,

@@ -1,22 +1,35 @@
-"""The book has an order: a module imports only modules that stand before it."""
+"""The layers of the simulator: a module imports only from layers above its own."""
 
 import ast
+import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import softmpm
+
 SRC = Path(__file__).parents[1] / "src"
-ORDER = """kernels.turn validate scene state watch silhouette surface shapes checks check_scene reference stability alarms
-    neighbours schedule horizon devices memory kernels.types kernels.spline kernels.polar kernels.elasticity
-    kernels.muscle kernels.solid kernels.contact kernels.grid kernels.failure kernels.particle kernels.transfer
-    kernels.boundary kernels.raster kernels.native kernels.stencil kernels.stencil_adj kernels.alarm kernels.fixed
-    kernels.fused kernels.fused_adj kernels.sorting kernels.packing description model buffers explain failures step
-    replay checkup plain between arrangement exact batches compiling program program_adj fast runner rollout raster
-    autograd graph warp_arrays tape layout layout_checks superblock content playback recording_file recording
-    appearance show rerun_file __main__""".split()
+LAYERS = """
+    validate state devices batches compiling kernels.compile
+    errors
+    scene planning alarms checks kernels.structs
+    reference kernels.physics
+    stability kernels.convert
+    kernels.rasterize kernels.plain kernels.fast
+    describe
+    model
+    schemes
+    schemes.plain schemes.fast recording
+    runner rasterization cuda_graph
+    rollout
+    autograd warp_arrays
+    warp_api __main__
+"""
+"""From the ground up. Each word is a module or a package; those of one line do not import each other."""
 OUTSIDE = {
-    "rerun": {"rerun_file"},
-    "h5py": {"layout", "layout_checks", "playback", "recording_file", "recording"},
+    "rerun": {"recording.rerun_export"},
+    "h5py": {f"recording.{name}" for name in ("format", "format_checks", "reader", "file", "writer")},
     "hydra": set(),
     "matplotlib": set(),
 }
@@ -34,23 +47,46 @@ def imports(path: Path) -> set[str]:
 
 def modules(package: str) -> dict[str, Path]:
     root = SRC / package
-    found = {".".join(p.relative_to(root).with_suffix("").parts): p for p in sorted(root.rglob("*.py"))}
-    return {name.removesuffix(".__init__"): path for name, path in found.items() if name != "__init__"}
+    paths = (path for path in sorted(root.rglob("*.py")) if path.name != "__init__.py")
+    return {".".join(path.relative_to(root).with_suffix("").parts): path for path in paths}
+
+
+def layer_of(module: str) -> tuple[int, str]:
+    """Line of a module in LAYERS, and its word there: the longest one that it stands under."""
+    lines = [line.split() for line in LAYERS.strip().splitlines()]
+    found = [
+        (len(word), line, word)
+        for line, words in enumerate(lines)
+        for word in words
+        if module == word or module.startswith(f"{word}.")
+    ]
+    assert found, f"{module} has no layer"
+    _, line, word = max(found)
+    return line, word
+
+
+def arrows(found: dict[str, Path]) -> dict[str, set[str]]:
+    """Modules of softmpm that each of its modules imports."""
+    inner = {name: {i.removeprefix("softmpm.") for i in imports(path)} for name, path in found.items()}
+    return {name: {i for i in names if i in found} for name, names in inner.items()}
 
 
 def test_the_simulator_imports_in_one_direction():
-    """Every module of softmpm has its place in ORDER, and imports only what stands before it."""
-    found = modules("softmpm")
-    for name, path in found.items():
-        if name == "kernels":
-            continue
-        assert name in ORDER, f"{path} has no place in the order of the book"
-        for imported in imports(path):
-            inner = imported.removeprefix("softmpm.")
-            if imported.startswith("softmpm.") and inner in ORDER:
-                assert ORDER.index(inner) < ORDER.index(name), (
-                    f"{name} imports {inner}, which stands after it"
-                )
+    """Every module of softmpm has a layer and imports only from those above, or from its own package without a circle."""
+    within = {}
+    for name, imported in arrows(modules("softmpm")).items():
+        own, word = layer_of(name)
+        for other in imported:
+            line, their = layer_of(other)
+            assert line < own or their == word, f"{name} imports {other}, which is not above it"
+        within[name] = {other for other in imported if layer_of(other)[1] == word}
+    graphlib.TopologicalSorter(within).prepare()  # raises CycleError
+
+
+def test_only_public_names_show():
+    """``dir(softmpm)`` is its public names, and none of them is also that of a module."""
+    assert dir(softmpm) == sorted(softmpm.__all__)
+    assert not set(softmpm.__all__) & {name.split(".")[0] for name in modules("softmpm")}
 
 
 def test_one_module_per_outside_world():
@@ -65,8 +101,6 @@ def test_one_module_per_outside_world():
 
 def test_the_learner_uses_public_names_only():
     """softmpm_learn imports softmpm itself or what its __all__ names; only app says Hydra."""
-    import softmpm
-
     for name, path in modules("softmpm_learn").items():
         for imported in imports(path):
             if imported.startswith("softmpm."):
@@ -93,5 +127,27 @@ def test_importing_the_simulator_is_light():
 
 def test_kernel_files_do_not_postpone_annotations():
     """``from __future__ import annotations`` would hide a factory's local types from Warp."""
-    for path in (SRC / "softmpm" / "kernels").glob("*.py"):
+    for path in (SRC / "softmpm" / "kernels").rglob("*.py"):
         assert "from __future__" not in path.read_text(), path
+
+
+DEFINITION = re.compile(r"  \(([A-Z]\d+)\)(?:  |$)", re.MULTILINE)
+"""A formula's label stands apart from it, at the end of its line."""
+
+
+def test_labels_lead_to_one_formula():
+    """No two pages of docs/math define the same label, nor both packages; and every label in the code is defined."""
+    defined = {}
+    for path in [*(SRC.parent / "docs" / "math").glob("*.md"), *(SRC / "softmpm_learn").rglob("*.py")]:
+        for label in DEFINITION.findall(path.read_text()):
+            assert label not in defined, f"({label}) stands in {defined[label]} and in {path}"
+            defined[label] = path
+    source = [path for kind in ("*.py", "*.h") for path in (SRC / "softmpm").rglob(kind)]
+    for path in source:
+        for label in DEFINITION.findall(path.read_text()):
+            assert "softmpm_learn" not in str(defined.setdefault(label, path)), (
+                f"({label}) of {path} is the learner's"
+            )
+    for path in [*source, *(SRC / "softmpm_learn").rglob("*.py")]:
+        for label in re.findall(r"\(([A-Z]\d+)(?:\.\w+)?\)", path.read_text()):
+            assert label in defined, f"({label}) in {path} leads nowhere"

@@ -85,9 +85,9 @@ def test_factors_keep_the_source(path):
         ("elasticity.py", "soft_pressure_slope", "real(2.0) * j"),
         ("polar.py", "rotation_adj", "c * (adj_R[1, 0] - adj_R[0, 1])"),
         ("contact.py", "slide_adj", "(c * along) * n"),
-        ("stencil_adj.py", "sums_adj", "wy[2] * tr"),
+        ("gather_adj.py", "sums_adj", "wy[2] * tr"),
         ("packing.py", "leave_adj", "load_vec(adj, i, row_fx) / scale.spacing"),
-        ("plain.py", "pull_back", "start.fx / model.scene.grid.spacing"),
+        ("chunk.py", "pull_back", "start.fx / model.scene.grid.spacing"),
     ],
 )
 def test_known_terms_are_found(file, function, text):

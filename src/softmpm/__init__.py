@@ -9,28 +9,19 @@ differentiable in the start, the activation and the material:
 
 from softmpm.alarms import Alarms, Failures
 from softmpm.autograd import rasterize, simulate
-from softmpm.graph import Graph
+from softmpm.cuda_graph import Graph
+from softmpm.errors import UnstableError
 from softmpm.model import Model, build
-from softmpm.playback import Recording
-from softmpm.recording import Recorder
-from softmpm.rerun_file import to_rerun
-from softmpm.scene import (
-    BarrierCorotated,
-    Body,
-    FixedCorotated,
-    Grid,
-    Muscle,
-    NeoHookean,
-    Particles,
-    Scene,
-    Wall,
-)
-from softmpm.shapes import ball, box, image, mesh
+from softmpm.recording.reader import Recording
+from softmpm.recording.rerun_export import to_rerun
+from softmpm.recording.writer import Recorder
+from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm.scene.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import GridField, Low, Params, State
-from softmpm.tape import step
+from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
-from softmpm.watch import UnstableError
 
 __version__ = "0.1.0"
 
@@ -73,3 +64,7 @@ __all__ = [
     "warp_solid",
     "warp_state",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from softmpm.rerun_file import to_rerun
+from softmpm.recording.rerun_export import to_rerun
 
 
 def main() -> int:

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
+from softmpm.errors import UnstableError
 from softmpm.validate import need
-from softmpm.watch import UnstableError
 
 Policy = Literal["freeze", "reset"]
 

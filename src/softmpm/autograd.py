@@ -10,7 +10,6 @@ from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
 from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
-from softmpm.buffers import Solid, lame, masses
 from softmpm.checks import (
     check_activation,
     check_bounds,
@@ -20,14 +19,14 @@ from softmpm.checks import (
     check_state,
 )
 from softmpm.compiling import opaque
-from softmpm.horizon import Horizon
-from softmpm.kernels.types import Wanted
-from softmpm.model import Model
-from softmpm.raster import rasterize_nodes, rasterize_nodes_adj
-from softmpm.replay import recording
+from softmpm.kernels.structs import Wanted
+from softmpm.model import Model, check_model
+from softmpm.planning.chunks import Horizon
+from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Trail, rollout, rollout_adj, short_of_memory
+from softmpm.schemes.buffers import Solid, lame, masses
+from softmpm.schemes.capture import recording
 from softmpm.state import GridField, Low, Params, State
-from softmpm.step import check_model
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "

@@ -9,13 +9,12 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.alarms import Alarms
-from softmpm.check_scene import check_precision, check_scene
 from softmpm.checks import check_whole
-from softmpm.description import describe
+from softmpm.describe import describe
 from softmpm.devices import device_of
-from softmpm.kernels.native import padded
-from softmpm.kernels.types import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.memory import (
+from softmpm.kernels.fast.native import padded
+from softmpm.kernels.structs import BASE_BITS, Spec, packed_rows, solid_types, types
+from softmpm.planning.memory import (
     MARGIN,
     Sizes,
     check_room,
@@ -24,8 +23,10 @@ from softmpm.memory import (
     price_of_chunk,
     window_shape,
 )
-from softmpm.neighbours import rest_neighbours
-from softmpm.scene import BarrierCorotated, FixedCorotated, Material, NeoHookean, Scene
+from softmpm.scene.check_scene import check_precision, check_scene
+from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean
+from softmpm.scene.neighbours import rest_neighbours
+from softmpm.scene.scene import Scene
 from softmpm.stability import need_stable, warn_sparse
 from softmpm.state import Low, Params, State
 
@@ -279,7 +280,7 @@ class Model:
         return math.prod(window_shape(self.scene.grid.shape, reach, MARGIN[self.dim]))
 
     def sizes(self) -> Sizes:
-        """Bytes of what a call may keep, see softmpm/memory.py."""
+        """Bytes of what a call may keep, see planning/memory.py."""
         real, d, particles = self.dtype.itemsize, self.dim, self.worlds * self.particle_count
         state = particles * real * (2 * d + 2 * d * d)
         start = state + state // 2 if real == 4 else state
@@ -350,3 +351,11 @@ def _spec(scene: Scene, dtype: torch.dtype, slots: int, fixed_point: bool) -> Sp
         damping=scene.damping > 0,
         deterministic=fixed_point,
     )
+
+
+def check_model(model: object, wants: str) -> None:
+    """Raise TypeError unless this is a model; ``wants`` names the function that needs it."""
+    if not isinstance(model, Model):
+        raise TypeError(
+            f"{wants} needs a model, as softmpm.build(scene) gives it, got {type(model).__name__}."
+        )

@@ -11,7 +11,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from softmpm.scene import BarrierCorotated, FixedCorotated, Material, NeoHookean, Scene, Wall
+from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean
+from softmpm.scene.scene import Scene, Wall
 from softmpm.state import GridField, Params, State
 
 

@@ -9,22 +9,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from softmpm import schedule
 from softmpm.alarms import Failures
-from softmpm.between import SortedState
-from softmpm.buffers import Solid, SolidAdj
-from softmpm.failures import Report, raise_gradient_failure
-from softmpm.fast import FastRun, forget
-from softmpm.horizon import Chunk, Horizon
-from softmpm.kernels.types import Wanted
-from softmpm.memory import Plan, memory, plan
+from softmpm.errors import NEVER
+from softmpm.kernels.structs import Wanted
 from softmpm.model import Model
-from softmpm.plain import PlainRun
-from softmpm.replay import alone, hold, note, recording
+from softmpm.planning import checkpointing
+from softmpm.planning.chunks import Chunk, Horizon
+from softmpm.planning.memory import Plan, memory, plan
 from softmpm.runner import Runner, as_state
+from softmpm.schemes.buffers import Solid, SolidAdj
+from softmpm.schemes.capture import alone, hold, note, recording
+from softmpm.schemes.device import on_its_gpu
+from softmpm.schemes.failure_report import Report, raise_gradient_failure
+from softmpm.schemes.fast.scheme import FastRun, forget
+from softmpm.schemes.fast.sorted_state import SortedState
+from softmpm.schemes.plain.chunk import PlainRun
 from softmpm.state import State
-from softmpm.step import on_its_gpu
-from softmpm.watch import NEVER
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Trail:
     @property
     def stays(self) -> tuple[int, ...]:
         """The chunks before which the state is kept."""
-        return schedule.kept_first(len(self.chunks), self.plan.slots) if self.plan.slots else ()
+        return checkpointing.kept_first(len(self.chunks), self.plan.slots) if self.plan.slots else ()
 
 
 @on_its_gpu
@@ -233,7 +233,7 @@ def _inside_out(trail: Trail, runner: Runner) -> Iterator[FastRun | PlainRun]:
     states = _taken(trail, runner)
     nothing = torch.empty(0)
     hand: State | SortedState = State(nothing, nothing, nothing, nothing)
-    for action, k in schedule.going_back(len(trail.chunks), trail.plan.slots):
+    for action, k in checkpointing.going_back(len(trail.chunks), trail.plan.slots):
         if action == "restore":
             hand = states[k]
         elif action == "advance":

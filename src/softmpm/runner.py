@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 from softmpm.alarms import Failures
-from softmpm.between import SortedAdj, SortedState
-from softmpm.buffers import Solid
-from softmpm.checkup import armed
-from softmpm.failures import Report, failed_worlds, failure, outgrown
-from softmpm.fast import Fast, FastRun, fast
-from softmpm.horizon import Chunk
+from softmpm.errors import UnstableError
 from softmpm.model import Model
-from softmpm.plain import Plain, PlainRun
-from softmpm.replay import note, recording
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.alarm_check import armed
+from softmpm.schemes.buffers import Solid
+from softmpm.schemes.capture import note, recording
+from softmpm.schemes.failure_report import Report, failed_worlds, failure, outgrown
+from softmpm.schemes.fast.scheme import Fast, FastRun, fast
+from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState
+from softmpm.schemes.plain.chunk import Plain, PlainRun
 from softmpm.state import State
-from softmpm.watch import UnstableError
 
 
 class Runner:

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.check_scene import check_scene
 from softmpm.reference import lame, muscle_tangent, tangent
-from softmpm.scene import Scene
+from softmpm.scene.check_scene import check_scene
+from softmpm.scene.scene import Scene
 from softmpm.state import Params
 from softmpm.validate import need
 

@@ -7,15 +7,16 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.buffers import Motion, Solid, lame, masses, view
 from softmpm.checks import check_bounds, check_finite, check_params, check_row, check_state
-from softmpm.checkup import armed, check_end
-from softmpm.failures import raise_failure
-from softmpm.kernels.types import types
-from softmpm.model import Model
-from softmpm.replay import recording
+from softmpm.kernels.structs import types
+from softmpm.model import Model, check_model
+from softmpm.schemes.alarm_check import armed, check_end
+from softmpm.schemes.buffers import Motion, Solid, lame, masses, view
+from softmpm.schemes.capture import recording
+from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.schemes.failure_report import raise_failure
+from softmpm.schemes.plain.substep import Substep
 from softmpm.state import Params, State
-from softmpm.step import Substep, check_model, on_its_gpu, stream_of
 
 
 @dataclass(eq=False, frozen=True, kw_only=True)

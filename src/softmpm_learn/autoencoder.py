@@ -1,6 +1,6 @@
 """Convolutional autoencoder of grid velocity, plain or variational, in 2D and 3D; training with early stopping.
 
-    ℓ = mean (u − û)² + β · mean Σ ½ (m² + s² − 1 − log s²)        (A1)   u: picture / scale; m, s: mean and deviation of z
+    ℓ = mean (u − û)² + β · mean Σ ½ (m² + s² − 1 − log s²)        (L1)   u: picture / scale; m, s: mean and deviation of z
 
 Kingma & Welling 2014, "Auto-encoding variational Bayes". Layers and channels are our choice: the 2019 paper states none.
 """
@@ -31,7 +31,7 @@ class Encoder(nn.Module):
     """Picture → latent. Each convolution halves the picture; smooth activations, because a policy's gradient passes here.
 
     Velocities are divided by ``scale``, and the latent that a policy sees is standardised: ``centre`` and ``spread`` bring
-    it to mean 0 and deviation 1 on the pictures learned from. Our choice: with the small weight of the divergence in (A1)
+    it to mean 0 and deviation 1 on the pictures learned from. Our choice: with the small weight of the divergence in (L1)
     the latent of a fresh network and of a trained one differ tenfold, and a policy between them saturates.
     """
 
@@ -126,7 +126,7 @@ class Autoencoder(nn.Module):
         self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=QUIET))
 
     def loss(self, pictures: Tensor, kl: float | None, generator: torch.Generator | None = None) -> Tensor:
-        """(A1); ``kl`` is β, or None for a plain autoencoder. Without a generator the latent is its mean."""
+        """(L1); ``kl`` is β, or None for a plain autoencoder. Without a generator the latent is its mean."""
         mean, log_variance = self.encoder.moments(pictures)
         z = mean
         if kl is not None and generator is not None:

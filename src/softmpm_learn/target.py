@@ -2,7 +2,7 @@
 
 Mnih et al. 2015, "Human-level control", copy every so often; Lillicrap et al. 2016 move a share of the way, as here:
 
-    θ' ← θ' + τ (θ − θ')        (T1)
+    θ' ← θ' + τ (θ − θ')        (L2)
 """
 
 import copy
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 
 class TargetNetwork(nn.Module):
-    """A copy of a network, its weights and buffers (so also its normalisation) following by (T1); never trained itself."""
+    """A copy of a network, its weights and buffers (so also its normalisation) following by (L2); never trained itself."""
 
     def __init__(self, network: nn.Module):
         super().__init__()
@@ -23,7 +23,7 @@ class TargetNetwork(nn.Module):
 
     @torch.no_grad()
     def follow(self, network: nn.Module, rate: float) -> None:
-        """(T1) with τ = ``rate``; 1 copies exactly."""
+        """(L2) with τ = ``rate``; 1 copies exactly."""
         if not 0.0 < rate <= 1.0:
             raise ValueError(f"the rate of a target network must lie in (0, 1], got {rate}.")
         source = network.state_dict()

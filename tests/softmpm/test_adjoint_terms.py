@@ -10,7 +10,7 @@ from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, d
 
 import softmpm
 from softmpm import reference
-from softmpm.kernels.solid import COLLECTORS
+from softmpm.kernels.physics.actuation_sum import COLLECTORS
 
 
 def walled_scene(dim: int) -> softmpm.Scene:

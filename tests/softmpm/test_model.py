@@ -19,11 +19,11 @@ from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradien
 
 import softmpm
 from softmpm import autograd
-from softmpm.buffers import SolidAdj, passing
-from softmpm.horizon import Horizon
-from softmpm.kernels.types import Wanted, adj_module, solid_types
-from softmpm.scene import CONTACTS
-from softmpm.step import Substep
+from softmpm.kernels.structs import Wanted, adj_module, solid_types
+from softmpm.planning.chunks import Horizon
+from softmpm.scene.scene import CONTACTS
+from softmpm.schemes.buffers import SolidAdj, passing
+from softmpm.schemes.plain.substep import Substep
 
 
 def plain_scene(**changes):
@@ -348,7 +348,7 @@ def square() -> softmpm.Scene:
 @pytest.mark.gpu
 def test_memory_follows_the_formula():
     """Peak of a call with gradient against Model.describe's formula, for 1, 10, 100 and 1,000 substeps: within 20 %."""
-    from softmpm.memory import memory
+    from softmpm.planning.memory import memory
 
     model = softmpm.build(square(), device="cuda")
     params = softmpm.Params(*(p.requires_grad_() for p in model.params()))

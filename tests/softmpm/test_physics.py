@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import softmpm
-from softmpm.buffers import masses
+from softmpm.schemes.buffers import masses
 
 
 def block(dim=2, law=softmpm.NeoHookean, cells=3, dx=0.1, shape=None, lower=None, **scene):

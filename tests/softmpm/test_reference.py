@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from softmpm import reference
-from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene, Wall
+from softmpm.scene.materials import FixedCorotated, NeoHookean
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
 from softmpm.state import Params, State
 
 DX = 0.1

@@ -9,8 +9,8 @@ from helpers import INPUTS, LAWS, assert_relative, busy_inputs, busy_scene, cota
 
 import softmpm
 from softmpm import reference
-from softmpm.horizon import Horizon
-from softmpm.memory import plan
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import plan
 
 
 @pytest.mark.parametrize("laws", [("neo_hookean",), ("fixed_corotated",), tuple(LAWS)])
@@ -71,7 +71,7 @@ POINTS = (
 
 @pytest.mark.parametrize(
     "law, kind",
-    # The other laws are undefined where det F < 0: tests/softmpm/test_watch.py has the error.
+    # The other laws are undefined where det F < 0: tests/softmpm/test_errors.py has the error.
     [(law, kind) for law in LAWS for kind in POINTS if kind != "inverted" or law == "fixed_corotated"],
 )
 @pytest.mark.parametrize("dim", [2, 3])

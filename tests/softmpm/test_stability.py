@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import softmpm
-from softmpm.scene import Body, FixedCorotated, Grid, Muscle, NeoHookean, Particles, Scene
+from softmpm.scene.materials import FixedCorotated, NeoHookean
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene
 from softmpm.stability import StabilityWarning, need_stable, stable_dt
 
 DX, RHO = 0.1, 2.0

@@ -10,7 +10,7 @@ import warp as wp
 from helpers import busy_scene
 
 import softmpm
-from softmpm.watch import MAX_SUBSTEP
+from softmpm.errors import MAX_SUBSTEP
 
 
 @pytest.fixture(scope="module")

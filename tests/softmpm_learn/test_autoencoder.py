@@ -51,7 +51,7 @@ def test_what_the_policy_sees_is_the_standardised_mean():
 
 
 def test_kullback_leibler_term():
-    """(A1): the variational loss exceeds the plain one by β times the divergence from the unit normal, computed by torch."""
+    """(L1): the variational loss exceeds the plain one by β times the divergence from the unit normal, computed by torch."""
     autoencoder, pictures = make(), waves(5)
     mean, log_variance = autoencoder.encoder.moments(pictures)
     normal = torch.distributions.Normal

@@ -12,7 +12,7 @@ def network() -> nn.Module:
 
 
 def test_follows_a_share_of_the_way():
-    """(T1): each tensor, buffers too, moves that share; rate 1 copies exactly; a wrong rate is an error."""
+    """(L2): each tensor, buffers too, moves that share; rate 1 copies exactly; a wrong rate is an error."""
     net, other = network(), network()
     target = TargetNetwork(net)
     before = {k: t.clone() for k, t in target.copy.state_dict().items()}

@@ -1,0 +1,66 @@
+"""A model in words: what was compiled for its scene, what was left out, and the memory of a call."""
+
+from softmpm.checks import check_whole
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import memory
+from softmpm.scene.scene import CONTACTS
+from softmpm.stability import stable_dt
+
+
+def describe(model, substeps: int) -> str:
+    """See :meth:`softmpm.Model.describe`."""
+    spec, limit = model.spec, stable_dt(model.scene)
+    check_whole("substeps", substeps)
+
+    def has(flag: bool) -> str:
+        return "compiled" if flag else "left out"
+
+    muscles = f"{model.muscle_count}, at most {spec.muscle_slots} on one particle"
+    counts = {kind: spec.contacts.count(kind) for kind in CONTACTS if kind in spec.contacts}
+    contacts = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    lines = [
+        f"softmpm model: {spec.dim}D, {spec.dtype}, on {model.device}, {model.worlds} world(s) of "
+        f"{model.particle_count} particles on {' x '.join(map(str, model.scene.grid.shape))} nodes",
+        f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
+        f"  muscles    {muscles if spec.muscle_slots else 'left out'}",
+        f"  walls      {contacts or 'left out'}",
+        f"  friction   {has(spec.friction)}",
+        f"  gravity    {has(spec.gravity)}",
+        f"  damping    {has(spec.damping)}",
+        "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
+        f"  alarms     {_alarms(model)}",
+        f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
+        f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
+        f"  sums       {_sums(model)}",
+        f"  memory     {_memory(model, substeps)}",
+    ]
+    return "\n".join(lines)
+
+
+def _memory(model, substeps: int) -> str:
+    try:
+        found = memory(model, Horizon(1, substeps))
+    except ValueError as error:
+        return str(error)
+    forward, kept, backward = (f"{size / 2**20:.1f} MiB" for size in found[:3])
+    often = "once" if found.runs == 1 else f"{found.runs:.3g} times"
+    steps = f"{model.calls} calls of {substeps} substeps" if model.calls > 1 else f"{substeps} substeps"
+    return f"{forward} to run; {steps} with gradient: {kept} kept, {backward} at the peak, each runs forward {often}"
+
+
+def _alarms(model) -> str:
+    alarms = model.alarms
+    texts = {
+        "det F below": alarms.collapse,
+        "neighbours at rest farther apart than, in cells,": alarms.gap,
+        "dt over its running limit above": alarms.step,
+    }
+    return "; ".join(f"{what} {limit:g}" for what, limit in texts.items() if limit is not None) or "off"
+
+
+def _sums(model) -> str:
+    if model.spec.deterministic:
+        return "in fixed point: deterministic, the same bits from run to run"
+    if model.device.type == "cpu":
+        return "in floating point, in one order: the same bits from run to run"
+    return "in floating point, in any order: the last bits vary; deterministic=True makes them repeat"

@@ -1,0 +1,1 @@
+"""Kernels of the fast scheme: sorted particles, sums over warps."""

@@ -1,0 +1,184 @@
+"""The adjoint of the fast scheme, with the same sums over warps. Derivation: docs/math/scatter.md.
+
+From the last substep to the first, with M the nodes' momentum and mass, V their velocity and a bar for adjoints:
+
+    grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
+    advance_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
+
+Nodes without mass keep their V and their V̄, as in g2p2g.py.
+
+A deterministic model adds up in a launch more, ``push`` of fixed_point.py, between the two.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.errors import Kind
+from softmpm.kernels.compile import once
+from softmpm.kernels.fast.fixed_point import fixed
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.fast.gather import stencil
+from softmpm.kernels.fast.gather_adj import stencil_adj
+from softmpm.kernels.fast.native import BLOCK, native, native_module
+from softmpm.kernels.physics import status
+from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.physics.particle import particle, particle_adj
+from softmpm.kernels.structs import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
+
+
+@once
+def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+    t, one, twin = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
+    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
+    Scale, Packed, Window, ParticleAdj = t.Scale, t.Packed, t.Window, twin.ParticleAdj
+    Solid, Walls, SolidAdj = (
+        solid_types(spec).Solid,
+        solid_types(spec).Walls,
+        solid_adj_type(spec, wanted),
+    )
+    s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
+    sums_adj, first_node, unpack_base = stencil_adj(spec.dim, spec.dtype), s.first_node, s.unpack_base
+    gather_adj, slope_adj = sums_adj.gather_adj, sums_adj.slope_adj
+    aligned, head = s.aligned, s.head
+    centre, place_of = fused(spec).centre, fused(spec).place_of
+    particle_of, world_of = s.particle_of, s.world_of
+    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
+    rotation, affine_momentum = one.rotation, one.affine_momentum
+    momentum_adj, moved_adj = twin.momentum_adj, twin.moved_adj
+    node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
+    report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
+    row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
+    exact, give = spec.deterministic, fixed(dim).give
+    take, leave = (fixed(dim).take, fixed(dim).leave) if exact else (load_node, store_node)
+    Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
+    module = native_module(adj_module(spec, wanted) + ".fused")
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def grid_velocity_adj(
+        # Parameters:
+        scale: Scale,
+        walls: Walls,
+        window: Window,
+        # In:
+        node: wp.array(dtype=node_vec),  # of this substep; empty after the last
+        node_before: wp.array(dtype=node_vec),  # of the substep before; empty in the first
+        # In and out:
+        adj: Sums,  # adjoint of the velocity, then of momentum and mass
+        # Out:
+        velocity: wp.array(dtype=node_vec),  # of the substep before
+        cleared: wp.array(dtype=node_vec),
+    ):
+        i = wp.tid()
+        place = place_of(window, i, velocity.shape[0])
+        if i < node.shape[0]:
+            here = load_node(node, i)
+            adj_v = take(adj, i)
+            if here[dim] > real(0.0):
+                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(adj_v))
+                leave(adj, i, aligned(back.p, back.m))
+        if i < node_before.shape[0]:
+            there = load_node(node_before, i)
+            if there[dim] > real(0.0):
+                v = node_velocity(scale, walls, place, head(there), there[dim])
+                store_node(velocity, i, aligned(v, real(0.0)))
+            if wp.static(not exact):
+                store_node(cleared, i, node_vec())
+
+    def advance_adj(
+        # Parameters:
+        scale: Scale,
+        body: Solid,
+        window: Window,
+        back: int,  # substeps from the end
+        start: bool,  # nothing before
+        end: bool,  # nothing after
+        crew: int,
+        count: int,
+        total: int,
+        order: wp.array(dtype=wp.int32),
+        # In:
+        before: Packed,
+        now: Packed,
+        velocity: wp.array(dtype=node_vec),  # of the substep before
+        adj_node: wp.array(dtype=node_vec),  # of this substep
+        # In and out:
+        adj_now: wp.array(dtype=real),
+        # Out:
+        watch: wp.array(dtype=wp.int64),
+        # Out, added into:
+        adj_body: SolidAdj,
+        adj_velocity: Shares,  # of the substep before
+    ):
+        i = particle_of(wp.tid(), crew, total)
+        first = int(-1)
+        g = vec()
+        b = vec()
+        B = mat()
+        if i < total:
+            world = world_of(i, count, total)
+            p = i - world * count
+            origin = window.origin[world]
+            held = world * window.count
+            old_fx = load_vec(before.rows, i, row_fx)
+            adj = ParticleAdj()
+            adj.fx = load_vec(adj_now, i, row_fx)
+            adj.H = load_mat(adj_now, i, row_H)
+            v = load_vec(now.rows, i, row_v)
+            C = load_mat(now.rows, i, row_C)
+            if end:
+                adj.v = load_vec(adj_now, i, row_v)
+                adj.C = load_mat(adj_now, i, row_C)
+            else:
+                H = load_mat(now.rows, i, row_H)
+                g = centre(load_vec(now.rows, i, row_fx))
+                m = body.mass[world, p]
+                Q = rotation(body, world, p, H)
+                A = affine_momentum(scale, body, world, p, C, H, Q)
+                here = held + first_node(unpack_base(now.base[i]), origin, window.shape)
+                sums = gather_adj(adj_node, here, window.shape, g, m * v - A * g, A, m)
+                B = sums.outer - wp.outer(sums.value, g)
+                # (T1.adj)
+                more = momentum_adj(scale, body, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_body)
+                adj.fx += sums.slope - wp.transpose(A) * sums.value  # (A6)
+                adj.v = more.v
+                adj.C = more.C
+                adj.H += more.H
+                size = (
+                    wp.dot(adj.fx, adj.fx)
+                    + wp.dot(adj.v, adj.v)
+                    + wp.ddot(adj.C, adj.C)
+                    + wp.ddot(adj.H, adj.H)
+                )
+                if not wp.isfinite(size):
+                    report(watch, world, back, bad_gradient, order[i])
+            if start:
+                store_vec(adj_now, i, row_v, adj.v)
+                store_mat(adj_now, i, row_C, adj.C)
+            else:
+                first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
+                g = centre(old_fx)
+                adj = moved_adj(scale, load_mat(before.rows, i, row_H), C, adj)  # (T3.adj)
+                B = adj.C
+                b = adj.v - B * g
+                sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
+                adj.fx += sums.slope - wp.transpose(B) * v  # (T2.adj)
+            store_vec(adj_now, i, row_fx, adj.fx)
+            store_mat(adj_now, i, row_H, adj.H)
+        if not start:
+            if wp.static(exact):
+                give(adj_velocity, i, count, total, b, B)
+            else:
+                scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
+
+    def compiled(few: bool) -> wp.Kernel:
+        """``advance_adj`` for few particles or for many, as in g2p2g.py: with so many registers that so many blocks fit at a time."""
+        name, blocks = (".few", 2) if few else ("", 3)
+        where = native_module(adj_module(spec, wanted) + ".fused" + name)
+        options = dict(module=where, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, blocks))
+        return wp.kernel(**options)(advance_adj)
+
+    return SimpleNamespace(
+        grid_velocity_adj=grid_velocity_adj, advance_adj={few: compiled(few) for few in (False, True)}
+    )

@@ -1,0 +1,91 @@
+"""What Warp's language cannot say: 16-byte loads and reductions, and the sum over a warp. The code is in scatter.h and fixed_point.h.
+
+Everything has a plain form as well, for the CPU, for double precision and for GPUs before sm_90, chosen when it is compiled.
+"""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import once
+from softmpm.kernels.structs import types
+
+HEADERS = [Path(__file__).with_name(name) for name in ("scatter.h", "fixed_point.h")]
+WARP = 32
+"""Threads that work together, and particles of a block of packed rows."""
+BLOCK = 128
+"""Threads of a block."""
+FEW, VERY_FEW = 20_000, 10_000
+"""Up to so many particles have kernels of their own in blocks of one warp, and a warp may have some for half of its threads only."""
+
+
+def padded(particles: int) -> int:
+    """Places that packed particles take, which come in whole warps."""
+    return -(-particles // WARP) * WARP
+
+
+def native_module(name: str) -> str:
+    """Give the Warp module of this name what native functions need; returns the name.
+
+    Machine code of the very GPU ("cubin"): PTX would be that of the oldest GPU in the machine, without 16-byte reductions.
+    """
+    source = "".join(header.read_text() for header in HEADERS)
+    build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)
+    options = {"extra_build_options": build, "cuda_output": "cubin", "enable_backward": False}
+    wp.set_module_options(options, module=wp.get_module(name))
+    return name
+
+
+@once
+def native(dim: int, dtype: str) -> SimpleNamespace:
+    t = types(dim, dtype)
+    real, vec, mat, ivec, node_vec, rows = t.real, t.vec, t.mat, t.ivec, t.aligned, t.rows
+
+    @wp.func_native(f"softmpm::scatter<{dim}>(node.data, shape, first, g, b, A, m);")
+    def scatter(node: wp.array(dtype=node_vec), shape: ivec, first: int, g: vec, b: vec, A: mat, m: real): ...
+
+    @wp.func_native("return softmpm::load_node(node.data, i);")
+    def load_node(node: wp.array(dtype=node_vec), i: int) -> node_vec: ...
+
+    @wp.func_native("softmpm::store_node(node.data, i, value);")
+    def store_node(node: wp.array(dtype=node_vec), i: int, value: node_vec): ...
+
+    @wp.func_native(
+        f"wp::vec_t<{dim}, {t.c_name}> value; softmpm::load_rows<{rows}, {dim}>(packed.data, i, r, value.c); return value;"
+    )
+    def load_vec(packed: wp.array(dtype=real), i: int, r: int) -> vec: ...
+
+    @wp.func_native(
+        f"wp::mat_t<{dim}, {dim}, {t.c_name}> value; "
+        f"softmpm::load_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]); return value;"
+    )
+    def load_mat(packed: wp.array(dtype=real), i: int, r: int) -> mat: ...
+
+    @wp.func_native(f"softmpm::store_rows<{rows}, {dim}>(packed.data, i, r, value.c);")
+    def store_vec(packed: wp.array(dtype=real), i: int, r: int, value: vec): ...
+
+    @wp.func_native(f"softmpm::store_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]);")
+    def store_mat(packed: wp.array(dtype=real), i: int, r: int, value: mat): ...
+
+    @wp.func_native(f"softmpm::spread<{dim}>(&out.data->c[0], row, value.c, i, total);")
+    def spread_vec(out: wp.array2d(dtype=vec), row: int, value: vec, i: int, total: int): ...
+
+    @wp.func_native(f"softmpm::spread<{dim * dim}>(&out.data->data[0][0], row, &value.data[0][0], i, total);")
+    def spread_mat(out: wp.array2d(dtype=mat), row: int, value: mat, i: int, total: int): ...
+
+    @wp.func_native(f"softmpm::copy_rows<{rows}>(source.data, j, target.data, i);")
+    def copy_rows(source: wp.array(dtype=real), j: int, target: wp.array(dtype=real), i: int): ...
+
+    return SimpleNamespace(
+        scatter=scatter,
+        load_node=load_node,
+        store_node=store_node,
+        load_vec=load_vec,
+        load_mat=load_mat,
+        store_vec=store_vec,
+        store_mat=store_mat,
+        spread_vec=spread_vec,
+        spread_mat=spread_mat,
+        copy_rows=copy_rows,
+    )

@@ -1,0 +1,1 @@
+"""The method: functions of one particle or one node with their adjoints, shared by every scheme."""

@@ -1,0 +1,93 @@
+"""Adjoint of a muscle's pull: the sum over its particles."""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import once
+from softmpm.kernels.structs import Spec, types
+
+COLLECTORS = 8_192
+"""Threads that share the particles of a world: a million sums into one number would stand in a queue."""
+
+
+def collectors(slots: Sequence[int]) -> tuple[int, int, int]:
+    """Threads of :func:`collect_pull` for slots (world, particle, slot)."""
+    worlds, particles, count = slots
+    return worlds, min(particles, COLLECTORS), count
+
+
+@once
+def collect_pull(spec: Spec):
+    """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
+    t = types(spec.dim, spec.dtype)
+
+    @wp.kernel(module=spec.module + ".pull", enable_backward=False)
+    def collect(
+        # In:
+        muscle: wp.array3d(dtype=wp.int32),
+        # In, cleared:
+        adj_slot: wp.array3d(dtype=t.real),
+        # Out, added into:
+        adj_pull: wp.array2d(dtype=t.real),
+    ):
+        world, n, slot = wp.tid()
+        last = int(-1)
+        total = t.real(0.0)
+        for p in range(n, muscle.shape[1], COLLECTORS):
+            k = muscle[world, p, slot]
+            if k != last:
+                if last >= 0:
+                    wp.atomic_add(adj_pull, world, last, total)
+                last = k
+                total = t.real(0.0)
+            if k >= 0:
+                total += adj_slot[world, p, slot]
+                adj_slot[world, p, slot] = t.real(0.0)
+        if last >= 0:
+            wp.atomic_add(adj_pull, world, last, total)
+
+    return collect
+
+
+PARTS = 256
+"""Partial sums of a muscle's pull, each of every 256th particle."""
+
+
+@once
+def collect_pull_in_order(spec: Spec) -> SimpleNamespace:
+    """As :func:`collect_pull`, in an order that is always the same: ``parts`` of each muscle, then their ``total``."""
+    t = types(spec.dim, spec.dtype)
+    module = spec.module + ".pull"
+
+    @wp.kernel(module=module, enable_backward=False)
+    def parts(
+        # In:
+        muscle: wp.array3d(dtype=wp.int32),
+        # In, cleared:
+        adj_slot: wp.array3d(dtype=t.real),
+        # Out:
+        part: wp.array3d(dtype=t.real),
+    ):
+        world, k, n = wp.tid()
+        total = t.real(0.0)
+        for p in range(n, muscle.shape[1], PARTS):
+            for slot in range(spec.muscle_slots):
+                if muscle[world, p, slot] == k:
+                    total += adj_slot[world, p, slot]
+                    adj_slot[world, p, slot] = t.real(0.0)
+        part[world, k, n] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def total(
+        # In:
+        part: wp.array3d(dtype=t.real),
+        # Out, added into:
+        adj_pull: wp.array2d(dtype=t.real),
+    ):
+        world, k = wp.tid()
+        for n in range(PARTS):
+            adj_pull[world, k] = adj_pull[world, k] + part[world, k, n]
+
+    return SimpleNamespace(parts=parts, total=total)

@@ -1,0 +1,85 @@
+"""Alarms between substeps: numerical fracture and the running step limit. Derivation: docs/math/alarms.md.
+
+    gap    |x_q − x_p| ≤ g dx                   for rest neighbours p, q                                        (W1)
+    step   Δt ≤ s dx √(ρ₀ / K)                  with the stiffness K of the present F, material and pull        (W2)
+    K = max ⟨G, A[G]⟩ / ⟨G, G⟩  over symmetric G,  A[G] = d/dε τ((I + εG) F)                                     (W3)
+
+A is symmetric, so A[G] = sym(F̄ Fᵀ) with the adjoint F̄ of the stress for τ̄ = G: no law needs a block of its own. Lanczos'
+iteration makes A tridiagonal, T, and T − κ I has a positive pivot in its elimination exactly if an eigenvalue of T is above κ. Both
+alarms stand at the start of a call and at the end of a chunk, where their price is shared by all its substeps; det F is checked in
+every substep (status.py).
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import once
+from softmpm.kernels.physics.elasticity import elasticity
+from softmpm.kernels.physics.stress import solid, solid_adj
+from softmpm.kernels.structs import Spec, Wanted, solid_adj_type, solid_types, types
+
+STEPS = {2: 3, 3: 5}
+"""Of Lanczos' iteration. In 2D there are three symmetric G, in 3D six, the last of which no longer moves K by 1 %."""
+
+
+@once
+def alarm(spec: Spec) -> SimpleNamespace:
+    """Blocks of one particle: is its step stable, and is a neighbour too far away."""
+    t, wanted = types(spec.dim, spec.dtype), Wanted(material=False, activation=False)
+    real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
+    Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
+    rotation, stiffness_bound = solid(spec).rotation, solid(spec).stiffness_bound
+    stress_adj = solid_adj(spec, wanted).stress_adj
+    identity, dim, steps = elasticity(spec.dim, spec.dtype).identity, spec.dim, STEPS[spec.dim]
+
+    @wp.func
+    def stiffer(body: Solid, world: int, p: int, H: mat, limit: real) -> bool:
+        """Whether K > ``limit`` [Pa] (W3); false where K is not a number, which is another alarm's business."""
+        F = identity() + H
+        Q = rotation(body, world, p, H)
+        G = F * wp.transpose(F)
+        G = G / wp.sqrt(wp.ddot(G, G))
+        for i in range(dim):
+            for j in range(dim):  # a part in every direction
+                G[i, j] += (
+                    real(0.3)
+                    * wp.where(i == 0, real(1.0), real(-0.4))
+                    * wp.where(j == 0, real(1.0), real(-0.4))
+                )
+        G = G / wp.sqrt(wp.ddot(G, G))
+        before = mat()
+        beta = real(0.0)
+        pivot = real(1.0)
+        for _step in range(steps):
+            A = stress_adj(body, world, p, H, Q, G, SolidAdj()) * wp.transpose(F)
+            A = real(0.5) * (A + wp.transpose(A))
+            alpha = wp.ddot(G, A)
+            pivot = alpha - limit - beta * beta / pivot
+            if pivot > real(0.0):
+                return wp.isfinite(pivot)
+            A = A - alpha * G - beta * before
+            beta = wp.sqrt(wp.ddot(A, A))
+            before = G
+            G = A / beta
+        return False
+
+    @wp.func
+    def step_is_stable(scale: Scale, body: Solid, world: int, p: int, H: mat) -> bool:
+        """(W2), as K ≤ s² ρ₀ dx² / Δt²."""
+        reach = scale.spacing / scale.dt
+        limit = scale.step * body.mass[world, p] / body.volume[world, p] * reach * reach
+        # Nearly all particles of a scene at half its stable step need no more than this:
+        if not stiffness_bound(body, world, p, H) > limit:
+            return True
+        return not stiffer(body, world, p, H, limit)
+
+    @wp.func
+    def near(scale: Scale, cells: ivec, apart: vec) -> bool:
+        """(W1) for two particles ``cells + apart`` from each other, in cells."""
+        d = apart
+        for axis in range(dim):
+            d[axis] = apart[axis] + real(cells[axis])
+        return not (wp.dot(d, d) > scale.gap)
+
+    return SimpleNamespace(step_is_stable=step_is_stable, near=near)

@@ -1,0 +1,148 @@
+"""Grid stage: nodal momentum to nodal velocity. Derivation: docs/math/grid.md.
+
+    u = p / m                                                                                        (G1)
+    v = W_k(... W_1(exp(−γ Δt) (u + Δt g)))   with the walls W_1 … W_k in the order of the scene     (G2)
+    p̄ = exp(−γ Δt) v̄₀ / m,  m̄ = −p̄ · u        v̄₀ being v̄ pulled back through the walls              (G1.adj)
+
+Empty nodes get zero in both directions; in the fast scheme they keep what they held (kernels/fast/g2p2g.py).
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import once
+from softmpm.kernels.physics.contact import contact
+from softmpm.kernels.physics.spline import spline
+from softmpm.kernels.structs import Spec, solid_types, types
+
+
+@once
+def grid(spec: Spec) -> SimpleNamespace:
+    t = types(spec.dim, spec.dtype)
+    real, vec, ivec, node_vec, Scale = t.real, t.vec, t.ivec, t.node, t.Scale
+    Walls = solid_types(spec).Walls
+    nodes = spline(spec.dim, spec.dtype)
+    node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
+    dim, gravity, damping = spec.dim, spec.gravity, spec.damping
+
+    @wp.struct
+    class NodeAdj:
+        p: vec
+        m: real
+
+    @wp.func
+    def free_velocity(scale: Scale, u: vec) -> vec:
+        v = u
+        if wp.static(gravity):
+            v += scale.dt * scale.gravity
+        if wp.static(damping):
+            v = scale.decay * v
+        return v
+
+    def after_walls(count: int) -> wp.Function:
+        """v after the first ``count`` walls (G2)."""
+        if count == 0:
+
+            @wp.func
+            def after(scale: Scale, walls: Walls, here: ivec, v: vec) -> vec:
+                return v
+        else:
+            before, wall = after_walls(count - 1), contact(spec, count - 1)
+            inside, respond = wall.inside, wall.respond
+
+            @wp.func
+            def after(scale: Scale, walls: Walls, here: ivec, v: vec) -> vec:
+                w = before(scale, walls, here, v)
+                if inside(walls, here, scale.exact_spacing):
+                    w = respond(walls, w)
+                return w
+
+        return after
+
+    def pull_back(k: int) -> wp.Function:
+        """Adjoint of the velocity before wall ``k``, from that of the velocity after all walls."""
+        if k == len(spec.contacts):
+
+            @wp.func
+            def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
+                return adj
+        else:
+            through_others, wall = pull_back(k + 1), contact(spec, k)
+            inside, respond, respond_adj = wall.inside, wall.respond, wall.respond_adj
+
+            @wp.func
+            def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
+                meets = inside(walls, here, scale.exact_spacing)
+                w = v
+                if meets:
+                    w = respond(walls, v)
+                adj_v = through_others(scale, walls, here, w, adj)
+                if meets:
+                    adj_v = respond_adj(walls, v, adj_v)
+                return adj_v
+
+        return back
+
+    after_all_walls, pull_back_through_all = after_walls(len(spec.contacts)), pull_back(0)
+
+    @wp.func
+    def node_velocity(scale: Scale, walls: Walls, here: ivec, p: vec, m: real) -> vec:
+        """Velocity of the node at ``here`` from its momentum and mass."""
+        v = vec()
+        if m > real(0.0):
+            v = after_all_walls(scale, walls, here, free_velocity(scale, p / m))  # (G1), (G2)
+        return v
+
+    @wp.func
+    def node_velocity_adj(
+        scale: Scale, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec
+    ) -> NodeAdj:
+        adj = NodeAdj()
+        if m > real(0.0):
+            u = p / m
+            adj_v = pull_back_through_all(scale, walls, here, free_velocity(scale, u), adj_velocity)
+            adj.p = adj_v / m  # (G1.adj)
+            if wp.static(damping):
+                adj.p = scale.decay * adj.p
+            adj.m = -wp.dot(adj.p, u)
+        return adj
+
+    @wp.kernel(module=spec.module, enable_backward=False)
+    def grid_velocity(
+        # Parameters:
+        scale: Scale,
+        walls: Walls,
+        # In:
+        node: wp.array2d(dtype=node_vec),
+        # Out:
+        velocity: wp.array2d(dtype=vec),
+    ):
+        world, n = wp.tid()
+        node_n = node[world, n]
+        here = node_coordinates(n, scale.shape)
+        velocity[world, n] = node_velocity(scale, walls, here, momentum(node_n), node_n[dim])
+
+    @wp.kernel(module=spec.module + ".adj", enable_backward=False)
+    def grid_velocity_adj(
+        # Parameters:
+        scale: Scale,
+        walls: Walls,
+        # In:
+        node: wp.array2d(dtype=node_vec),
+        adj_velocity: wp.array2d(dtype=vec),
+        # Out:
+        adj_node: wp.array2d(dtype=node_vec),
+    ):
+        world, n = wp.tid()
+        node_n = node[world, n]
+        here = node_coordinates(n, scale.shape)
+        adj = node_velocity_adj(scale, walls, here, momentum(node_n), node_n[dim], adj_velocity[world, n])
+        adj_node[world, n] = pack(adj.p, adj.m)
+
+    return SimpleNamespace(
+        node_velocity=node_velocity,
+        node_velocity_adj=node_velocity_adj,
+        grid_velocity=grid_velocity,
+        grid_velocity_adj=grid_velocity_adj,
+    )

@@ -1,0 +1,85 @@
+"""Failures found on the device, and how they are reported: one 64-bit word per world, see softmpm/errors.py."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.errors import FROZEN, KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
+from softmpm.kernels.compile import once
+from softmpm.kernels.physics.elasticity import elasticity
+from softmpm.kernels.structs import Spec, types
+
+
+@once
+def report(dim: int, dtype: str) -> SimpleNamespace:
+    """How a kernel asks whether its world still runs, and how it says that it failed."""
+
+    @wp.func
+    def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
+        return watch[world] == wp.int64(NEVER)
+
+    @wp.func
+    def write(watch: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
+        word = (
+            (wp.int64(substep) << wp.int64(SUBSTEP_SHIFT))
+            | (wp.int64(kind) << wp.int64(KIND_SHIFT))
+            | wp.int64(particle)
+        )
+        wp.atomic_min(watch, world, word)
+
+    @wp.func
+    def ran(watch: wp.array(dtype=wp.int64), world: int, substep: int) -> bool:
+        """Whether the world came through the substeps before ``substep``."""
+        word = watch[world]
+        return word >= wp.int64(substep) << wp.int64(SUBSTEP_SHIFT) and word != wp.int64(FROZEN)
+
+    return SimpleNamespace(running=running, ran=ran, report=write)
+
+
+@once
+def check(spec: Spec) -> SimpleNamespace:
+    """What must hold of a new state: finite, on the grid, and not collapsed."""
+    t = types(spec.dim, spec.dtype)
+    real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
+    write, volume_change = report(spec.dim, spec.dtype).report, elasticity(spec.dim, spec.dtype).volume_change
+    dim = spec.dim
+    not_finite, left_grid, collapsed = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.COLLAPSED)
+    left_window = int(Kind.LEFT_WINDOW)
+    largest = 1.0e12  # of det F, and of a squared distance in cells
+
+    @wp.func
+    def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
+        """The new state may be kept: ``fx`` as it came, ``base`` as it would be, on ``shape`` nodes from ``corner``.
+
+        A comparison with NaN is false. Without a branch: behind one, a GPU would start late to read what the stress needs.
+        """
+        j = volume_change(H)
+        ok = int(j > scale.collapse) & int(j < real(largest)) & int(wp.dot(fx, fx) < real(largest))
+        for axis in range(dim):  # unsigned: below zero is far above as well
+            ok &= int(wp.uint32(base[axis] - corner[axis]) <= wp.uint32(shape[axis] - 3))
+        return ok != 0
+
+    @wp.func
+    def complain(
+        watch: wp.array(dtype=wp.int64),
+        scale: Scale,
+        world: int,
+        p: int,
+        substep: int,
+        fx: vec,
+        base: ivec,
+        H: mat,
+    ):
+        """Report the rule that a state breaks; NaN before place before collapse."""
+        kind = left_window
+        for axis in range(dim):
+            if wp.uint32(base[axis]) > wp.uint32(scale.shape[axis] - 3):
+                kind = left_grid
+        j = volume_change(H)
+        if not wp.isfinite(wp.ddot(H, H) + wp.dot(fx, fx)) or not j < real(largest):
+            kind = not_finite
+        elif not j > scale.collapse:
+            kind = collapsed
+        write(watch, world, substep, kind, p)
+
+    return SimpleNamespace(sound=sound, complain=complain)

@@ -1,0 +1,178 @@
+"""What an observer sees on the grid, mass and velocity: P2G without any force, and its twin. Derivation: docs/math/transfer.md.
+
+(p, m)_i += w m (v + C r, 1),   v_i = p_i / m_i where m_i > 0, else 0                   (O1)
+p̄_i = v̄_i / m_i,   m̄_i −= p̄_i·v_i
+g = p̄_i·(v + C r) + m̄_i
+x̄ = m Σ g ∇w − w Cᵀ p̄_i,   v̄ = m Σ w p̄_i,   C̄ = m Σ w p̄_i rᵀ                          (O1.adj)
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.errors import Kind
+from softmpm.kernels.compile import once
+from softmpm.kernels.convert import boundary
+from softmpm.kernels.physics import status
+from softmpm.kernels.physics.spline import spline
+from softmpm.kernels.structs import types
+
+
+@once
+def raster(dim: int, dtype: str) -> SimpleNamespace:
+    t, s = types(dim, dtype), spline(dim, dtype)
+    real, vec, mat, node_vec, Scale = t.real, t.vec, t.mat, t.node, t.Scale
+    Entered, entered = boundary(dim, dtype).Entered, boundary(dim, dtype).entered
+    weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
+    weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
+    pack, momentum, report = s.pack, s.momentum, status.report(dim, dtype).report
+    bad_start = int(Kind.START)
+    module = f"softmpm.raster.d{dim}.{dtype}"
+
+    @wp.func
+    def placed(scale: Scale, x: vec, v: vec, C: mat) -> Entered:
+        """A particle as the kernels hold it; F does not enter and is taken as I."""
+        return entered(scale, x, v, C, wp.identity(n=dim, dtype=real), vec(), mat())
+
+    @wp.kernel(module=module, enable_backward=False)
+    def splat(
+        # Parameters:
+        scale: Scale,
+        mass: wp.array(dtype=real),
+        # In:
+        x: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        C: wp.array2d(dtype=mat),
+        # Out, lowered:
+        watch: wp.array(dtype=wp.int64),
+        # Out, added into:
+        node: wp.array2d(dtype=node_vec),
+    ):
+        world, p = wp.tid()
+        speed = v[world, p]
+        at = placed(scale, x[world, p], speed, C[world, p])
+        if not at.sound:
+            report(watch, world, 0, bad_start, p)
+        affine = scale.spacing * C[world, p]
+        m = mass[p]
+        w = weights(at.fx)
+        for n in range(s.count):
+            o = offset(n)
+            share = m * weight(w, o)
+            wp.atomic_add(
+                node,
+                world,
+                node_index(at.base, o, scale.shape),
+                share * pack(speed + affine * (position(o) - at.fx), real(1.0)),
+            )
+
+    @wp.kernel(module=module, enable_backward=False)
+    def splat_fixed(
+        # Parameters:
+        scale: Scale,
+        mass: wp.array(dtype=real),
+        unit: wp.array2d(dtype=wp.float64),  # of momentum and mass, (world, 2)
+        # In:
+        x: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        C: wp.array2d(dtype=mat),
+        # Out, lowered:
+        watch: wp.array(dtype=wp.int64),
+        # Out, added into:
+        node: wp.array3d(dtype=wp.int64),  # (world, node, dim + 1), in these units
+    ):
+        """As ``splat``, into integers, whose sum does not depend on the order."""
+        world, p = wp.tid()
+        speed = v[world, p]
+        at = placed(scale, x[world, p], speed, C[world, p])
+        if not at.sound:
+            report(watch, world, 0, bad_start, p)
+        affine = scale.spacing * C[world, p]
+        m = mass[p]
+        w = weights(at.fx)
+        for n in range(s.count):
+            o = offset(n)
+            i = node_index(at.base, o, scale.shape)
+            share = m * weight(w, o)
+            value = share * (speed + affine * (position(o) - at.fx))
+            for axis in range(dim):
+                whole = wp.rint(wp.float64(value[axis]) / unit[world, 0])
+                wp.atomic_add(node, world, i, axis, wp.int64(whole))
+            wp.atomic_add(node, world, i, dim, wp.int64(wp.rint(wp.float64(share) / unit[world, 1])))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def splat_adj(
+        # Parameters:
+        scale: Scale,
+        mass: wp.array(dtype=real),
+        # In:
+        x: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        C: wp.array2d(dtype=mat),
+        adj_node: wp.array2d(dtype=node_vec),
+        # Out:
+        adj_x: wp.array2d(dtype=vec),
+        adj_v: wp.array2d(dtype=vec),
+        adj_C: wp.array2d(dtype=mat),
+    ):
+        world, p = wp.tid()
+        speed = v[world, p]
+        at = placed(scale, x[world, p], speed, C[world, p])
+        affine = scale.spacing * C[world, p]
+        m = mass[p]
+        w = weights(at.fx)
+        slope = slopes(at.fx)
+        sum_fx = vec()
+        sum_v = vec()
+        sum_C = mat()
+        for n in range(s.count):
+            o = offset(n)
+            r = position(o) - at.fx
+            adj_i = adj_node[world, node_index(at.base, o, scale.shape)]
+            adj_p = momentum(adj_i)
+            share = weight(w, o)
+            sum_fx += (wp.dot(adj_p, speed + affine * r) + adj_i[dim]) * weight_slope(w, slope, o)
+            sum_fx -= share * (wp.transpose(affine) * adj_p)
+            sum_v += share * adj_p
+            sum_C += wp.outer(share * adj_p, r)
+        adj_x[world, p] = (m / scale.spacing) * sum_fx
+        adj_v[world, p] = m * sum_v
+        adj_C[world, p] = (m * scale.spacing) * sum_C
+
+    @wp.kernel(module=module, enable_backward=False)
+    def divide(
+        # In:
+        node: wp.array2d(dtype=node_vec),
+        # Out:
+        mass: wp.array2d(dtype=real),
+        velocity: wp.array3d(dtype=real),  # (world, node, dim)
+    ):
+        world, i = wp.tid()
+        m = node[world, i][dim]
+        mass[world, i] = m
+        for axis in range(dim):
+            velocity[world, i, axis] = wp.where(m > real(0.0), node[world, i][axis] / m, real(0.0))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def divide_adj(
+        # In:
+        mass: wp.array2d(dtype=real),
+        velocity: wp.array3d(dtype=real),
+        adj_mass: wp.array2d(dtype=real),
+        adj_velocity: wp.array3d(dtype=real),
+        # Out:
+        adj_node: wp.array2d(dtype=node_vec),
+    ):
+        world, i = wp.tid()
+        m = mass[world, i]
+        adj_p = vec()
+        adj_m = adj_mass[world, i]
+        if m > real(0.0):
+            for axis in range(dim):
+                adj_p[axis] = adj_velocity[world, i, axis] / m  # never 1/m², which overflows
+                adj_m -= adj_p[axis] * velocity[world, i, axis]
+        adj_node[world, i] = pack(adj_p, adj_m)
+
+    return SimpleNamespace(
+        splat=splat, splat_fixed=splat_fixed, splat_adj=splat_adj, divide=divide, divide_adj=divide_adj
+    )

@@ -1,0 +1,1 @@
+"""Chunks, checkpoints and memory of a call: integers only."""

@@ -1,0 +1,221 @@
+"""How much a differentiable call keeps, and what it runs again instead. Formula and figures: docs/memory.md.
+
+A call is cut into chunks. To pull a chunk back, what is inside it must be there: its states and the mass and momentum of the
+nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
+
+    keep all:  everything inside all chunks, N (S + G) and one S for each; nothing runs twice
+    schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
+               chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (checkpointing.py)
+
+In a closed loop one backward pass goes through many calls, each of which also holds its start, the end of the one before. They are
+pulled back one after the other.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from softmpm.devices import memory_of
+from softmpm.planning.checkpointing import recomputed
+
+LONGEST = 128
+"""Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
+MANY, LONGEST_OF_MANY = 30_000, 64
+"""From so many particles on the host has time enough, and sorting in time is worth more."""
+
+MARGIN = {2: 6, 3: 3}
+"""Nodes of a window around the particles' stencils, on each side, in 2D and 3D, until they leave it."""
+
+
+def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int) -> tuple[int, ...]:
+    """Nodes along each axis of the part of the grid that is in memory.
+
+    Args:
+        grid: Nodes of the whole grid.
+        reach: How far the particles' base nodes lie apart.
+        margin: Nodes around their stencils on each side.
+    """
+    wide = [apart + 3 + 2 * margin for apart in reach]
+    wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns begin where reads from memory do
+    return tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
+
+
+def longest_chunk(particles: int) -> int:
+    """Substeps of a chunk, at most, for so many particles in all worlds."""
+    return LONGEST if particles < MANY else LONGEST_OF_MANY
+
+
+def price_of_chunk(particles: int) -> int:
+    """What each chunk is taken to cost on a GPU besides its substeps, in substeps.
+
+    With few particles it is the host's time, with many that of sorting and moving them.
+    """
+    least, most = 4, 48
+    return max(least, min(most, 3_000_000 // particles))
+
+
+class Sizes(NamedTuple):
+    """Bytes of what a call may keep, and what decides how long its chunks are."""
+
+    inside: int
+    """State of all worlds inside a chunk."""
+    nodes: int
+    """What is kept of the nodes of all worlds for each substep."""
+    between: int
+    """State of all worlds between chunks."""
+    start: int
+    """State of all worlds in the user's order, as a call begins or ends, with what rounding took."""
+    longest: int
+    """Substeps of a chunk, at most."""
+    price: int
+    """What each chunk costs besides its substeps, in substeps."""
+    calls: int
+    """How many calls share the budget."""
+
+
+def default_budget(device: torch.device, sizes: Sizes) -> int:
+    """Bytes that all calls may keep where nobody says how many.
+
+    For one call a sixteenth of a GPU's memory, or 64 MiB on the CPU. For several as often as much, but at most 6 times, or 64 times on
+    the CPU: a :class:`softmpm.Graph` of them holds its own beside what the same calls keep outside of it, and there must be room for
+    both. The starts are there anyway: they never take what one call would have.
+    """
+    one, most = 64 * 2**20, 64
+    if device.type == "cuda":
+        one, most = torch.cuda.get_device_properties(device).total_memory // 16, 6
+    return max(min(sizes.calls, most) * one, one + (sizes.calls - 1) * sizes.start)
+
+
+class Plan(NamedTuple):
+    """What is kept of a call."""
+
+    longest: int
+    """Substeps of a chunk, at most."""
+    slots: int
+    """States between chunks that are kept; 0 if everything is."""
+    kept: int
+    """Bytes kept by the forward pass, of one call."""
+    recomputed: int
+    """Bytes of what the backward pass runs again at a time."""
+
+    @property
+    def keep_all(self) -> bool:
+        return self.slots == 0
+
+
+@functools.lru_cache(maxsize=256)
+def plan(horizon, sizes: Sizes, budget: int) -> Plan:
+    """The plan that takes the least time within the budget [B] of all calls.
+
+    Args:
+        horizon: A :class:`softmpm.horizon.Horizon`.
+
+    Raises:
+        ValueError: Not even one substep at a time fits.
+    """
+    chunks = len(horizon.chunks(sizes.longest))
+    everything = horizon.total * (sizes.inside + sizes.nodes) + chunks * sizes.inside
+    others = sizes.calls - 1
+    if sizes.calls * everything + others * sizes.start <= budget or horizon.total == 0:
+        return Plan(sizes.longest, 0, everything, 0)
+    room = budget - others * (sizes.start - sizes.between)  # the first state that is kept is the start
+    best, least = None, math.inf
+    for longest in _lengths(horizon.substeps, sizes.longest):
+        chunks = horizon.chunks(longest)
+        inside = sum((n + 1) * sizes.inside + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
+        slots = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
+        if slots < 1:
+            continue
+        runs = recomputed(len(chunks), slots)
+        length = max(chunk.length for chunk in chunks)
+        # Each chunk runs forward and is pulled back, some run again between.
+        if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
+            best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
+    if best is None:
+        smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes + others * sizes.start
+        raise ValueError(
+            f"a gradient {f'through {sizes.calls} calls ' if sizes.calls > 1 else ''}needs at least {smallest:,} bytes for states, "
+            f"memory_budget is {budget:,} bytes: raise it, or make the scene smaller."
+        )
+    return best
+
+
+def _lengths(substeps: int, longest: int) -> list[int]:
+    """Lengths of chunks to try, the longest first: halved again and again, and those that divide a control step.
+
+    These leave no shorter chunk, which would need buffers of its own.
+    """
+    halved = (longest >> k for k in range(longest.bit_length()))
+    even = (n for n in range(1, longest + 1) if substeps % n == 0)
+    return sorted({*halved, *even}, reverse=True)
+
+
+class Memory(NamedTuple):
+    """Bytes that the calls of one gradient take at their peak, besides what the model itself holds, and how often they run."""
+
+    forward: int
+    """A call without gradient."""
+    kept: int
+    """What all calls keep until the backward pass."""
+    backward: int
+    """Peak of the backward pass, kept states included."""
+    runs: float
+    """How often a substep runs forward, in the mean; with little memory the backward pass takes so much longer."""
+
+
+def memory(model, horizon) -> Memory:
+    """Evaluates the formula of docs/memory.md for calls of one length, all gradients wanted."""
+    real, sizes, calls = model.dtype.itemsize, model.sizes(), model.calls
+    particles = model.worlds * model.particle_count
+    state = particles * real * (2 * model.dim + 2 * model.dim**2)  # adjoints of x, v, C, F
+    material, pull = 4 * particles * real, particles * model.spec.muscle_slots * real
+    chosen = plan(horizon, sizes, model.budget)
+    if model.scheme == "fast":
+        program = material + sizes.nodes + (2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0)
+        small = program + sizes.inside + 2 * sizes.nodes
+        forward = small * _at_once(horizon, sizes.longest)
+        handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
+        if chosen.keep_all:
+            own = calls * program * len(horizon.chunks(chosen.longest))
+        else:
+            own = program * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
+            # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
+            handed += 2 * small if model.device.type == "cuda" else 0
+    else:
+        forward, handed, own = 2 * sizes.inside, sizes.inside, 0
+    # Each call but the first holds its start besides, which is one of the states that are kept if those inside are not.
+    starts = (calls - 1) * (sizes.start - (0 if chosen.keep_all else sizes.between))
+    kept = calls * (chosen.kept + material) + own + starts
+    adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
+    if model.spec.deterministic:
+        adjoints += 2 * sizes.nodes
+    chunks = len(horizon.chunks(chosen.longest))
+    runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.slots) / chunks
+    return Memory(forward + material + sizes.start, kept, kept + chosen.recomputed + state + adjoints, runs)
+
+
+def _shapes(horizon, longest: int) -> int:
+    return len({chunk.shape for chunk in horizon.chunks(longest)})
+
+
+def _at_once(horizon, longest: int) -> int:
+    """Programs of chunks that keep nothing inside: one that runs, one launched ahead, one that holds the start of the first, and one of
+    another shape that waits.
+    """
+    return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))
+
+
+def check_room(model) -> None:
+    """Raise ValueError if the start, the end and the grid of a call alone are more than the device has."""
+    room = memory_of(model.device)
+    per_node = 8 if model.scheme == "fast" else 2 * model.dim + 1
+    per_world = 2 * model.particle_count * 2 * (model.dim + model.dim**2) + model.held_nodes * per_node
+    needed = model.worlds * per_world * model.dtype.itemsize
+    if room is not None and needed > room:
+        raise ValueError(
+            f"a call takes at least {needed:,} bytes for {model.worlds:,} world(s) of {model.particle_count:,} particles and "
+            f"{model.held_nodes:,} nodes, but {model.device} has {room:,}: take fewer worlds, fewer nodes or fewer particles."
+        )

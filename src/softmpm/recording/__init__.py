@@ -1,0 +1,1 @@
+"""Recordings: HDF5 format, writer, reader, Rerun export."""

@@ -1,0 +1,151 @@
+"""What is where in a recording: an HDF5 file of tables that only grow, one row at a time.
+
+    episode           {iteration, attributes}       one row per recorded simulation
+    scalar            {iteration, name, value}      one row per number, such as a loss
+    frame/index       {episode, time, field, latent}  one row per frame; its rows of the last two, or -1
+    frame/x, frame/v  (frame, particle, dim)        [m], [m/s]
+    frame/strain      (frame, particle)             size of the Green strain [-], see writer.py
+    frame/activation  (frame, muscle)               [-], NaN where none was given
+    field/velocity    (row, *nodes, dim)            grid velocity [m/s]
+    latent/value      (row, size)                   what an observer saw
+    static/*                                        rest shape, muscles, walls
+
+A row of a table with names is complete when its first number is not negative; HDF5 shows the fill value -1
+until then.
+"""
+
+from typing import cast
+
+import h5py
+import numpy as np
+
+from softmpm.model import Model
+from softmpm.scene.scene import CONTACTS
+
+FORMAT, VERSION = "softmpm recording", 1
+EPISODE = np.dtype([("iteration", "<i8"), ("attributes", "S4096")])
+SCALAR = np.dtype([("iteration", "<i8"), ("name", "S64"), ("value", "<f8")])
+FRAME = np.dtype([("episode", "<i8"), ("time", "<f8"), ("field", "<i8"), ("latent", "<i8")])
+REAL, INDEX = np.dtype("<f4"), np.dtype("<i8")
+
+STATIC = {  # name: type, axes. p particles, d dim, m muscles, w walls
+    "positions": (REAL, "pd"),
+    "volume": (REAL, "p"),
+    "body": (INDEX, "p"),
+    "particle": (INDEX, "p"),
+    "gravity": (REAL, "d"),
+    "muscle": (np.dtype("u1"), "mp"),
+    "muscle_direction": (REAL, "md"),
+    "muscle_strength": (REAL, "m"),
+    "wall_normal": (REAL, "wd"),
+    "wall_offset": (REAL, "w"),
+    "wall_friction": (REAL, "w"),
+    "wall_contact": (np.dtype(f"S{max(map(len, CONTACTS))}"), "w"),
+    "grid_shape": (INDEX, "d"),
+}
+TABLES = {  # as above; r rows, n the nodes of the grid (dim axes), l the size of the latent
+    "episode": (EPISODE, "r"),
+    "scalar": (SCALAR, "r"),
+    "frame/index": (FRAME, "r"),
+    "frame/x": (REAL, "rpd"),
+    "frame/v": (REAL, "rpd"),
+    "frame/strain": (REAL, "rp"),
+    "frame/activation": (REAL, "rm"),
+    "field/velocity": (REAL, "rnd"),
+    "latent/value": (REAL, "rl"),
+}
+PER_FRAME = ("x", "v", "strain", "activation")
+PARTS = {"field": "field/velocity", "latent": "latent/value"}
+_LATENT_CHUNK, _LATENT_MOST = 64, 65536
+
+
+def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarray]:
+    """What does not change, for the particles that are recorded."""
+    scene, n = model.scene, model.particle_count
+    particle = np.arange(n)
+    if max_particles is not None and max_particles < n:
+        particle = np.sort(np.random.default_rng(0).choice(n, max_particles, replace=False))
+    member = np.zeros((len(scene.muscles), n))
+    for row, muscle in zip(member, scene.muscles, strict=True):
+        row[muscle.particles] = 1
+    bodies, dim = scene.bodies, scene.grid.dim
+    values = {
+        "positions": np.concatenate([b.particles.positions for b in bodies])[particle],
+        "volume": np.concatenate([b.particles.volume for b in bodies])[particle],
+        "body": np.repeat(np.arange(len(bodies)), [len(b.particles) for b in bodies])[particle],
+        "particle": particle,
+        "gravity": scene.gravity,
+        "muscle": member[:, particle],
+        "muscle_direction": np.array([m.direction for m in scene.muscles]).reshape(-1, dim),
+        "muscle_strength": [m.strength for m in scene.muscles],
+        "wall_normal": np.array([w.normal for w in scene.walls]).reshape(-1, dim),
+        "wall_offset": [w.offset for w in scene.walls],
+        "wall_friction": [w.friction for w in scene.walls],
+        "wall_contact": [w.contact for w in scene.walls],
+        "grid_shape": scene.grid.shape,
+    }
+    return {name: np.asarray(values[name]).astype(dtype) for name, (dtype, _) in STATIC.items()}
+
+
+def create(file: h5py.File, model: Model, static: dict[str, np.ndarray]) -> None:
+    """Everything that the file will ever have a name for; later only rows are added."""
+    grid = model.scene.grid
+    file.attrs["format"], file.attrs["version"] = np.bytes_(FORMAT), VERSION
+    file.attrs["dt"], file.attrs["spacing"] = model.scene.dt, grid.spacing
+    file.attrs["share"] = len(static["particle"]) / model.particle_count
+    for name, values in static.items():
+        checksum = {"fletcher32": True, "chunks": values.shape} if values.size else {}
+        file.create_dataset(f"static/{name}", data=values, **checksum)
+    size = {
+        "p": (len(static["particle"]),),
+        "d": (grid.dim,),
+        "m": (len(model.scene.muscles),),
+        "n": tuple(grid.shape),
+    }
+    for name, (dtype, axes) in TABLES.items():
+        if axes == "rl":
+            _create_table(file, name, dtype, (0,), (_LATENT_MOST,), (_LATENT_CHUNK,))
+        else:
+            row = sum((size[axis] for axis in axes[1:]), ())
+            most = tuple(max(n, 1) for n in row)  # HDF5 has no chunks of size 0
+            _create_table(file, name, dtype, row, most, most)
+
+
+def _create_table(file: h5py.File, name: str, dtype: np.dtype, row: tuple, most: tuple, chunk: tuple) -> None:
+    """A table without rows. One row is one chunk, which is written once: a kill cannot harm an older row."""
+    fill = np.zeros((), dtype)
+    if dtype.names:
+        fill[dtype.names[0]] = -1
+    squeeze = (
+        {} if dtype in (SCALAR, FRAME) else {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    )
+    file.create_dataset(
+        name,
+        (0, *row),
+        dtype,
+        maxshape=(None, *most),
+        chunks=(1, *chunk),
+        fillvalue=fill,
+        fletcher32=True,
+        **squeeze,
+    )
+
+
+def tables(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """All tables of a file that :func:`create` made."""
+    return {name: cast(h5py.Dataset, file[name]) for name in TABLES}
+
+
+def put(table: h5py.Dataset, start: int, rows: np.ndarray) -> None:
+    """Write rows at ``start``, the end of a table or the remains of an attempt that failed there."""
+    shape = (max(len(table), start + len(rows)), *rows.shape[1:])
+    if table.shape != shape:
+        table.resize(shape)
+    table[start : start + len(rows)] = rows
+
+
+def complete(rows: np.ndarray) -> np.ndarray:
+    """Rows of a table with names, up to the first that a killed run did not finish."""
+    names = rows.dtype.names or ("",)
+    unfinished = np.flatnonzero(rows[names[0]] < 0)
+    return rows[: unfinished[0]] if len(unfinished) else rows

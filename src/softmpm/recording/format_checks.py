@@ -1,0 +1,86 @@
+"""Checks that a file holds what a recorder writes, and no more than it can hold, before any of it is read.
+
+A recording may come from somebody else. Each dataset must be plain numbers inside the file (no links, no external
+or virtual data), stored as ``format.py`` stores it, and what it declares must be there: HDF5 would make up the
+rest, in memory.
+"""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from softmpm.recording.format import FRAME, PARTS, PER_FRAME, SCALAR, STATIC, TABLES
+
+_CHECKSUM = {h5py.h5z.FILTER_FLETCHER32}
+_PACKED = _CHECKSUM | {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
+_BEST_COMPRESSION = 1100  # deflate never exceeds 1032:1
+_UNFINISHED = 2**20  # bytes that a table may declare and lack: a kill between the two
+
+
+def plain_dataset(path: Path, file: h5py.File, name: str, dtype: np.dtype) -> h5py.Dataset:
+    """The named dataset, if it is what a recording holds under that name and lies wholly in this file."""
+    node = file
+    for part in name.split("/"):
+        if not isinstance(node, h5py.Group) or not isinstance(node.get(part, getlink=True), h5py.HardLink):
+            raise ValueError(f"{path}: {name} is missing or leads out of the file.")
+        node = node[part]
+    if not isinstance(node, h5py.Dataset) or node.is_virtual or node.external:
+        raise ValueError(f"{path}: {name} is not data of this file.")
+    if node.dtype != dtype:
+        raise ValueError(f"{path}: {name} must have type {dtype}, got {node.dtype}.")
+    created = node.id.get_create_plist()
+    filters = {created.get_filter(i)[0] for i in range(created.get_nfilters())}
+    known = _CHECKSUM if name.startswith("static/") or dtype in (SCALAR, FRAME) else _PACKED
+    if not filters <= known:
+        raise ValueError(f"{path}: {name} uses HDF5 filters {filters - known}; refused.")
+    _check_storage(path, node, name, _BEST_COMPRESSION if filters - _CHECKSUM else 1)
+    return node
+
+
+def _check_storage(path: Path, node: h5py.Dataset, name: str, compression: int) -> None:
+    stored, row = node.id.get_storage_size(), node.dtype.itemsize * int(np.prod(node.shape[1:], dtype=object))
+    chunk = node.dtype.itemsize * int(np.prod(node.chunks or (0,), dtype=object))
+    lacking = 0 if name.startswith("static/") else max(row, _UNFINISHED)
+    if node.nbytes > compression * stored + lacking or chunk > compression * max(stored, _UNFINISHED):
+        raise ValueError(f"{path}: {name} declares {node.nbytes} bytes, but stores only {stored}.")
+    if stored > path.stat().st_size:
+        raise ValueError(f"{path}: {name} stores {stored} bytes, more than the file has.")
+
+
+def check_shapes(path: Path, static: dict[str, np.ndarray], tables: dict[str, h5py.Dataset]) -> None:
+    """One size for each axis, everywhere."""
+    if static["positions"].ndim != 2 or static["positions"].shape[1] not in (2, 3):
+        raise ValueError(f"{path}: static/positions must have shape (particle, 2 or 3).")
+    size = dict(zip("pd", ((n,) for n in static["positions"].shape), strict=True))
+    size |= {"n": tuple(int(n) for n in static["grid_shape"].ravel())}
+    size |= {"m": static["muscle"].shape[:1], "w": static["wall_offset"].shape[:1]}
+    size |= {"l": tables["latent/value"].shape[1:]}
+    found = {f"static/{name}": (static[name].shape, axes) for name, (_, axes) in STATIC.items()}
+    found |= {name: (tables[name].shape[1:], axes[1:]) for name, (_, axes) in TABLES.items()}
+    for name, (got, axes) in found.items():
+        want = sum((size[axis] for axis in axes), ())
+        if got != want:
+            raise ValueError(f"{path}: {name} must have shape {want} (without rows), got {got}.")
+
+
+def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
+    """Finite numbers, and a grid that has cells."""
+    for name, values in static.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise ValueError(f"{path}: static/{name} must be finite.")
+    if static["grid_shape"].min() < 2:
+        raise ValueError(f"{path}: static/grid_shape must be at least 2, got {static['grid_shape']}.")
+
+
+def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset]) -> None:
+    """What each frame names is there; frames of episodes that began meanwhile are nobody's."""
+    for name, table in PARTS.items():
+        count = len(tables[table])
+        if len(index) and not -1 <= index[name].min() <= index[name].max() < count:
+            raise ValueError(f"{path}: frame/index names rows of {name} beyond the {count} that there are.")
+    for name in PER_FRAME:
+        if len(tables[f"frame/{name}"]) < len(index):
+            raise ValueError(f"{path}: frame/{name} has fewer rows than frame/index.")
+    if not np.isfinite(index["time"]).all():
+        raise ValueError(f"{path}: the times in frame/index must be finite.")

@@ -1,0 +1,214 @@
+"""Recording: read what a Recorder wrote, while it writes, after it ended or after it was killed.
+
+A recording may come from somebody else, so nothing in it is trusted: only the names in ``format.py`` are
+read, after the checks of ``format_checks.py``. That keeps a file from reading other files and from filling
+memory; it cannot mend faults of the HDF5 library itself.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softmpm.recording.format import FORMAT, PARTS, PER_FRAME, STATIC, TABLES, VERSION, complete
+from softmpm.recording.format_checks import check_frames, check_shapes, check_values, plain_dataset
+from softmpm.recording.superblock import readable
+
+_DAMAGE = (OSError, RuntimeError, LookupError, TypeError, AttributeError, OverflowError, MemoryError)
+"""As h5py reports what HDF5 cannot read."""
+_ATTEMPTS, _PAUSE = 20, 0.02  # [s]
+_T = TypeVar("_T")
+
+
+class Recording:
+    """A recorded run.
+
+    Other tools can open the file too: ``h5py.File(path, "r", swmr=True)``; without ``swmr`` HDF5 refuses the
+    file of a run that still writes or was killed, and with it HDF5 never returns from one that is damaged.
+
+    Attributes:
+        static: What does not change, by name: ``positions`` (particle, dim) [m], ``volume``, ``body``,
+            ``particle`` (the model's index of each recorded particle), ``muscle`` (muscle, particle) 0 or 1,
+            ``wall_normal``, ``grid_shape``, ...
+        dt, spacing: Substep [s] and grid spacing [m].
+        share: Part of the model's particles that was recorded, 1 for all.
+        episodes: Iterations of the recorded simulations, in the order of the run.
+        scalars: Name to (iteration, value), two arrays.
+
+    Raises:
+        FileNotFoundError, OSError: There is no such file, or it is damaged.
+        ValueError: The file is no recording, or holds what a recording must not.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FileNotFoundError(f"there is no recording {self.path}.")
+        self._steadily(self._load)
+
+    def _steadily(self, read: Callable[[], _T]) -> _T:
+        """The result of ``read``; again after a failure while the file changes, because a writer is at work then."""
+        for attempt in range(_ATTEMPTS):
+            before = self._stamp()
+            try:
+                return read()
+            except (OSError, ValueError):
+                time.sleep(_PAUSE)
+                if (
+                    attempt and self._stamp() == before
+                ):  # once may be too soon for the clock of the file system
+                    raise
+        return read()
+
+    def _stamp(self) -> tuple[int, ...]:
+        found = os.stat(self.path)
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+    def _load(self) -> None:
+        try:
+            self._file = h5py.File(readable(self.path), "r", locking="best-effort")
+        except (*_DAMAGE, ValueError) as error:
+            raise OSError(f"{self.path} is not a readable recording: {error}.") from error
+        try:
+            self._read_tables()
+        except _DAMAGE as error:
+            self.close()
+            raise OSError(f"{self.path} is damaged: {error}.") from error
+        except ValueError:
+            self.close()
+            raise
+
+    def _read_tables(self) -> None:
+        attributes = self._file.attrs
+        if attributes.get("format") != FORMAT.encode():
+            raise ValueError(f"{self.path} is an HDF5 file, but no softmpm recording.")
+        if (version := self._number("version")) != VERSION:
+            raise ValueError(f"{self.path} has format version {version:g}; this softmpm reads {VERSION}.")
+        self.dt, self.spacing, self.share = (self._number(name) for name in ("dt", "spacing", "share"))
+        self.static = {
+            name: self._dataset(f"static/{name}", dtype)[()] for name, (dtype, _) in STATIC.items()
+        }
+        self._tables = {name: self._dataset(name, dtype) for name, (dtype, _) in TABLES.items()}
+        check_shapes(self.path, self.static, self._tables)
+        check_values(self.path, self.static)
+        episodes = complete(self._tables["episode"].fields(["iteration"])[()])
+        self._newest = {int(iteration): row for row, iteration in enumerate(episodes["iteration"])}
+        self.episodes = tuple(self._newest)
+        self._frame = complete(self._tables["frame/index"][()])
+        check_frames(self.path, self._frame, self._tables)
+        self.scalars = self._by_name(complete(self._tables["scalar"][()]))
+
+    def _dataset(self, name: str, dtype: np.dtype) -> h5py.Dataset:
+        return plain_dataset(self.path, self._file, name, dtype)
+
+    def _number(self, name: str) -> float:
+        value = np.asarray(self._file.attrs[name])
+        if value.size != 1 or value.dtype.kind not in "iuf" or not 0 < float(value.item()) < np.inf:
+            raise ValueError(f"{self.path}: the attribute {name} must be a number > 0, got {value!r:.100}.")
+        return float(value.item())
+
+    def _by_name(self, rows: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        names, first = np.unique(rows["name"], return_index=True)
+        found = {name: rows[rows["name"] == name] for name in names[np.argsort(first)]}
+        try:
+            return {name.decode(): (those["iteration"], those["value"]) for name, those in found.items()}
+        except UnicodeDecodeError as error:
+            raise OSError(f"{self.path} is damaged: the name of a scalar is not UTF-8: {error}.") from error
+
+    @property
+    def dim(self) -> int:
+        return self.static["positions"].shape[1]
+
+    @property
+    def particle_count(self) -> int:
+        return self.static["positions"].shape[0]
+
+    def attributes(self, iteration: int) -> dict:
+        """What :meth:`softmpm.Recorder.episode` was given for this simulation."""
+        row = self._row(iteration)
+        try:
+            found = json.loads(bytes(self._one_row("episode", row)["attributes"]) or b"{}")
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, dict):
+            raise OSError(
+                f"{self.path} is damaged: the attributes of iteration {iteration} are no JSON object."
+            )
+        return found
+
+    def _row(self, iteration: int) -> int:
+        if iteration not in self._newest:
+            raise KeyError(
+                f"{self.path} has no simulation of iteration {iteration}; it has {list(self.episodes)}."
+            )
+        return self._newest[iteration]
+
+    def rows(self, iteration: int) -> np.ndarray:
+        """Rows of this simulation's frames, for :meth:`read`; of the newer one, if it was recorded twice."""
+        return np.flatnonzero(self._frame["episode"] == self._row(iteration))
+
+    def recorded(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Those of ``rows`` at which this quantity was recorded."""
+        return rows[self._frame[name][rows] >= 0] if name in PARTS else rows
+
+    def read(self, name: str, rows: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """One quantity, ``time x v strain activation field latent``, at some frames.
+
+        Returns:
+            Those of ``rows`` at which it was recorded, and its values there, with a first axis of rows.
+        """
+        rows = np.asarray(rows, dtype=np.int64)
+        if name == "time":
+            return rows, self._frame["time"][rows]
+        if name in PER_FRAME:
+            return rows, self._take(f"frame/{name}", rows)
+        rows = self.recorded(name, rows)
+        return rows, self._take(PARTS[name], self._frame[name][rows])
+
+    def _take(self, table: str, rows: np.ndarray) -> np.ndarray:
+        data = self._tables[table]
+        out = np.zeros((len(rows), *data.shape[1:]), data.dtype)
+        for k, row in enumerate(rows if out.size else ()):
+            out[k] = self._one_row(table, int(row))
+        return out
+
+    def _one_row(self, table: str, row: int) -> np.ndarray:
+        def read() -> np.ndarray:
+            try:
+                return self._tables[table][row]
+            except (*_DAMAGE, ValueError) as error:
+                raise OSError(f"{self.path} is damaged: row {row} of {table}: {error}.") from error
+
+        return self._steadily(read)
+
+    def frames(self, iteration: int) -> dict[str, np.ndarray]:
+        """All frames of one simulation.
+
+        Returns:
+            ``time`` (frame,) [s], ``x`` and ``v`` (frame, particle, dim), ``strain`` (frame, particle),
+            ``activation`` (frame, muscle); and where they were recorded ``field`` (row, *nodes, dim) and
+            ``latent`` (row, size), with ``field_frame`` and ``latent_frame`` (row,), the frame that each row
+            belongs to.
+        """
+        rows = self.rows(iteration)
+        out = {name: self.read(name, rows)[1] for name in ("time", *PER_FRAME)}
+        for name in PARTS:
+            have, values = self.read(name, rows)
+            if len(have):
+                out[name], out[f"{name}_frame"] = values, np.searchsorted(rows, have)
+        return out
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()

@@ -1,0 +1,269 @@
+"""to_rerun: a recording as a Rerun file, for ``rerun run.rrd``. No other module imports rerun.
+
+Three time lines: ``time`` plays the recorded simulations one after the other at the speed of the simulation;
+``frame`` counts their frames; ``iteration`` is that of the run. A number of an iteration between two recorded
+simulations stands on ``time`` at the same fraction of the way between them, so that the losses grow while the
+robots play.
+"""
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from softmpm.recording import style
+from softmpm.recording.reader import Recording
+from softmpm.recording.selection import Show, Simulation, plan
+
+_BLOCK_BYTES = 2**26  # of positions converted at a time
+
+
+def to_rerun(
+    recording: str | Path,
+    rrd: str | Path | None = None,
+    *,
+    every: int = 1,
+    max_particles: int | None = None,
+) -> Path:
+    """Convert a recording to a Rerun file, on any machine, during the run or after it ended in any way.
+
+    Args:
+        recording: HDF5 file of a :class:`softmpm.Recorder`.
+        rrd: File to write; None puts it beside the recording. An older one is replaced.
+        every: Convert each ``every``-th frame only.
+        max_particles: Convert this many particles, chosen evenly at random; None for all that were recorded.
+
+    Returns:
+        The path of the Rerun file.
+
+    Raises:
+        ImportError: rerun is not installed. The recording can be converted later.
+        FileNotFoundError, OSError, ValueError: The recording cannot be read; see :class:`softmpm.Recording`.
+    """
+    try:
+        import rerun as rr
+        from rerun.error_utils import RerunWarning
+    except ImportError as error:
+        raise ImportError(
+            "a Rerun file needs the package rerun-sdk (pip install rerun-sdk). Nothing is lost without it: "
+            f"{recording} can be converted later, on any machine, with: python -m softmpm {recording}"
+        ) from error
+    for name, value in (("every", every), ("max_particles", max_particles)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}.")
+    rrd = Path(recording).with_suffix(".rrd") if rrd is None else Path(rrd)
+    draft = rrd.with_name(f"{rrd.name}.new")
+    stream = rr.RecordingStream("softmpm")
+    try:
+        with Recording(recording) as source, warnings.catch_warnings():
+            warnings.simplefilter("error", RerunWarning)  # rerun would warn and leave data out
+            show = plan(source, every, max_particles)
+            stream.save(draft, default_blueprint=_blueprint(source, show))
+            _log_all(stream, source, show)
+        stream.flush()
+        stream.disconnect()
+        os.replace(draft, rrd)
+    finally:
+        stream.disconnect()
+        draft.unlink(missing_ok=True)
+    return rrd
+
+
+def _log_all(stream, source: Recording, show: Show) -> None:
+    _log_static(stream, source, show)
+    for simulation in show.simulations:
+        _log_simulation(stream, source, show, simulation)
+    _log_scalars(stream, source, show)
+
+
+def _log_static(stream, source: Recording, show: Show) -> None:
+    import rerun as rr
+
+    if source.dim == 2:  # Rerun's y points down, a robot's up
+        stream.log("scene", rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])), static=True)
+    points = rr.Points2D if source.dim == 2 else rr.Points3D
+    shown = source.share * len(show.particle) / source.particle_count
+    radii = style.radii(source.static["volume"][show.particle], shown, source.dim)
+    for name in ("activation", "strain"):
+        stream.log(f"scene/robot/{name}", points.from_fields(radii=radii), static=True)
+    _log_walls(stream, source)
+    muscles = [f"muscle {k}" for k in range(len(source.static["muscle"]))]
+    if muscles:
+        stream.log("activation", rr.SeriesLines(names=muscles), static=True)
+
+
+def _log_walls(stream, source: Recording) -> None:
+    import rerun as rr
+
+    static = source.static
+    normals, offsets = static["wall_normal"].astype(float), static["wall_offset"].astype(float)
+    outlines = style.wall_outlines(normals, offsets, (static["grid_shape"] - 1) * source.spacing)
+    for k, (outline, normal) in enumerate(zip(outlines, normals, strict=True)):
+        colour = style.WALL.get(static["wall_contact"][k], style.WALL[b"stick"])
+        if len(outline) < source.dim:
+            continue
+        if source.dim == 2:
+            strokes = style.hatch(outline, normal, 2 * source.spacing)
+            lines = rr.LineStrips2D(
+                [outline, *strokes], colors=[colour], radii=0.12 * source.spacing, draw_order=0
+            )
+            stream.log(f"scene/walls/{k}", lines, static=True)
+        else:
+            fan = np.array([(0, i, i + 1) for i in range(1, len(outline) - 1)])
+            sheet = rr.Mesh3D(vertex_positions=outline, triangle_indices=fan, albedo_factor=(*colour, 70))
+            edge = rr.LineStrips3D(
+                [np.vstack([outline, outline[:1]])], colors=[colour], radii=0.15 * source.spacing
+            )
+            stream.log(f"scene/walls/{k}", sheet, static=True)
+            stream.log(f"scene/walls/{k}/edge", edge, static=True)
+
+
+def _times(simulation: Simulation, at: np.ndarray):
+    import rerun as rr
+
+    return [
+        rr.TimeColumn("time", duration=simulation.time[at]),
+        rr.TimeColumn("frame", sequence=simulation.frame[at]),
+        rr.TimeColumn("iteration", sequence=np.full(len(at), simulation.iteration)),
+    ]
+
+
+def _log_simulation(stream, source: Recording, show: Show, simulation: Simulation) -> None:
+    import rerun as rr
+
+    points = rr.Points2D if source.dim == 2 else rr.Points3D
+    rows, count = simulation.rows, len(show.particle)
+    block = max(1, _BLOCK_BYTES // (4 * source.dim * source.particle_count))
+    for start in range(0, len(rows), block):
+        at = np.arange(start, min(start + block, len(rows)))
+        x = source.read("x", rows[at])[1][:, show.particle]
+        activation = source.read("activation", rows[at])[1]
+        colours = {
+            "activation": style.activation_colours(source.static, activation)[:, show.particle],
+            "strain": style.strain_colours(source.read("strain", rows[at])[1][:, show.particle], show.strain),
+        }
+        for name, colour in colours.items():
+            columns = points.columns(positions=x.reshape(-1, source.dim), colors=colour.ravel())
+            stream.send_columns(
+                f"scene/robot/{name}", _times(simulation, at), columns.partition([count] * len(at))
+            )
+        if show.has["activation"]:
+            _send_series(stream, "activation", _times(simulation, at), activation)
+        _log_fields(stream, source, show, simulation, at)
+        have, latent = source.read("latent", rows[at])
+        if len(have):
+            _send_series(stream, "latent", _times(simulation, np.searchsorted(rows, have)), latent)
+    _log_caption(stream, source, simulation)
+
+
+def _send_series(stream, name: str, times: list, values: np.ndarray) -> None:
+    """Values (frame, series), drawn as lines over time."""
+    import rerun as rr
+
+    columns = rr.Scalars.columns(scalars=values.ravel().astype(np.float64))
+    stream.send_columns(name, times, columns.partition([values.shape[1]] * len(values)))
+
+
+def _log_fields(stream, source: Recording, show: Show, simulation: Simulation, at: np.ndarray) -> None:
+    import rerun as rr
+
+    kind = rr.Arrows2D if source.dim == 2 else rr.Arrows3D
+    for k in at:
+        have, field = source.read("field", simulation.rows[[k]])
+        if len(have) == 0:
+            if k > 0 or not show.has["field"]:
+                continue
+            field = np.zeros((1, *(2,) * source.dim, source.dim))  # no arrows of the simulation before
+        origins, vectors, colours = style.arrows(field[0], source.spacing, show.speed)
+        columns = kind.columns(origins=origins, vectors=vectors, colors=colours)
+        stream.send_columns(
+            "scene/grid/velocity", _times(simulation, np.array([k])), columns.partition([len(origins)])
+        )
+
+
+def _log_caption(stream, source: Recording, simulation: Simulation) -> None:
+    """What is playing: the iteration, its numbers, and what the run noted about it."""
+    import rerun as rr
+
+    lines = [f"# Iteration {simulation.iteration}", ""]
+    for name, (iterations, values) in source.scalars.items():
+        lines += [f"- {name}: {value:.6g}" for value in values[iterations == simulation.iteration][-1:]]
+    lines += [f"- {name}: {value}" for name, value in source.attributes(simulation.iteration).items()]
+    columns = rr.TextDocument.columns(text=["\n".join(lines)], media_type=["text/markdown"])
+    stream.send_columns("caption", _times(simulation, np.array([0])), columns)
+
+
+def _log_scalars(stream, source: Recording, show: Show) -> None:
+    import rerun as rr
+
+    starts = [(s.iteration, s.time[0]) for s in show.simulations]
+    starts += [(s.iteration + 1, s.time[-1]) for s in show.simulations[-1:]]
+    known, time = np.array(sorted(starts)).T if starts else (np.zeros(1), np.zeros(1))
+    for name, (iterations, values) in source.scalars.items():
+        times = [
+            rr.TimeColumn("iteration", sequence=iterations),
+            rr.TimeColumn("time", duration=np.interp(iterations, known, time)),
+        ]
+        _send_series(stream, _curve(name), times, values[:, None])
+
+
+def _curve(name: str) -> str:
+    """Entity of a scalar, whatever characters its name has."""
+    import rerun as rr
+
+    return rr.new_entity_path(["scalars", name])
+
+
+def _blueprint(source: Recording, show: Show):
+    import rerun.blueprint as rrb
+
+    robot, walls = "/scene/robot", "/scene/walls/**"
+    main = _space(source, show, "muscles: red pulls, blue pushes", [f"{robot}/activation", walls])
+    rest = [_space(source, show, f"strain, 0 to {show.strain:.2g}", [f"{robot}/strain", walls])]
+    if show.has["field"]:
+        name = f"grid velocity, up to {show.speed:.2g} m/s"
+        rest.append(_space(source, show, name, ["/scene/grid/velocity", walls]))
+    side: list = [rrb.TextDocumentView(origin="/caption", name="now playing")]
+    quiet = rrb.PlotLegend(visible=False)
+    curves = [
+        rrb.TimeSeriesView(origin=_curve(name), name=name, plot_legend=quiet) for name in source.scalars
+    ]
+    if curves:
+        side.append(rrb.Tabs(*curves, active_tab=0))
+    for name in ("activation", "latent"):
+        if show.has[name]:
+            side.append(rrb.TimeSeriesView(origin=f"/{name}", name=name, plot_legend=quiet))
+    left = rrb.Vertical(main, rrb.Horizontal(*rest), row_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            left, rrb.Vertical(*side, row_shares=[2] + [3] * (len(side) - 1)), column_shares=[5, 2]
+        ),
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all"),
+        collapse_panels=True,
+    )
+
+
+def _space(source: Recording, show: Show, name: str, contents: list[str]):
+    """A view of the scene that stands upright and shows the robot's whole way."""
+    import rerun.blueprint as rrb
+
+    white = rrb.Background(color=[252, 252, 252])
+    if source.dim == 2:
+        bounds = rrb.VisualBounds2D(
+            x_range=[show.low[0], show.high[0]], y_range=[-show.high[1], -show.low[1]]
+        )
+        return rrb.Spatial2DView(
+            origin="/", contents=contents, name=name, visual_bounds=bounds, background=white
+        )
+    gravity = source.static["gravity"].astype(float)
+    up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 1.0, 0.0])
+    position, target = style.eye(show.low, show.high, up)
+    return rrb.Spatial3DView(
+        origin="/",
+        contents=contents,
+        name=name,
+        background=white,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=up),
+    )

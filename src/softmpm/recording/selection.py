@@ -1,0 +1,84 @@
+"""Which part of a recording is shown, when, and on which scales."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softmpm.recording import style
+from softmpm.recording.reader import Recording
+
+_SAMPLE = 64  # frames that decide the scales and the framing
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """One recorded simulation, shown after those before it."""
+
+    iteration: int
+    rows: np.ndarray
+    """Rows of the recording, shape (frame,)."""
+    frame: np.ndarray
+    """Number of each frame, counted through all simulations."""
+    time: np.ndarray
+    """Time of each frame since the first simulation began [s]."""
+
+
+@dataclass(frozen=True)
+class Show:
+    """What is shown of a recording."""
+
+    simulations: list[Simulation]
+    particle: np.ndarray
+    """Indices of the recorded particles that are shown."""
+    strain: float
+    """Strain at the top of its colour scale [-]."""
+    speed: float
+    """Speed of the longest arrow [m/s]."""
+    low: np.ndarray
+    """Lower corner of what to frame [m], shape (dim,)."""
+    high: np.ndarray
+    """Upper corner [m]."""
+    has: dict[str, bool]
+    """Whether there is any ``activation``, ``field``, ``latent``."""
+
+
+def plan(source: Recording, every: int, max_particles: int | None) -> Show:
+    """Decide it for each ``every``-th frame and at most ``max_particles``."""
+    particle = np.arange(source.particle_count)
+    if max_particles is not None and max_particles < len(particle):
+        particle = np.sort(np.random.default_rng(0).choice(particle, max_particles, replace=False))
+    simulations = _in_sequence(source, every)
+    rows = np.concatenate([np.zeros(0, np.int64), *(simulation.rows for simulation in simulations)])
+    some = _spread(rows)
+    x = np.concatenate([source.static["positions"], source.read("x", some)[1].reshape(-1, source.dim)])
+    x = x[np.isfinite(x).all(-1)]
+    low, high = style.frame_box(x.min(0), x.max(0), (source.static["grid_shape"] - 1) * source.spacing)
+    has = {name: len(source.recorded(name, rows)) > 0 for name in ("field", "latent")}
+    has["activation"] = bool(np.isfinite(source.read("activation", some)[1]).any())
+    fields = source.recorded("field", rows)
+    tops = [_top(np.linalg.norm(source.read("field", row)[1], axis=-1)) for row in _spread(fields)[:, None]]
+    strain, speed = _top(source.read("strain", some)[1]), max(tops, default=0.0)
+    return Show(simulations, particle, strain or 1.0, speed or 1.0, low, high, has)
+
+
+def _in_sequence(source: Recording, every: int) -> list[Simulation]:
+    simulations, frame, time = [], 0, 0.0
+    for iteration in source.episodes:
+        rows = source.rows(iteration)[::every]
+        if len(rows):
+            since = source.read("time", rows)[1]
+            at = time + since - since[0]
+            simulations.append(Simulation(iteration, rows, frame + np.arange(len(rows)), at))
+            frame, time = frame + len(rows), at[-1] + (at[-1] - at[0]) / max(len(rows) - 1, 1)
+    return simulations
+
+
+def _spread(rows: np.ndarray) -> np.ndarray:
+    """A few of them, evenly."""
+    return rows[:: -(-len(rows) // _SAMPLE) or 1]
+
+
+def _top(values: np.ndarray) -> float:
+    """Top of a scale: nearly the largest value, of those that are not 0; 0 if there is none."""
+    values = values[np.isfinite(values) & (values > 0)]
+    return float(np.quantile(values, 0.99)) if len(values) else 0.0

@@ -1,0 +1,228 @@
+"""Recorder: a run to HDF5 as it happens.
+
+The file can be read at every instant, also after ``kill -9``: everything with a name exists before the first
+row is written; the file is then in HDF5's single-writer-multiple-reader mode, in which the library orders its
+writes so that the file is always consistent; and a frame counts only once its row of ``frame/index`` has
+followed its data. Layout: ``format.py``.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softmpm.model import Model
+from softmpm.recording.digest import Content, Hash
+from softmpm.recording.file import begin, open_to_append, put_in_place, room
+from softmpm.recording.format import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
+from softmpm.state import GridField, State
+
+
+class Recorder:
+    """Writes what happens in a run, for people to look at: particles, muscles, grid velocity, losses.
+
+    ::
+
+        with softmpm.Recorder("run.h5", model) as recorder:
+            with recorder.episode(iteration=0) as episode:
+                episode.frame(0.0, state, activation)
+            recorder.scalars(0, {"loss": 0.3})
+
+    A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity
+    comes on top.
+
+    Args:
+        path: The file to write. It must not exist, unless ``resume_before`` is given.
+        model: What is simulated.
+        resume_before: Keep the simulations and scalars of iterations before this one of an existing file and
+            go on after them; without a file, start one.
+        resume_digest: What :attr:`digest` was when these iterations had been recorded; None does not ask.
+        every: Record each ``every``-th frame of a simulation only.
+        max_particles: Record this many particles, chosen evenly at random, the same in every run; None: all.
+
+    Raises:
+        FileExistsError: The file exists, and ``resume_before`` was not given.
+        ValueError: The existing file records another scene, or has another digest.
+        OSError: There is no room on the disk; also from the methods. What was recorded before is safe.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        model: Model,
+        *,
+        resume_before: int | None = None,
+        resume_digest: str | None = None,
+        every: int = 1,
+        max_particles: int | None = None,
+    ):
+        for name, value in (("every", every), ("max_particles", max_particles)):
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}.")
+        self.path, self.every = Path(path), every
+        if resume_before is None and self.path.exists():
+            raise FileExistsError(
+                f"{self.path} exists; choose another path, or go on with resume_before=<iteration>."
+            )
+        static = static_values(model, max_particles)
+        self._particles = torch.from_numpy(static["particle"])
+        self._shape = (model.particle_count, model.scene.grid.dim)
+        self._content = Content()
+        draft = self.path.with_name(f"{self.path.name}.new")
+        draft.unlink(missing_ok=True)  # of a killed process, or a link
+        try:
+            begin(draft, model, static, self.path, resume_before, self._content)
+            if resume_digest is not None and self.digest != resume_digest:
+                raise ValueError(
+                    f"{self.path} does not hold what was recorded before iteration {resume_before}: it was changed, or is of another "
+                    "run."
+                )
+            put_in_place(draft, self.path)
+        finally:
+            draft.unlink(missing_ok=True)
+        self._file = open_to_append(self.path)
+        self._tables = tables(self._file)
+        self._count = {name: len(table) for name, table in self._tables.items()}
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all simulations and scalars recorded so far, for ``resume_digest``."""
+        return self._content.hexdigest()
+
+    def episode(self, iteration: int, **attributes) -> "Episode":
+        """Begin a simulation, shown under this iteration; ``attributes`` are JSON values to keep with it."""
+        text = json.dumps(attributes).encode()
+        if len(text) > EPISODE["attributes"].itemsize:
+            raise ValueError(f"the attributes of an episode must fit in 4096 bytes of JSON, got {len(text)}.")
+        self._write("episode", np.array([(_checked(iteration), text)], EPISODE))
+        return Episode(self, self._count["episode"] - 1, self._content.episode(int(iteration), text))
+
+    def scalars(self, iteration: int, values: dict[str, float]) -> None:
+        """Numbers of one iteration, such as its loss."""
+        rows = [(_checked(iteration), name.encode(), float(value)) for name, value in values.items()]
+        for _, name, _ in rows:
+            if not 0 < len(name) <= SCALAR["name"].itemsize:
+                raise ValueError(f"the name of a scalar must have 1 to 64 bytes, got {name.decode()!r}.")
+        self._write("scalar", np.array(rows, SCALAR))
+        for row in rows:
+            self._content.scalar(*row)
+
+    def _frame(
+        self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]
+    ) -> None:
+        """One row in each table of a frame; it counts once the last, ``frame/index``, is written."""
+        rows = {f"frame/{name}": ("frame/index", one) for name, one in values.items()}
+        rows |= {PARTS[name]: (PARTS[name], one) for name, one in parts.items()}
+        with room(self._file, sum(one.nbytes for _, one in rows.values())):
+            for table, (counted, one) in rows.items():
+                put(self._tables[table], self._count[counted], one[None])
+        field, latent = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
+        self._write("frame/index", np.array([(episode, time, field, latent)], FRAME))
+        for name in parts:
+            self._count[PARTS[name]] += 1
+
+    def _write(self, name: str, rows: np.ndarray) -> None:
+        self._need_open()
+        with room(self._file, rows.nbytes):
+            put(self._tables[name], self._count[name], rows)
+        self._count[name] += len(rows)
+
+    def _need_open(self) -> None:
+        if not self._file:
+            raise ValueError(f"{self.path}: this recorder is closed.")
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+class Episode:
+    """One simulation of a recording; from :meth:`Recorder.episode`."""
+
+    def __init__(self, recorder: Recorder, row: int, content: Hash):
+        self._recorder, self._row, self._content, self._calls = recorder, row, content, 0
+
+    def frame(
+        self,
+        time: float,
+        state: State,
+        activation: Tensor | None = None,
+        field: GridField | Tensor | None = None,
+        latent: Tensor | None = None,
+        *,
+        world: int = 0,
+    ) -> None:
+        """Record one instant of one world. Nothing is differentiated or modified.
+
+        Args:
+            time: Time since the start of this simulation [s].
+            state: State of all worlds.
+            activation: Muscle activation [-], shape (world, muscle) or (muscle,).
+            field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize``
+                returns.
+            latent: What an observer saw, shape (world, size) or (size,).
+            world: The world to record.
+        """
+        recorder, self._calls = self._recorder, self._calls + 1
+        recorder._need_open()
+        if (self._calls - 1) % recorder.every:
+            return
+        if tuple(state.x.shape[1:]) != recorder._shape:
+            raise ValueError(
+                f"state.x must have shape (world, *{recorder._shape}), got {tuple(state.x.shape)}."
+            )
+        particles = recorder._particles.to(state.x.device)
+        x, v, F = (tensor.detach()[world][particles] for tensor in (state.x, state.v, state.F))
+        values = {"x": _numpy(x), "v": _numpy(v), "strain": _numpy(strain(F))}
+        row = {name: table.shape[1:] for name, table in recorder._tables.items()}
+        values["activation"] = np.full(row["frame/activation"], np.nan, np.float32)
+        if activation is not None:
+            values["activation"] = _one_world("activation", activation, world, row["frame/activation"])
+        parts = {}
+        if field is not None:
+            velocity = field.velocity if isinstance(field, GridField) else field
+            parts["field"] = _one_world("field", velocity, world, row["field/velocity"])
+        if latent is not None:  # the first one decides the size
+            size = row["latent/value"] if row["latent/value"] != (0,) else tuple(latent.shape[-1:])
+            parts["latent"] = _one_world("latent", latent, world, size)
+        recorder._frame(self._row, float(time), values, parts)
+        Content.frame(self._content, float(time), values | parts)
+
+    def __enter__(self) -> "Episode":
+        return self
+
+    def __exit__(self, *_) -> None:
+        pass
+
+
+def strain(F: Tensor) -> Tensor:
+    """Size of the Green strain, ‖(FᵀF − I)/2‖ [-], zero for every rigid motion; F is (..., dim, dim)."""
+    eye = torch.eye(F.shape[-1], dtype=F.dtype, device=F.device)
+    return torch.linalg.matrix_norm(F.mT @ F - eye) / 2
+
+
+def _checked(iteration: int) -> int:
+    if not (iteration == int(iteration) and iteration >= 0):
+        raise ValueError(f"iteration must be a whole number from 0 on, got {iteration}.")
+    return int(iteration)
+
+
+def _numpy(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().to("cpu", torch.float32).numpy()
+
+
+def _one_world(name: str, tensor: Tensor, world: int, shape: tuple[int, ...]) -> np.ndarray:
+    one = tensor[world] if tensor.ndim == len(shape) + 1 else tensor
+    if tuple(one.shape) != shape:
+        raise ValueError(
+            f"{name} must have shape {shape}, or that after a first axis world, got {tuple(tensor.shape)}; a frame is one instant, "
+            "so of many control steps it takes one."
+        )
+    return _numpy(one)

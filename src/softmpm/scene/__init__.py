@@ -1,0 +1,1 @@
+"""What a person designs: NumPy arrays and plain SI numbers only."""

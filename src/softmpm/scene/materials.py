@@ -1,0 +1,61 @@
+"""Elastic laws and their constants."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from softmpm.validate import need, store_numbers
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Material:
+    """Isotropic elastic solid. Use one of its laws, the subclasses below."""
+
+    survives_inversion: ClassVar[bool] = False
+    """Whether the stress is defined where det F ≤ 0."""
+
+    density: float
+    """Rest density ρ₀ [kg/m³]. Differentiable."""
+    young: float
+    """Young's modulus E [Pa]. Differentiable."""
+    poisson: float = 0.3
+    """Poisson's ratio ν [-], in (-1, 0.5). Differentiable."""
+
+    def __post_init__(self):
+        need(
+            type(self) is not Material,
+            "a material needs a law: use NeoHookean, FixedCorotated or BarrierCorotated.",
+        )
+        store_numbers(self, "material", "density", "young", "poisson")
+        need(self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
+        need(self.young > 0, f"young must be > 0 Pa, got {self.young}.")
+        need(
+            -1.0 < self.poisson < 0.5,
+            f"poisson must lie in (-1, 0.5), got {self.poisson}; rubber has 0.45 to 0.49.",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NeoHookean(Material):
+    """Neo-Hookean solid, τ = μ(FFᵀ − I) + λ log(J) I. For large stretch; an inverted particle is an error.
+
+    Source: Hu et al. 2019, "ChainQueen", section III. Good values: E 10 to 1e6 Pa, ν 0.2 to 0.45.
+    """
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FixedCorotated(Material):
+    """Fixed corotated solid, τ = 2μ(F − R)Fᵀ + λ(J − 1)J I. Defined through inversion; softens below J = 0.5.
+
+    Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity". Values: as NeoHookean.
+    """
+
+    survives_inversion: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BarrierCorotated(Material):
+    """Fixed corotated solid with a volumetric barrier, τ = 2μ(F − R)Fᵀ + λ/4 (J² − J⁻²) I.
+
+    As FixedCorotated at small strain, but resists the more the more it is compressed, which takes a smaller step: the stiffness
+    λ/2 (J² + J⁻²) is 2 λ at J = 0.5 and 13 λ at J = 0.2. Source: the derivative of λ/8 (J − 1/J)². Values: as NeoHookean.
+    """

@@ -1,0 +1,96 @@
+"""What is inside a closed triangle mesh: where its winding number is above one half, so parts may overlap.
+
+Source: Jacobson et al. 2013, "Robust inside-outside segmentation using generalized winding numbers". Warp
+answers it on the CPU; trimesh's own test would need rtree.
+"""
+
+import os
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softmpm.kernels.compile import launch
+from softmpm.validate import need
+
+wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
+
+
+def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (vertex, 3) and outward faces (face, 3) of a mesh file or trimesh object with an inside."""
+    if isinstance(source, (str, os.PathLike)):
+        source = _load(source)
+    need(
+        np.ndim(getattr(source, "faces", ())) == 2 and len(source.faces) > 0,
+        f"mesh needs a path or a trimesh.Trimesh with faces, got {type(source).__name__}.",
+    )
+    vertices, faces = np.asarray(source.vertices, np.float64), np.asarray(source.faces)
+    need(
+        0 <= faces.min() <= faces.max() < len(vertices),
+        f"the mesh's faces must be made of its {len(vertices)} vertices, got vertex {faces.max()}.",
+    )
+    size = float(np.ptp(vertices, axis=0).min())
+    need(
+        bool(np.isfinite(vertices).all()) and size > 1e-6 * np.abs(vertices).max(),
+        f"the mesh's vertices must be finite and not lie farther from the origin than a million times its smallest side, got "
+        f"{np.abs(vertices).max():.4g} m and {size:.4g} m: check its units, or move it to the origin with "
+        "apply_translation(-mesh.centroid).",
+    )
+    if not source.is_watertight:
+        _, joined = np.unique(np.asarray(source.edges_sorted), axis=0, return_counts=True)
+        raise ValueError(
+            f"the mesh is not closed: {(joined != 2).sum()} of its {len(joined)} edges do not join two faces; "
+            "try merge_vertices(), then trimesh.repair.fill_holes, or close it where it was drawn."
+        )
+    need(
+        bool(source.is_winding_consistent) and source.volume != 0,
+        "the mesh's faces do not all turn the same way, so it has no inside: try trimesh.repair.fix_normals.",
+    )
+    return vertices, faces if source.volume > 0 else faces[:, ::-1]  # all faces may turn inwards
+
+
+def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which points (point, 3) lie inside, as booleans."""
+    low = vertices.min(axis=0)
+    unit = float(np.ptp(vertices, axis=0).max())  # the query is in float32: keep its numbers near one
+    surface = wp.Mesh(
+        wp.array((vertices - low) / unit, dtype=wp.vec3, device="cpu"),
+        wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu"),
+        support_winding_number=True,
+    )
+    queries = wp.array((points - low) / unit, dtype=wp.vec3, device="cpu")
+    inside = wp.zeros(len(points), dtype=wp.int32, device="cpu")
+    launch(_inside, len(points), [surface.id, queries, inside], wp.get_device("cpu"))
+    return inside.numpy().astype(bool)
+
+
+@wp.kernel
+def _inside(
+    # In:
+    surface: wp.uint64,
+    points: wp.array(dtype=wp.vec3),  # pyright: ignore
+    # Out:
+    inside: wp.array(dtype=wp.int32),  # pyright: ignore
+):
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(surface, points[i], 10.0)  # the mesh spans one
+    if query.result and query.sign < 0.0:  # pyright: ignore
+        inside[i] = 1
+
+
+def _load(path: "str | os.PathLike[str]") -> Any:
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"there is no mesh file {os.fspath(path)!r}.")
+    try:
+        import trimesh
+
+        return trimesh.load_mesh(path)
+    except ImportError as error:
+        raise ImportError(
+            f"reading the mesh {os.fspath(path)!r} needs the package {error.name or 'trimesh'}: pip install softmpm[mesh]."
+        ) from error
+    except Exception as error:  # a damaged file meets any error of trimesh's readers, their own mistakes too
+        raise ValueError(
+            f"{os.fspath(path)!r} cannot be read as a mesh: {type(error).__name__}: {error}; open it in a program for meshes and "
+            "save it as STL."
+        ) from error

@@ -1,0 +1,193 @@
+"""What a person designs: grid, bodies with a material, muscles, walls. Plain SI numbers, checked at once.
+
+A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
+Rules that need the whole scene (particles inside the grid, muscle indices) live in ``check_scene.py``.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from softmpm.scene.materials import Material
+from softmpm.validate import array, need, need_kind, numbers, read_only, restore, store_numbers, unit
+
+Contact = Literal["stick", "slip", "separate"]
+CONTACTS: tuple[Contact, ...] = ("stick", "slip", "separate")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Grid:
+    """Background grid of nodes; node (i, j, k) sits at (i, j, k) · spacing."""
+
+    shape: tuple[int, ...]
+    """Nodes along each axis; two axes make a plane-strain scene, three a solid one."""
+    spacing: float
+    """Distance of neighbouring nodes, dx [m]."""
+
+    def __post_init__(self):
+        need(np.shape(self.shape) in ((2,), (3,)), f"grid shape must have 2 or 3 axes, got {self.shape!r}.")
+        shape = numbers("grid shape", self.shape)
+        need(
+            all(n.is_integer() and n >= 4 for n in shape),
+            f"grid shape needs whole numbers of at least 4 nodes along each axis, got {self.shape}.",
+        )
+        need(
+            all(n < 2**31 for n in shape),
+            f"grid shape must be below 2,147,483,648 nodes along each axis, which 32-bit indices reach, got {self.shape}.",
+        )
+        object.__setattr__(self, "shape", tuple(int(n) for n in shape))
+        store_numbers(self, "grid", "spacing")
+        need(self.spacing > 0, f"grid spacing must be > 0 m, got {self.spacing}.")
+
+    @property
+    def dim(self) -> int:
+        return len(self.shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Particles:
+    """Material points of a shape at rest."""
+
+    positions: np.ndarray
+    """Rest positions X [m], shape (particle, dim); copied, read-only."""
+    volume: np.ndarray | float
+    """Rest volume of each particle V⁰ [m³], in 2D [m²] of unit depth; one number or shape (particle,); copied, read-only."""
+
+    def __post_init__(self):
+        positions = np.array(array("positions", self.positions), dtype=np.float64, ndmin=2)
+        need(
+            positions.ndim == 2 and positions.shape[1] in (2, 3),
+            f"positions must have shape (particle, 2) or (particle, 3), got {positions.shape}.",
+        )
+        need(len(positions) > 0, "a shape has no particles: make it larger or its spacing smaller.")
+        volume = array("volume", self.volume).astype(np.float64)
+        need(
+            volume.shape in ((), (len(positions),)),
+            f"volume must be one number or have shape ({len(positions)},), got {volume.shape}.",
+        )
+        for name, values in (("positions", positions), ("volume", volume)):
+            if not np.isfinite(values).all():
+                particle = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0][0]
+                raise ValueError(f"{name} must be finite; particle {particle} is not.")
+        need(bool((volume > 0).all()), f"volume must be > 0, got {volume.min()}.")
+        object.__setattr__(self, "positions", read_only(positions))
+        object.__setattr__(self, "volume", read_only(np.broadcast_to(volume, (len(positions),)).copy()))
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    __setstate__ = restore
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """Particles made of one material."""
+
+    particles: Particles
+    material: Material
+
+    def __post_init__(self):
+        need_kind("body particles", self.particles, Particles)
+        need_kind("body material", self.material, Material)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Muscle:
+    """Fibres that pull (activation > 0) or push (< 0) along one material direction: τ += a s (Fd)(Fd)ᵀ.
+
+    Muscles may overlap: their stresses add. Source: Spielberg et al. 2021 (Robotica), section on actuation.
+    """
+
+    particles: np.ndarray
+    """Indices into the model's particles: the bodies' particles in the order of the bodies."""
+    direction: Sequence[float]
+    """Fibre direction d in the rest shape; normalised here."""
+    strength: float
+    """Stress at full activation, s [Pa]."""
+
+    def __post_init__(self):
+        index = array("muscle particles", self.particles, "biufO", "whole numbers")
+        need(index.ndim == 1 and index.size > 0, "a muscle needs a list of particle indices, not empty.")
+        need(
+            np.issubdtype(index.dtype, np.integer),
+            f"muscle particles must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",
+        )
+        need(len(np.unique(index)) == index.size, "a muscle names a particle twice; give each index once.")
+        object.__setattr__(self, "particles", read_only(index.astype(np.int64)))
+        object.__setattr__(self, "direction", unit("muscle direction", self.direction)[0])
+        store_numbers(self, "muscle", "strength")
+
+    __setstate__ = restore
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Wall:
+    """Half space n·x ≤ offset that a body cannot enter; acts on the nodes inside it.
+
+    ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the
+    wall and applies Coulomb friction to the rest.
+    """
+
+    normal: Sequence[float]
+    """Normal n, pointing out of the wall into the free space; normalised here together with the offset."""
+    offset: float
+    """The wall's surface is n·x = offset [m]."""
+    contact: Contact = "separate"
+    friction: float = 0.0
+    """Coulomb coefficient [-], for ``separate`` only."""
+
+    def __post_init__(self):
+        need(
+            self.contact in CONTACTS,
+            f"wall contact must be one of {', '.join(CONTACTS)}, got {self.contact!r}.",
+        )
+        store_numbers(self, "wall", "offset", "friction")
+        need(self.friction >= 0, f"wall friction must be ≥ 0, got {self.friction}.")
+        need(
+            self.friction == 0.0 or self.contact == "separate",
+            f"a {self.contact} wall has no friction, got {self.friction}; use contact='separate'.",
+        )
+        normal, length = unit("wall normal", self.normal)
+        if abs(length - 1.0) > 1e-15:  # a unit normal leaves the offset as it was written
+            object.__setattr__(self, "offset", self.offset / length)
+        object.__setattr__(self, "normal", normal)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Scene:
+    """Everything that does not change while a robot moves."""
+
+    grid: Grid
+    bodies: Sequence[Body]
+    muscles: Sequence[Muscle] = ()
+    walls: Sequence[Wall] = ()
+    """They act one after the other, at most 64."""
+    gravity: Sequence[float] | None = None
+    """Gravity g [m/s²], one number per axis; None is weightless."""
+    damping: float = 0.0
+    """Rate at which grid velocity decays [1/s]; the same for every dt."""
+    dt: float
+    """Length of one substep, Δt [s]; see :func:`softmpm.stable_dt`."""
+
+    def __post_init__(self):
+        need_kind("scene grid", self.grid, Grid)
+        for name, kind in (("bodies", Body), ("muscles", Muscle), ("walls", Wall)):
+            parts = getattr(self, name)
+            if isinstance(parts, kind) or not isinstance(parts, Iterable):
+                raise TypeError(
+                    f"scene {name} must be a list of {kind.__name__}, got {type(parts).__name__}."
+                )
+            parts = tuple(parts)
+            for k, part in enumerate(parts):
+                need_kind(f"scene {name}[{k}]", part, kind)
+            object.__setattr__(self, name, parts)
+        need(len(self.bodies) > 0, "a scene needs at least one body.")
+        dim = self.grid.dim
+        gravity = (0.0,) * dim if self.gravity is None else numbers("gravity", self.gravity)
+        need(len(gravity) == dim, f"gravity needs {dim} numbers, one per axis, got {self.gravity}.")
+        object.__setattr__(self, "gravity", gravity)
+        store_numbers(self, "scene", "damping", "dt")
+        need(self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
+        need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")

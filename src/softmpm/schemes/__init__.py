@@ -1,0 +1,1 @@
+"""Buffers, launches and graphs: how substeps run."""

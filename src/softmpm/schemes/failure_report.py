@@ -1,0 +1,142 @@
+"""How a failure that the kernels reported reaches the user: read back, put into words, raised."""
+
+import torch
+from torch import Tensor
+
+from softmpm.errors import FROZEN, NEVER, Kind, UnstableError, decode
+from softmpm.model import Model
+from softmpm.schemes.buffers import Solid
+from softmpm.schemes.failure_messages import Case
+from softmpm.state import State
+
+
+class Report:
+    """Watch words on their way to the host, so that more work can be launched before they are read."""
+
+    def __init__(self, words: Tensor):
+        self._event = None
+        if words.device.type == "cpu":
+            self._words = words.clone()
+        else:
+            self._words = torch.empty(words.shape, dtype=words.dtype, device="cpu", pin_memory=True)
+            self._words.copy_(words, non_blocking=True)
+            self._event = torch.cuda.Event()
+            # Unasked, PyTorch would take the stream of the current GPU:
+            self._event.record(torch.cuda.current_stream(words.device))
+
+    def read(self) -> list[int]:
+        """Waits for the device to come to where the report was made."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._words.tolist()
+
+
+def outgrown(words: list[int]) -> bool:
+    """Whether a particle left the part of the grid that is in memory."""
+    return any(decode(words[world])[1] is Kind.LEFT_WINDOW for world in failed_worlds(words))
+
+
+def failed_worlds(words: list[int]) -> list[int]:
+    """Worlds whose word reports something."""
+    return [world for world, word in enumerate(words) if word not in (NEVER, FROZEN)]
+
+
+def failure(
+    model: Model,
+    words: list[int],
+    world: int,
+    end: State,
+    *,
+    first: int = 0,
+    start: State | None = None,
+    solid: Solid | None = None,
+    pull: Tensor | None = None,
+    state: State | None = None,
+    before: bool = False,
+) -> UnstableError:
+    """The failure of a world as an error.
+
+    Args:
+        words: One for each world.
+        end: State in which the worlds stopped.
+        first: Substep of the call that the kernels counted as 0.
+        start: State of the call before it, if it is at hand: for worlds that never ran.
+        solid, pull: Material, and activation times strength of each world and muscle [Pa], if they are at hand.
+        state: What the error holds as its state; ``end`` if None.
+        before: Whether the start itself was checked, before any substep.
+    """
+    substep, kind, particle = decode(words[world])
+    substep += first
+    if start is not None:
+        unmoved = [w for w in failed_worlds(words) if decode(words[w])[1] is Kind.START]
+        end, state = (
+            _never_ran(end, start, unmoved),
+            None if state is None else _never_ran(state, start, unmoved),
+        )
+    name, value, limit, advice = Case(model, kind, world, particle, end, solid, pull).explain()
+    where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
+    time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
+    more = len(failed_worlds(words)) - 1
+    others = f" ({more} more world(s) failed too.)" if more else ""
+    when = "in the start state" if kind is Kind.START or before else f"at {time}"
+    return UnstableError(
+        f"{where} {value} {when}; {limit}. {advice}{others}",
+        kind=name,
+        world=world,
+        particle=particle,
+        substep=substep,
+        value=value,
+        limit=limit,
+        state=end if state is None else state,
+    )
+
+
+def raise_failure(model: Model, words: list[int], end: State, **about) -> None:
+    """Raise what the kernels reported first, if anything; ``about`` as for :func:`failure`."""
+    failed = failed_worlds(words)
+    if failed:
+        raise failure(model, words, min(failed, key=lambda world: words[world]), end, **about)
+
+
+def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last: int, total: int) -> None:
+    """Raise what the adjoint kernels reported, if anything.
+
+    Args:
+        words: One for each world.
+        adj_end: Adjoint of the end of the call.
+        last: Substep of the call from which the kernels counted backward.
+        total: Substeps of the call.
+    """
+    world = min(range(len(words)), key=lambda w: words[w])
+    if words[world] == NEVER:
+        return
+    back, kind, particle = decode(words[world])
+    substep, limit = last - back, "gradients must be finite"
+    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end[:4])
+    cause = (
+        "It overflowed on the way back: shorten the horizon or scale the loss"
+        if given
+        else ("The gradient of the loss with respect to the end state came in like that: look at the loss")
+    )
+    raise UnstableError(
+        f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite at substep "
+        f"{substep} of {total}, counted from the start of the call; {limit}. {cause}.",
+        kind=kind.name.lower(),
+        world=world,
+        particle=particle,
+        substep=substep,
+        value="not finite",
+        limit=limit,
+    )
+
+
+def _never_ran(end: State, start: State, worlds: list[int]) -> State:
+    """These worlds as they were given: the fast scheme cannot hold what is off the grid."""
+    if not worlds:
+        return end
+    given, start = end.clone(), start.detach()
+    for tensor, from_start in zip(given[:4], start[:4], strict=True):
+        tensor[worlds] = from_start[worlds]
+    for name in () if given.low is None else ("x", "F"):
+        getattr(given.low, name)[worlds] = 0.0 if start.low is None else getattr(start.low, name)[worlds]
+    return given

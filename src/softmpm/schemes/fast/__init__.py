@@ -1,0 +1,1 @@
+"""The fast scheme: chunks of substeps captured as graphs, on sorted particles."""

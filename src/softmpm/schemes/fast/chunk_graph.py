@@ -1,0 +1,266 @@
+"""The fast scheme's substeps of one chunk as a fixed list of launches on buffers of its own, replayed as a graph.
+
+A graph holds addresses, so everything that changes between calls is copied to fixed places first: the start, the material, the
+pull of the muscles. A program is lent: one that kept its states until the backward pass is done, any other until nothing starts from
+its end.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.errors import FROZEN, NEVER
+from softmpm.kernels.fast.alarms import packed_alarms
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.fast.material_order import sorted_solid
+from softmpm.kernels.fast.native import BLOCK, FEW, VERY_FEW, WARP, padded
+from softmpm.kernels.fast.packing import packing
+from softmpm.kernels.fast.sorting import sorting
+from softmpm.kernels.structs import solid_types, types
+from softmpm.model import Model
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.alarm_check import armed
+from softmpm.schemes.buffers import Solid, passing, slot, slots_in, view
+from softmpm.schemes.capture import recording
+from softmpm.schemes.device import stream_of
+from softmpm.schemes.fast.fixed_point import Exact
+from softmpm.schemes.fast.particle_order import Arrangement
+from softmpm.schemes.fast.sorted_state import SortedState
+from softmpm.schemes.launch import Command, Launcher, Replay
+from softmpm.state import State
+
+
+class Program:
+    """One chunk on one arrangement."""
+
+    def __init__(self, model: Model, arrangement: Arrangement, chunk: Chunk, keep: bool):
+        self.model, self.arrangement, self.chunk, self.keep = model, arrangement, chunk, keep
+        self.types = t = types(model.spec.dim, model.spec.dtype)
+        self.lead = (model.worlds, model.particle_count)
+        self.total = model.worlds * model.particle_count
+        places = padded(self.total)
+
+        def tensor(*size, dtype=model.dtype):
+            return torch.empty(*size, dtype=dtype, device=model.device)
+
+        self._tensor = tensor
+        self.order = tensor(*self.lead, dtype=torch.int32)
+        self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
+        self.words = tensor(model.worlds + 2, dtype=torch.int64)
+        self._calm = torch.full_like(self.words, NEVER)
+        self._calm[-2:].zero_()
+        self._version = -1  # of the arrangement that order and origin were taken from
+        # What the sorted material was taken from, if it needs no gradient:
+        self._given: tuple[Tensor, ...] = ()
+        slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
+        self.base = tensor(slots, places, dtype=torch.int32)
+        self.rows = tensor(slots, places * t.rows)
+        self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
+        self.velocity = tensor(model.worlds * arrangement.node_count, 4)
+        rows = chunk.row(chunk.length - 1) + 1
+        self.pull = tensor(rows, model.worlds, model.muscle_count) if model.muscle_count else None
+        self._structs()
+        self.exact = None
+        if model.spec.deterministic:
+            self.exact = Exact(model, view(tensor(places * t.rows), t.real), self.node_arrays)
+        self._forward = Replay(model)
+        self._commands()
+
+    def _structs(self) -> None:
+        """What the kernels see of the buffers."""
+        model, t = self.model, self.types
+        self.window = self.arrangement.window(self.origin)
+        self.packed = []
+        for base, rows in zip(self.base, self.rows, strict=True):
+            packed = t.Packed()
+            packed.base, packed.rows = view(base, wp.int32), view(rows, t.real)
+            self.packed.append(packed)
+        self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
+        self.nothing = view(self._tensor(0, 4), t.aligned)
+        self.velocity_array = view(self.velocity, t.aligned)
+        self.order_array = view(self.order, wp.int32)
+        self.order_flat = view(self.order.view(-1), wp.int32)
+        self.watch = view(self.words, wp.int64)
+        material = [self._tensor(*self.lead) for _ in range(4)]
+        solid = solid_types(model.spec).Solid()
+        for name, tensor in zip(("mass", "mu", "lam", "volume"), material, strict=True):
+            setattr(solid, name, view(tensor, t.real))
+        if len(model.spec.laws) > 1:
+            solid.law = view(self._tensor(*self.lead, dtype=torch.int32), wp.int32)
+        if model.spec.muscle_slots:
+            slots = self._tensor(*self.lead, model.spec.muscle_slots, dtype=torch.int32)
+            self.muscle_array = view(slots, wp.int32)
+            solid.muscle, solid.fibre = self.muscle_array, view(model.fibre, t.vec)
+        self._solid = solid
+        self.solids = []
+        for row in self.pull if self.pull is not None else [None]:
+            solid = solid_types(model.spec).Solid()
+            for name in solid_types(model.spec).Solid.vars:
+                if name != "pull":
+                    setattr(solid, name, getattr(self._solid, name))
+            if row is not None:
+                solid.pull = view(row, t.real)
+            self.solids.append(solid)
+
+    def _commands(self) -> None:
+        """The launches that fill the buffers, from what users hold or from the end of another program."""
+        model, t, pack, lead = self.model, self.types, self.packing, self.lead
+        at, low = (model.scale, self.window, self.order_array), (t.vec, t.mat)
+        state = (t.vec, t.vec, t.mat, t.mat)
+        zero = torch.zeros(t.dim, t.dim, dtype=model.dtype, device=model.device)
+        none = passing(zero[0].expand(*lead, -1), t.vec), passing(zero.expand(*lead, -1, -1), t.mat)
+
+        def enter(*dtypes, low=()) -> Command:
+            slots = [slot(model, dtype) for dtype in dtypes]
+            inputs = (*at, *slots, *low, self.watch, self.packed[0])
+            return Command(model, pack.enter, lead, inputs, slots)
+
+        self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
+        places, sort = padded(self.total), sorting(t.dim, model.spec.dtype)
+        slots = [slot(model, wp.int32), slot(model, wp.int32, places), slot(model, t.real, places * t.rows)]
+        inputs = (self.window, self.order_array, *slots, self.watch, self.packed[0])
+        self._move = Command(model, sort.move, lead, inputs, slots)
+        given = Solid.fixed(model)
+        slots = slots_in(given, ("mass", "mu", "lam"), model, t.real)
+        inputs = (self.order_array, given, self._solid)
+        self._sort = Command(model, sorted_solid(model.spec), lead, inputs, slots)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of its own."""
+        sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
+        return sum(tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums))
+
+    def calm(self) -> None:
+        """Forget what the kernels reported."""
+        self.words.copy_(self._calm)
+
+    def solid(self, s: int):
+        """Material and pull of substep ``s``."""
+        return self.solids[self.chunk.row(s) if self.pull is not None else 0]
+
+    @property
+    def few(self) -> bool:
+        """Whether this is a GPU that has more room than there are warps."""
+        return self.model.device.type == "cuda" and self.total <= FEW
+
+    @property
+    def block(self) -> int:
+        """Threads of a block over particles."""
+        return WARP if self.few else BLOCK
+
+    @functools.cached_property
+    def crew(self) -> int:
+        """Particles of a warp going forward."""
+        return self.crew_of(may_halve=self.types.dim == 2)
+
+    def crew_of(self, may_halve: bool) -> int:
+        """Particles of a warp: as many as it has threads or, if it may, half as many while the GPU has more room than warps.
+
+        Then each walks a shorter way, but more sums are sent: whether that pays, bench/step.py and gradient.py say.
+        """
+        few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
+        return WARP // 2 if may_halve and few else WARP
+
+    def threads(self, crew: int) -> int:
+        """Threads of a launch over particles: on a GPU whole blocks, since the lanes of a warp work together."""
+        if self.model.device.type != "cuda":
+            return self.total
+        warps = -(-self.total // crew)
+        return -(-warps * WARP // self.block) * self.block
+
+    def run(
+        self, start: State | SortedState, pull: Tensor | None, solid: Solid, frozen: Sequence[int] = ()
+    ) -> None:
+        """All substeps from ``start``; the end is the last of :attr:`base` and :attr:`rows`. Failures are in :attr:`words`.
+
+        Args:
+            frozen: Worlds that stay as they are.
+        """
+        stream = stream_of(self.model.device)
+        moved = recording(self.model) or self._version != self.arrangement.version
+        if moved:
+            self._version, self._given = -1, ()  # until the material has this order too
+            self.order.copy_(self.arrangement.order)
+            self.origin.copy_(self.arrangement.origin)
+            self.arrangement.place_neighbours()
+        self.calm()
+        if frozen:
+            self.words[list(frozen)] = FROZEN
+        if self.pull is not None and pull is not None:
+            self.pull.copy_(pull)
+        if not self._has(solid):
+            self._given = ()
+            self._sort(stream, solid.mass, solid.mu, solid.lam)
+            given = (solid.mass, solid.mu, solid.lam)
+            self._given = () if any(tensor.requires_grad for tensor in given) else given
+            self._version = self.arrangement.version
+        self._take(stream, start)
+        if self.exact is not None:
+            self.exact.begin(solid.mass)
+        self._forward.run(stream, self._launch_all)
+
+    def _take(self, stream: wp.Stream | None, start: State | SortedState) -> None:
+        """Put the start where the kernels look for it."""
+        if isinstance(start, SortedState):
+            self._move(stream, start.places(), start.base, start.rows)
+        else:
+            given = [tensor.contiguous() for tensor in (*start[:4], *(start.low or ()))]
+            self._enter[start.low is not None](stream, *given)
+
+    def _has(self, solid: Solid) -> bool:
+        """Whether the material is the one of the run before: the very tensors, which nothing else writes to."""
+        given = (solid.mass, solid.mu, solid.lam)
+        return bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
+
+    @property
+    def packing(self):
+        return packing(self.model.spec.dim, self.model.spec.dtype)
+
+    def _launch_all(self, launch: Launcher) -> None:
+        model, nodes, length = self.model, self.node_arrays, self.chunk.length
+        kernels, held = fused(model.spec), len(self.velocity)
+        launch(kernels.clear, held, self.velocity_array, block_dim=BLOCK)
+        if self.exact is None:
+            launch(kernels.clear, held, nodes[0], block_dim=BLOCK)
+        self._begin(launch)
+        for s in range(length):
+            now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
+            if self.exact is not None:
+                now, then = self.exact.sums(s), self.nothing
+            arguments = (model.scale, model.walls, self.window, now, self.velocity_array, then)
+            launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
+            self._advance(s, launch)
+        survey = sorting(self.types.dim, model.spec.dtype).survey
+        arguments = (model.scale, self.window, model.particle_count, self.packed[-1].base)
+        launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
+        if armed(model):
+            sizes = (length - 1, model.particle_count, self.total, self.order_flat)
+            given = (model.scale, self.solid(length - 1), self.arrangement.neighbours, *sizes)
+            launch(packed_alarms(model.spec).check, self.total, *given, self.packed[-1], self.watch)
+
+    def _begin(self, launch: Launcher) -> None:
+        """P2G of the first substep."""
+        model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
+        sizes = (self.crew, model.particle_count, self.total, self.order_flat)
+        arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
+        launch(fused(model.spec).begin[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
+        if self.exact is not None:
+            self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
+
+    def _advance(self, s: int, launch: Launcher) -> None:
+        """G2P of substep ``s`` and P2G of the next."""
+        model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
+        now, then = (s, s + 1) if self.keep else (0, 0)
+        solid = self.solid(min(s + 1, length - 1))
+        parameters = (model.scale, solid, self.window, s, s + 1 == length, self.crew)
+        sizes = (model.particle_count, self.total, self.order_flat)
+        states = (packed[now], self.watch, packed[then])
+        sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
+        arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
+        launch(fused(model.spec).advance[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
+        if self.exact is not None and s + 1 < length:
+            self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)

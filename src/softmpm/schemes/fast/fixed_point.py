@@ -1,0 +1,62 @@
+"""Buffers and launches of sums in fixed point, for programs of a deterministic model. Kernels: kernels/fast/fixed_point.py."""
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.kernels.fast.fixed_point import fixed
+from softmpm.model import Model
+from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.launch import Launcher
+
+
+class Exact:
+    """Sums over particles, one after the other; those with an even and an odd number have sizes of their own.
+
+    Args:
+        rows: Packed particles; the rows of v and C hold what a particle gives.
+        nodes: Sums as floats, number k in ``nodes[k % len(nodes)]``.
+    """
+
+    def __init__(self, model: Model, rows: wp.array, nodes: Sequence[wp.array]):
+        f, device = fixed(model.dim), model.device
+        self.model, self.rows = model, rows
+        self.fixed = torch.empty(len(nodes[0]), 4, dtype=torch.int64, device=device)
+        self.largest = torch.zeros(2, model.worlds, 2, dtype=torch.float32, device=device)
+        self._none = view(self.largest.new_empty(0, 0), wp.float32)
+        largest = [view(part.view(-1), wp.float32) for part in self.largest]
+        self._shares, self._sums = [], []
+        for part in largest:
+            shares = f.Shares()
+            shares.rows, shares.largest = rows, part
+            self._shares.append(shares)
+        for k in range(max(len(nodes), 2)):
+            sums = f.Sums()
+            sums.nodes, sums.particles = len(self.fixed) // model.worlds, model.particle_count
+            sums.fixed = view(self.fixed.view(-1), wp.int64)
+            sums.largest, sums.other_largest = largest[k % 2], largest[(k + 1) % 2]
+            sums.node = nodes[k % len(nodes)]
+            self._sums.append(sums)
+
+    def begin(self, mass: Tensor | None) -> None:
+        """Before number 0: the masses (world, particle) that enter the sums, or None."""
+        clear(self.fixed)  # who reads a sum clears it, but a run may have been interrupted
+        clear(self.largest)
+        if mass is not None:
+            self.largest[..., 1] = mass.amax(1)
+
+    def shares(self, k: int):
+        """Where the particles leave what they give to number ``k``."""
+        return self._shares[k % 2]
+
+    def sums(self, k: int):
+        return self._sums[k % len(self._sums)]
+
+    def push(self, program, k: int, states, mass: wp.array | None, launch: Launcher) -> None:
+        """Add up number ``k``: what the particles of ``states`` gave."""
+        mass = self._none if mass is None else mass
+        arguments = (program.window, program.total, states, self.shares(k), mass, self.sums(k))
+        kernel = fixed(self.model.dim).push
+        launch(kernel, program.threads(program.crew), *arguments, block_dim=program.block)

@@ -1,0 +1,1 @@
+"""The plain scheme: three kernels per substep, launched one by one."""

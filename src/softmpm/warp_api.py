@@ -1,0 +1,87 @@
+"""The same substep for users of Warp: :func:`step` works on Warp arrays and records its explicit adjoint on a ``wp.Tape``.
+
+solid = softmpm.warp_solid(model, params, activation, requires_grad=True)
+states = [softmpm.warp_state(model, start, requires_grad=True), softmpm.warp_state(model, requires_grad=True)]
+tape = wp.Tape()
+softmpm.step(model, states[0], states[1], solid, tape=tape)
+tape.backward(grads={states[1].v: ...})             # fills states[0].v.grad, solid.mu.grad, ...
+"""
+
+import numpy as np
+import warp as wp
+
+from softmpm.errors import MAX_SUBSTEP
+from softmpm.kernels.structs import Wanted, solid_adj_type, types
+from softmpm.model import Model
+from softmpm.schemes.buffers import SolidAdj, view
+from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.warp_arrays import WarpSolid, WarpState, check_own
+
+
+def step(
+    model: Model,
+    state_in: WarpState,
+    state_out: WarpState,
+    solid: WarpSolid,
+    *,
+    substep: int = 0,
+    tape: wp.Tape | None = None,
+) -> None:
+    """Advance by one substep of ``model.scene.dt``, on PyTorch's current stream.
+
+    Args:
+        state_in, state_out: From :func:`warp_state`; two different ones. With a tape both need ``requires_grad=True``,
+            and neither may be written again before ``tape.backward()``.
+        solid: From :func:`warp_solid`.
+        substep: Number of this step, from 0 on, for the message of a failure.
+        tape: Where the adjoint is recorded. It adds into ``.grad`` of ``state_in`` and ``solid``; ``tape.zero()`` clears.
+
+    Raises:
+        TypeError, ValueError: A state or ``solid`` is of another model or has other arrays; the two states are the same; a tape is
+            given and an array carries no gradient; or the model is deterministic and on a GPU.
+    """
+    check_own(model, "step", solid=solid, state_in=state_in, state_out=state_out)
+    if state_in.v.ptr == state_out.v.ptr:
+        raise ValueError(
+            "state_in and state_out must be two different states, each with arrays of its own; make another with "
+            "softmpm.warp_state."
+        )
+    whole = isinstance(substep, (int, np.integer)) and not isinstance(substep, bool)
+    if not whole or not 0 <= substep <= MAX_SUBSTEP:
+        raise ValueError(f"substep must be a whole number from 0 to {MAX_SUBSTEP:,}, got {substep!r}.")
+    if model.deterministic and model.device.type == "cuda":
+        raise ValueError(
+            "step adds in floating point, in any order, but the model was built with deterministic=True; use softmpm.simulate, "
+            "or a model built without it."
+        )
+    arrays = [*state_in.differentiable(), *state_out.differentiable(), *solid.differentiable()]
+    if tape is not None and any(array.grad is None for array in arrays):
+        raise ValueError(
+            "with a tape, states and solid need requires_grad=True; give it to warp_state and warp_solid."
+        )
+    _advance(model, state_in, state_out, solid, int(substep))
+    if tape is not None:
+        tape.record_func(lambda: _adjoint(model, state_in, state_out, solid, substep), arrays)
+
+
+@on_its_gpu
+def _advance(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
+    solid.work.stream = stream_of(model.device)
+    solid.work.advance(state_in.struct(model), state_out.struct(model), substep)
+
+
+@on_its_gpu
+def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
+    solid.work.stream = stream_of(model.device)
+    wanted = Wanted(material=True, activation=solid.pull is not None)
+    struct = solid_adj_type(model.spec, wanted)()
+    struct.mass, struct.mu, struct.lam = solid.mass.grad, solid.mu.grad, solid.lam.grad
+    slots = SolidAdj.zeros(model, Wanted(material=False, activation=wanted.activation))
+    if slots.slot is not None:
+        struct.pull = view(slots.slot, types(model.spec.dim, model.spec.dtype).real)
+    now, then = state_in.struct(model), state_out.struct(model)
+    solid.work.adjoint(
+        wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), struct, substep
+    )
+    if solid.pull is not None and solid.pull.grad is not None:
+        solid.work.collect_pull(slots, wp.to_torch(solid.pull.grad))

@@ -1,0 +1,105 @@
+"""The machine code of the fast scheme's kernels, compiled here for a GPU that need not be here: sm_90, as for an H100."""
+
+import dataclasses
+import re
+
+import cubin
+import pytest
+import warp as wp
+
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.fast.g2p2g_adj import fused_adj
+from softmpm.kernels.fast.native import BLOCK, WARP
+from softmpm.kernels.structs import Spec, Wanted
+
+ARCH = 90
+CASES = [(2, "neo_hookean"), (2, "fixed_corotated"), (3, "neo_hookean"), (3, "fixed_corotated")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiler():
+    wp.init()
+    if ARCH not in wp.get_cuda_supported_archs():
+        pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
+
+
+def scene_spec(dim: int, law: str, bare: bool) -> Spec:
+    """A bare scene, or one with everything but damping."""
+    return Spec(
+        dim=dim,
+        dtype="float32",
+        laws=(law,),
+        muscle_slots=0 if bare else 2,
+        contacts=() if bare else ("separate",),
+        friction=not bare,
+        gravity=True,
+        damping=False,
+    )
+
+
+def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
+    """What goes over the particles."""
+    spec = scene_spec(dim, law, bare)
+    if which == "adjoint":
+        return fused_adj(spec, Wanted(material=not bare, activation=not bare)).advance_adj[few]
+    return fused(spec).advance[few]
+
+
+def compiled(kernel) -> tuple[str, cubin.Kernel]:
+    """PTX of this kernel, and what its binary says about it; from Warp's cache if nothing has changed."""
+    threads = WARP if kernel.module.name.endswith(".few") else BLOCK
+    wp.set_module_options({"block_dim": threads}, module=kernel.module)
+    (ptx,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
+    (binary,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=False)
+    name = re.compile(rf"{kernel.key}_\w*_cuda_kernel_forward")
+    (code,) = (code for entry, code in cubin.entries(ptx).items() if name.fullmatch(entry))
+    (facts,) = (facts for entry, facts in cubin.kernels(binary).items() if name.fullmatch(entry))
+    return code, facts
+
+
+@pytest.mark.parametrize("few", [False, True], ids=["many", "few"])
+@pytest.mark.parametrize("bare", [False, True], ids=["full", "bare"])
+@pytest.mark.parametrize("which", ["forward", "adjoint"])
+@pytest.mark.parametrize("dim, law", CASES)
+def test_machine_code(dim, law, which, bare, few):
+    """Nodes are read and added 16 bytes at a time, never number by number; no register is spilled, nothing is in local memory."""
+    code, facts = compiled(kernel(dim, law, which, bare, few))
+    print(f"\n{dim}D {law} {which}: {facts}")
+    assert len(re.findall(r"\bred\.global\.add\.v4\.f32", code)) > 0
+    assert not re.findall(r"\b(?:red|atom)\.global\.add\.f32", code)
+    assert len(re.findall(r"\bld\.global\.nc\.v4\.f32", code)) >= 3  # a row of nodes, at least
+    assert 0 < facts.registers <= 255
+    declared = cubin.arrays(code)
+    assert facts.frame == facts.stack == declared, f"{facts.frame - declared} bytes of registers are spilled"
+    assert declared == 0
+    assert not re.findall(r"^\s+[a-z]+\.\S*f64\b.*", code, re.MULTILINE), (
+        "double precision where float32 is meant"
+    )
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_walls_are_not_in_memory(dim):
+    """Whatever their number, the kernels of the grid load nothing for them and have nothing in local memory."""
+    loads = []
+    for kinds in (("separate",), ("separate", "slip", "stick", "slip", "separate", "separate")):
+        spec = dataclasses.replace(scene_spec(dim, "neo_hookean", bare=False), contacts=kinds)
+        wanted = Wanted(material=False, activation=False)
+        both = [compiled(k) for k in (fused(spec).grid_velocity, fused_adj(spec, wanted).grid_velocity_adj)]
+        assert all(facts.frame == facts.stack == 0 for _, facts in both)
+        loads.append([len(re.findall(r"\bld\.global", code)) for code, _ in both])
+    assert loads[0] == loads[1] and min(loads[0]) > 0
+
+
+def test_spilled_registers_would_be_seen():
+    """The reader finds them where there must be some: the same kernel with room for four times as many blocks at a time."""
+    spilling = kernel(3, "neo_hookean", "adjoint", bare=False, few=False)
+    options = dict(spilling.options)
+    try:
+        spilling.options["launch_bounds"] = (BLOCK, 16)
+        spilling.module.mark_modified()
+        code, facts = compiled(spilling)
+    finally:
+        spilling.options.clear()
+        spilling.options.update(options)
+        spilling.module.mark_modified()
+    assert facts.frame > cubin.arrays(code) and facts.registers <= 32

@@ -1,0 +1,104 @@
+"""The plan of what a call keeps, and the formula of its memory."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers import busy_scene
+
+import softmpm
+from softmpm.planning.checkpointing import going_back
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import Plan, Sizes, default_budget, plan, price_of_chunk
+
+SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4, calls=1)
+
+
+def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
+    """Substeps that run again before their pull-back, and how many chunks run in all, by going through the moves."""
+    chunks = horizon.chunks(chosen.longest)
+    moves = list(going_back(len(chunks), chosen.slots))
+    substeps = sum(chunks[move.stage].length for move in moves if move.kind == "advance")
+    return substeps, len(chunks) + sum(move.kind in ("advance", "pull_back") for move in moves)
+
+
+def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
+    """In substeps."""
+    substeps, chunks = again(chosen, horizon)
+    return substeps + sizes.price * chunks
+
+
+@pytest.mark.parametrize("calls", [1, 5])
+@pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
+def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
+    """What all calls keep and what is run again fit, shorter last chunks included; with more memory it takes no longer."""
+    times, sizes = [], SIZES._replace(calls=calls)
+    for budget in np.geomspace(600 + 200 * calls, 100_000 * calls, 20).astype(int):
+        chosen = plan(horizon, sizes, int(budget))
+        if chosen.keep_all:
+            break
+        shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
+        inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
+        assert chosen.kept == chosen.slots * SIZES.between and chosen.recomputed == inside + SIZES.between
+        starts = (calls - 1) * (SIZES.start - SIZES.between)  # the first state that is kept is the user's
+        assert calls * chosen.kept + starts + chosen.recomputed <= budget
+        times.append(seconds(chosen, horizon, SIZES))
+    assert len(times) > 3 and times == sorted(times, reverse=True)
+
+
+def test_calls_share_a_budget():
+    """Five calls keep everything with five times what one needs for that and four starts, not with less."""
+    horizon, sizes = Horizon(1, 64), SIZES._replace(calls=5)
+    everything = 5 * plan(horizon, SIZES, 10**9).kept + 4 * 130
+    assert plan(horizon, sizes, everything).keep_all and not plan(horizon, sizes, everything - 1).keep_all
+    with pytest.raises(ValueError, match="a gradient through 5 calls needs at least 938 bytes"):
+        plan(horizon, sizes, 937)
+    assert plan(horizon, sizes, 938) == Plan(longest=1, slots=1, kept=104, recomputed=314)
+
+
+@pytest.mark.parametrize("device, one, most", [("cpu", 2**26, 64), ("cuda", 10**9, 6)])
+def test_without_a_budget_several_calls_may_keep_more(device, one, most, monkeypatch):
+    """So often what one may, up to a limit; but all starts always leave as much as that."""
+    gpu = SimpleNamespace(total_memory=16 * 10**9)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
+    for calls, want in ((1, one), (3, 3 * one), (1000, most * one), (10**8, one + (10**8 - 1) * SIZES.start)):
+        assert default_budget(torch.device(device), SIZES._replace(calls=calls)) == want
+
+
+def test_the_price_of_a_chunk_makes_chunks_longer():
+    """Where memory is short, many short chunks run least again; what each costs besides decides against them."""
+    horizon, budget = Horizon(1, 64), 64 * 110 // 5
+    free, dear = (plan(horizon, SIZES._replace(price=price), budget) for price in (0, 10))
+    assert free.longest < dear.longest
+    assert (
+        again(free, horizon)[0] < again(dear, horizon)[0]
+        and again(free, horizon)[1] > again(dear, horizon)[1]
+    )
+    for sizes, better, worse in (
+        (SIZES._replace(price=0), free, dear),
+        (SIZES._replace(price=10), dear, free),
+    ):
+        assert seconds(better, horizon, sizes) < seconds(worse, horizon, sizes)
+
+
+def test_chunks_that_divide_a_control_step_save_the_memory_of_a_shorter_one():
+    """1000 substeps: 25 at a time, where 32 would leave 8, with buffers of their own."""
+    assert plan(Horizon(1, 1000), SIZES, 6_000).longest == 25
+    assert plan(Horizon(1, 1024), SIZES, 6_000).longest == 32
+
+
+def test_the_price_of_a_chunk_falls_with_the_particles():
+    """48 substeps for few of them, 4 for many, never rising in between."""
+    prices = [price_of_chunk(n) for n in (1, 62_500, 62_501, 300_000, 750_000, 10_000_000)]
+    assert prices[:2] == [48, 48] and prices[-2:] == [4, 4] and prices == sorted(prices, reverse=True)
+
+
+def test_sizes_of_both_schemes():
+    """Between chunks the fast scheme keeps a state and an order; the plain one keeps no nodes."""
+    fast, plain = (
+        softmpm.build(busy_scene(3), device="cpu", scheme=name).sizes() for name in ("fast", "plain")
+    )
+    particles = softmpm.build(busy_scene(3), device="cpu").particle_count
+    assert fast.between == fast.inside + 4 * particles and fast.nodes > 0
+    assert plain.nodes == 0 and fast.price == plain.price == 1
