@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ALSO = ("slopes", "pull_back", "collect", "parts", "total")
+ALSO = ("slopes", "vjp", "collect", "parts", "total")
 """Used by adjoints alone, though their names do not say so."""
 BUILDERS = ("vec", "mat", "triple", "node_vec", "aligned", "pack", "matrix_from_cols", "skew")
 """Calls whose arguments are the components of a value."""

@@ -11,7 +11,7 @@ import softmpm
 
 SRC = Path(__file__).parents[1] / "src"
 LAYERS = """
-    validate state devices batches compiling kernels.compile
+    validate state devices batches compiling workspace kernels.compile
     errors
     scene planning alarms checks kernels.structs
     reference kernels.physics
@@ -21,7 +21,8 @@ LAYERS = """
     model
     schemes
     schemes.plain schemes.fast recording
-    runner rasterization cuda_graph
+    schemes.registry
+    building runner rasterization cuda_graph
     rollout
     autograd warp_arrays
     warp_api __main__

@@ -87,7 +87,7 @@ def test_factors_keep_the_source(path):
         ("contact.py", "slide_adj", "(c * along) * n"),
         ("gather_adj.py", "sums_adj", "wy[2] * tr"),
         ("packing.py", "leave_adj", "load_vec(adj, i, row_fx) / scale.spacing"),
-        ("chunk.py", "pull_back", "start.fx / model.scene.grid.spacing"),
+        ("chunk.py", "vjp", "start.fx / model.scene.grid.spacing"),
     ],
 )
 def test_known_terms_are_found(file, function, text):

@@ -9,9 +9,10 @@ differentiable in the start, the activation and the material:
 
 from softmpm.alarms import Alarms, Failures
 from softmpm.autograd import rasterize, simulate
+from softmpm.building import build
 from softmpm.cuda_graph import Graph
 from softmpm.errors import UnstableError
-from softmpm.model import Model, build
+from softmpm.model import Model
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder

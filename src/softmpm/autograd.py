@@ -1,6 +1,5 @@
 """The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
 
-import threading
 from collections.abc import Iterable
 from typing import Any
 
@@ -123,7 +122,7 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
 
     Those of the call before if nothing changed and nothing needs a gradient.
     """
-    last, seen = vars(model).setdefault("_last_material", _Last()), _seen(model, params)
+    last, seen = model.workspace.get(_Last, _Last), _seen(model, params)
     if seen and seen == last.seen:
         return last.found
     check_params(model, params)
@@ -137,8 +136,8 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     return found
 
 
-class _Last(threading.local):
-    """Material of this thread's call before: what another one computes may not be there yet, on a stream of its own."""
+class _Last:
+    """Material of the call before in this thread: what another one computes may not be there yet, on a stream of its own."""
 
     params: Any = None  # held, so that nothing else takes their names in ``seen``
     seen: tuple = ()

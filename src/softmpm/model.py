@@ -9,26 +9,14 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.alarms import Alarms
-from softmpm.checks import check_whole
 from softmpm.describe import describe
-from softmpm.devices import device_of
-from softmpm.kernels.fast.native import padded
-from softmpm.kernels.structs import BASE_BITS, Spec, packed_rows, solid_types, types
-from softmpm.planning.memory import (
-    MARGIN,
-    Sizes,
-    check_room,
-    default_budget,
-    longest_chunk,
-    price_of_chunk,
-    window_shape,
-)
-from softmpm.scene.check_scene import check_precision, check_scene
+from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean
 from softmpm.scene.neighbours import rest_neighbours
 from softmpm.scene.scene import Scene
-from softmpm.stability import need_stable, warn_sparse
 from softmpm.state import Low, Params, State
+from softmpm.workspace import Workspace
 
 LAWS = {
     NeoHookean: "neo_hookean",
@@ -37,77 +25,8 @@ LAWS = {
 }
 
 
-def build(
-    scene: Scene,
-    device: str | torch.device | None = None,
-    dtype: torch.dtype = torch.float32,
-    worlds: int = 1,
-    memory_budget: int | None = None,
-    scheme: str = "auto",
-    deterministic: bool = False,
-    calls: int = 1,
-    alarms: Alarms | None = None,
-) -> "Model":
-    """Make a scene ready to run.
-
-    Args:
-        scene: What to simulate.
-        device: Where; None takes CUDA if there is one, and says so in the log.
-        dtype: ``torch.float32`` or ``torch.float64``.
-        worlds: Number of independent copies of the scene that run in one launch.
-        memory_budget: Most bytes of states that ``simulate`` may keep for a backward pass, or run again at a time; None for a
-            sensible choice. ``describe`` says what it takes in all; see docs/memory.md.
-        scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
-            docs/performance.md.
-        deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
-            scheme. The CPU adds in one order anyway. See docs/conventions.md.
-        calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
-            budget. If there are more, they keep more.
-        alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
-
-    Returns:
-        The model: immutable, shared by any number of simulations.
-
-    Raises:
-        ValueError: The scene breaks a rule, or its dt is above :func:`softmpm.stable_dt`; the message names the rule, the value
-            received and a remedy.
-    """
-    check_scene(scene)
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
-    check_whole("worlds", worlds)
-    check_whole("calls", calls)
-    if memory_budget is not None:
-        if isinstance(memory_budget, float) and memory_budget.is_integer():
-            memory_budget = int(memory_budget)
-        check_whole("memory_budget, in bytes,", memory_budget)
-        memory_budget = int(memory_budget)
-    if scheme not in ("auto", "fast", "plain"):
-        raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
-    if not isinstance(deterministic, (bool, np.bool_)):
-        raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
-    alarms = Alarms() if alarms is None else alarms
-    if not isinstance(alarms, Alarms):
-        raise TypeError(f"alarms must be a softmpm.Alarms or None, got {type(alarms).__name__}.")
-    check_precision(scene, dtype)
-    if alarms.step is not None:
-        need_stable(scene, alarms.step)
-    warn_sparse(scene)
-    return Model(
-        scene,
-        device_of(device),
-        dtype,
-        scheme,
-        bool(deterministic),
-        alarms,
-        worlds=int(worlds),
-        memory_budget=memory_budget,
-        calls=int(calls),
-    )
-
-
 class Model:
-    """What does not change in time. From :func:`softmpm.build`; never modified.
+    """What does not change in time. From :func:`softmpm.build`; never modified, its workspace apart.
 
     Attributes:
         scene: The scene it was built from.
@@ -116,7 +35,7 @@ class Model:
         calls: How many calls of ``simulate`` share the memory budget.
         alarms: Limits beyond which a simulation is stopped.
         neighbours: Neighbours at rest of each particle, -1 for none, shape (particle, at most dim).
-        positions: Rest positions X [m], shape (particle, dim).
+        positions: Rest positions X [m], shape (particle, dim); ``exact_positions`` are the scene's, a NumPy array.
         volume: Rest volumes V⁰ [m³], shape (particle,).
         mass: Mass [kg] as the scene gives it, shape (particle,).
         mass_unit: Mass of the heaviest particle [kg], in which the kernels count, shape ().
@@ -124,6 +43,9 @@ class Model:
         body: Index of each particle's body, shape (particle,).
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
+        scheme, scheme_reason: Name of the scheme, and why it was chosen.
+        footprint: Memory of that scheme.
+        workspace: What calls leave for later calls; no part of the model's value.
     """
 
     def __init__(
@@ -132,9 +54,12 @@ class Model:
         device: torch.device,
         dtype: torch.dtype,
         scheme: str,
-        deterministic: bool,
+        scheme_reason: str,
+        footprint: Footprint,
         alarms: Alarms,
         *,
+        deterministic: bool,
+        fixed_point: bool,
         worlds: int,
         memory_budget: int | None,
         calls: int,
@@ -147,13 +72,13 @@ class Model:
         self.muscle_count = len(scene.muscles)
         self.node_count = math.prod(scene.grid.shape)
         self.body = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes)).to(device)
-        self._exact_positions = np.concatenate([body.particles.positions for body in scene.bodies])
-        self.positions = self._tensor(self._exact_positions)
+        self.exact_positions = np.concatenate([body.particles.positions for body in scene.bodies])
+        self.positions = self._tensor(self.exact_positions)
         self.volume = self._tensor(np.concatenate([body.particles.volume for body in scene.bodies]))
         slots = _muscle_slots(scene, self.particle_count)
-        self.scheme, self.scheme_reason = self._scheme(scheme)
-        self.deterministic = deterministic
-        self.spec = _spec(scene, dtype, slots.shape[1], deterministic and self._in_fixed_point())
+        self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
+        self.deterministic, self.workspace = deterministic, Workspace()
+        self.spec = _spec(scene, dtype, slots.shape[1], fixed_point)
         self.muscle_slots = torch.from_numpy(slots).to(device)
         self.fibre = self._tensor([m.direction for m in scene.muscles]).reshape(-1, self.dim)
         self.strength = self._tensor([m.strength for m in scene.muscles])
@@ -219,7 +144,7 @@ class Model:
 
     def _rounded(self) -> Tensor:
         """What rounding took off the rest positions [m], shape (particle, dim)."""
-        exact = torch.from_numpy(self._exact_positions).to(self.device)
+        exact = torch.from_numpy(self.exact_positions).to(self.device)
         return (exact - self.positions.double()).to(self.dtype)
 
     def params(self) -> Params:
@@ -232,39 +157,6 @@ class Model:
             *(self._tensor([getattr(m, name) for m in materials])[self.body] for name in Params._fields)
         )
 
-    def _scheme(self, wanted: str) -> tuple[str, str]:
-        """The scheme, and why."""
-        largest = 2 ** BASE_BITS[self.dim]
-        numbers = padded(self.worlds * self.particle_count) * packed_rows(self.dim).rows
-        obstacle = None
-        if max(self.scene.grid.shape) > largest:
-            obstacle = f"the grid has more than {largest} nodes along an axis"
-        elif numbers >= 2**31:
-            obstacle = "there are more particles than 32-bit indices reach"
-        if wanted == "fast" and obstacle:
-            raise ValueError(
-                f"scheme 'fast' cannot hold this scene: {obstacle}; use scheme='plain' or 'auto'."
-            )
-        if wanted != "auto":
-            return wanted, "as asked for"
-        if obstacle:
-            return "plain", obstacle
-        if self.dtype == torch.float64:
-            return "plain", "double precision gains nothing from 16-byte reductions"
-        return "fast", "single precision"
-
-    def _in_fixed_point(self) -> bool:
-        """Whether a deterministic model has to sum in fixed point; an error if it cannot."""
-        if self.scheme == "fast" and self.dtype == torch.float32:
-            return True
-        if self.device.type == "cpu":
-            return False
-        raise ValueError(
-            "deterministic=True needs torch.float32 and the fast scheme on a GPU, because only its sums are in fixed point; "
-            f"got {self.dtype} and scheme {self.scheme!r} ({self.scheme_reason}). Change these, or use device='cpu', which adds "
-            "in one order, or build without it."
-        )
-
     @functools.cached_property
     def budget(self) -> int:
         """Bytes that all calls may keep for a backward pass."""
@@ -272,27 +164,12 @@ class Model:
 
     @functools.cached_property
     def held_nodes(self) -> int:
-        """Nodes of one world in memory: all of them, or in the fast scheme those around the particles, counted at rest."""
-        if self.scheme == "plain":
-            return self.node_count
-        cells = np.floor(self._exact_positions / self.scene.grid.spacing - 0.5)
-        reach = np.ptp(cells, axis=0).astype(int).tolist()
-        return math.prod(window_shape(self.scene.grid.shape, reach, MARGIN[self.dim]))
+        """Nodes of one world in memory: all of them or, in the fast scheme, those around the particles, counted at rest."""
+        return self.footprint.node_count(self)
 
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see planning/memory.py."""
-        real, d, particles = self.dtype.itemsize, self.dim, self.worlds * self.particle_count
-        state = particles * real * (2 * d + 2 * d * d)
-        start = state + state // 2 if real == 4 else state
-        if self.scheme == "fast":
-            inside = particles * (4 + real * packed_rows(d).rows)
-            nodes = self.worlds * self.held_nodes * 4 * real
-            between = inside + 4 * particles  # and their order
-        else:
-            inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-            nodes, between = 0, start
-        price = 1 if self.device.type == "cpu" else price_of_chunk(particles)
-        return Sizes(inside, nodes, between, start, longest_chunk(particles), price, self.calls)
+        return self.footprint.sizes(self)
 
     def __reduce__(self):
         raise TypeError(

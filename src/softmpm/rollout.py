@@ -16,14 +16,12 @@ from softmpm.model import Model
 from softmpm.planning import checkpointing
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import Plan, memory, plan
-from softmpm.runner import Runner, as_state
+from softmpm.runner import Runner
 from softmpm.schemes.buffers import Solid, SolidAdj
 from softmpm.schemes.capture import alone, hold, note, recording
 from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.failure_report import Report, raise_gradient_failure
-from softmpm.schemes.fast.scheme import FastRun, forget
-from softmpm.schemes.fast.sorted_state import SortedState
-from softmpm.schemes.plain.chunk import PlainRun
+from softmpm.schemes.scheme import Run
 from softmpm.state import State
 
 
@@ -35,16 +33,16 @@ class Trail:
     chunks: tuple[Chunk, ...]
     start: State
     """The user's, which is never written to."""
-    runs: list[FastRun | PlainRun] = field(default_factory=list)
+    runs: list[Run] = field(default_factory=list)
     """Every chunk, if everything is kept."""
-    states: dict[int, State | SortedState] = field(default_factory=dict)
+    states: dict[int, Any] = field(default_factory=dict)
     """Else the states before some of the chunks, the first of which is the start, until a backward pass takes them."""
     turn: threading.Lock = field(default_factory=threading.Lock)
     """One backward pass at a time."""
     frozen: dict[int, int] = field(default_factory=dict)
     """Worlds that failed, and the substep from which they took no part."""
 
-    def keep(self, run: FastRun | PlainRun) -> None:
+    def keep(self, run: Run) -> None:
         """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
         del run.end
         self.runs.append(run)
@@ -87,7 +85,7 @@ def rollout(
     if recording(model):
         return _recorded(runner, trail, inside), trail if keep else None
     stays = trail.stays
-    state: State | SortedState = start
+    state: Any = start
     k, before = 0, None
     while k < len(trail.chunks) or before is not None:
         ahead = None
@@ -107,11 +105,11 @@ def rollout(
         if before is not None and inside:
             trail.keep(before[0])
         if k in stays:
-            trail.states[k] = _kept(state)
+            trail.states[k] = runner.scheme.checkpoint(state)
         if ahead is not None:
             state, k = ahead[0].end, k + 1
         before = ahead
-    return _returned(model, as_state(state), start, runner), trail if keep else None
+    return _returned(model, runner.scheme.to_user(state), start, runner), trail if keep else None
 
 
 def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
@@ -129,24 +127,19 @@ def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
     return end
 
 
-def _kept(between: State | SortedState) -> State | SortedState:
-    """In memory of its own, so that a program's buffers are not on loan meanwhile; a :class:`State` is never written to."""
-    return between if isinstance(between, State) else between.copy()
-
-
 def _recorded(runner: Runner, trail: Trail, inside: bool) -> State:
     """:func:`rollout` while PyTorch records a graph: nothing is read back."""
     hold(runner.model)
-    state: State | SortedState = trail.start
+    state: Any = trail.start
     stays = trail.stays
     for k, chunk in enumerate(trail.chunks):
         if k in stays:
-            trail.states[k] = _kept(state)
+            trail.states[k] = runner.scheme.checkpoint(state)
         run = runner.settle(chunk, state, inside)
         state = run.end
         if inside:
             trail.keep(run)
-    return as_state(state)
+    return runner.scheme.to_user(state)
 
 
 @on_its_gpu
@@ -174,7 +167,7 @@ def rollout_adj(
     runner.frozen = trail.frozen
     with trail.turn:
         for run in _inside_out(trail, runner):
-            adj, part = run.pull_back(adj, adj_solid, wanted)
+            adj, part = run.vjp(adj, adj_solid, wanted)
             if adj_pull is not None and part is not None:
                 adj_pull[run.chunk.rows] += part
             if recording(model):
@@ -187,7 +180,7 @@ def rollout_adj(
         for world in trail.frozen:
             words[world] = NEVER
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
-    adj = as_state(adj)
+    adj = runner.scheme.to_user(adj)
     found = (*adj[:4], adj_solid.mass, adj_solid.mu, adj_solid.lam)
     for world in trail.frozen:  # a state off the grid has no adjoint
         for tensor in found:
@@ -206,7 +199,7 @@ def _without(frozen: dict[int, int], adj_end: State) -> State:
     return State(x, v, C, F)
 
 
-def _taken(trail: Trail, runner: Runner) -> dict[int, State | SortedState]:
+def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:
     """What the forward pass kept; the trail has it no longer, so that each state is free as soon as it is dropped.
 
     A second backward pass finds nothing there, and the chunks run again first.
@@ -215,31 +208,31 @@ def _taken(trail: Trail, runner: Runner) -> dict[int, State | SortedState]:
     trail.states.clear()
     if states:
         return states
-    state: State | SortedState = trail.start
+    state: Any = trail.start
     stays = trail.stays
     for k in range(stays[-1] + 1):
         if k > 0:
             state = runner.settle(trail.chunks[k - 1], state, keep=False).end
         if k in stays:
-            states[k] = _kept(state)
+            states[k] = runner.scheme.checkpoint(state)
     return states
 
 
-def _inside_out(trail: Trail, runner: Runner) -> Iterator[FastRun | PlainRun]:
+def _inside_out(trail: Trail, runner: Runner) -> Iterator[Run]:
     """Every chunk as a run that kept what is inside, from the last to the first."""
     if trail.plan.keep_all:
         yield from reversed(trail.runs)
         return
     states = _taken(trail, runner)
     nothing = torch.empty(0)
-    hand: State | SortedState = State(nothing, nothing, nothing, nothing)
+    hand: Any = State(nothing, nothing, nothing, nothing)
     for action, k in checkpointing.going_back(len(trail.chunks), trail.plan.slots):
         if action == "restore":
             hand = states[k]
         elif action == "advance":
             hand = runner.settle(trail.chunks[k], hand, keep=False).end
         elif action == "keep":
-            states[k] = _kept(hand)
+            states[k] = runner.scheme.checkpoint(hand)
         elif action == "drop":
             del states[k]
         else:
@@ -254,7 +247,7 @@ def short_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[
     except torch.OutOfMemoryError as error:
         with alone(wait=False) as turn:  # else a graph that goes may end another's recording
             if turn and not recording(model):
-                forget(model)
+                model.workspace.release()
         error.add_note(_needs(model, horizon, gradient))
         raise
 

@@ -3,7 +3,6 @@
 import functools
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from softmpm.alarms import Failures
@@ -13,10 +12,9 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
 from softmpm.schemes.buffers import Solid
 from softmpm.schemes.capture import note, recording
-from softmpm.schemes.failure_report import Report, failed_worlds, failure, outgrown
-from softmpm.schemes.fast.scheme import Fast, FastRun, fast
-from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState
-from softmpm.schemes.plain.chunk import Plain, PlainRun
+from softmpm.schemes.failure_report import Report, failed_worlds, failure
+from softmpm.schemes.registry import SCHEMES
+from softmpm.schemes.scheme import Run, Scheme
 from softmpm.state import State
 
 
@@ -34,10 +32,9 @@ class Runner:
     def __init__(self, model: Model, pull: Tensor | None, solid: Solid, failures: Failures | None = None):
         self.model, self.pull, self.solid, self.failures = model, pull, solid, failures
         self.frozen: dict[int, int] = {}
-        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
-        self.scheme = fast(model, stream) if model.scheme == "fast" else Plain(model)
+        self.scheme: Scheme = SCHEMES[model.scheme].of(model)
 
-    def run(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
+    def run(self, chunk: Chunk, start: Any, keep: bool) -> Run:
         """Run a chunk from a :class:`State` or what the scheme gave as an end."""
         pull = None if self.pull is None else self.pull[chunk.rows]
         frozen = [world for world, substep in self.frozen.items() if chunk.first >= substep]
@@ -47,7 +44,7 @@ class Runner:
         """Launch the check of the start of the call; see :meth:`passed`."""
         if not armed(self.model) and self.model.alarms.collapse is None:
             return None
-        words = self.scheme.start_check(start, self.pull, self.solid)
+        words = self.scheme.check_start(start, self.pull, self.solid)
         if recording(self.model):
             note(words.clone())
             return None
@@ -68,19 +65,16 @@ class Runner:
     def _strongest(self) -> Tensor | None:
         return None if self.pull is None else self.pull.amax(0)
 
-    def settled(self, run: FastRun | PlainRun, report: Report) -> bool:
+    def settled(self, run: Run, report: Report) -> bool:
         """Accept a run; False if the chunk must be repeated, with a larger window or without a world that failed.
 
         Raises:
             UnstableError: A world failed, and the failures are not taken.
         """
         words = report.read()
-        if isinstance(run, FastRun) and isinstance(self.scheme, Fast):
-            *words, cells, near_edge = words
-            if outgrown(words):
-                self.scheme.widen(run)
-                return False
-            run.pool.arrangement.judge(cells, bool(near_edge))
+        if not self.scheme.accept(run, words):
+            return False
+        words = words[: self.model.worlds]
         if self._failed(words):
             self._take(self._located(run, words), run.chunk.first)
             return False
@@ -99,10 +93,10 @@ class Runner:
         self.failures.errors.append(error)
         self.frozen[error.world] = first
 
-    def _located(self, run: FastRun | PlainRun, words: list[int]) -> UnstableError:
+    def _located(self, run: Run, words: list[int]) -> UnstableError:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
         state: Any = run.start
-        at_end, start = as_state(run.end), run.start if isinstance(run.start, State) else None
+        at_end, start = self.scheme.to_user(run.end), run.start if isinstance(run.start, State) else None
         found = functools.partial(failure, self.model, solid=self.solid, start=start, state=at_end)
         for s in range(run.chunk.length):
             one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
@@ -110,34 +104,28 @@ class Runner:
             if self._failed(reported):
                 world = min(self._failed(reported), key=lambda w: reported[w])
                 pull = None if self.pull is None else self.pull[one.rows][0]
-                return found(reported, world, as_state(single.end), first=one.first, pull=pull)
+                return found(reported, world, self.scheme.to_user(single.end), first=one.first, pull=pull)
             state = single.end
         # Sums in another order may have avoided it; what was reported is true all the same.
         world = min(self._failed(words), key=lambda w: words[w])
         return found(words, world, at_end, first=run.chunk.first, pull=self._strongest())
 
-    def _single(self, chunk: Chunk, state: Any) -> tuple[FastRun | PlainRun, list[int]]:
+    def _single(self, chunk: Chunk, state: Any) -> tuple[Run, list[int]]:
         """A run of one substep, and what it reported."""
         while True:
             run = self.run(chunk, state, keep=False)
-            words = run.words.tolist()[: self.model.worlds]
-            if not outgrown(words) or not isinstance(run, FastRun) or not isinstance(self.scheme, Fast):
-                return run, words
-            self.scheme.widen(run)
+            words = run.words.tolist()
+            if self.scheme.accept(run, words):
+                return run, words[: self.model.worlds]
 
-    def settle(self, chunk: Chunk, start: Any, keep: bool) -> FastRun | PlainRun:
+    def settle(self, chunk: Chunk, start: Any, keep: bool) -> Run:
         """Run a chunk, and wait until it can be used."""
         while True:
             run = self.run(chunk, start, keep)
             if recording(self.model):
                 words = run.words[: self.model.worlds].clone()  # the backward pass uses them anew
-                note(words, run.pool.arrangement.outgrow if isinstance(run, FastRun) else None)
+                note(words, run.outgrow)
                 return run
             if self.settled(run, Report(run.words)):
                 return run
             del run  # or its program would be there beside the next one, which has a larger window
-
-
-def as_state(between: State | SortedState | SortedAdj) -> State:
-    """In the user's order."""
-    return between if isinstance(between, State) else between.state()

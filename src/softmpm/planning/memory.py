@@ -14,7 +14,7 @@ pulled back one after the other.
 import functools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import torch
 
@@ -55,6 +55,12 @@ def price_of_chunk(particles: int) -> int:
     """
     least, most = 4, 48
     return max(least, min(most, 3_000_000 // particles))
+
+
+def state_bytes(particles: int, dim: int, real: int) -> int:
+    """Bytes of a :class:`softmpm.State` of so many particles with numbers of ``real`` bytes, what rounding took included."""
+    state = particles * real * (2 * dim + 2 * dim * dim)
+    return state + state // 2 if real == 4 else state
 
 
 class Sizes(NamedTuple):
@@ -111,7 +117,7 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     """The plan that takes the least time within the budget [B] of all calls.
 
     Args:
-        horizon: A :class:`softmpm.horizon.Horizon`.
+        horizon: A :class:`softmpm.planning.chunks.Horizon`.
 
     Raises:
         ValueError: Not even one substep at a time fits.
@@ -153,6 +159,40 @@ def _lengths(substeps: int, longest: int) -> list[int]:
     return sorted({*halved, *even}, reverse=True)
 
 
+class Footprint(Protocol):
+    """Memory of one scheme. Models come without a type, since they stand above this module."""
+
+    numbers_per_node: ClassVar[dict[int, int]]
+    """Numbers of a node that a call takes at least, in 2D and 3D."""
+
+    def obstacle(self, shape: Sequence[int], particles: int) -> str | None:
+        """Why the scheme cannot hold a grid of this shape with so many particles in all worlds; None if it can."""
+        ...
+
+    def node_count(self, model) -> int:
+        """Nodes of one world in memory."""
+        ...
+
+    def sizes(self, model) -> Sizes:
+        """Bytes of what a call may keep."""
+        ...
+
+    def buffers(self, model, horizon, chosen: Plan) -> "Buffers":
+        """Bytes of the buffers that run calls of this length, besides states that are kept."""
+        ...
+
+
+class Buffers(NamedTuple):
+    """Bytes of the buffers that run calls."""
+
+    forward: int
+    """Of a call without gradient."""
+    kept: int
+    """Of all calls until the backward pass."""
+    backward: int
+    """Of the backward pass: adjoints that are passed from chunk to chunk, and what runs chunks again."""
+
+
 class Memory(NamedTuple):
     """Bytes that the calls of one gradient take at their peak, besides what the model itself holds, and how often they run."""
 
@@ -173,49 +213,29 @@ def memory(model, horizon) -> Memory:
     state = particles * real * (2 * model.dim + 2 * model.dim**2)  # adjoints of x, v, C, F
     material, pull = 4 * particles * real, particles * model.spec.muscle_slots * real
     chosen = plan(horizon, sizes, model.budget)
-    if model.scheme == "fast":
-        program = material + sizes.nodes + (2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0)
-        small = program + sizes.inside + 2 * sizes.nodes
-        forward = small * _at_once(horizon, sizes.longest)
-        handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
-        if chosen.keep_all:
-            own = calls * program * len(horizon.chunks(chosen.longest))
-        else:
-            own = program * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
-            # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
-            handed += 2 * small if model.device.type == "cuda" else 0
-    else:
-        forward, handed, own = 2 * sizes.inside, sizes.inside, 0
+    buffers = model.footprint.buffers(model, horizon, chosen)
     # Each call but the first holds its start besides, which is one of the states that are kept if those inside are not.
     starts = (calls - 1) * (sizes.start - (0 if chosen.keep_all else sizes.between))
-    kept = calls * (chosen.kept + material) + own + starts
-    adjoints = 2 * state + material + pull + 3 * sizes.nodes + handed
+    kept = calls * (chosen.kept + material) + buffers.kept + starts
+    adjoints = 2 * state + material + pull + 3 * sizes.nodes + buffers.backward
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
     chunks = len(horizon.chunks(chosen.longest))
     runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.slots) / chunks
-    return Memory(forward + material + sizes.start, kept, kept + chosen.recomputed + state + adjoints, runs)
-
-
-def _shapes(horizon, longest: int) -> int:
-    return len({chunk.shape for chunk in horizon.chunks(longest)})
-
-
-def _at_once(horizon, longest: int) -> int:
-    """Programs of chunks that keep nothing inside: one that runs, one launched ahead, one that holds the start of the first, and one of
-    another shape that waits.
-    """
-    return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))
+    return Memory(
+        buffers.forward + material + sizes.start, kept, kept + chosen.recomputed + state + adjoints, runs
+    )
 
 
 def check_room(model) -> None:
     """Raise ValueError if the start, the end and the grid of a call alone are more than the device has."""
     room = memory_of(model.device)
-    per_node = 8 if model.scheme == "fast" else 2 * model.dim + 1
-    per_world = 2 * model.particle_count * 2 * (model.dim + model.dim**2) + model.held_nodes * per_node
+    nodes = model.footprint.node_count(model)
+    per_node = model.footprint.numbers_per_node[model.dim]
+    per_world = 2 * model.particle_count * 2 * (model.dim + model.dim**2) + nodes * per_node
     needed = model.worlds * per_world * model.dtype.itemsize
     if room is not None and needed > room:
         raise ValueError(
             f"a call takes at least {needed:,} bytes for {model.worlds:,} world(s) of {model.particle_count:,} particles and "
-            f"{model.held_nodes:,} nodes, but {model.device} has {room:,}: take fewer worlds, fewer nodes or fewer particles."
+            f"{nodes:,} nodes, but {model.device} has {room:,}: take fewer worlds, fewer nodes or fewer particles."
         )

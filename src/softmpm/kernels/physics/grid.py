@@ -60,7 +60,7 @@ def grid(spec: Spec) -> SimpleNamespace:
 
         return after
 
-    def pull_back(k: int) -> wp.Function:
+    def after_walls_adj(k: int) -> wp.Function:
         """Adjoint of the velocity before wall ``k``, from that of the velocity after all walls."""
         if k == len(spec.contacts):
 
@@ -68,7 +68,7 @@ def grid(spec: Spec) -> SimpleNamespace:
             def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
                 return adj
         else:
-            through_others, wall = pull_back(k + 1), contact(spec, k)
+            through_others, wall = after_walls_adj(k + 1), contact(spec, k)
             inside, respond, respond_adj = wall.inside, wall.respond, wall.respond_adj
 
             @wp.func
@@ -84,7 +84,7 @@ def grid(spec: Spec) -> SimpleNamespace:
 
         return back
 
-    after_all_walls, pull_back_through_all = after_walls(len(spec.contacts)), pull_back(0)
+    after_all_walls, after_all_walls_adj = after_walls(len(spec.contacts)), after_walls_adj(0)
 
     @wp.func
     def node_velocity(scale: Scale, walls: Walls, here: ivec, p: vec, m: real) -> vec:
@@ -101,7 +101,7 @@ def grid(spec: Spec) -> SimpleNamespace:
         adj = NodeAdj()
         if m > real(0.0):
             u = p / m
-            adj_v = pull_back_through_all(scale, walls, here, free_velocity(scale, u), adj_velocity)
+            adj_v = after_all_walls_adj(scale, walls, here, free_velocity(scale, u), adj_velocity)
             adj.p = adj_v / m  # (G1.adj)
             if wp.static(damping):
                 adj.p = scale.decay * adj.p

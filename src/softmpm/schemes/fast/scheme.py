@@ -2,20 +2,23 @@
 
 import threading
 import weakref
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple
 
+import torch
 from torch import Tensor
 
 from softmpm.kernels.structs import Wanted
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
-from softmpm.planning.memory import LONGEST
+from softmpm.planning.memory import LONGEST, Footprint
 from softmpm.schemes.alarm_check import StartCheck
 from softmpm.schemes.buffers import Solid, SolidAdj
 from softmpm.schemes.capture import hold, recording
+from softmpm.schemes.failure_report import outgrown
 from softmpm.schemes.fast.chunk_graph import Program
 from softmpm.schemes.fast.chunk_graph_adj import ProgramAdj, Scratch
+from softmpm.schemes.fast.footprint import FastFootprint
 from softmpm.schemes.fast.particle_order import Arrangement
 from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacking
 from softmpm.state import State
@@ -106,8 +109,8 @@ class FastRun:
     Attributes:
         renewed: Whether the arrangement was made for its start.
         start, end: State before and after it; the end lies in the program's buffers.
-        words: What the kernels reported, see errors.py; then cells met along the order of the particles, and whether one is
-            near the window's edge; shape (world + 2,).
+        words: Status words, see errors.py; then cells met along the order of the particles, and whether one is near the
+            window's edge; shape (world + 2,).
     """
 
     def __init__(
@@ -127,8 +130,9 @@ class FastRun:
         program.run(start, pull, solid, frozen)
         self.end = SortedState(pool.unpacking, program.base[-1], program.rows[-1], program.order, self._lease)
         self.words = program.words
+        self.outgrow: Callable[[], None] | None = pool.arrangement.outgrow
 
-    def pull_back(
+    def vjp(
         self, adj_end: State | SortedAdj, adj_solid: SolidAdj, wanted: Wanted
     ) -> tuple[SortedAdj, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
@@ -140,7 +144,15 @@ class FastRun:
 
 
 class Fast:
-    """Runs chunks by the fast scheme. One for each thread and stream: its buffers serve one run after the other."""
+    """See :class:`softmpm.schemes.scheme.Scheme`. One for each thread and stream: its buffers serve one run after the other."""
+
+    footprint: ClassVar[Footprint] = FastFootprint()
+
+    @classmethod
+    def of(cls, model: Model) -> "Fast":
+        """Kept in the model's workspace, so that it must not hold the model."""
+        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
+        return model.workspace.get((cls, stream), lambda: cls(weakref.proxy(model)))
 
     def __init__(self, model: Model):
         self.model = model
@@ -164,8 +176,7 @@ class Fast:
         assert self._pool is not None
         return FastRun(self._pool, renewed, chunk, start, pull, solid, keep, frozen)
 
-    def start_check(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
-        """Words of the check of a start, which the next one overwrites."""
+    def check_start(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
         if self._start_check is None or recording(self.model):
             check = StartCheck(self.model)
             if recording(self.model):
@@ -208,7 +219,22 @@ class Fast:
     def _use(self, arrangement: Arrangement) -> None:
         self._pool = Pool(self.model, arrangement, self._unpacking)
 
-    def widen(self, run: FastRun) -> None:
+    def accept(self, run: FastRun, words: list[int]) -> bool:
+        """False if a particle left the window."""
+        *words, cells, near_edge = words
+        if outgrown(words):
+            self._widen(run)
+            return False
+        run.pool.arrangement.judge(cells, bool(near_edge))
+        return True
+
+    def checkpoint(self, state: State | SortedState) -> State | SortedState:
+        return state if isinstance(state, State) else state.copy()
+
+    def to_user(self, state: State | SortedState | SortedAdj) -> State:
+        return state if isinstance(state, State) else state.state()
+
+    def _widen(self, run: FastRun) -> None:
         """A particle left the window during ``run``: put it around the start, once; whatever moves so fast needs a larger one."""
         arrangement = run.pool.arrangement
         if run.renewed or arrangement.left:
@@ -217,21 +243,3 @@ class Fast:
             arrangement.renew(run.start.x)
             arrangement.left = True
         self._widened = True
-
-
-class _Local(threading.local):
-    def __init__(self):
-        self.of_stream: dict[int, Fast] = {}
-
-
-def fast(model: Model, stream: int) -> Fast:
-    """The runner of this model in this thread on this stream. It lives as long as the model, which it does not hold."""
-    local = model.__dict__.setdefault("_runners", _Local())
-    if stream not in local.of_stream:
-        local.of_stream[stream] = Fast(weakref.proxy(model))
-    return local.of_stream[stream]
-
-
-def forget(model: Model) -> None:
-    """Let go of what waits for the calls to come."""
-    model.__dict__.pop("_runners", None)

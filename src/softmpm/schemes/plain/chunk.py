@@ -1,6 +1,7 @@
 """The plain scheme: three kernels for each substep, launched one by one, any precision, any device."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -9,8 +10,10 @@ from softmpm.errors import FROZEN, NEVER
 from softmpm.kernels.structs import Wanted
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
+from softmpm.planning.memory import Footprint
 from softmpm.schemes.alarm_check import StartCheck, armed, check_end
 from softmpm.schemes.buffers import Motion, MotionAdj, Solid, SolidAdj, clear
+from softmpm.schemes.plain.footprint import PlainFootprint
 from softmpm.schemes.plain.substep import Substep
 from softmpm.state import State
 
@@ -20,7 +23,8 @@ class PlainRun:
 
     Attributes:
         start, end: State before and after it; the end is handed over once the run is kept.
-        words: What the kernels reported, see errors.py; shape (world,).
+        words: Status words, see errors.py; shape (world,).
+        outgrow: None, since the whole grid is in memory.
     """
 
     def __init__(
@@ -50,12 +54,13 @@ class PlainRun:
         if armed(model):
             check_end(model, self.step.solid, self.end, self.step.watch, chunk.length - 1)
         self.words = self.step.watch_words
+        self.outgrow: Callable[[], None] | None = None
 
     def _drive(self, s: int) -> None:
         if self.row is not None and self.pull is not None:
             self.row.copy_(self.pull[self.chunk.row(s)])
 
-    def pull_back(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
+    def vjp(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
         model, chunk, step = self.model, self.chunk, self.step
         step.watch_words.fill_(NEVER)
@@ -79,7 +84,13 @@ class PlainRun:
 
 
 class Plain:
-    """Runs chunks by the plain scheme."""
+    """See :class:`softmpm.schemes.scheme.Scheme`. Keeps nothing between runs, and its states are the user's."""
+
+    footprint: ClassVar[Footprint] = PlainFootprint()
+
+    @classmethod
+    def of(cls, model: Model) -> "Plain":
+        return cls(model)
 
     def __init__(self, model: Model):
         self.model = model
@@ -95,5 +106,14 @@ class Plain:
     ) -> PlainRun:
         return PlainRun(self.model, chunk, start, pull, solid, keep, frozen)
 
-    def start_check(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
+    def check_start(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
         return StartCheck(self.model)(start, pull, solid)
+
+    def accept(self, run: PlainRun, words: list[int]) -> bool:
+        return True
+
+    def checkpoint(self, state: State) -> State:
+        return state
+
+    def to_user(self, state: State) -> State:
+        return state

@@ -142,7 +142,7 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
     (smaller,) = living(particle_order.Arrangement)
     smaller.left = True
     del smaller
-    outgrown, make = runner.outgrown, chunk_graph.Program.__init__
+    outgrown, make = fast_scheme.outgrown, chunk_graph.Program.__init__
 
     def left_once(words) -> bool:
         seen.append(words)
@@ -152,7 +152,7 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
         others.append(sum(one.arrangement is not window for one in living(chunk_graph.Program)))
         make(self, model, window, *args)
 
-    monkeypatch.setattr(runner, "outgrown", left_once)
+    monkeypatch.setattr(fast_scheme, "outgrown", left_once)
     monkeypatch.setattr(chunk_graph.Program, "__init__", making)
     pull(*call(built))
     assert len(seen) > report and others and max(others) <= 1
@@ -160,7 +160,9 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
 
 def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, device):
     """Those that were kept on the way forward go as others take their slots; a second backward pass has to find them again."""
-    monkeypatch.setattr("softmpm.model.price_of_chunk", lambda particles: 1)  # the same chunks on a GPU
+    monkeypatch.setattr(
+        "softmpm.schemes.fast.footprint.price_of_chunk", lambda particles: 1
+    )  # the same chunks on a GPU
     built, kept, most, programs = model(device=device, **little_memory(model())), [], [], []
     horizon, copied, runs = Horizon(3, 7), SortedState.copy, chunk_graph.Program.run
     chosen = plan(horizon, built.sizes(), built.budget)
@@ -232,14 +234,14 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
     pull(*call(built))
     waiting = call(built) if failing == "backward" else None
     owner, name = (
-        (particle_order.Arrangement, "judge") if failing == "forward" else (fast_scheme.FastRun, "pull_back")
+        (particle_order.Arrangement, "judge") if failing == "forward" else (fast_scheme.FastRun, "vjp")
     )
 
     def full(*args):
         raise torch.OutOfMemoryError("no room")
 
     if built.scheme == "plain":
-        owner, name = plain_chunk.PlainRun, "__init__" if failing == "forward" else "pull_back"
+        owner, name = plain_chunk.PlainRun, "__init__" if failing == "forward" else "vjp"
     monkeypatch.setattr(owner, name, full)
     try:
         pull(*(waiting or call(built)))

@@ -24,6 +24,7 @@ from helpers import (
 
 import softmpm
 from softmpm import autograd
+from softmpm.building import choose_scheme
 from softmpm.kernels.fast.native import WARP
 from softmpm.kernels.structs import BASE_BITS, packed_rows
 from softmpm.planning import memory
@@ -98,9 +99,7 @@ def test_more_numbers_than_indices_reach_take_the_plain_scheme():
     """Particles of all worlds, in whole warps, times the numbers of each must stay below 2³¹."""
     most = 2**31 // packed_rows(2).rows // WARP * WARP
     for worlds, scheme in ((most + 1, "plain"), (most, "fast")):
-        small = softmpm.build(tiny((8, 8)), device="cpu")
-        small.worlds = worlds  # a real one would not fit into memory
-        chosen, reason = small._scheme("auto")
+        chosen, reason = choose_scheme(tiny((8, 8)), torch.float32, worlds, "auto")
         assert chosen == scheme
         assert scheme == "fast" or "32-bit indices" in reason
     with pytest.raises(ValueError, match="scheme must be 'auto', 'fast' or 'plain', got 'quick'"):

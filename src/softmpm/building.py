@@ -1,0 +1,126 @@
+"""``build``: a scene checked, a scheme chosen, and the model of both."""
+
+import numpy as np
+import torch
+
+from softmpm.alarms import Alarms
+from softmpm.checks import check_whole
+from softmpm.devices import device_of
+from softmpm.model import Model
+from softmpm.scene.check_scene import check_precision, check_scene
+from softmpm.scene.scene import Scene
+from softmpm.schemes.registry import SCHEMES
+from softmpm.stability import need_stable, warn_sparse
+
+
+def build(
+    scene: Scene,
+    device: str | torch.device | None = None,
+    dtype: torch.dtype = torch.float32,
+    worlds: int = 1,
+    memory_budget: int | None = None,
+    scheme: str = "auto",
+    deterministic: bool = False,
+    calls: int = 1,
+    alarms: Alarms | None = None,
+) -> Model:
+    """Make a scene ready to run.
+
+    Args:
+        scene: What to simulate.
+        device: Where; None takes CUDA if there is one, and says so in the log.
+        dtype: ``torch.float32`` or ``torch.float64``.
+        worlds: Number of independent copies of the scene that run in one launch.
+        memory_budget: Most bytes of states that ``simulate`` may keep for a backward pass, or run again at a time; None for a
+            sensible choice. ``describe`` says what it takes in all; see docs/memory.md.
+        scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
+            docs/performance.md.
+        deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
+            scheme. The CPU adds in one order anyway. See docs/conventions.md.
+        calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
+            budget. If there are more, they keep more.
+        alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
+
+    Returns:
+        The model: immutable, shared by any number of simulations.
+
+    Raises:
+        ValueError: The scene breaks a rule, or its dt is above :func:`softmpm.stable_dt`; the message names the rule, the value
+            received and a remedy.
+    """
+    check_scene(scene)
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
+    check_whole("worlds", worlds)
+    check_whole("calls", calls)
+    if memory_budget is not None:
+        if isinstance(memory_budget, float) and memory_budget.is_integer():
+            memory_budget = int(memory_budget)
+        check_whole("memory_budget, in bytes,", memory_budget)
+        memory_budget = int(memory_budget)
+    if scheme not in ("auto", "fast", "plain"):
+        raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
+    if not isinstance(deterministic, (bool, np.bool_)):
+        raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
+    alarms = Alarms() if alarms is None else alarms
+    if not isinstance(alarms, Alarms):
+        raise TypeError(f"alarms must be a softmpm.Alarms or None, got {type(alarms).__name__}.")
+    check_precision(scene, dtype)
+    if alarms.step is not None:
+        need_stable(scene, alarms.step)
+    warn_sparse(scene)
+    scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
+    place = device_of(device)
+    return Model(
+        scene,
+        place,
+        dtype,
+        scheme,
+        reason,
+        SCHEMES[scheme].footprint,
+        alarms,
+        deterministic=bool(deterministic),
+        fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme, reason),
+        worlds=int(worlds),
+        memory_budget=memory_budget,
+        calls=int(calls),
+    )
+
+
+def choose_scheme(scene: Scene, dtype: torch.dtype, worlds: int, wanted: str) -> tuple[str, str]:
+    """Name of the scheme for ``wanted``, which may be "auto", and the reason.
+
+    Raises:
+        ValueError: The scheme that is asked for cannot hold the scene.
+    """
+    particles = worlds * sum(len(body.particles) for body in scene.bodies)
+    if wanted != "auto":
+        obstacle = SCHEMES[wanted].footprint.obstacle(scene.grid.shape, particles)
+        if obstacle:
+            raise ValueError(
+                f"scheme {wanted!r} cannot hold this scene: {obstacle}; use scheme='plain' or 'auto'."
+            )
+        return wanted, "as asked for"
+    obstacle = SCHEMES["fast"].footprint.obstacle(scene.grid.shape, particles)
+    if obstacle:
+        return "plain", obstacle
+    if dtype == torch.float64:
+        return "plain", "double precision gains nothing from 16-byte reductions"
+    return "fast", "single precision"
+
+
+def in_fixed_point(device: torch.device, dtype: torch.dtype, scheme: str, reason: str) -> bool:
+    """Whether a deterministic model has to sum in fixed point.
+
+    Raises:
+        ValueError: It would have to, and cannot.
+    """
+    if scheme == "fast" and dtype == torch.float32:
+        return True
+    if device.type == "cpu":
+        return False
+    raise ValueError(
+        "deterministic=True needs torch.float32 and the fast scheme on a GPU, because only its sums are in fixed point; "
+        f"got {dtype} and scheme {scheme!r} ({reason}). Change these, or use device='cpu', which adds in one order, or build "
+        "without it."
+    )

@@ -1,0 +1,76 @@
+"""Memory of the fast scheme: packed particles, and the nodes around them."""
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from softmpm.kernels.fast.native import padded
+from softmpm.kernels.structs import BASE_BITS, packed_rows
+from softmpm.planning.memory import (
+    MARGIN,
+    Buffers,
+    Plan,
+    Sizes,
+    longest_chunk,
+    price_of_chunk,
+    state_bytes,
+    window_shape,
+)
+
+
+class FastFootprint:
+    """See :class:`softmpm.planning.memory.Footprint`."""
+
+    numbers_per_node: ClassVar[dict[int, int]] = {2: 8, 3: 8}  # momentum and mass, velocity: 4 each
+
+    def obstacle(self, shape: Sequence[int], particles: int) -> str | None:
+        largest = 2 ** BASE_BITS[len(shape)]
+        if max(shape) > largest:
+            return f"the grid has more than {largest} nodes along an axis"
+        if padded(particles) * packed_rows(len(shape)).rows >= 2**31:
+            return "there are more particles than 32-bit indices reach"
+        return None
+
+    def node_count(self, model) -> int:
+        """Nodes of the window around the particles at rest."""
+        cells = np.floor(model.exact_positions / model.scene.grid.spacing - 0.5)
+        reach = np.ptp(cells, axis=0).astype(int).tolist()
+        return math.prod(window_shape(model.scene.grid.shape, reach, MARGIN[model.dim]))
+
+    def sizes(self, model) -> Sizes:
+        real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
+        inside = particles * (4 + real * packed_rows(d).rows)
+        between = inside + 4 * particles  # and their order
+        nodes = model.worlds * model.held_nodes * 4 * real
+        price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
+        start = state_bytes(particles, d, real)
+        return Sizes(inside, nodes, between, start, longest_chunk(particles), price, model.calls)
+
+    def buffers(self, model, horizon, chosen: Plan) -> Buffers:
+        sizes = model.sizes()
+        material = 4 * model.worlds * model.particle_count * model.dtype.itemsize
+        fixed_point = 2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0
+        program = material + sizes.nodes + fixed_point
+        small = program + sizes.inside + 2 * sizes.nodes
+        forward = small * _at_once(horizon, sizes.longest)
+        handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
+        if chosen.keep_all:
+            kept = model.calls * program * len(horizon.chunks(chosen.longest))
+            return Buffers(forward, kept, handed)
+        kept = program * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
+        # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
+        again = 2 * small if model.device.type == "cuda" else 0
+        return Buffers(forward, kept, handed + again)
+
+
+def _shapes(horizon, longest: int) -> int:
+    return len({chunk.shape for chunk in horizon.chunks(longest)})
+
+
+def _at_once(horizon, longest: int) -> int:
+    """Chunk graphs that keep nothing inside: one that runs, one launched ahead, one that holds the start of the first, and one of
+    another shape that waits.
+    """
+    return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))

@@ -1,0 +1,29 @@
+"""Memory of the plain scheme: states in the user's order, and every node of the grid."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+from softmpm.planning.memory import Buffers, Plan, Sizes, longest_chunk, price_of_chunk, state_bytes
+
+
+class PlainFootprint:
+    """See :class:`softmpm.planning.memory.Footprint`."""
+
+    numbers_per_node: ClassVar[dict[int, int]] = {2: 5, 3: 7}  # momentum and mass, velocity
+
+    def obstacle(self, shape: Sequence[int], particles: int) -> str | None:
+        return None
+
+    def node_count(self, model) -> int:
+        return model.node_count
+
+    def sizes(self, model) -> Sizes:
+        real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
+        inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
+        start = state_bytes(particles, d, real)
+        price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
+        return Sizes(inside, 0, start, start, longest_chunk(particles), price, model.calls)
+
+    def buffers(self, model, horizon, chosen: Plan) -> Buffers:
+        inside = model.sizes().inside
+        return Buffers(2 * inside, 0, inside)

@@ -1,0 +1,7 @@
+"""The schemes by name."""
+
+from softmpm.schemes.fast.scheme import Fast
+from softmpm.schemes.plain.chunk import Plain
+from softmpm.schemes.scheme import Scheme
+
+SCHEMES: dict[str, type[Scheme]] = {"fast": Fast, "plain": Plain}
