@@ -2,6 +2,7 @@
 
 import functools
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -106,3 +107,11 @@ def special_deformations(dim: int) -> dict[str, torch.Tensor]:
         "small strain": eye + 1e-6 * torch.randn(dim, dim, generator=generator, dtype=torch.float64),
         "random": torch.randn(dim, dim, generator=generator, dtype=torch.float64) + 2 * eye,
     }
+
+
+def svd_rotation(F: np.ndarray) -> np.ndarray:
+    """The proper rotation nearest to F: U diag(1, …, det UVᵀ) Vᵀ."""
+    U, _, Vt = np.linalg.svd(F)
+    sign = np.ones(F.shape[:-1])
+    sign[..., -1] = np.sign(np.linalg.det(U @ Vt))
+    return (U * sign[..., None, :]) @ Vt

@@ -489,15 +489,15 @@ def run_here(function: str, *arguments: object) -> None:
     assert done.returncode == 0, done.stderr
 
 
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    globals()[sys.argv[1]](Path(sys.argv[2]), sys.argv[3])
-
-
 def test_the_name_of_a_contact_fits(monkeypatch):
     """However long the longest is: it was cut to 8 bytes, which is what "separate" has."""
-    monkeypatch.setattr(softmpm.scene, "CONTACTS", ("stick", "slip", "separate", "separate_slowly"))
+    monkeypatch.setattr(softmpm.scene.scene, "CONTACTS", ("stick", "slip", "separate", "separate_slowly"))
     found = importlib.util.find_spec("softmpm.recording.format")
     layout = importlib.util.module_from_spec(found)
     found.loader.exec_module(layout)
     assert layout.STATIC["wall_contact"][0].itemsize == len("separate_slowly")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    globals()[sys.argv[1]](Path(sys.argv[2]), sys.argv[3])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from blocks import apply, special_deformations
-from test_polar import svd_rotation
+from blocks import apply, special_deformations, svd_rotation
 
 from softmpm import BarrierCorotated, FixedCorotated, NeoHookean, reference
 from softmpm.kernels.physics.elasticity import elasticity

@@ -3,20 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from blocks import apply, special_deformations
+from blocks import apply, special_deformations, svd_rotation
 
 from softmpm.kernels.physics.polar import polar
 from softmpm.kernels.structs import types
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
-
-def svd_rotation(F: np.ndarray) -> np.ndarray:
-    """The proper rotation nearest to F: U diag(1, …, det UVᵀ) Vᵀ."""
-    U, _, Vt = np.linalg.svd(F)
-    sign = np.ones(F.shape[:-1])
-    sign[..., -1] = np.sign(np.linalg.det(U @ Vt))
-    return (U * sign[..., None, :]) @ Vt
 
 
 def rotation(dim, dtype, H):
