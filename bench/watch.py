@@ -40,7 +40,7 @@ def unchecked(model: softmpm.Model):
     report_of, check_of = status.report, status.check
     status.report = lambda *_: SimpleNamespace(running=running, report=report_of(spec.dim, spec.dtype).report)
     # Nobody complains of a state that is sound:
-    status.check = lambda *_: SimpleNamespace(sound=sound, complain=check_of(spec).complain)
+    status.check = lambda *_: SimpleNamespace(sound=sound, report_invalid=check_of(spec).report_invalid)
     transfer(spec) if model.scheme == "plain" else fused(spec)
     status.report, status.check = report_of, check_of
 

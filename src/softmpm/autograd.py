@@ -18,13 +18,13 @@ from softmpm.checks import (
     check_state,
 )
 from softmpm.compiling import opaque
-from softmpm.kernels.structs import Wanted
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model, check_model
 from softmpm.planning.chunks import Horizon
 from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
-from softmpm.rollout import Trail, rollout, rollout_adj, short_of_memory
+from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
 from softmpm.schemes.buffers import Solid, lame, masses
-from softmpm.schemes.capture import recording
+from softmpm.schemes.capture import is_capturing
 from softmpm.state import GridField, Low, Params, State
 
 _SECOND = (
@@ -47,13 +47,13 @@ def simulate(
     Each row of ``activation`` drives ``substeps`` MLS-MPM substeps (Hu et al. 2018, Eq. 29). Second derivatives raise.
 
     Args:
-        model: What does not change in time; from :func:`softmpm.build`.
+        model: The model of the scene, from :func:`softmpm.build`.
         start: State at the first substep. Differentiable, never modified.
         activation: Muscle activation [-], shape (control_step, world, muscle); None is one control step without
             activation. Differentiable.
         params: Material of each particle: ``young`` [Pa], ``poisson`` [-], ``density`` [kg/m³], shapes that broadcast
-            to (world, particle). Differentiable. Tensors without gradient that come again are taken as unchanged unless
-            PyTorch counted a write, which it does not where ``.data``, NumPy or Warp write into them: hand over others then.
+            to (world, particle). Differentiable. Quantities derived from parameters that need no gradient are cached by tensor
+            identity and version. In-place writes through ``.data``, NumPy or Warp are not detected; pass a new tensor instead.
         substeps: Substeps of ``model.scene.dt`` [s] for each row of ``activation``.
         failures: Counts the failures of single worlds, whose state is frozen or reset meanwhile; None raises the first.
 
@@ -62,10 +62,10 @@ def simulate(
 
     Raises:
         TypeError: ``model`` is something else.
-        ValueError: An argument has a wrong shape, precision or device; says what must hold and what came.
+        ValueError: An argument has a wrong shape, precision or device; names the rule and the value received.
         UnstableError: A particle became non-finite, collapsed or left the grid, a body tore, or dt is above the running stable
             step (:class:`softmpm.Alarms`); names world, particle, substep and limit.
-        torch.OutOfMemoryError: With a note on what the call takes. The backward pass may raise it and UnstableError as well.
+        torch.OutOfMemoryError: With a note of the estimated requirement. The backward pass may raise it and UnstableError as well.
     """
     return _simulate(model, start, activation, params, substeps, failures)
 
@@ -88,7 +88,7 @@ def _simulate(
     check_activation(model, activation)
     refuse_batches((*start[:4], activation, *(params if isinstance(params, tuple) else ())))
     check_horizon(activation, substeps)
-    if not recording(model):  # else nothing can be read back; NaN is reported by the kernels
+    if not is_capturing(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
     mu, lam, mass = _material(model, params)
     pull, control_steps = None, 1
@@ -102,15 +102,15 @@ def _simulate(
     inputs = (pull, mu, lam, mass, *start[:4])
     needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     call = _Call(needed, failures)
-    simulated: Any = _Simulate.apply if needed or _followed(inputs) else _Simulate.forward
+    simulated: Any = _Simulate.apply if needed or _has_transform_or_tangent(inputs) else _Simulate.forward
     end = simulated(model, Horizon(control_steps, substeps), call, *inputs, *low)
     return State(*end[:4], low=Low(*end[4:6]) if model.dtype == torch.float32 else None)
 
 
-def _followed(tensors: Iterable[Tensor | None]) -> bool:
-    """Whether PyTorch would look into a function of these without asking for its gradient: torch.func, or forward mode.
+def _has_transform_or_tangent(tensors: Iterable[Tensor | None]) -> bool:
+    """Whether a torch.func transform is active or a tensor carries a forward-mode tangent.
 
-    If not, and no gradient is needed, what the function runs is called directly, without PyTorch's preparations.
+    If not, and no gradient is needed, the function's ``forward`` is called directly, which skips PyTorch's preparations.
     """
     return torch._C._are_functorch_transforms_active() or any(
         t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
@@ -126,7 +126,7 @@ def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
     if seen and seen == last.seen:
         return last.found
     check_params(model, params)
-    if not recording(model):  # else nothing can be read back
+    if not is_capturing(model):  # else nothing can be read back
         check_bounds(params, params.density * model.volume, model.mass_unit)
     lead = (model.worlds, model.particle_count)
     mu, lam = (term.expand(lead).contiguous() for term in lame(params))
@@ -146,7 +146,7 @@ class _Last:
 
 def _seen(model: Model, params: Any) -> tuple:
     """What would differ if these tensors were others, were written to or given other memory; nothing where that cannot be told."""
-    if recording(model) or torch._C._are_functorch_transforms_active() or not isinstance(params, Params):
+    if is_capturing(model) or torch._C._are_functorch_transforms_active() or not isinstance(params, Params):
         return ()
     if not all(type(p) is Tensor and not p.requires_grad and not p.is_inference() for p in params):
         return ()
@@ -215,7 +215,7 @@ class _Simulate(_Function):
         model, horizon, call, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
         start = State(x, v, C, F, None if low_x is None else Low(low_x, low_F))
         solid, needed = Solid(mass, mu, lam, pull), call.differentiable
-        with short_of_memory(model, horizon, needed):
+        with explain_out_of_memory(model, horizon, needed):
             end, call.trail = rollout(model, horizon, start, pull, solid, needed, call.failures)
         return (*end[:4], *(end.low or (None, None)))
 
@@ -230,10 +230,12 @@ class _Simulate(_Function):
     @staticmethod
     def backward(ctx, *adj_end):
         refuse_batches(adj_end)
-        wanted = Wanted(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
+        wanted = RequestedGrads(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
         about = ctx.model, ctx.horizon, ctx.trail, wanted
         inputs = *about, *ctx.saved_tensors, *adj_end[:4]
-        again = torch.is_grad_enabled() or _followed(inputs[4:])  # it may be differentiated once more
+        again = torch.is_grad_enabled() or _has_transform_or_tangent(
+            inputs[4:]
+        )  # it may be differentiated once more
         adj = (_SimulateBackward.apply if again else _SimulateBackward.forward)(*inputs)
         return None, None, None, *adj, None, None
 
@@ -255,7 +257,7 @@ class _SimulateBackward(_Function):
             )
         )
         solid = Solid(mass, mu, lam, pull)
-        with short_of_memory(model, horizon, gradient=True):
+        with explain_out_of_memory(model, horizon, gradient=True):
             adj, adj_solid, adj_pull = rollout_adj(model, horizon, trail, pull, solid, adj_end, wanted)
         return adj_pull, adj_solid.mu, adj_solid.lam, adj_solid.mass, *adj[:4]
 

@@ -66,7 +66,8 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
             f"got {tuple(activation.shape)}; {hint}."
         )
     need(
-        len(activation) > 0, "activation needs at least one control step, got none; pass None to move freely."
+        len(activation) > 0,
+        "activation needs at least one control step, got none; pass None for no actuation.",
     )
 
 

@@ -9,10 +9,10 @@ from softmpm.kernels.rasterize import raster
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import passing
-from softmpm.schemes.capture import hold, note, recording
+from softmpm.schemes.capture import defer_status_check, is_capturing, keep_alive
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.failure_report import raise_failure
-from softmpm.schemes.launch import Launcher
+from softmpm.schemes.launch import KernelLauncher
 from softmpm.state import GridField, State
 
 
@@ -38,7 +38,7 @@ def _units(model: Model, mass: Tensor, state: State) -> Tensor:
 
 def _sums(model: Model, state: State, watch: Tensor) -> Tensor:
     """Momentum and mass of the nodes, (world, node, dim + 1)."""
-    launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
     t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.particle_count)
     mass, words = passing(model.mass, t.real), passing(watch, wp.int64)
     moving = _particles(model, *(tensor.contiguous() for tensor in (state.x, state.v, state.C)))
@@ -59,15 +59,15 @@ def rasterize_nodes(model: Model, state: State) -> GridField:
     """Mass (world, *nodes) and velocity (world, *nodes, dim) of what :func:`softmpm.rasterize` sees."""
     watch = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
     node = _sums(model, state, watch)
-    if recording(model):
-        note(watch)
-        hold(model)
+    if is_capturing(model):
+        defer_status_check(watch)
+        keep_alive(model)
     else:
         raise_failure(model, watch.tolist(), state)
     grid = model.scene.grid.shape
     velocity = node.new_empty(model.worlds, model.dim, *grid).movedim(1, -1)  # in memory as in a picture
     field = GridField(node.new_empty(model.worlds, *grid), velocity)
-    launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
     nodes = passing(node, types(model.dim, model.spec.dtype).node)
     launch(kernels.divide, (model.worlds, model.node_count), nodes, *_nodes(model, *field))
     return field
@@ -80,7 +80,7 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
     Raises:
         UnstableError: An adjoint is not finite.
     """
-    launch, kernels = Launcher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
     t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.node_count)
     adj_node = passing(field.mass.new_empty(*lead, model.dim + 1), t.node)
     launch(kernels.divide_adj, lead, *_nodes(model, *field, *adj), adj_node)
@@ -96,8 +96,8 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
 def _raise_gradient_failure(model: Model, adj: GridField, adj_moving: list[Tensor]) -> None:
     """Raise for the first particle whose adjoint is not finite; reads back once."""
     bad = ~torch.stack([torch.isfinite(tensor).flatten(2).all(-1) for tensor in adj_moving]).all(0)
-    if recording(model):
-        note(torch.where(bad.any(1), 0, NEVER))
+    if is_capturing(model):
+        defer_status_check(torch.where(bad.any(1), 0, NEVER))
         return
     if not bool(bad.any()):
         return

@@ -1,4 +1,4 @@
-"""Many substeps: chunk after chunk, what is kept on the way forward, what runs again on the way back."""
+"""Time integration over chunks of substeps: checkpointing in the forward pass, recomputation in the backward pass."""
 
 import threading
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ from torch import Tensor
 
 from softmpm.alarms import Failures
 from softmpm.errors import NEVER
-from softmpm.kernels.structs import Wanted
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning import checkpointing
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import Plan, memory, plan
 from softmpm.runner import Runner
 from softmpm.schemes.buffers import Solid, SolidAdj
-from softmpm.schemes.capture import alone, hold, note, recording
+from softmpm.schemes.capture import defer_status_check, exclusive_capture, is_capturing, keep_alive
 from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.failure_report import Report, raise_gradient_failure
 from softmpm.schemes.scheme import Run
@@ -27,30 +27,30 @@ from softmpm.state import State
 
 @dataclass
 class Trail:
-    """What a call keeps for its backward pass."""
+    """Checkpoints of a call for its backward pass."""
 
     plan: Plan
     chunks: tuple[Chunk, ...]
     start: State
-    """The user's, which is never written to."""
+    """The user's initial state, which is never written to."""
     runs: list[Run] = field(default_factory=list)
-    """Every chunk, if everything is kept."""
+    """All chunks, if every state is retained."""
     states: dict[int, Any] = field(default_factory=dict)
-    """Else the states before some of the chunks, the first of which is the start, until a backward pass takes them."""
+    """Otherwise the checkpointed states, by the chunk that they precede, until a backward pass takes them."""
     turn: threading.Lock = field(default_factory=threading.Lock)
-    """One backward pass at a time."""
+    """Held by the backward pass that is running."""
     frozen: dict[int, int] = field(default_factory=dict)
-    """Worlds that failed, and the substep from which they took no part."""
+    """Worlds that failed, and the substep from which they were inactive."""
 
     def keep(self, run: Run) -> None:
-        """Its end is the call's business: the last one would hold the call's result, and that holds the trail."""
+        """Retain a run without its final state: the last one is the result of the call, which refers to this trail."""
         del run.end
         self.runs.append(run)
 
     @property
     def stays(self) -> tuple[int, ...]:
-        """The chunks before which the state is kept."""
-        return checkpointing.kept_first(len(self.chunks), self.plan.slots) if self.plan.slots else ()
+        """Chunks whose initial state is checkpointed."""
+        return checkpointing.initial_checkpoints(len(self.chunks), self.plan.slots) if self.plan.slots else ()
 
 
 @on_its_gpu
@@ -63,7 +63,7 @@ def rollout(
     keep: bool,
     failures: Failures | None = None,
 ) -> tuple[State, Trail | None]:
-    """Run from ``start``. Each chunk is launched before the report of the one before it is read.
+    """Integrate from ``start``. Each chunk is launched before the status of the previous one is read.
 
     Args:
         pull: Activation times strength [Pa], shape (control_step, world, muscle), or None without muscles.
@@ -82,8 +82,8 @@ def rollout(
     runner, inside = Runner(model, pull, solid, failures), keep and chosen.keep_all
     trail.frozen = runner.frozen
     check = runner.check(start)
-    if recording(model):
-        return _recorded(runner, trail, inside), trail if keep else None
+    if is_capturing(model):
+        return _captured(runner, trail, inside), trail if keep else None
     stays = trail.stays
     state: Any = start
     k, before = 0, None
@@ -100,7 +100,7 @@ def rollout(
                 continue
         if before is not None and not runner.settled(*before):
             k, state, before = k - 1, before[0].start, None
-            del run, ahead  # what ran ahead of it is void
+            del run, ahead  # the chunk launched ahead is void
             continue
         if before is not None and inside:
             trail.keep(before[0])
@@ -127,9 +127,9 @@ def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
     return end
 
 
-def _recorded(runner: Runner, trail: Trail, inside: bool) -> State:
-    """:func:`rollout` while PyTorch records a graph: nothing is read back."""
-    hold(runner.model)
+def _captured(runner: Runner, trail: Trail, inside: bool) -> State:
+    """:func:`rollout` while PyTorch captures a graph: nothing is read back."""
+    keep_alive(runner.model)
     state: Any = trail.start
     stays = trail.stays
     for k, chunk in enumerate(trail.chunks):
@@ -150,7 +150,7 @@ def rollout_adj(
     pull: Tensor | None,
     solid: Solid,
     adj_end: State,
-    wanted: Wanted,
+    wanted: RequestedGrads,
 ):
     """Adjoint of :func:`rollout`.
 
@@ -170,11 +170,11 @@ def rollout_adj(
             adj, part = run.vjp(adj, adj_solid, wanted)
             if adj_pull is not None and part is not None:
                 adj_pull[run.chunk.rows] += part
-            if recording(model):
-                note(run.words[: model.worlds].clone())  # a second backward pass uses them anew
+            if is_capturing(model):
+                defer_status_check(run.words[: model.worlds].clone())  # a second backward pass uses them anew
             else:
                 reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
-            del run  # or it would keep its memory while the one before runs again
+            del run  # release its buffers before the previous chunk is recomputed
     for report, last in reports:
         words = report.read()[: model.worlds]
         for world in trail.frozen:
@@ -200,9 +200,9 @@ def _without(frozen: dict[int, int], adj_end: State) -> State:
 
 
 def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:
-    """What the forward pass kept; the trail has it no longer, so that each state is free as soon as it is dropped.
+    """Take the checkpoints out of the trail, so that each state is freed as soon as it is dropped.
 
-    A second backward pass finds nothing there, and the chunks run again first.
+    A second backward pass finds none and recomputes them first.
     """
     states = dict(trail.states)
     trail.states.clear()
@@ -219,14 +219,14 @@ def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:
 
 
 def _inside_out(trail: Trail, runner: Runner) -> Iterator[Run]:
-    """Every chunk as a run that kept what is inside, from the last to the first."""
+    """All chunks as runs that store their states, from the last to the first."""
     if trail.plan.keep_all:
         yield from reversed(trail.runs)
         return
     states = _taken(trail, runner)
     nothing = torch.empty(0)
     hand: Any = State(nothing, nothing, nothing, nothing)
-    for action, k in checkpointing.going_back(len(trail.chunks), trail.plan.slots):
+    for action, k in checkpointing.backward_schedule(len(trail.chunks), trail.plan.slots):
         if action == "restore":
             hand = states[k]
         elif action == "advance":
@@ -240,13 +240,15 @@ def _inside_out(trail: Trail, runner: Runner) -> Iterator[Run]:
 
 
 @contextmanager
-def short_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[None]:
-    """If a call does not fit, gives back what waited for others, and says what it takes."""
+def explain_out_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Iterator[None]:
+    """On ``OutOfMemoryError``, free the cached buffers and add a note with the estimated requirement."""
     try:
         yield
     except torch.OutOfMemoryError as error:
-        with alone(wait=False) as turn:  # else a graph that goes may end another's recording
-            if turn and not recording(model):
+        with exclusive_capture(
+            wait=False
+        ) as turn:  # else destroying a graph could invalidate another thread's capture
+            if turn and not is_capturing(model):
                 model.workspace.release()
         error.add_note(_needs(model, horizon, gradient))
         raise

@@ -1,4 +1,4 @@
-"""Runner of the chunks of one call: runs them by the model's scheme, accepts or repeats them, and locates failures."""
+"""Runs the chunks of one call by the model's scheme, accepts or repeats them, and locates failures."""
 
 import functools
 from typing import Any
@@ -11,7 +11,7 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
 from softmpm.schemes.buffers import Solid
-from softmpm.schemes.capture import note, recording
+from softmpm.schemes.capture import defer_status_check, is_capturing
 from softmpm.schemes.failure_report import Report, failed_worlds, failure
 from softmpm.schemes.registry import SCHEMES
 from softmpm.schemes.scheme import Run, Scheme
@@ -26,7 +26,7 @@ class Runner:
         failures: Takes the failures of worlds, which then stop; None raises them.
 
     Attributes:
-        frozen: Worlds that take no part from a substep on, that one by world.
+        frozen: First inactive substep of each world that failed.
     """
 
     def __init__(self, model: Model, pull: Tensor | None, solid: Solid, failures: Failures | None = None):
@@ -45,8 +45,8 @@ class Runner:
         if not armed(self.model) and self.model.alarms.collapse is None:
             return None
         words = self.scheme.check_start(start, self.pull, self.solid)
-        if recording(self.model):
-            note(words.clone())
+        if is_capturing(self.model):
+            defer_status_check(words.clone())
             return None
         return Report(words)
 
@@ -89,7 +89,9 @@ class Runner:
             try:
                 raise error
             finally:
-                del error  # else it would refer to itself, through this frame, and hold what the frame holds
+                del (
+                    error
+                )  # else it would refer to itself through this frame, and keep the frame's objects alive
         self.failures.errors.append(error)
         self.frozen[error.world] = first
 
@@ -106,7 +108,7 @@ class Runner:
                 pull = None if self.pull is None else self.pull[one.rows][0]
                 return found(reported, world, self.scheme.to_user(single.end), first=one.first, pull=pull)
             state = single.end
-        # Sums in another order may have avoided it; what was reported is true all the same.
+        # Sums in another order may have avoided the failure; the report remains true.
         world = min(self._failed(words), key=lambda w: words[w])
         return found(words, world, at_end, first=run.chunk.first, pull=self._strongest())
 
@@ -122,10 +124,10 @@ class Runner:
         """Run a chunk, and wait until it can be used."""
         while True:
             run = self.run(chunk, start, keep)
-            if recording(self.model):
-                words = run.words[: self.model.worlds].clone()  # the backward pass uses them anew
-                note(words, run.outgrow)
+            if is_capturing(self.model):
+                words = run.words[: self.model.worlds].clone()  # the backward pass overwrites them
+                defer_status_check(words, run.outgrow)
                 return run
             if self.settled(run, Report(run.words)):
                 return run
-            del run  # or its program would be there beside the next one, which has a larger window
+            del run  # release its buffers before those with a larger window are allocated

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from softmpm.errors import MAX_SUBSTEP
-from softmpm.kernels.structs import Wanted, solid_adj_type, types
+from softmpm.kernels.structs import RequestedGrads, solid_adj_type, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import SolidAdj, view
 from softmpm.schemes.device import on_its_gpu, stream_of
@@ -73,10 +73,10 @@ def _advance(model: Model, state_in: WarpState, state_out: WarpState, solid: War
 @on_its_gpu
 def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
     solid.work.stream = stream_of(model.device)
-    wanted = Wanted(material=True, activation=solid.pull is not None)
+    wanted = RequestedGrads(material=True, activation=solid.pull is not None)
     struct = solid_adj_type(model.spec, wanted)()
     struct.mass, struct.mu, struct.lam = solid.mass.grad, solid.mu.grad, solid.lam.grad
-    slots = SolidAdj.zeros(model, Wanted(material=False, activation=wanted.activation))
+    slots = SolidAdj.zeros(model, RequestedGrads(material=False, activation=wanted.activation))
     if slots.slot is not None:
         struct.pull = view(slots.slot, types(model.spec.dim, model.spec.dtype).real)
     now, then = state_in.struct(model), state_out.struct(model)

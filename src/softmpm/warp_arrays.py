@@ -12,7 +12,7 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model, check_model
 from softmpm.schemes.alarm_check import armed, check_end
 from softmpm.schemes.buffers import Motion, Solid, lame, masses, view
-from softmpm.schemes.capture import recording
+from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.failure_report import raise_failure
 from softmpm.schemes.plain.substep import Substep
@@ -173,7 +173,7 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
     check_model(model, "warp_state")
     if state is not None:
         check_state(model, state)
-        if not recording(model):
+        if not is_capturing(model):
             check_finite(state, None)
     return _warp_state(model, model.rest() if state is None else state, requires_grad)
 
@@ -226,7 +226,7 @@ def warp_solid(
     params = model.params() if params is None else params
     check_params(model, params)
     check_row(model, activation)
-    if not recording(model):
+    if not is_capturing(model):
         check_bounds(params, params.density * model.volume, model.mass_unit)
         check_finite(None, activation)
     return _warp_solid(model, params, activation, requires_grad)

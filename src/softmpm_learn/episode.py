@@ -155,7 +155,7 @@ class ClosedLoop:
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
     ) -> tuple[Episode, tuple[Tensor, ...]]:
         """The episode, detached, and the gradient of its mean loss with respect to the parameters of the policy, then to
-        ``free``; overwritten by the next call. A film is not replayed.
+        ``free``; overwritten by the next call. With ``on_frame`` the CUDA graph is bypassed.
 
         Raises:
             softmpm.UnstableError: As :func:`run_episode`.

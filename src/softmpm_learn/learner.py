@@ -16,7 +16,7 @@ MANY = 512
 
 
 class Learner:
-    """Learns pictures of grid velocity; the policy looks through :attr:`encoder`."""
+    """Learns pictures of grid velocity; the policy uses :attr:`encoder`."""
 
     def __init__(self, conf: LearningConf, autoencoder: Autoencoder, replay: Replay):
         self.conf, self.autoencoder, self.replay = conf, autoencoder, replay

@@ -204,7 +204,7 @@ class TrainConf:
     seed: int = 0
     """Everything random follows from it: on a CPU, the same seed gives the same run to the last bit."""
     worlds: int = 1
-    """Simulations side by side in each step, of all processes together; more than one pays where goals are random."""
+    """Simulations side by side in each step, of all processes together; useful with random goals."""
     goal_spread: list[float] = field(default_factory=list)
     """Half widths [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
     record_every: int = 10

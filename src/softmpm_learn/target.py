@@ -1,4 +1,4 @@
-"""TargetNetwork: the slowly following copy that a policy looks through while the network itself is in training.
+"""TargetNetwork: the slowly following copy that a policy uses while the network itself is in training.
 
 Mnih et al. 2015, "Human-level control", copy every so often; Lillicrap et al. 2016 move a share of the way, as here:
 

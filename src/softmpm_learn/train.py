@@ -2,7 +2,7 @@
 
 for each iteration:
     optimise   simulate in closed loop, then step policy and design along the gradient of the loss,
-               which passes through every substep, every activation and every look of the encoder
+               which passes through every substep, every activation and every encoder evaluation
     learn      every few iterations: train the autoencoder on the grid velocity of past simulations,
                and let the target network, through which the policy looks, follow it
     save       metrics, recording, checkpoint
@@ -251,8 +251,9 @@ def _length(gradients: Sequence[Tensor]) -> float:
 
 
 def learn(run: Run, seen: Tensor | None) -> dict[str, float]:
-    """Remember what was seen; the learning phase, where one is due. Gives figures for metrics.csv in the first process, which alone
-    does both.
+    """Add the observations to the replay buffer and run a learning phase if one is due; in the first process alone.
+
+    Returns its figures for metrics.csv.
     """
     if run.learner is None or seen is None:
         return {}

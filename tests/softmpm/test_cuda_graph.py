@@ -22,11 +22,11 @@ def test_one_records_at_a_time():
 
     def another():
         for wait in (False, True):
-            with capture.alone(wait) as turn:
+            with capture.exclusive_capture(wait) as turn:
                 turns.put((turn, gc.isenabled()))
 
     thread = threading.Thread(target=another, daemon=True)
-    with capture.alone(wait=True):
+    with capture.exclusive_capture(wait=True):
         thread.start()
         assert turns.get(timeout=10) == (False, False)
         with pytest.raises(queue.Empty):
@@ -43,8 +43,8 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
     inputs = busy_inputs(built)
     run(softmpm.simulate, built, inputs, 5).x.sum().backward()
     for module in (autograd, fast_scheme, chunk_graph, rollout, runner):
-        monkeypatch.setattr(module, "recording", lambda model: True)
-    with capture.opened_ledger() as ledger:
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    with capture.collected_resources() as ledger:
         end = run(softmpm.simulate, built, inputs, 5)
         torch.autograd.grad((end.x[0, 1] * torch.inf).sum(), inputs["v"], retain_graph=True)
         torch.autograd.grad(end.x.sum(), inputs["v"])
@@ -62,7 +62,7 @@ def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
         raise RuntimeError("not now")
 
     monkeypatch.setattr(softmpm.Graph, "_run", lambda self, stream: did.append("run"))
-    monkeypatch.setattr(softmpm.Graph, "_record", record)
+    monkeypatch.setattr(softmpm.Graph, "_capture", record)
     for _ in range(2):
         graph()
         with pytest.raises(RuntimeError, match="not now"):
@@ -83,6 +83,6 @@ def test_a_recording_inside_another_is_refused():
     inner = softmpm.Graph(work, model.device)
     outer = softmpm.Graph(inner, model.device)
     want = outer()
-    with pytest.raises(RuntimeError, match="being recorded already: call the inner one's work itself"):
+    with pytest.raises(RuntimeError, match="being captured already: call the inner graph's function"):
         outer()
     assert_relative(inner(), want, 2e-5)

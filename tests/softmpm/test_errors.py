@@ -37,9 +37,9 @@ def test_leaving_the_grid_names_particle_world_and_substep(device):
         and "off the grid" in str(error)
         and "1.05" in str(error)
     )
-    calm = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
+    reset_status = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
     for name in "xvCF":
-        assert torch.equal(getattr(error.state, name)[:2], getattr(calm, name)[:2]), name
+        assert torch.equal(getattr(error.state, name)[:2], getattr(reset_status, name)[:2]), name
 
 
 def test_a_start_that_is_inverted_is_named(device):
@@ -50,8 +50,8 @@ def test_a_start_that_is_inverted_is_named(device):
     error = fails(model, start)
     assert (error.kind, error.world, error.particle, error.substep) == ("start", 1, 2, 0)
     assert "det F = -1 in the start state" in str(error) and "not inverted" in str(error)
-    calm = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
-    assert_relative(error.state.x[0], calm.x[0], 1e-6)  # the other world went on to the end
+    reset_status = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
+    assert_relative(error.state.x[0], reset_status.x[0], 1e-6)  # the other world went on to the end
     model = single("fixed_corotated", device, alarms=softmpm.Alarms(collapse=None))
     start = model.rest()
     start.F[0, 2] = -start.F[0, 2].flip(-1)
@@ -148,13 +148,13 @@ def test_a_world_that_fails_leaves_the_others_alone(device):
     model = single(worlds=8, device=device)
     start = model.rest()
     start.v.add_(torch.linspace(-0.5, 0.5, 8, device=device)[:, None, None])
-    calm = softmpm.simulate(model, start, None, model.params(), substeps=30)
+    reset_status = softmpm.simulate(model, start, None, model.params(), substeps=30)
     start.v[3, 0] = torch.tensor([500.0, 0.0], device=device)
     error = fails(model, start, substeps=30)
     others = [0, 1, 2, 4, 5, 6, 7]
     assert error.world == 3
     for name in "xvCF":
-        got, want = getattr(error.state, name)[others], getattr(calm, name)[others]
+        got, want = getattr(error.state, name)[others], getattr(reset_status, name)[others]
         if device == "cpu":
             assert torch.equal(got, want), name
         else:

@@ -19,7 +19,7 @@ from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradien
 
 import softmpm
 from softmpm import autograd
-from softmpm.kernels.structs import Wanted, adj_module, solid_types
+from softmpm.kernels.structs import RequestedGrads, adj_module, solid_types
 from softmpm.planning.chunks import Horizon
 from softmpm.scene.scene import CONTACTS
 from softmpm.schemes.buffers import SolidAdj, passing
@@ -86,7 +86,9 @@ def _source(model, folder) -> str:
 def test_what_a_scene_lacks_is_not_stored():
     """Bytes of the adjoint follow what is asked for; a passive scene has no pull, a model without laws mixed no index."""
     model = softmpm.build(busy_scene(2), device="cpu")
-    nothing, everything = (SolidAdj.zeros(model, Wanted(material=w, activation=w)) for w in (False, True))
+    nothing, everything = (
+        SolidAdj.zeros(model, RequestedGrads(material=w, activation=w)) for w in (False, True)
+    )
     assert all(getattr(nothing, name) is None for name in ("mass", "mu", "lam", "slot"))
     assert everything.slot.shape == (1, model.particle_count, 2)
     passive = softmpm.build(plain_scene(), device="cpu")
@@ -119,8 +121,8 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
     a = softmpm.build(busy_scene(2, seed=0), device="cpu").spec
     b = softmpm.build(busy_scene(2, seed=5, dt=2e-3), device="cpu").spec
     assert a == b and a.module == b.module
-    wanted = Wanted(material=True, activation=False)
-    assert adj_module(a, wanted) != adj_module(a, Wanted(material=False, activation=False))
+    wanted = RequestedGrads(material=True, activation=False)
+    assert adj_module(a, wanted) != adj_module(a, RequestedGrads(material=False, activation=False))
 
 
 def test_modules_of_many_walls_have_names_short_enough_for_files():
@@ -128,7 +130,7 @@ def test_modules_of_many_walls_have_names_short_enough_for_files():
     kinds = itertools.islice(itertools.cycle(CONTACTS), 64)
     walls = [softmpm.Wall(normal=(0, 1), offset=0.3, contact=kind) for kind in kinds]
     spec = softmpm.build(busy_scene(2, walls=walls), device="cpu", deterministic=True).spec
-    name = adj_module(spec, Wanted(material=True, activation=True)) + ".fused.few"
+    name = adj_module(spec, RequestedGrads(material=True, activation=True)) + ".fused.few"
     assert len(f"wp_{name}_1234567_p1234567_t123456789012345") <= 255
     fewer = dataclasses.replace(spec, contacts=spec.contacts[1:])
     assert spec.module != fewer.module

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def boundary(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, Scale, Motion = t.real, t.vec, t.mat, t.ivec, t.Scale, t.Motion

@@ -11,14 +11,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.convert import boundary
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def raster(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
     real, vec, mat, node_vec, Scale = t.real, t.vec, t.mat, t.node, t.Scale

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 LETTER = {"stick": "k", "slip": "l", "separate": "s"}
@@ -39,7 +39,7 @@ class Spec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
+class RequestedGrads:
     """Which gradients a backward pass computes besides those of the start; the others are not compiled or stored."""
 
     material: bool
@@ -65,7 +65,7 @@ def packed_rows(dim: int) -> Rows:
     return Rows(0, dim, 2 * dim, 3 * dim, 3 * dim + dim * dim, 3 * dim + 2 * dim * dim)
 
 
-@once
+@kernel_factory
 def types(dim: int, dtype: str) -> SimpleNamespace:
     """Scalar, vector, matrix and struct types of one dimension and precision."""
     real: Any = DTYPES[dtype]
@@ -159,7 +159,7 @@ def _struct(name: str, module: str, annotations: dict):
     return wp.struct(type(name, (), {"__annotations__": annotations}), module=module)
 
 
-@once
+@kernel_factory
 def solid_types(spec: Spec) -> SimpleNamespace:
     """Structs of the material and the walls: only the fields that this scene needs."""
     t = types(spec.dim, spec.dtype)
@@ -190,8 +190,8 @@ def solid_types(spec: Spec) -> SimpleNamespace:
     )
 
 
-@once
-def solid_adj_type(spec: Spec, wanted: Wanted):
+@kernel_factory
+def solid_adj_type(spec: Spec, wanted: RequestedGrads):
     """Struct of the gradients that are wanted besides those of the start."""
     t = types(spec.dim, spec.dtype)
     fields = {}
@@ -204,7 +204,7 @@ def solid_adj_type(spec: Spec, wanted: Wanted):
     return _struct("SolidAdj", adj_module(spec, wanted), fields)
 
 
-def adj_module(spec: Spec, wanted: Wanted) -> str:
+def adj_module(spec: Spec, wanted: RequestedGrads) -> str:
     """Name of the Warp module that holds the adjoint kernels."""
     return ".".join(
         [spec.module, "adj", *(name for name in ("material", "activation") if getattr(wanted, name))]

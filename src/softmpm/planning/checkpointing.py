@@ -1,4 +1,4 @@
-"""Which states a long gradient keeps, and which stages it runs again: binomial checkpointing.
+"""Binomial checkpointing: which states a long gradient stores, and which stages it recomputes.
 
 Griewank & Walther 2000, "Algorithm 799: revolve". A chain of l stages is pulled back from the last to the
 first; stage i needs the state before it, and s of these states can be kept at once, the first one included.
@@ -35,8 +35,8 @@ class Action(NamedTuple):
     """The stage itself, or the state before it."""
 
 
-def kept_first(stages: int, slots: int) -> tuple[int, ...]:
-    """The stages before which the first forward sweep keeps the state; the first of them is 0.
+def initial_checkpoints(stages: int, slots: int) -> tuple[int, ...]:
+    """Stages whose initial state the forward sweep checkpoints; the first of them is 0.
 
     Args:
         stages: Length of the chain.
@@ -55,16 +55,16 @@ def kept_first(stages: int, slots: int) -> tuple[int, ...]:
     return tuple(kept)
 
 
-def going_back(stages: int, slots: int) -> Iterator[Action]:
-    """What the backward pass does with the states of :func:`kept_first`, in order; at the end none is kept.
+def backward_schedule(stages: int, slots: int) -> Iterator[Action]:
+    """What the backward pass does with the states of :func:`initial_checkpoints`, in order; at the end none is kept.
 
-    No schedule for as many slots has fewer ``advance``. Arguments and errors as in :func:`kept_first`.
+    No schedule for as many slots has fewer ``advance``. Arguments and errors as in :func:`initial_checkpoints`.
     """
-    return _going_back(list(kept_first(stages, slots)), stages, slots)
+    return _going_back(list(initial_checkpoints(stages, slots)), stages, slots)
 
 
 def recomputed(stages: int, slots: int) -> int:
-    """How many ``advance`` :func:`going_back` has, (B4); 0 if each stage has a slot."""
+    """How many ``advance`` :func:`backward_schedule` has, (B4); 0 if each stage has a slot."""
     _check(stages, slots)
     r = _repeats(stages + 1, slots)
     return r * (stages + 1) - _reach(slots + 1, r - 1) - stages

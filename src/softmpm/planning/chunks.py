@@ -1,4 +1,4 @@
-"""How the substeps of a call are cut into chunks; a chunk runs, and is pulled back, as one."""
+"""Partition of a call into chunks of substeps; a chunk is launched, and differentiated, as a whole."""
 
 import functools
 import math
@@ -45,7 +45,7 @@ class Horizon:
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - keeps numbers, not what is simulated
     def chunks(self, longest: int) -> tuple[Chunk, ...]:
-        """Whole control steps as far as they fit, or equal parts of one: few shapes, so that few programs are made."""
+        """Whole control steps as far as they fit, or equal parts of one: few shapes, so that few chunk graphs are captured."""
         if self.substeps <= longest:
             length = self.substeps * (longest // self.substeps)
             starts = range(0, self.total, length)

@@ -1,6 +1,6 @@
-"""How much a differentiable call keeps, and what it runs again instead. Formula and figures: docs/memory.md.
+"""Memory plan of a differentiable call: which states are checkpointed and which are recomputed. Formula: docs/memory.md.
 
-A call is cut into chunks. To pull a chunk back, what is inside it must be there: its states and the mass and momentum of the
+A call is divided into chunks. The backward pass of a chunk needs all of its intermediate states and the mass and momentum of the
 nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
 
     keep all:  everything inside all chunks, N (S + G) and one S for each; nothing runs twice

@@ -163,7 +163,7 @@ class Scene:
     bodies: Sequence[Body]
     muscles: Sequence[Muscle] = ()
     walls: Sequence[Wall] = ()
-    """They act one after the other, at most 64."""
+    """Applied in this order; at most 64."""
     gravity: Sequence[float] | None = None
     """Gravity g [m/s²], one number per axis; None is weightless."""
     damping: float = 0.0

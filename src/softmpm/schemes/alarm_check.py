@@ -11,7 +11,7 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import Solid, slot, slots_in, view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.launch import Command
+from softmpm.schemes.launch import RebindableLaunch
 from softmpm.state import State
 
 
@@ -37,7 +37,7 @@ class StartCheck:
         neighbours, words = view(model.neighbours, wp.int32), view(self.words, wp.int64)
         inputs = (model.scale, solid, neighbours, -1, *places, words)
         lead = (model.worlds, model.particle_count)
-        self._check = Command(model, state_alarms(model.spec), lead, inputs, [*slots, *places])
+        self._check = RebindableLaunch(model, state_alarms(model.spec), lead, inputs, [*slots, *places])
 
     def __call__(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
         """The words, after the check has been launched.

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.structs import Wanted, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, solid_adj_type, solid_types, types
 from softmpm.model import Model
 from softmpm.state import Params
 
@@ -37,7 +37,7 @@ def passing(tensor: Tensor, dtype):
 
 
 def slot(model: Model, dtype, *size: int):
-    """As :func:`passing`, for contiguous tensors that come later, see :class:`softmpm.replay.Command`.
+    """As :func:`passing`, for contiguous tensors that come later, see :class:`softmpm.schemes.launch.RebindableLaunch`.
 
     Args:
         size: Of the tensors, without the last axes of vectors and matrices; (world, particle) if nothing is said.
@@ -186,7 +186,7 @@ class SolidAdj:
     Those of the material lie in one tensor, ``material``, so that they are cleared at once.
     """
 
-    wanted: Wanted
+    wanted: RequestedGrads
     material: Tensor | None = None
     mass: Tensor | None = None
     mu: Tensor | None = None
@@ -194,7 +194,7 @@ class SolidAdj:
     slot: Tensor | None = None
 
     @staticmethod
-    def zeros(model: Model, wanted: Wanted) -> "SolidAdj":
+    def zeros(model: Model, wanted: RequestedGrads) -> "SolidAdj":
         lead, kind = (model.worlds, model.particle_count), {"dtype": model.dtype, "device": model.device}
         adj = SolidAdj(wanted)
         if wanted.material:

@@ -11,22 +11,24 @@ from softmpm.model import Model
 from softmpm.schemes.failure_report import outgrown
 
 
-def recording(model: Model) -> bool:
-    """Whether PyTorch is recording a CUDA graph on the current stream: nothing may wait for the device then."""
+def is_capturing(model: Model) -> bool:
+    """Whether PyTorch captures a CUDA graph on the current stream; nothing may wait for the device then."""
     return model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
-_recording = threading.Lock()
+_capture_lock = threading.Lock()
 
 
 @contextlib.contextmanager
-def alone(wait: bool) -> Iterator[bool]:
-    """One recording at a time, and no garbage collected meanwhile: to destroy a graph that waits for the collector would end it.
+def exclusive_capture(wait: bool) -> Iterator[bool]:
+    """Hold the process-wide capture lock with garbage collection disabled.
+
+    The collector may destroy a CUDA graph, which during a capture invalidates that capture.
 
     Yields:
-        Whether it is this one's turn; always, for who waits.
+        Whether the lock was acquired; always True if ``wait``.
     """
-    if not _recording.acquire(blocking=wait):
+    if not _capture_lock.acquire(blocking=wait):
         yield False
         return
     collects = gc.isenabled()
@@ -36,16 +38,17 @@ def alone(wait: bool) -> Iterator[bool]:
     finally:
         if collects:
             gc.enable()
-        _recording.release()
+        _capture_lock.release()
 
 
-class Ledger:
-    """What belongs to a CUDA graph: it must live as long.
+class GraphResources:
+    """Objects that a captured CUDA graph refers to; they must outlive it.
 
     Attributes:
-        words: Watch words of the calls that the graph holds, to be read after each replay, and what to call if they say that a
-            particle left the window; None where there is no window.
-        uses: What the graph reads and writes though it was made before. What is made while it is recorded lies in its own memory.
+        words: Status words of the captured calls, to be read after each replay, each with the function to call if they report
+            that a particle left the window; None in its place without a window.
+        uses: Buffers that the graph reads and writes and that existed before the capture. Tensors that are created during the
+            capture lie in the graph's own memory pool.
     """
 
     def __init__(self):
@@ -53,38 +56,38 @@ class Ledger:
         self.uses: list[object] = []
 
     def widen(self) -> None:
-        """After a replay that failed: see to it that the next recording has larger windows where a particle left one."""
+        """Prepare the next capture, after a replay that failed: larger windows where a particle left one."""
         for words, outgrow in self.words:
             if outgrow and outgrown(words.tolist()):
                 outgrow()
 
 
-_open: list[Ledger] = []
-"""The ledger of the graph that PyTorch is recording, which is one at a time; its backward pass runs in another thread."""
+_open: list[GraphResources] = []
+"""Resources of the graph that is being captured: one at a time, and its backward pass runs in another thread."""
 
 
 @contextlib.contextmanager
-def opened_ledger() -> Iterator[Ledger]:
-    _open.append(Ledger())
+def collected_resources() -> Iterator[GraphResources]:
+    _open.append(GraphResources())
     try:
         yield _open[-1]
     finally:
         _open.pop()
 
 
-def note(words: torch.Tensor, outgrow: Callable[[], None] | None = None) -> None:
-    """Leave the reading of these words, one for each world, to whoever replays the graph being recorded; see :class:`Ledger`."""
-    _ledger().words.append((words, outgrow))
+def defer_status_check(words: torch.Tensor, outgrow: Callable[[], None] | None = None) -> None:
+    """Check these status words, one for each world, after each replay of the graph that is being captured."""
+    _resources().words.append((words, outgrow))
 
 
-def hold(used: object) -> None:
-    """Let what was made before live as long as the graph that is being recorded."""
-    _ledger().uses.append(used)
+def keep_alive(used: object) -> None:
+    """Keep an object alive as long as the graph that is being captured."""
+    _resources().uses.append(used)
 
 
-def _ledger() -> Ledger:
+def _resources() -> GraphResources:
     if not _open:
         raise RuntimeError(
-            "softmpm cannot tell whether a simulation fails inside a CUDA graph of your own: record it with softmpm.Graph."
+            "softmpm cannot report failures inside a CUDA graph of your own: capture it with softmpm.Graph."
         )
     return _open[-1]

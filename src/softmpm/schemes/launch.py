@@ -1,4 +1,4 @@
-"""Kernel launches that are made once and then repeated: one on other tensors each time, or a list on fixed ones as a graph."""
+"""Repeated kernel launches: single ones with other arrays each time, and lists on fixed arrays, captured as CUDA graphs."""
 
 import functools
 import threading
@@ -9,11 +9,11 @@ import warp as wp
 
 from softmpm.kernels.compile import launch
 from softmpm.model import Model
-from softmpm.schemes.capture import alone, recording
+from softmpm.schemes.capture import exclusive_capture, is_capturing
 
 
-class Launcher:
-    """Launches kernels on one stream, or collects the launches to be repeated later."""
+class KernelLauncher:
+    """Launches kernels on one stream, or collects the launches so that they can be repeated."""
 
     def __init__(self, model: Model, stream: wp.Stream | None, collected: list | None = None):
         self.device, self.stream, self.collected = model.wp_device, stream, collected
@@ -26,12 +26,12 @@ class Launcher:
             self.collected.append(made)
 
 
-class Command:
-    """A launch on other tensors each time: only their addresses are put in.
+class RebindableLaunch:
+    """A recorded kernel launch whose array arguments are rebound by address before each launch.
 
     Args:
-        inputs: Of the kernel, some of which are slots, or structs that hold slots.
-        slots: These, from :func:`softmpm.buffers.slot`; each is filled in place, so they belong to this command alone.
+        inputs: Inputs of the kernel, some of which are placeholders, or structs that hold placeholders.
+        slots: The placeholders, from :func:`softmpm.schemes.buffers.slot`. They are written in place, so no other launch may use them.
     """
 
     def __init__(self, model: Model, kernel, dim, inputs: Sequence, slots: Sequence):
@@ -41,9 +41,9 @@ class Command:
         self._launch, self._filling = made, threading.Lock()
 
     def __call__(self, stream: wp.Stream | None, *tensors: torch.Tensor) -> None:
-        """Launch it on contiguous tensors of the slots' shapes and precision.
+        """Launch on contiguous tensors of the placeholders' shapes and precision.
 
-        A backward pass runs in a thread of its own and shares commands with that of the call: one of them at a time.
+        A backward pass runs in a thread of its own and shares launches with the thread of the call, hence the lock.
         """
         assert all(tensor.is_contiguous() for tensor in tensors)
         with self._filling:
@@ -52,13 +52,13 @@ class Command:
             self._launch.launch(stream)
 
 
-class Replay:
-    """Runs ``launches(launcher)`` the first time to record it, as a CUDA graph or, on the CPU, as a list of launches.
+class LaunchReplay:
+    """Captures ``launches(launcher)`` on first use, as a CUDA graph or, on the CPU, as a list of launches, and replays it.
 
-    It is given the launches each time and does not hold them: whoever makes them holds it.
+    The function is passed at each use and not stored, since its owner holds this object.
 
-    While PyTorch itself records a CUDA graph, the launches become part of that one. Warp's CPU graphs would be faster still, but
-    take up what other threads launch meanwhile.
+    While PyTorch captures a CUDA graph, the launches become part of that graph. Warp's CPU graphs would be faster still, but they
+    also capture what other threads launch meanwhile.
     """
 
     def __init__(self, model: Model):
@@ -66,42 +66,42 @@ class Replay:
         self._graph: wp.Graph | None = None
         self._list: list | None = None
 
-    def run(self, stream: wp.Stream | None, launches: Callable[[Launcher], None]) -> None:
+    def run(self, stream: wp.Stream | None, launches: Callable[[KernelLauncher], None]) -> None:
         if stream is None:
             self._run_list(launches)
-        elif recording(self.model):
-            launches(Launcher(self.model, stream))
+        elif is_capturing(self.model):
+            launches(KernelLauncher(self.model, stream))
         else:
             if self._graph is None:
                 self._graph = self._record(launches)
             if self._graph is None:
-                launches(Launcher(self.model, stream))
+                launches(KernelLauncher(self.model, stream))
             else:
                 wp.capture_launch(self._graph, stream=stream)
 
-    def _run_list(self, launches: Callable[[Launcher], None]) -> None:
+    def _run_list(self, launches: Callable[[KernelLauncher], None]) -> None:
         if self._list is None:
             collected = []
-            launches(Launcher(self.model, None, collected))
+            launches(KernelLauncher(self.model, None, collected))
             self._list = collected  # only now: an interruption, while they compile, would leave a part of it
         for command in self._list:
             command.launch()
 
-    def _record(self, launches: Callable[[Launcher], None]) -> wp.Graph | None:
-        """The graph, or None while another thread records, which may be waiting for this one."""
-        with alone(wait=False) as turn:
+    def _record(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
+        """The captured graph; None if another thread is capturing: waiting for it could deadlock."""
+        with exclusive_capture(wait=False) as turn:
             if not turn:
                 return None
             stream = _recorder(self.model.device)
             with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-                launches(Launcher(self.model, stream))
+                launches(KernelLauncher(self.model, stream))
             assert capture.graph is not None
             return capture.graph
 
 
 @functools.lru_cache(maxsize=None)
 def _recorder(device: torch.device) -> wp.Stream:
-    """Where programs are recorded, one at a time. Of high priority, since those are few: PyTorch hands its streams out again and
-    again, and what another thread launches on one that records would become part of the recording.
+    """Stream on which chunk graphs are captured, one at a time. PyTorch reuses the streams of its pools, and what another thread
+    launches on a capturing stream would become part of the graph; the pool of high priority is hardly used.
     """
     return wp.stream_from_torch(torch.cuda.Stream(device, priority=-1))

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Protocol, Self
 
 from torch import Tensor
 
-from softmpm.kernels.structs import Wanted
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
@@ -28,7 +28,7 @@ class Run(Protocol):
     words: Tensor
     outgrow: Callable[[], None] | None
 
-    def vjp(self, adj_end: Any, adj_solid: SolidAdj, wanted: Wanted) -> tuple[Any, Tensor | None]:
+    def vjp(self, adj_end: Any, adj_solid: SolidAdj, wanted: RequestedGrads) -> tuple[Any, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``. Needs a run that kept its states."""
         ...
 

@@ -7,7 +7,7 @@ from math import comb
 
 import pytest
 
-from softmpm.planning.checkpointing import _split, going_back, kept_first, recomputed
+from softmpm.planning.checkpointing import _split, backward_schedule, initial_checkpoints, recomputed
 
 SMALL = [(stages, slots) for stages in range(1, 31) for slots in range(1, 9)]
 LARGE = [
@@ -24,9 +24,9 @@ LARGE = [
 
 def simulate(stages: int, slots: int) -> int:
     """Executes the schedule on states that are just their place in the chain; the number of advances."""
-    kept, hand, left, advances = set(kept_first(stages, slots)), None, stages, 0
+    kept, hand, left, advances = set(initial_checkpoints(stages, slots)), None, stages, 0
     assert 0 in kept and len(kept) <= slots
-    for kind, stage in going_back(stages, slots):
+    for kind, stage in backward_schedule(stages, slots):
         if kind == "restore":
             assert stage in kept
             hand = stage
@@ -124,32 +124,32 @@ def test_binomial_formula():
 @pytest.mark.parametrize("more", [0, 1, 50])
 def test_a_slot_for_each_stage_recomputes_nothing(stages, more):
     slots = stages + more
-    assert kept_first(stages, slots) == tuple(range(stages))
+    assert initial_checkpoints(stages, slots) == tuple(range(stages))
     assert recomputed(stages, slots) == simulate(stages, slots) == 0
 
 
 @pytest.mark.parametrize("stages", [1, 2, 9, 1000])
 def test_one_slot_starts_over_for_each_stage(stages):
-    assert kept_first(stages, 1) == (0,)
+    assert initial_checkpoints(stages, 1) == (0,)
     assert recomputed(stages, 1) == stages * (stages - 1) // 2
 
 
 @pytest.mark.parametrize("stages, slots", LARGE)
 def test_the_first_sweep_keeps_in_order_and_fills_the_slots(stages, slots):
-    kept = kept_first(stages, slots)
+    kept = initial_checkpoints(stages, slots)
     assert kept[0] == 0 and kept[-1] < stages and len(kept) == min(stages, slots)
     assert all(a < b for a, b in pairwise(kept))
 
 
 def test_a_schedule_in_full():
-    assert kept_first(4, 2) == (0, 2)
-    assert [f"{kind} {stage}" for kind, stage in going_back(4, 2)] == [
+    assert initial_checkpoints(4, 2) == (0, 2)
+    assert [f"{kind} {stage}" for kind, stage in backward_schedule(4, 2)] == [
         *["restore 2", "advance 2", "pull_back 3", "restore 2", "pull_back 2", "drop 2"],
         *["restore 0", "advance 0", "pull_back 1", "restore 0", "pull_back 0", "drop 0"],
     ]
 
 
-@pytest.mark.parametrize("function", [kept_first, going_back, recomputed])
+@pytest.mark.parametrize("function", [initial_checkpoints, backward_schedule, recomputed])
 def test_arguments(function):
     with pytest.raises(ValueError, match="stages must be at least 1, got 0; an empty chain"):
         function(0, 3)

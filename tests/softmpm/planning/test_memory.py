@@ -8,7 +8,7 @@ import torch
 from helpers import busy_scene
 
 import softmpm
-from softmpm.planning.checkpointing import going_back
+from softmpm.planning.checkpointing import backward_schedule
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import Plan, Sizes, default_budget, plan, price_of_chunk
 
@@ -18,7 +18,7 @@ SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4,
 def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
     """Substeps that run again before their pull-back, and how many chunks run in all, by going through the moves."""
     chunks = horizon.chunks(chosen.longest)
-    moves = list(going_back(len(chunks), chosen.slots))
+    moves = list(backward_schedule(len(chunks), chosen.slots))
     substeps = sum(chunks[move.stage].length for move in moves if move.kind == "advance")
     return substeps, len(chunks) + sum(move.kind in ("advance", "pull_back") for move in moves)
 

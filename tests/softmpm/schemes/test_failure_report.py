@@ -33,10 +33,10 @@ def test_a_failed_world_stops_and_the_others_go_on(policy, scheme, device):
     with pytest.raises(softmpm.UnstableError) as caught:
         simulate(model, bad)
     failures = softmpm.Failures(policy)
-    end, calm = simulate(model, bad, failures=failures), simulate(model, start)
+    end, reset_status = simulate(model, bad, failures=failures), simulate(model, start)
     assert len(failures) == 1 and failures.worlds == [1] and str(failures.errors[0]) == str(caught.value)
     for name in FIELDS:
-        got, want = getattr(end, name), getattr(calm, name)
+        got, want = getattr(end, name), getattr(reset_status, name)
         if model.device.type == "cpu":
             assert torch.equal(got[[0, 2]], want[[0, 2]]), name
         else:

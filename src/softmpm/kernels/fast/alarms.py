@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import native, native_module
 from softmpm.kernels.physics import status
@@ -13,7 +13,7 @@ from softmpm.kernels.physics.alarms import alarm
 from softmpm.kernels.structs import Spec, solid_types, types
 
 
-@once
+@kernel_factory
 def packed_alarms(spec: Spec) -> SimpleNamespace:
     """The same for the packed particles of the fast scheme, at the end of a chunk."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)

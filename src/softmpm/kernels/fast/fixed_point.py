@@ -9,13 +9,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import native, native_module
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def fixed(dim: int) -> SimpleNamespace:
     """In single precision: double has more digits than such sums keep."""
     t, n, s = types(dim, "float32"), native(dim, "float32"), stencil(dim, "float32")

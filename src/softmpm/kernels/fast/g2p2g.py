@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import BLOCK, native, native_module
@@ -29,7 +29,7 @@ from softmpm.kernels.physics.particle import particle
 from softmpm.kernels.structs import Spec, solid_types, types
 
 
-@once
+@kernel_factory
 def fused(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
@@ -43,7 +43,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum, moved = one.rotation, one.affine_momentum, one.moved
     node_velocity = grid(spec).node_velocity
-    running, complain = status.report(spec.dim, spec.dtype).running, status.check(spec).complain
+    running, report_invalid = status.report(spec.dim, spec.dtype).running, status.check(spec).report_invalid
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     exact, give, not_finite = spec.deterministic, fixed(dim).give, int(Kind.NOT_FINITE)
     take = fixed(dim).take if exact else load_node
@@ -178,7 +178,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         # Out, added into:
         node: Shares,
     ):
-        # A lane without a particle follows the last one and leaves nothing behind: no branch around all that.
+        # Idle lanes recompute the last particle and skip the stores, which avoids a divergent branch.
         place = particle_of(wp.tid(), crew, total)
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
@@ -216,7 +216,7 @@ def fused(spec: Spec) -> SimpleNamespace:
                 store_mat(then.rows, i, row_H, new.H)
                 store_mat(then.rows, i, row_C, new.C)
                 if not new.sound:
-                    complain(watch, scale, world, order[i], substep, new.fx, new.base, new.H)
+                    report_invalid(watch, scale, world, order[i], substep, new.fx, new.base, new.H)
             else:
                 stay(i, now, then)
         if not last:

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
@@ -24,11 +24,11 @@ from softmpm.kernels.fast.native import BLOCK, native, native_module
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.particle import particle, particle_adj
-from softmpm.kernels.structs import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_type, solid_types, types
 
 
-@once
-def fused_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+@kernel_factory
+def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one, twin = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
     Scale, Packed, Window, ParticleAdj = t.Scale, t.Packed, t.Window, twin.ParticleAdj

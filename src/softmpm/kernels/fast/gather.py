@@ -12,12 +12,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.native import WARP, native
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def stencil(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import native
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def stencil_adj(dim: int, dtype: str) -> SimpleNamespace:
     t, one = types(dim, dtype), stencil(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned

@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from softmpm.kernels.compile import once
-from softmpm.kernels.structs import Spec, Wanted, adj_module, solid_adj_type, solid_types
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_type, solid_types
 
 
-@once
+@kernel_factory
 def sorted_solid(spec: Spec):
     """Kernel that puts the material into the order of the packed particles."""
     Solid, mixed, slots = solid_types(spec).Solid, len(spec.laws) > 1, spec.muscle_slots
@@ -35,8 +35,8 @@ def sorted_solid(spec: Spec):
     return sort
 
 
-@once
-def sorted_solid_adj(spec: Spec, wanted: Wanted):
+@kernel_factory
+def sorted_solid_adj(spec: Spec, wanted: RequestedGrads):
     """Twin of :func:`sorted_solid` for what is wanted of the material: adds to the particle what its place found."""
     SolidAdj = solid_adj_type(spec, wanted)
 

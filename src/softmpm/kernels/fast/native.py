@@ -1,4 +1,4 @@
-"""What Warp's language cannot say: 16-byte loads and reductions, and the sum over a warp. The code is in scatter.h and fixed_point.h.
+"""Native functions that Warp's language cannot express: 16-byte loads and reductions, sums over a warp. Code: scatter.h, fixed_point.h.
 
 Everything has a plain form as well, for the CPU, for double precision and for GPUs before sm_90, chosen when it is compiled.
 """
@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.structs import types
 
 HEADERS = [Path(__file__).with_name(name) for name in ("scatter.h", "fixed_point.h")]
@@ -17,7 +17,7 @@ WARP = 32
 BLOCK = 128
 """Threads of a block."""
 FEW, VERY_FEW = 20_000, 10_000
-"""Up to so many particles have kernels of their own in blocks of one warp, and a warp may have some for half of its threads only."""
+"""Up to ``FEW`` particles: separate kernels with one-warp blocks. Up to ``VERY_FEW``: half-populated warps."""
 
 
 def padded(particles: int) -> int:
@@ -37,7 +37,7 @@ def native_module(name: str) -> str:
     return name
 
 
-@once
+@kernel_factory
 def native(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, node_vec, rows = t.real, t.vec, t.mat, t.ivec, t.aligned, t.rows

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.convert import boundary
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import native, native_module
@@ -17,7 +17,7 @@ from softmpm.kernels.physics import status
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def packing(dim: int, dtype: str) -> SimpleNamespace:
     t, b, n, s = types(dim, dtype), boundary(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import WARP, native, native_module
 from softmpm.kernels.physics import status
@@ -18,7 +18,7 @@ SAMPLES = 50_000
 """Particles of which it is counted whether their cell is another one than that of the particle before."""
 
 
-@once
+@kernel_factory
 def sorting(dim: int, dtype: str) -> SimpleNamespace:
     t, n, s = types(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, ivec = t.real, t.vec, t.ivec

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.structs import Spec, types
 
 COLLECTORS = 8_192
@@ -18,7 +18,7 @@ def collectors(slots: Sequence[int]) -> tuple[int, int, int]:
     return worlds, min(particles, COLLECTORS), count
 
 
-@once
+@kernel_factory
 def collect_pull(spec: Spec):
     """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
     t = types(spec.dim, spec.dtype)
@@ -55,7 +55,7 @@ PARTS = 256
 """Partial sums of a muscle's pull, each of every 256th particle."""
 
 
-@once
+@kernel_factory
 def collect_pull_in_order(spec: Spec) -> SimpleNamespace:
     """As :func:`collect_pull`, in an order that is always the same: ``parts`` of each muscle, then their ``total``."""
     t = types(spec.dim, spec.dtype)

@@ -14,19 +14,19 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.elasticity import elasticity
 from softmpm.kernels.physics.stress import solid, solid_adj
-from softmpm.kernels.structs import Spec, Wanted, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, solid_adj_type, solid_types, types
 
 STEPS = {2: 3, 3: 5}
 """Of Lanczos' iteration. In 2D there are three symmetric G, in 3D six, the last of which no longer moves K by 1 %."""
 
 
-@once
+@kernel_factory
 def alarm(spec: Spec) -> SimpleNamespace:
     """Blocks of one particle: is its step stable, and is a neighbour too far away."""
-    t, wanted = types(spec.dim, spec.dtype), Wanted(material=False, activation=False)
+    t, wanted = types(spec.dim, spec.dtype), RequestedGrads(material=False, activation=False)
     real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
     Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
     rotation, stiffness_bound = solid(spec).rotation, solid(spec).stiffness_bound

@@ -14,11 +14,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.structs import Spec, solid_types, types
 
 
-@once
+@kernel_factory
 def contact(spec: Spec, k: int) -> SimpleNamespace:
     """Wall number ``k``."""
     t = types(spec.dim, spec.dtype)

@@ -27,12 +27,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.polar import polar
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def elasticity(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat

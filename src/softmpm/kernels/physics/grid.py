@@ -11,13 +11,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.contact import contact
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import Spec, solid_types, types
 
 
-@once
+@kernel_factory
 def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, ivec, node_vec, Scale = t.real, t.vec, t.ivec, t.node, t.Scale

@@ -15,14 +15,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.elasticity import elasticity
 from softmpm.kernels.physics.stress import solid, solid_adj
-from softmpm.kernels.structs import Spec, Wanted, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, solid_adj_type, solid_types, types
 
 
-@once
+@kernel_factory
 def particle(spec: Spec) -> SimpleNamespace:
     t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
     real, vec, mat, ivec, Scale, divide = t.real, t.vec, t.mat, t.ivec, t.Scale, t.divide
@@ -83,8 +83,8 @@ def particle(spec: Spec) -> SimpleNamespace:
     )
 
 
-@once
-def particle_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+@kernel_factory
+def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, Scale, divide = t.real, t.vec, t.mat, t.Scale, t.divide
     Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)

@@ -19,7 +19,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.structs import types
 
 NEWTON_STEPS = {"float32": 2, "float64": 3}  # each doubles the digits of a start that has a few
@@ -27,7 +27,7 @@ QUARTIC_STEPS = 40  # an upper bound: at F = I none is taken, elsewhere 3 to 8
 INVERSE_STEPS = 3
 
 
-@once
+@kernel_factory
 def polar(dim: int, dtype: str) -> SimpleNamespace:
     return _polar2(dtype) if dim == 2 else _polar3(dtype)
 

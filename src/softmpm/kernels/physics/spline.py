@@ -15,11 +15,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.structs import types
 
 
-@once
+@kernel_factory
 def spline(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, ivec, node_vec = t.real, t.vec, t.ivec, t.node

@@ -1,18 +1,18 @@
-"""Failures found on the device, and how they are reported: one 64-bit word per world, see softmpm/errors.py."""
+"""Detection of failures on the device, reported as one 64-bit status word per world, see softmpm/errors.py."""
 
 from types import SimpleNamespace
 
 import warp as wp
 
 from softmpm.errors import FROZEN, KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.elasticity import elasticity
 from softmpm.kernels.structs import Spec, types
 
 
-@once
+@kernel_factory
 def report(dim: int, dtype: str) -> SimpleNamespace:
-    """How a kernel asks whether its world still runs, and how it says that it failed."""
+    """Functions that read and write the status word of a world."""
 
     @wp.func
     def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
@@ -29,16 +29,16 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def ran(watch: wp.array(dtype=wp.int64), world: int, substep: int) -> bool:
-        """Whether the world came through the substeps before ``substep``."""
+        """Whether the world has not failed before ``substep``."""
         word = watch[world]
         return word >= wp.int64(substep) << wp.int64(SUBSTEP_SHIFT) and word != wp.int64(FROZEN)
 
     return SimpleNamespace(running=running, ran=ran, report=write)
 
 
-@once
+@kernel_factory
 def check(spec: Spec) -> SimpleNamespace:
-    """What must hold of a new state: finite, on the grid, and not collapsed."""
+    """Validity of a new state: finite, on the grid, not collapsed."""
     t = types(spec.dim, spec.dtype)
     real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
     write, volume_change = report(spec.dim, spec.dtype).report, elasticity(spec.dim, spec.dtype).volume_change
@@ -49,9 +49,9 @@ def check(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
-        """The new state may be kept: ``fx`` as it came, ``base`` as it would be, on ``shape`` nodes from ``corner``.
+        """Whether the updated particle is finite, inside the window of ``shape`` nodes from ``corner``, and not collapsed.
 
-        A comparison with NaN is false. Without a branch: behind one, a GPU would start late to read what the stress needs.
+        A comparison with NaN is false. No branch: it would delay the loads that the stress needs.
         """
         j = volume_change(H)
         ok = int(j > scale.collapse) & int(j < real(largest)) & int(wp.dot(fx, fx) < real(largest))
@@ -60,7 +60,7 @@ def check(spec: Spec) -> SimpleNamespace:
         return ok != 0
 
     @wp.func
-    def complain(
+    def report_invalid(
         watch: wp.array(dtype=wp.int64),
         scale: Scale,
         world: int,
@@ -70,7 +70,7 @@ def check(spec: Spec) -> SimpleNamespace:
         base: ivec,
         H: mat,
     ):
-        """Report the rule that a state breaks; NaN before place before collapse."""
+        """Write the status word of an invalid particle. Precedence: non-finite, off the grid, collapsed."""
         kind = left_window
         for axis in range(dim):
             if wp.uint32(base[axis]) > wp.uint32(scale.shape[axis] - 3):
@@ -82,4 +82,4 @@ def check(spec: Spec) -> SimpleNamespace:
             kind = collapsed
         write(watch, world, substep, kind, p)
 
-    return SimpleNamespace(sound=sound, complain=complain)
+    return SimpleNamespace(sound=sound, report_invalid=report_invalid)

@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.elasticity import elasticity
 from softmpm.kernels.physics.muscle import muscle
-from softmpm.kernels.structs import Spec, Wanted, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, solid_adj_type, solid_types, types
 
 
-@once
+@kernel_factory
 def solid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, mat, Solid = t.real, t.mat, solid_types(spec).Solid
@@ -118,8 +118,8 @@ def _law_of(spec: Spec) -> wp.Function:
     return law_of
 
 
-@once
-def solid_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+@kernel_factory
+def solid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, mat, Solid, SolidAdj = t.real, t.mat, solid_types(spec).Solid, solid_adj_type(spec, wanted)
     laws, fibres, law_of = elasticity(spec.dim, spec.dtype), muscle(spec.dim, spec.dtype), _law_of(spec)

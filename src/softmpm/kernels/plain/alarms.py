@@ -3,14 +3,14 @@
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.alarms import alarm
 from softmpm.kernels.physics.elasticity import elasticity
 from softmpm.kernels.structs import Spec, solid_types, types
 
 
-@once
+@kernel_factory
 def state_alarms(spec: Spec):
     """Kernel that checks a state in the user's order, before any substep or after ``substep``."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)

@@ -23,14 +23,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import once
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.particle import particle, particle_adj
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.structs import Spec, Wanted, adj_module, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_type, solid_types, types
 
 
-@once
+@kernel_factory
 def transfer(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     vec, mat, node_vec, Scale, Motion, ivec = t.vec, t.mat, t.node, t.Scale, t.Motion, t.ivec
@@ -39,7 +39,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     pack, Particle, moved = s.pack, one.Particle, one.moved
     rotation, affine_momentum = one.rotation, one.affine_momentum
     running, rounds = status.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
-    complain = status.check(spec).complain
+    report_invalid = status.check(spec).report_invalid
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def p2g(
@@ -97,7 +97,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
                 B += wp.outer(share, position(o) - old.fx)
             new = moved(scale, ivec(), scale.shape, old, v, B)  # (T3)
             if not new.sound:
-                complain(watch, scale, world, p, substep, new.fx, new.base, new.H)
+                report_invalid(watch, scale, world, p, substep, new.fx, new.base, new.H)
                 new.base = old.base
         else:
             new = old
@@ -114,8 +114,8 @@ def transfer(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(p2g=p2g, g2p=g2p)
 
 
-@once
-def transfer_adj(spec: Spec, wanted: Wanted) -> SimpleNamespace:
+@kernel_factory
+def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.node
     Scale, Motion, MotionAdj = t.Scale, t.Motion, t.MotionAdj

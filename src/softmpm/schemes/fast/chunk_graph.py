@@ -1,8 +1,8 @@
-"""The fast scheme's substeps of one chunk as a fixed list of launches on buffers of its own, replayed as a graph.
+"""A chunk graph: the launches of one chunk of the fast scheme on fixed buffers, captured once and replayed.
 
-A graph holds addresses, so everything that changes between calls is copied to fixed places first: the start, the material, the
-pull of the muscles. A program is lent: one that kept its states until the backward pass is done, any other until nothing starts from
-its end.
+A captured graph refers to addresses, so everything that changes between calls is first copied into the graph's buffers: the initial
+state, the material, the pull of the muscles. A chunk graph is leased to one call: until its backward pass has run if it stores states,
+otherwise until no later chunk reads its final state.
 """
 
 import functools
@@ -24,19 +24,19 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
 from softmpm.schemes.buffers import Solid, passing, slot, slots_in, view
-from softmpm.schemes.capture import recording
+from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.fast.fixed_point import Exact
-from softmpm.schemes.fast.particle_order import Arrangement
+from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
+from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedState
-from softmpm.schemes.launch import Command, Launcher, Replay
+from softmpm.schemes.launch import KernelLauncher, LaunchReplay, RebindableLaunch
 from softmpm.state import State
 
 
-class Program:
-    """One chunk on one arrangement."""
+class ChunkGraph:
+    """One shape of chunk on one particle layout."""
 
-    def __init__(self, model: Model, arrangement: Arrangement, chunk: Chunk, keep: bool):
+    def __init__(self, model: Model, arrangement: ParticleLayout, chunk: Chunk, keep: bool):
         self.model, self.arrangement, self.chunk, self.keep = model, arrangement, chunk, keep
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
@@ -50,10 +50,10 @@ class Program:
         self.order = tensor(*self.lead, dtype=torch.int32)
         self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
         self.words = tensor(model.worlds + 2, dtype=torch.int64)
-        self._calm = torch.full_like(self.words, NEVER)
-        self._calm[-2:].zero_()
-        self._version = -1  # of the arrangement that order and origin were taken from
-        # What the sorted material was taken from, if it needs no gradient:
+        self._no_status = torch.full_like(self.words, NEVER)
+        self._no_status[-2:].zero_()
+        self._version = -1  # of the layout that order and origin were copied from
+        # Tensors that the sorted material was copied from, if they need no gradient:
         self._given: tuple[Tensor, ...] = ()
         slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
         self.base = tensor(slots, places, dtype=torch.int32)
@@ -65,12 +65,12 @@ class Program:
         self._structs()
         self.exact = None
         if model.spec.deterministic:
-            self.exact = Exact(model, view(tensor(places * t.rows), t.real), self.node_arrays)
-        self._forward = Replay(model)
+            self.exact = FixedPointAccumulator(model, view(tensor(places * t.rows), t.real), self.node_arrays)
+        self._forward = LaunchReplay(model)
         self._commands()
 
     def _structs(self) -> None:
-        """What the kernels see of the buffers."""
+        """Warp structs of the buffers."""
         model, t = self.model, self.types
         self.window = self.arrangement.window(self.origin)
         self.packed = []
@@ -106,37 +106,37 @@ class Program:
             self.solids.append(solid)
 
     def _commands(self) -> None:
-        """The launches that fill the buffers, from what users hold or from the end of another program."""
+        """Launches that fill the buffers from a user's state or from the final state of another chunk."""
         model, t, pack, lead = self.model, self.types, self.packing, self.lead
         at, low = (model.scale, self.window, self.order_array), (t.vec, t.mat)
         state = (t.vec, t.vec, t.mat, t.mat)
         zero = torch.zeros(t.dim, t.dim, dtype=model.dtype, device=model.device)
         none = passing(zero[0].expand(*lead, -1), t.vec), passing(zero.expand(*lead, -1, -1), t.mat)
 
-        def enter(*dtypes, low=()) -> Command:
+        def enter(*dtypes, low=()) -> RebindableLaunch:
             slots = [slot(model, dtype) for dtype in dtypes]
             inputs = (*at, *slots, *low, self.watch, self.packed[0])
-            return Command(model, pack.enter, lead, inputs, slots)
+            return RebindableLaunch(model, pack.enter, lead, inputs, slots)
 
         self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
         places, sort = padded(self.total), sorting(t.dim, model.spec.dtype)
         slots = [slot(model, wp.int32), slot(model, wp.int32, places), slot(model, t.real, places * t.rows)]
         inputs = (self.window, self.order_array, *slots, self.watch, self.packed[0])
-        self._move = Command(model, sort.move, lead, inputs, slots)
+        self._move = RebindableLaunch(model, sort.move, lead, inputs, slots)
         given = Solid.fixed(model)
         slots = slots_in(given, ("mass", "mu", "lam"), model, t.real)
         inputs = (self.order_array, given, self._solid)
-        self._sort = Command(model, sorted_solid(model.spec), lead, inputs, slots)
+        self._sort = RebindableLaunch(model, sorted_solid(model.spec), lead, inputs, slots)
 
     @property
     def bytes(self) -> int:
-        """Memory of its own."""
+        """Bytes of its buffers."""
         sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
         return sum(tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums))
 
-    def calm(self) -> None:
-        """Forget what the kernels reported."""
-        self.words.copy_(self._calm)
+    def reset_status(self) -> None:
+        """Reset all status words."""
+        self.words.copy_(self._no_status)
 
     def solid(self, s: int):
         """Material and pull of substep ``s``."""
@@ -144,29 +144,30 @@ class Program:
 
     @property
     def few(self) -> bool:
-        """Whether this is a GPU that has more room than there are warps."""
+        """Whether the particles are too few to fill a GPU with blocks of full size."""
         return self.model.device.type == "cuda" and self.total <= FEW
 
     @property
     def block(self) -> int:
-        """Threads of a block over particles."""
+        """Threads of a block in launches over particles."""
         return WARP if self.few else BLOCK
 
     @functools.cached_property
     def crew(self) -> int:
-        """Particles of a warp going forward."""
+        """Particles assigned to each warp by the forward kernels."""
         return self.crew_of(may_halve=self.types.dim == 2)
 
     def crew_of(self, may_halve: bool) -> int:
-        """Particles of a warp: as many as it has threads or, if it may, half as many while the GPU has more room than warps.
+        """Particles assigned to each warp: one per thread or, if ``may_halve``, one per two threads for few particles.
 
-        Then each walks a shorter way, but more sums are sent: whether that pays, bench/step.py and gradient.py say.
+        Half-populated warps walk through fewer particles each but send more reductions; bench/step.py and gradient.py measure
+        which is faster.
         """
         few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
         return WARP // 2 if may_halve and few else WARP
 
     def threads(self, crew: int) -> int:
-        """Threads of a launch over particles: on a GPU whole blocks, since the lanes of a warp work together."""
+        """Threads of a launch over particles; whole blocks on a GPU, since the lanes of a warp cooperate."""
         if self.model.device.type != "cuda":
             return self.total
         warps = -(-self.total // crew)
@@ -175,19 +176,19 @@ class Program:
     def run(
         self, start: State | SortedState, pull: Tensor | None, solid: Solid, frozen: Sequence[int] = ()
     ) -> None:
-        """All substeps from ``start``; the end is the last of :attr:`base` and :attr:`rows`. Failures are in :attr:`words`.
+        """Launch all substeps from ``start``. The final state is the last of :attr:`base` and :attr:`rows`.
 
         Args:
-            frozen: Worlds that stay as they are.
+            frozen: Worlds whose particles do not move.
         """
         stream = stream_of(self.model.device)
-        moved = recording(self.model) or self._version != self.arrangement.version
+        moved = is_capturing(self.model) or self._version != self.arrangement.version
         if moved:
-            self._version, self._given = -1, ()  # until the material has this order too
+            self._version, self._given = -1, ()  # until the material is in this order too
             self.order.copy_(self.arrangement.order)
             self.origin.copy_(self.arrangement.origin)
             self.arrangement.place_neighbours()
-        self.calm()
+        self.reset_status()
         if frozen:
             self.words[list(frozen)] = FROZEN
         if self.pull is not None and pull is not None:
@@ -204,15 +205,15 @@ class Program:
         self._forward.run(stream, self._launch_all)
 
     def _take(self, stream: wp.Stream | None, start: State | SortedState) -> None:
-        """Put the start where the kernels look for it."""
+        """Copy the initial state into the buffers, permuted into the present order."""
         if isinstance(start, SortedState):
-            self._move(stream, start.places(), start.base, start.rows)
+            self._move(stream, start.inverse_permutation(), start.base, start.rows)
         else:
             given = [tensor.contiguous() for tensor in (*start[:4], *(start.low or ()))]
             self._enter[start.low is not None](stream, *given)
 
     def _has(self, solid: Solid) -> bool:
-        """Whether the material is the one of the run before: the very tensors, which nothing else writes to."""
+        """Whether the material is that of the previous run: the same tensor objects, which nothing else writes to."""
         given = (solid.mass, solid.mu, solid.lam)
         return bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
 
@@ -220,7 +221,7 @@ class Program:
     def packing(self):
         return packing(self.model.spec.dim, self.model.spec.dtype)
 
-    def _launch_all(self, launch: Launcher) -> None:
+    def _launch_all(self, launch: KernelLauncher) -> None:
         model, nodes, length = self.model, self.node_arrays, self.chunk.length
         kernels, held = fused(model.spec), len(self.velocity)
         launch(kernels.clear, held, self.velocity_array, block_dim=BLOCK)
@@ -242,16 +243,16 @@ class Program:
             given = (model.scale, self.solid(length - 1), self.arrangement.neighbours, *sizes)
             launch(packed_alarms(model.spec).check, self.total, *given, self.packed[-1], self.watch)
 
-    def _begin(self, launch: Launcher) -> None:
+    def _begin(self, launch: KernelLauncher) -> None:
         """P2G of the first substep."""
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
         sizes = (self.crew, model.particle_count, self.total, self.order_flat)
         arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
         launch(fused(model.spec).begin[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None:
-            self.exact.push(self, 0, self.packed[0], self._solid.mass, launch)
+            self.exact.accumulate(self, 0, self.packed[0], self._solid.mass, launch)
 
-    def _advance(self, s: int, launch: Launcher) -> None:
+    def _advance(self, s: int, launch: KernelLauncher) -> None:
         """G2P of substep ``s`` and P2G of the next."""
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (s, s + 1) if self.keep else (0, 0)
@@ -263,4 +264,4 @@ class Program:
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
         launch(fused(model.spec).advance[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
         if self.exact is not None and s + 1 < length:
-            self.exact.push(self, s + 1, packed[then], self._solid.mass, launch)
+            self.exact.accumulate(self, s + 1, packed[then], self._solid.mass, launch)

@@ -1,4 +1,4 @@
-"""Buffers and launches of sums in fixed point, for programs of a deterministic model. Kernels: kernels/fast/fixed_point.py."""
+"""Buffers and launches of fixed-point sums, for chunk graphs of a deterministic model. Kernels: kernels/fast/fixed_point.py."""
 
 from collections.abc import Sequence
 
@@ -9,14 +9,14 @@ from torch import Tensor
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.model import Model
 from softmpm.schemes.buffers import clear, view
-from softmpm.schemes.launch import Launcher
+from softmpm.schemes.launch import KernelLauncher
 
 
-class Exact:
-    """Sums over particles, one after the other; those with an even and an odd number have sizes of their own.
+class FixedPointAccumulator:
+    """Double-buffered fixed-point P2G sums; even and odd substeps have separate scale factors.
 
     Args:
-        rows: Packed particles; the rows of v and C hold what a particle gives.
+        rows: Packed particles; the rows of v and C hold the contribution of a particle.
         nodes: Sums as floats, number k in ``nodes[k % len(nodes)]``.
     """
 
@@ -41,22 +41,22 @@ class Exact:
             self._sums.append(sums)
 
     def begin(self, mass: Tensor | None) -> None:
-        """Before number 0: the masses (world, particle) that enter the sums, or None."""
-        clear(self.fixed)  # who reads a sum clears it, but a run may have been interrupted
+        """Prepare sum 0 with the masses (world, particle) that enter the sums, or None."""
+        clear(self.fixed)  # the reader of a sum clears it, but a run may have been interrupted
         clear(self.largest)
         if mass is not None:
             self.largest[..., 1] = mass.amax(1)
 
     def shares(self, k: int):
-        """Where the particles leave what they give to number ``k``."""
+        """Destination of the particles' contributions to sum ``k``."""
         return self._shares[k % 2]
 
     def sums(self, k: int):
         return self._sums[k % len(self._sums)]
 
-    def push(self, program, k: int, states, mass: wp.array | None, launch: Launcher) -> None:
-        """Add up number ``k``: what the particles of ``states`` gave."""
+    def accumulate(self, graph, k: int, states, mass: wp.array | None, launch: KernelLauncher) -> None:
+        """Accumulate the contributions of the particles of ``states`` in sum ``k``."""
         mass = self._none if mass is None else mass
-        arguments = (program.window, program.total, states, self.shares(k), mass, self.sums(k))
+        arguments = (graph.window, graph.total, states, self.shares(k), mass, self.sums(k))
         kernel = fixed(self.model.dim).push
-        launch(kernel, program.threads(program.crew), *arguments, block_dim=program.block)
+        launch(kernel, graph.threads(graph.crew), *arguments, block_dim=graph.block)

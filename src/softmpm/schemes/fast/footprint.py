@@ -52,14 +52,14 @@ class FastFootprint:
         sizes = model.sizes()
         material = 4 * model.worlds * model.particle_count * model.dtype.itemsize
         fixed_point = 2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0
-        program = material + sizes.nodes + fixed_point
-        small = program + sizes.inside + 2 * sizes.nodes
+        graph = material + sizes.nodes + fixed_point
+        small = graph + sizes.inside + 2 * sizes.nodes
         forward = small * _at_once(horizon, sizes.longest)
         handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
         if chosen.keep_all:
-            kept = model.calls * program * len(horizon.chunks(chosen.longest))
+            kept = model.calls * graph * len(horizon.chunks(chosen.longest))
             return Buffers(forward, kept, handed)
-        kept = program * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
+        kept = graph * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
         # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
         again = 2 * small if model.device.type == "cuda" else 0
         return Buffers(forward, kept, handed + again)

@@ -1,11 +1,11 @@
-"""Where the fast scheme keeps things: particles in the order of their cells, and only the nodes around them.
+"""Particle order and grid window of the fast scheme: particles are sorted by cell, and only nodes near them are allocated.
 
-Neither has to be exact. An order that has grown stale costs speed, never correctness, and is renewed when particles that stand
-next to each other share their cell too rarely. The window is the part of the grid that is in memory, in each world at a place of
-its own; a particle that is about to leave it is seen in time. When one does leave it, its chunk runs again: with the window put
-around its start or, if it was already there or this is not the first time, with a larger one. A recorded graph cannot look: after a
-replay in which a particle left, the window grows and the graph is recorded once more. The cost of a substep follows the window, not the
-grid.
+Both may be out of date without affecting results. A stale order costs speed only; particles are sorted again when neighbours in
+memory share their cell too rarely. The window is the allocated part of the grid, at a separate place in each world, and it is centred
+again when a particle comes near its edge. If a particle leaves it, the chunk is repeated: with the window centred on its initial
+state or, if it was already centred or this is not the first time, with a larger window. A captured graph cannot do this: after a replay
+in which a particle left, the window is enlarged and the graph captured again. The cost of a substep is proportional to the window, not
+to the grid.
 """
 
 import math
@@ -21,37 +21,37 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.memory import MARGIN, window_shape
 from softmpm.schemes.buffers import slot, view
-from softmpm.schemes.capture import recording
+from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import Report
-from softmpm.schemes.launch import Command
+from softmpm.schemes.launch import RebindableLaunch
 
 STALE, STALE_FEW = 1.5, 3.0
-"""Renew the order when going along it meets so many times more cells than when it was new; with few particles it matters less."""
+"""Sort again when the number of changes of cell along the order has grown by this factor; with few particles it matters less."""
 
 
-class Arrangement:
-    """Order of the particles and window of the grid. Both are renewed in place; only a window that grows is another one.
+class ParticleLayout:
+    """Order of the particles and window of the grid. Both are updated in place; a larger window is a new layout.
 
     Args:
-        x: Positions to start from [m], shape (world, particle, dim).
-        before: One whose window was too small, if there is one: its margin is doubled, and nothing gets smaller.
+        x: Initial positions [m], shape (world, particle, dim).
+        before: A layout whose window was too small, or None. Its margin is doubled, and no axis gets shorter.
 
     Attributes:
         order: Particle at each place, shape (world, particle), int32.
         neighbours: Places of the neighbours at rest of the particle at each place; Warp array (world, particle, at most dim).
         origin: First node of the window, shape (world, dim), int32.
         shape: Nodes of the window along each axis.
-        version: How often it was renewed.
-        stale: Whether to renew it.
-        left: Whether a particle left the window before.
-        outgrown: Whether to take a larger one, because a particle left the window inside a recorded graph.
+        version: Number of updates.
+        stale: Whether the particles should be sorted again.
+        left: Whether a particle has left the window before.
+        outgrown: Whether the window must be enlarged, because a particle left it inside a captured graph.
     """
 
-    def __init__(self, model: Model, x: Tensor, before: "Arrangement | None" = None):
+    def __init__(self, model: Model, x: Tensor, before: "ParticleLayout | None" = None):
         self.model, self.version = model, 0
         self._margin = 2 * before._margin + 1 if before else MARGIN[model.dim]
-        self._fresh: Report | None = None  # cells met along the order when it was new
+        self._fresh: Report | None = None  # changes of cell along the order when it was new
         self.stale = self.left = self.outgrown = False
 
         def integers(*size):
@@ -72,23 +72,25 @@ class Arrangement:
         wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)], self._margin)
         self.shape = tuple(max(sizes) for sizes in zip(wide, before.shape if before else wide, strict=True))
         self._centre = self._centring()
-        self.renew(x)
+        self.resort(x)
 
     @property
     def node_count(self) -> int:
         """Nodes of one world in memory."""
         return math.prod(self.shape)
 
-    def _finding(self) -> Command:
-        """Fills the keys to sort by, and the ends of the box around the particles."""
+    def _finding(self) -> RebindableLaunch:
+        """Launch that computes the sort keys and the bounding box of the particles."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         gravity = model.scene.gravity
         up = max(range(t.dim), key=lambda axis: abs(gravity[axis])) if gravity else 0
         places, found = [slot(model, t.vec) for _ in range(2)], (self._key, *self._ends)
         inputs = (model.scale, up, *places, *(view(tensor, wp.int32) for tensor in found))
-        return Command(model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places)
+        return RebindableLaunch(
+            model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places
+        )
 
-    def _arranging(self, by_place: Tensor) -> list[Command]:
+    def _arranging(self, by_place: Tensor) -> list[RebindableLaunch]:
         """See :meth:`place_neighbours`."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         if by_place.shape[2] == 0:
@@ -97,23 +99,25 @@ class Arrangement:
         invert, arrange = sorting(t.dim, model.spec.dtype).invert, packed_alarms(model.spec).arrange
         given = (order, places, view(model.neighbours, wp.int32), self.neighbours)
         return [
-            Command(model, invert, self.order.shape, (order, places), ()),
-            Command(model, arrange, self.order.shape, given, ()),
+            RebindableLaunch(model, invert, self.order.shape, (order, places), ()),
+            RebindableLaunch(model, arrange, self.order.shape, given, ()),
         ]
 
-    def _centring(self) -> Command:
-        """Puts the window around that box."""
+    def _centring(self) -> RebindableLaunch:
+        """Launch that centres the window on that box."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         ends = (view(tensor, wp.int32) for tensor in (*self._ends, self.origin))
         inputs = (model.scale, t.ivec(*self.shape), *ends)
-        return Command(model, sorting(t.dim, model.spec.dtype).centre_window, self.origin.shape, inputs, ())
+        return RebindableLaunch(
+            model, sorting(t.dim, model.spec.dtype).centre_window, self.origin.shape, inputs, ()
+        )
 
     def _locate(self, x: Tensor) -> None:
-        """Cell of each particle, and the box around them in each world.
+        """Compute the sort keys and the bounding box of the particles of each world.
 
-        In a cell the lower half comes first: when a body falls, that is what leaves it, and it stays together.
-        On the CPU, where nothing is summed in parallel, the order is that at rest, so that results never depend on what ran
-        before; the window does not change a result.
+        Within a cell the lower half comes first: particles of a falling body that leave their cell together stay together in memory.
+        On the CPU, where sums are sequential, the order is that at rest, so that results do not depend on earlier calls; the window
+        never affects results.
         """
         model = self.model
         follow = x if model.device.type == "cuda" else model.positions.expand_as(x)
@@ -121,34 +125,34 @@ class Arrangement:
         self._ends[1].fill_(0)
         self._find(stream_of(model.device), x.contiguous(), follow.contiguous())
 
-    def renew(self, x: Tensor) -> None:
+    def resort(self, x: Tensor) -> None:
         """Sort by cell and centre the window on the particles, without waiting for the device."""
         model = self.model
         self._locate(x)
         key, order = torch.sort(self._key, dim=1, stable=True)
         self.order.copy_(order)
         self._centre(stream_of(model.device))
-        if not recording(model):
+        if not is_capturing(model):
             cell = key // 2
             self._fresh = Report(model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])
         self.stale = False
         self.version += 1
 
     def place_neighbours(self) -> None:
-        """Put the neighbours at rest into the present order."""
+        """Permute the lists of rest neighbours into the present order."""
         for command in self._arrange:
             command(stream_of(self.model.device))
 
-    def grown(self, x: Tensor) -> "Arrangement":
-        """Another one with a larger window."""
-        return Arrangement(self.model, x, before=self)
+    def grown(self, x: Tensor) -> "ParticleLayout":
+        """A layout with a larger window."""
+        return ParticleLayout(self.model, x, before=self)
 
     def outgrow(self) -> None:
-        """Take note that a particle left the window inside a recorded graph: the next call that is not recorded takes a larger one."""
+        """Request a larger window for the next call outside of a capture, after a particle left it inside a captured graph."""
         self.outgrown = True
 
-    def judge(self, cells: int, near_edge: bool) -> None:
-        """Take note of what a call reports: cells met along the order, and whether a particle is near the window's edge."""
+    def update_staleness(self, cells: int, near_edge: bool) -> None:
+        """Decide whether to sort again, from the changes of cell along the order and whether a particle is near the window's edge."""
         assert self._fresh is not None
         limit = STALE_FEW if self.order.numel() <= FEW else STALE
         scattered = self.model.device.type == "cuda" and cells > limit * self._fresh.read()[0]

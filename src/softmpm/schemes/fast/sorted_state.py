@@ -1,7 +1,7 @@
-"""States and adjoints between two chunks, as the kernels hold them: only the two ends of a call are in the user's order.
+"""Sorted states and adjoints passed between chunks. They are permuted to the user's particle order only at the ends of a call.
 
-A chunk takes its start straight from the buffers in which the one before left its end. These stay on loan as long as somebody holds
-the :class:`SortedState`.
+A chunk reads its initial state directly from the buffers that hold the final state of the previous chunk. Their lease lasts as long as
+the :class:`SortedState` is referenced.
 """
 
 import math
@@ -17,12 +17,12 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import slot
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.launch import Command
+from softmpm.schemes.launch import RebindableLaunch
 from softmpm.state import Low, State
 
 
-class Unpacking:
-    """The launches that lead from packed particles back to the user's order."""
+class Unpacker:
+    """Launches that permute packed particles to the user's order."""
 
     def __init__(self, model: Model):
         self.model = model
@@ -33,9 +33,9 @@ class Unpacking:
         low = [(t.vec,), (t.mat,)] if model.dtype == torch.float32 else []
         nothing = (2 - len(low)) * (None,)
 
-        def command(kernel, parameters, *fields, none=()) -> Command:
+        def command(kernel, parameters, *fields, none=()) -> RebindableLaunch:
             slots = [slot(model, *field) for field in fields]
-            return Command(model, kernel, lead, (*parameters, *slots, *none), slots)
+            return RebindableLaunch(model, kernel, lead, (*parameters, *slots, *none), slots)
 
         self.invert = command(sorting(spec.dim, spec.dtype).invert, (), order, (wp.int32,))
         self.leave = command(pack.leave, scale, order, base, rows, *end, *low, none=nothing)
@@ -50,22 +50,22 @@ class Unpacking:
 
 
 class Sorted:
-    """Particles in the order of some arrangement.
+    """Particles in the order of some particle layout.
 
     Args:
         rows: Packed particles, see :class:`softmpm.kernels.types`.
         order: Particle at each place, shape (world, particle), int32.
     """
 
-    def __init__(self, unpacking: Unpacking, rows: Tensor, order: Tensor):
+    def __init__(self, unpacking: Unpacker, rows: Tensor, order: Tensor):
         self._unpacking, self.rows, self.order = unpacking, rows, order
 
     @property
     def _stream(self) -> wp.Stream | None:
         return stream_of(self._unpacking.model.device)
 
-    def places(self) -> Tensor:
-        """Where each particle stands, shape (world, particle), int32."""
+    def inverse_permutation(self) -> Tensor:
+        """Place of each particle in memory, shape (world, particle), int32."""
         places = torch.empty_like(self.order)
         self._unpacking.invert(self._stream, self.order, places)
         return places
@@ -76,15 +76,15 @@ class SortedState(Sorted):
 
     Args:
         base: Packed base nodes.
-        owner: Whose buffers these are: nobody else writes to them as long as it lives. None if they are its own.
+        owner: Lease of the buffers, which nothing else writes to while it is referenced. None if the state owns them.
     """
 
-    def __init__(self, unpacking: Unpacking, base: Tensor, rows: Tensor, order: Tensor, owner: object = None):
+    def __init__(self, unpacking: Unpacker, base: Tensor, rows: Tensor, order: Tensor, owner: object = None):
         super().__init__(unpacking, rows, order)
         self.base, self._owner = base, owner
 
     def copy(self) -> "SortedState":
-        """In memory of its own."""
+        """A copy in buffers of its own."""
         return SortedState(self._unpacking, self.base.clone(), self.rows.clone(), self.order.clone())
 
     @property

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
-from softmpm.kernels.structs import Wanted
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
@@ -60,7 +60,7 @@ class PlainRun:
         if self.row is not None and self.pull is not None:
             self.row.copy_(self.pull[self.chunk.row(s)])
 
-    def vjp(self, adj_end: State, adj_solid: SolidAdj, wanted: Wanted) -> tuple[State, Tensor | None]:
+    def vjp(self, adj_end: State, adj_solid: SolidAdj, wanted: RequestedGrads) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
         model, chunk, step = self.model, self.chunk, self.step
         step.watch_words.fill_(NEVER)

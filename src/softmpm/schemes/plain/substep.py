@@ -16,7 +16,7 @@ from softmpm.kernels.convert import boundary
 from softmpm.kernels.physics.actuation_sum import collect_pull, collectors
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.plain.transfer import transfer, transfer_adj
-from softmpm.kernels.structs import Wanted, types
+from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import SolidAdj, clear, view
 from softmpm.schemes.device import stream_of
@@ -89,7 +89,7 @@ class Substep:
         arguments = (self.model.scale, substep, self._array("velocity"), now, self.watch, then)
         self.launch(transfer(self.model.spec).g2p, self.particles, *arguments)
 
-    def adjoint(self, wanted: Wanted, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:
+    def adjoint(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:
         """Adjoint of :meth:`advance`: adds into ``adj_now`` and ``adj_solid``. The grid is computed again."""
         self.to_grid(now)
         clear(self.adj_velocity)
@@ -97,7 +97,7 @@ class Substep:
         self.grid_adj()
         self.p2g_adj(wanted, now, adj_now, adj_solid, substep)
 
-    def g2p_adj(self, wanted: Wanted, now, then, adj_then, adj_now) -> None:
+    def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now) -> None:
         velocity, adj_velocity = self._array("velocity"), self._array("adj_velocity")
         arguments = (self.model.scale, velocity, now, then, adj_then, adj_velocity, adj_now)
         self.launch(transfer_adj(self.model.spec, wanted).g2p_adj, self.particles, *arguments)
@@ -107,7 +107,7 @@ class Substep:
         arguments = (model.scale, model.walls, *arrays)
         self.launch(grid(model.spec).grid_velocity_adj, self.nodes, *arguments)
 
-    def p2g_adj(self, wanted: Wanted, now, adj_now, adj_solid, substep: int) -> None:
+    def p2g_adj(self, wanted: RequestedGrads, now, adj_now, adj_solid, substep: int) -> None:
         adj_node = self._array("adj_node")
         arguments = (self.model.scale, self.solid, substep, now, adj_node, self.watch, adj_solid, adj_now)
         self.launch(transfer_adj(self.model.spec, wanted).p2g_adj, self.particles, *arguments)

@@ -10,7 +10,7 @@ import warp as wp
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK, WARP
-from softmpm.kernels.structs import Spec, Wanted
+from softmpm.kernels.structs import RequestedGrads, Spec
 
 ARCH = 90
 CASES = [(2, "neo_hookean"), (2, "fixed_corotated"), (3, "neo_hookean"), (3, "fixed_corotated")]
@@ -41,7 +41,7 @@ def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
     """What goes over the particles."""
     spec = scene_spec(dim, law, bare)
     if which == "adjoint":
-        return fused_adj(spec, Wanted(material=not bare, activation=not bare)).advance_adj[few]
+        return fused_adj(spec, RequestedGrads(material=not bare, activation=not bare)).advance_adj[few]
     return fused(spec).advance[few]
 
 
@@ -83,7 +83,7 @@ def test_walls_are_not_in_memory(dim):
     loads = []
     for kinds in (("separate",), ("separate", "slip", "stick", "slip", "separate", "separate")):
         spec = dataclasses.replace(scene_spec(dim, "neo_hookean", bare=False), contacts=kinds)
-        wanted = Wanted(material=False, activation=False)
+        wanted = RequestedGrads(material=False, activation=False)
         both = [compiled(k) for k in (fused(spec).grid_velocity, fused_adj(spec, wanted).grid_velocity_adj)]
         assert all(facts.frame == facts.stack == 0 for _, facts in both)
         loads.append([len(re.findall(r"\bld\.global", code)) for code, _ in both])

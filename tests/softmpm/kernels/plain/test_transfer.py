@@ -8,12 +8,12 @@ from helpers import assert_relative, busy_inputs, busy_scene
 import softmpm
 from softmpm import reference
 from softmpm.kernels.physics.actuation_sum import COLLECTORS, collect_pull, collectors
-from softmpm.kernels.structs import Wanted
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.schemes.buffers import Motion, MotionAdj, Solid, SolidAdj, lame, masses
 from softmpm.schemes.plain.substep import Substep
 
 LIMIT = 1e-13
-EVERYTHING = Wanted(material=True, activation=True)
+EVERYTHING = RequestedGrads(material=True, activation=True)
 
 
 class Bench:

@@ -9,7 +9,7 @@ from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent,
 
 import softmpm
 from softmpm import reference
-from softmpm.schemes.fast.particle_order import Arrangement
+from softmpm.schemes.fast.particle_order import ParticleLayout
 
 
 def build(dim: int, deterministic=True, device="cpu", **settings) -> softmpm.Model:
@@ -58,7 +58,7 @@ def test_the_order_of_the_particles_leaves_no_trace(dim, monkeypatch):
         "reversed": lambda order: order.flip(1),
         "shuffled": lambda order: order[:, torch.randperm(order.shape[1])],
     }
-    renew = Arrangement.renew
+    renew = ParticleLayout.resort
 
     def put(arrangement, x, change):
         renew(arrangement, x)
@@ -67,7 +67,7 @@ def test_the_order_of_the_particles_leaves_no_trace(dim, monkeypatch):
     for deterministic in (True, False):
         found = {}
         for name, change in orders.items():
-            monkeypatch.setattr(Arrangement, "renew", functools.partialmethod(put, change=change))
+            monkeypatch.setattr(ParticleLayout, "resort", functools.partialmethod(put, change=change))
             model = build(dim, deterministic)
             found[name] = everything(model, busy_inputs(model))
         names = set(found["sorted"]) - {"activation"}  # that is added up in the order of the places
@@ -126,7 +126,7 @@ def test_a_value_that_is_not_finite_is_reported_and_stays_in_its_world(device):
     """Stress overflows: the particle is named, and the other world ends as it would."""
     model = build(2, device=device)
     inputs = {name: t.detach() for name, t in busy_inputs(model).items()}
-    calm = run(softmpm.simulate, model, inputs, 10)
+    reset_status = run(softmpm.simulate, model, inputs, 10)
     inputs["F"] = inputs["F"].clone()
     inputs["F"][1, 5] *= 5e18
     with pytest.raises(softmpm.UnstableError) as caught:
@@ -134,7 +134,7 @@ def test_a_value_that_is_not_finite_is_reported_and_stays_in_its_world(device):
     error = caught.value
     assert (error.kind, error.world, error.particle, error.substep) == ("not_finite", 1, 5, 0)
     for name in "xvCF":
-        assert torch.equal(getattr(error.state, name)[0], getattr(calm, name)[0]), name
+        assert torch.equal(getattr(error.state, name)[0], getattr(reset_status, name)[0]), name
 
 
 def test_a_gradient_that_is_not_finite_is_an_error(device):

@@ -21,10 +21,10 @@ from softmpm.schemes.plain import chunk as plain_chunk
 
 HOLD_MEMORY = (
     softmpm.Model,
-    particle_order.Arrangement,
-    chunk_graph.Program,
-    chunk_graph_adj.ProgramAdj,
-    chunk_graph_adj.Scratch,
+    particle_order.ParticleLayout,
+    chunk_graph.ChunkGraph,
+    chunk_graph_adj.ChunkGraphAdj,
+    chunk_graph_adj.AdjointBuffers,
     fast_scheme.FastRun,
     plain_chunk.PlainRun,
 )
@@ -139,21 +139,21 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
     horizon = Horizon(3, 7)
     assert len(horizon.chunks(plan(horizon, built.sizes(), built.budget).longest)) == 21
     pull(*call(built))
-    (smaller,) = living(particle_order.Arrangement)
+    (smaller,) = living(particle_order.ParticleLayout)
     smaller.left = True
     del smaller
-    outgrown, make = fast_scheme.outgrown, chunk_graph.Program.__init__
+    outgrown, make = fast_scheme.outgrown, chunk_graph.ChunkGraph.__init__
 
     def left_once(words) -> bool:
         seen.append(words)
         return outgrown(words) or len(seen) == report + 1
 
     def making(self, model, window, *args):
-        others.append(sum(one.arrangement is not window for one in living(chunk_graph.Program)))
+        others.append(sum(one.arrangement is not window for one in living(chunk_graph.ChunkGraph)))
         make(self, model, window, *args)
 
     monkeypatch.setattr(fast_scheme, "outgrown", left_once)
-    monkeypatch.setattr(chunk_graph.Program, "__init__", making)
+    monkeypatch.setattr(chunk_graph.ChunkGraph, "__init__", making)
     pull(*call(built))
     assert len(seen) > report and others and max(others) <= 1
 
@@ -164,7 +164,7 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
         "softmpm.schemes.fast.footprint.price_of_chunk", lambda particles: 1
     )  # the same chunks on a GPU
     built, kept, most, programs = model(device=device, **little_memory(model())), [], [], []
-    horizon, copied, runs = Horizon(3, 7), SortedState.copy, chunk_graph.Program.run
+    horizon, copied, runs = Horizon(3, 7), SortedState.copy, chunk_graph.ChunkGraph.run
     chosen = plan(horizon, built.sizes(), built.budget)
     assert len(horizon.chunks(chosen.longest)) > 2 * chosen.slots > 4
 
@@ -175,11 +175,11 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
 
     def running(self, *args):
         most.append(sum(ref() is not None for ref in kept))
-        programs.append(len(living(chunk_graph.Program)))
+        programs.append(len(living(chunk_graph.ChunkGraph)))
         return runs(self, *args)
 
     monkeypatch.setattr(SortedState, "copy", copying)
-    monkeypatch.setattr(chunk_graph.Program, "run", running)
+    monkeypatch.setattr(chunk_graph.ChunkGraph, "run", running)
     end, inputs = call(built)
     weights = dot(cotangent(end), end)
     first = torch.autograd.grad(weights, list(inputs.values()), retain_graph=True)
@@ -234,7 +234,9 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
     pull(*call(built))
     waiting = call(built) if failing == "backward" else None
     owner, name = (
-        (particle_order.Arrangement, "judge") if failing == "forward" else (fast_scheme.FastRun, "vjp")
+        (particle_order.ParticleLayout, "update_staleness")
+        if failing == "forward"
+        else (fast_scheme.FastRun, "vjp")
     )
 
     def full(*args):
@@ -252,7 +254,7 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
         raise AssertionError("it did fit")
     del waiting
     for _ in range(100):  # PyTorch's own thread may hold the call for a moment longer
-        left = living((chunk_graph.Program, chunk_graph_adj.ProgramAdj, plain_chunk.PlainRun))
+        left = living((chunk_graph.ChunkGraph, chunk_graph_adj.ChunkGraphAdj, plain_chunk.PlainRun))
         if not left:
             return
         del left
@@ -266,7 +268,7 @@ def test_a_call_without_gradient_that_does_not_fit_says_so(monkeypatch):
     def full(*args):
         raise torch.OutOfMemoryError("no room")
 
-    monkeypatch.setattr(particle_order.Arrangement, "judge", full)
+    monkeypatch.setattr(particle_order.ParticleLayout, "update_staleness", full)
     for settings, note in (({}, "takes 0."), ({"memory_budget": 1000}, "needs at least")):
         with torch.no_grad(), pytest.raises(torch.OutOfMemoryError) as caught:
             call(model(**settings))
@@ -281,10 +283,10 @@ def test_calls_of_many_lengths_leave_few_programs(living, device):
     for substeps in lengths:
         assert plan(Horizon(3, substeps), sizes, budget).keep_all
         pull(*call(built, substeps=substeps))
-        last = living(chunk_graph.Program)
+        last = living(chunk_graph.ChunkGraph)
         assert sum(one.bytes for one in last) <= 2 * budget
         pull(*call(built, substeps=substeps))
-        assert living(chunk_graph.Program) == last
+        assert living(chunk_graph.ChunkGraph) == last
         del last
 
 
@@ -294,7 +296,7 @@ def test_small_programs_all_stay(living, device):
     for _ in range(2):
         for substeps in range(10, 20):
             pull(*call(built, substeps=substeps))
-        left.append(living(chunk_graph.Program))
+        left.append(living(chunk_graph.ChunkGraph))
     assert left[0] == left[1] and len(left[0]) >= 10
 
 
@@ -303,16 +305,18 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     built = model(**budget)
     pull(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
-    with_graphs = [weakref.ref(made) for made in living((chunk_graph.Program, chunk_graph_adj.ProgramAdj))]
+    with_graphs = [
+        weakref.ref(made) for made in living((chunk_graph.ChunkGraph, chunk_graph_adj.ChunkGraphAdj))
+    ]
     for module in (autograd, chunk_graph, fast_scheme, rollout, runner):
-        monkeypatch.setattr(module, "recording", lambda model: True)
-    with capture.opened_ledger() as ledger:
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    with capture.collected_resources() as ledger:
         pull(*call(built))
         assert with_graphs and all(made() is not None for made in with_graphs), (
             "a graph that is destroyed ends the recording"
         )
     del built
-    for kind in (softmpm.Model, particle_order.Arrangement, chunk_graph.Program):
+    for kind in (softmpm.Model, particle_order.ParticleLayout, chunk_graph.ChunkGraph):
         assert living(kind)
     assert {id(held) for held in living(HOLD_MEMORY)} <= before, (
         "the recording owns the memory of what it made"
@@ -348,7 +352,7 @@ def test_a_graph_runs_on_memory_of_its_own():
 @pytest.mark.gpu
 def test_garbage_does_not_end_a_recording(monkeypatch):
     """A graph that nothing but itself refers to waits for the collector, which is made to come at once."""
-    built, launches, threshold = model(device="cuda"), chunk_graph.Program._launch_all, gc.get_threshold()
+    built, launches, threshold = model(device="cuda"), chunk_graph.ChunkGraph._launch_all, gc.get_threshold()
     inputs, weights = busy_inputs(built, control_steps=3), cotangent(built.rest())
 
     def work():
@@ -365,7 +369,7 @@ def test_garbage_does_not_end_a_recording(monkeypatch):
         knot = None
         launches(self, launch)
 
-    monkeypatch.setattr(chunk_graph.Program, "_launch_all", launching)
+    monkeypatch.setattr(chunk_graph.ChunkGraph, "_launch_all", launching)
     gc.set_threshold(1)
     try:
         other = model(device="cuda")  # which records its own

@@ -17,7 +17,7 @@ from softmpm import autograd, rollout, runner
 from softmpm.planning.memory import MARGIN
 from softmpm.schemes.fast import chunk_graph, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
-from softmpm.schemes.fast.particle_order import STALE_FEW, Arrangement
+from softmpm.schemes.fast.particle_order import STALE_FEW, ParticleLayout
 
 DX = 1 / 16  # a power of two: shifting by whole cells is exact
 
@@ -51,7 +51,7 @@ def bases(model, x) -> np.ndarray:
     return np.floor(x.double().cpu().numpy() / DX - 0.5).astype(int)
 
 
-def window(found: Arrangement) -> tuple[np.ndarray, np.ndarray]:
+def window(found: ParticleLayout) -> tuple[np.ndarray, np.ndarray]:
     """First node in memory and the first one beyond, (world, dim) each."""
     first = found.origin.cpu().numpy()
     return first, first + np.array(found.shape)
@@ -84,7 +84,7 @@ def test_the_order_is_a_stable_sort_by_cell(dim, device):
         device=device,
     )
     x = scattered(model, 3.0, 12.0)
-    found = Arrangement(model, x)
+    found = ParticleLayout(model, x)
     followed = x if device == "cuda" else model.rest().x
     sorted_by = bases(model, followed)
     upper = (followed.double().cpu().numpy()[..., 1] / DX - 0.5) % 1 >= 0.5
@@ -101,7 +101,7 @@ def test_the_window_holds_every_stencil(low, high, device):
     """With a margin on each side, but for where the grid ends; and it never reaches beyond the grid."""
     model = robot(2, [(6, 6), (9, 9)], grid=(30, 30), worlds=2, device=device)
     x = scattered(model, low, high)
-    found, base = Arrangement(model, x), bases(model, x)
+    found, base = ParticleLayout(model, x), bases(model, x)
     first, beyond = window(found)
     assert (first >= 0).all() and (beyond <= 30).all()
     below, above = base.min(1) - first, beyond - (base.max(1) + 3)
@@ -116,7 +116,7 @@ def test_a_window_is_as_small_as_its_particles_allow(device):
     x = scattered(model, 100.0, 104.0)
     x[1, :, 0] += 150 * DX
     x[1, 0, 1] += 9 * DX
-    found = Arrangement(model, x)
+    found = ParticleLayout(model, x)
     reach = np.ptp(bases(model, x), axis=1).max(0)
     assert (np.array(found.shape) >= reach + 3 + 2 * MARGIN[2]).all()
     assert (np.array(found.shape) <= reach + 3 + 2 * MARGIN[2] + 3).all()  # rounded up to four
@@ -127,11 +127,11 @@ def test_the_window_moves_with_the_robot(device):
     """Renewed where the robot has gone to: as large as before, its origin further by as many nodes in that world."""
     model = robot(2, [(20, 20)], grid=(80, 80), worlds=3, device=device)
     x = model.rest().x
-    found = Arrangement(model, x)
+    found = ParticleLayout(model, x)
     before, shape, version = found.origin.clone(), found.shape, found.version
     x[1, :, 0] += 30 * DX
     x[2, :, 1] -= 9 * DX
-    found.renew(x)
+    found.resort(x)
     assert found.shape == shape and found.version == version + 1
     assert (found.origin - before).cpu().tolist() == [[0, 0], [30, 0], [0, -9]]
 
@@ -140,7 +140,7 @@ def test_a_grown_window_has_twice_the_margin(device):
     """Or is as large as the grid, or as the particles need by then; the old one stays as it is."""
     model = robot(2, [(20, 20)], grid=(80, 26), device=device)
     x = model.rest().x
-    found = Arrangement(model, x)
+    found = ParticleLayout(model, x)
     before = found.shape
     grown = found.grown(x)
     wider = 2 * (MARGIN[2] + 1)  # a margin of m becomes one of 2 m + 1
@@ -157,10 +157,10 @@ def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
     """Measured by the cells it met when it was new; on the CPU, where the order is fixed, only the edge counts."""
     model = robot(2, [(20, 20)], grid=(80, 80), worlds=2, device=device)
     x = model.rest().x
-    found = Arrangement(model, x)
+    found = ParticleLayout(model, x)
     for apart in (1.0, 3.0):  # further apart in a renewed order: other cells, another measure
         x = x.mean(1, keepdim=True) + apart * (x - x.mean(1, keepdim=True))
-        found.renew(x)
+        found.resort(x)
         followed = x if device == "cuda" else model.rest().x
         cells = sum(len(np.unique(base, axis=0)) for base in bases(model, followed))
         for met, near_edge, stale in (
@@ -169,16 +169,16 @@ def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
             (int(STALE_FEW * cells) + 1, False, device == "cuda"),
             (cells, True, True),
         ):
-            found.judge(met, near_edge)
+            found.update_staleness(met, near_edge)
             assert found.stale == stale, (apart, met, near_edge)
-    found.renew(x)
+    found.resort(x)
     assert not found.stale
 
 
 # -- what a window must not change --------------------------------------------------------------------------------
 
 
-class Watched(Arrangement):
+class Watched(ParticleLayout):
     """Notes what becomes of windows."""
 
     made: list[tuple[int, ...]]
@@ -193,16 +193,16 @@ class Watched(Arrangement):
         Watched.grown_from.append(self.shape)
         return super().grown(x)
 
-    def renew(self, x):
+    def resort(self, x):
         Watched.renewals += 1
-        super().renew(x)
+        super().resort(x)
 
 
 @pytest.fixture
 def watched(monkeypatch) -> type[Watched]:
     Watched.made, Watched.grown_from, Watched.renewals = [], [], 0
-    monkeypatch.setattr(particle_order, "Arrangement", Watched)
-    monkeypatch.setattr("softmpm.schemes.fast.scheme.Arrangement", Watched)
+    monkeypatch.setattr(particle_order, "ParticleLayout", Watched)
+    monkeypatch.setattr("softmpm.schemes.fast.scheme.ParticleLayout", Watched)
     return Watched
 
 
@@ -371,15 +371,15 @@ def test_the_size_of_the_grid_costs_nothing(dtype, limit, watched, device):
 @pytest.fixture
 def recordings(monkeypatch, device) -> list[softmpm.Graph]:
     """Graphs, once for each time that they were recorded. On the CPU what is recorded runs, reading nothing back."""
-    recorded, record = [], softmpm.Graph._record
-    monkeypatch.setattr(softmpm.Graph, "_record", lambda *args: recorded.append(args[0]) or record(*args))
+    recorded, record = [], softmpm.Graph._capture
+    monkeypatch.setattr(softmpm.Graph, "_capture", lambda *args: recorded.append(args[0]) or record(*args))
     if device == "cpu":
 
         @contextlib.contextmanager
         def blindly(*_, **__):
             with monkeypatch.context() as patch:
                 for module in (particle_order, autograd, fast_scheme, chunk_graph, rollout, runner):
-                    patch.setattr(module, "recording", lambda model: True)
+                    patch.setattr(module, "is_capturing", lambda model: True)
                 yield
 
         pretended = SimpleNamespace(

@@ -34,7 +34,7 @@ from softmpm.schemes import launch
 from softmpm.schemes.buffers import Solid
 from softmpm.schemes.fast import chunk_graph, chunk_graph_adj
 from softmpm.schemes.fast import scheme as fast_scheme
-from softmpm.schemes.fast.particle_order import Arrangement
+from softmpm.schemes.fast.particle_order import ParticleLayout
 
 SHORT = 8
 
@@ -150,8 +150,8 @@ def test_what_new_memory_holds_leaves_no_trace(dim, deterministic, device, monke
 
     found = []
     for number in (0.0, torch.nan):
-        monkeypatch.setattr(fast_scheme, "Program", full_of(number, chunk_graph.Program))
-        monkeypatch.setattr(fast_scheme, "Scratch", full_of(number, chunk_graph_adj.Scratch))
+        monkeypatch.setattr(fast_scheme, "ChunkGraph", full_of(number, chunk_graph.ChunkGraph))
+        monkeypatch.setattr(fast_scheme, "AdjointBuffers", full_of(number, chunk_graph_adj.AdjointBuffers))
         built = softmpm.build(tiny((16,) * dim), device=device, scheme="fast", deterministic=deterministic)
         start = built.rest()
         start.v.add_(torch.tensor([0.3, 0.2, 0.1][:dim], device=device))
@@ -204,12 +204,12 @@ def made(monkeypatch) -> list:
     """Every program that is made."""
     programs = []
 
-    class Counted(chunk_graph.Program):
+    class Counted(chunk_graph.ChunkGraph):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
             programs.append((self.chunk, self.keep))
 
-    monkeypatch.setattr(fast_scheme, "Program", Counted)
+    monkeypatch.setattr(fast_scheme, "ChunkGraph", Counted)
     return programs
 
 
@@ -352,7 +352,7 @@ def test_material_is_not_mixed_up_when_the_order_is_renewed(device):
         return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end.state().v
 
     first, _ = chunk_of(0), chunk_of(0)  # the second takes note of a material that was already in order
-    runner._pool.arrangement.renew(start.x)
+    runner._pool.arrangement.resort(start.x)
     other, again = chunk_of(1), chunk_of(0)
     assert_relative(again, first, same_on(device))
     assert not torch.allclose(other, first)
@@ -543,15 +543,15 @@ def test_a_start_stays_until_nothing_needs_it(device):
 @pytest.fixture
 def shuffled(monkeypatch):
     """Before each chunk another order is drawn at random."""
-    renew = Arrangement.renew
+    renew = ParticleLayout.resort
 
     def anew(self, x):
         renew(self, x)
         for order in self.order:
             order.copy_(order[torch.randperm(len(order)).to(order.device)])
 
-    monkeypatch.setattr(Arrangement, "renew", anew)
-    monkeypatch.setattr(Arrangement, "judge", lambda self, *_: setattr(self, "stale", True))
+    monkeypatch.setattr(ParticleLayout, "resort", anew)
+    monkeypatch.setattr(ParticleLayout, "update_staleness", lambda self, *_: setattr(self, "stale", True))
 
 
 @pytest.mark.parametrize("kept", ["all", "some"])
@@ -637,7 +637,7 @@ class Interruption(BaseException):
 @pytest.fixture
 def interrupted(monkeypatch):
     """Does some work again and again, and each time stops it somewhere else: at a launch, which may compile, or at a new buffer."""
-    places = (torch, "empty"), (wp, "launch"), (wp.Launch, "launch"), (launch.Command, "__call__")
+    places = (torch, "empty"), (wp, "launch"), (wp.Launch, "launch"), (launch.RebindableLaunch, "__call__")
 
     def attempts(make, work, every: int):
         """What was made for each attempt, once its work was stopped."""

@@ -9,15 +9,15 @@ from helpers import busy_inputs, busy_scene
 import softmpm
 from softmpm.errors import NEVER, Kind, decode
 from softmpm.kernels.fast.sorting import sorting
-from softmpm.kernels.structs import Wanted
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import outgrown
-from softmpm.schemes.fast.chunk_graph import Program
-from softmpm.schemes.fast.chunk_graph_adj import ProgramAdj, Scratch
-from softmpm.schemes.fast.particle_order import Arrangement
-from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacking
+from softmpm.schemes.fast.chunk_graph import ChunkGraph
+from softmpm.schemes.fast.chunk_graph_adj import AdjointBuffers, ChunkGraphAdj
+from softmpm.schemes.fast.particle_order import ParticleLayout
+from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacker
 
 WORLDS = 2
 
@@ -35,19 +35,19 @@ def state_of(model) -> softmpm.State:
         return softmpm.simulate(model, start, None, model.params(), substeps=2)
 
 
-def program_in(model, seed: int, x) -> Program:
+def program_in(model, seed: int, x) -> ChunkGraph:
     """A program whose particles stand in an order drawn at random, another one in each world."""
-    program = Program(model, Arrangement(model, x), Chunk(0, 1, 1), keep=True)
+    program = ChunkGraph(model, ParticleLayout(model, x), Chunk(0, 1, 1), keep=True)
     generator = torch.Generator().manual_seed(seed)
     for world in range(WORLDS):
         program.order[world] = torch.randperm(model.particle_count, generator=generator)
     program.origin.copy_(program.arrangement.origin)
-    program.calm()
+    program.reset_status()
     return program
 
 
 def start_of(model, program) -> SortedState:
-    return SortedState(Unpacking(model), program.base[0], program.rows[0], program.order)
+    return SortedState(Unpacker(model), program.base[0], program.rows[0], program.order)
 
 
 def test_a_state_changes_hands_unchanged(model):
@@ -74,16 +74,20 @@ def test_a_state_changes_hands_unchanged(model):
 
 def test_an_adjoint_changes_hands_unchanged(model):
     """The same for adjoints, from the scratch of one program to that of another."""
-    state, stream, wanted = state_of(model), stream_of(model.device), Wanted(material=False, activation=False)
+    state, stream, wanted = (
+        state_of(model),
+        stream_of(model.device),
+        RequestedGrads(material=False, activation=False),
+    )
     generator = torch.Generator().manual_seed(0)
     adj = softmpm.State(*(torch.randn(t.shape, generator=generator).to(t) for t in state[:4]))
     programs = [program_in(model, seed, state.x) for seed in (1, 2)]
-    first, second = (ProgramAdj(program, wanted, Scratch(program, wanted)) for program in programs)
+    first, second = (ChunkGraphAdj(program, wanted, AdjointBuffers(program, wanted)) for program in programs)
     first._enter(stream, *adj[:4])
-    between = SortedAdj(Unpacking(model), first.scratch.adj, programs[0].order)
-    second._move(stream, between.places(), between.rows)
+    between = SortedAdj(Unpacker(model), first.scratch.adj, programs[0].order)
+    second._move(stream, between.inverse_permutation(), between.rows)
     assert not torch.equal(programs[0].order, programs[1].order)
-    back = SortedAdj(Unpacking(model), second.scratch.adj, programs[1].order).state()
+    back = SortedAdj(Unpacker(model), second.scratch.adj, programs[1].order).state()
     for name, got, want in zip("xvCF", back[:4], adj[:4], strict=True):
         torch.testing.assert_close(
             got, want, rtol=3e-7, atol=0, msg=name
