@@ -11,7 +11,8 @@ import softmpm
 
 SRC = Path(__file__).parents[1] / "src"
 LAYERS = """
-    validate state devices batches compiling workspace kernels.compile
+    validate summary devices batches compiling workspace kernels.compile
+    state
     errors
     scene planning alarms checks kernels.structs
     reference kernels.physics

@@ -1,6 +1,7 @@
 """A scene made ready to run: fixed arrays on one device, and what was specialised for it."""
 
 import functools
+import html
 import math
 
 import numpy as np
@@ -16,6 +17,7 @@ from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, 
 from softmpm.scene.neighbours import rest_neighbours
 from softmpm.scene.scene import Scene
 from softmpm.state import Low, Params, State
+from softmpm.summary import counted
 from softmpm.workspace import Workspace
 
 LAWS = {
@@ -175,6 +177,17 @@ class Model:
         raise TypeError(
             "a model cannot be copied or pickled, it holds kernels and buffers: take its scene, and build it again."
         )
+
+    def __repr__(self) -> str:
+        particles, muscles = (
+            counted(self.particle_count, "particle"),
+            counted(self.muscle_count, "muscle"),
+        )
+        sizes = f"{counted(self.worlds, 'world')} of {particles} and {muscles}"
+        return f"Model({self.dim}D, {self.spec.dtype} on {self.device}, {sizes}, {self.scheme} scheme, dt {self.scene.dt:.4g} s)"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(self.describe())}</pre>"
 
     def describe(self, substeps: int = 1000) -> str:
         """What was compiled for this scene, what was left out, and the memory of calls of so many substeps each."""

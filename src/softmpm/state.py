@@ -5,12 +5,33 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from softmpm.summary import table
+
+
+def _rows(fields: dict[str, Any]) -> dict[str, str]:
+    """Shape, precision and device of each tensor, by its name."""
+    texts = {}
+    for name, value in fields.items():
+        if isinstance(value, Tensor):
+            texts[name] = f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')} on {value.device}"
+        else:
+            texts[name] = type(value).__name__ if value is not None else "None"
+    return texts
+
+
+def _text(fields: Any) -> str:
+    inside = ", ".join(f"{name}: {text}" for name, text in _rows(fields._asdict()).items())
+    return f"{type(fields).__name__}({inside})"
+
 
 class Low(NamedTuple):
     """Low-order parts: the exact state is ``State.x + Low.x`` and ``State.F + Low.F``."""
 
     x: Tensor
     F: Tensor
+
+    def __repr__(self) -> str:
+        return _text(self)
 
     def detach(self) -> "Low":
         """The same parts without their history."""
@@ -41,6 +62,12 @@ class State(NamedTuple):
     of 1e-5 of a cell survives a division into many calls; they carry no gradient. A state without them stands for exactly its
     four tensors."""
 
+    def __repr__(self) -> str:
+        return _text(self)
+
+    def _repr_html_(self) -> str:
+        return table("softmpm.State", _rows(self._asdict()))
+
     def detach(self) -> "State":
         """The same state without its history, the low-order parts included."""
         return self._each(lambda part: part.detach())
@@ -68,6 +95,9 @@ class Params(NamedTuple):
     density: Tensor
     """Rest density ρ₀ [kg/m³]."""
 
+    def __repr__(self) -> str:
+        return _text(self)
+
 
 class GridField(NamedTuple):
     """Mass and velocity on the nodes of the grid."""
@@ -76,3 +106,6 @@ class GridField(NamedTuple):
     """Nodal mass [kg], shape (world, *nodes)."""
     velocity: Tensor
     """Nodal velocity [m/s], shape (world, *nodes, dim); zero on nodes without mass."""
+
+    def __repr__(self) -> str:
+        return _text(self)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from softmpm.recording.format import FORMAT, PARTS, PER_FRAME, STATIC, TABLES, VERSION, complete
 from softmpm.recording.format_checks import check_frames, check_shapes, check_values, plain_dataset
 from softmpm.recording.superblock import readable
+from softmpm.summary import table
 
 _DAMAGE = (OSError, RuntimeError, LookupError, TypeError, AttributeError, OverflowError, MemoryError)
 """As h5py reports what HDF5 cannot read."""
@@ -51,6 +52,21 @@ class Recording:
         if not self.path.is_file():
             raise FileNotFoundError(f"there is no recording {self.path}.")
         self._steadily(self._load)
+
+    def __repr__(self) -> str:
+        return f"Recording({', '.join(f'{name}: {text}' for name, text in self._rows().items())})"
+
+    def _repr_html_(self) -> str:
+        return table("softmpm.Recording", self._rows())
+
+    def _rows(self) -> dict[str, str]:
+        return {
+            "file": str(self.path),
+            "particles": f"{len(self.static['positions']):,}, {100 * self.share:.3g} % of the model's",
+            "episodes": str(len(self.episodes)),
+            "frames": str(len(self._frame)),
+            "scalars": ", ".join(self.scalars) or "none",
+        }
 
     def _steadily(self, read: Callable[[], _T]) -> _T:
         """The result of ``read``; again after a failure while the file changes, because a writer is at work then."""

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from softmpm.scene.materials import Material
+from softmpm.summary import counted, table
 from softmpm.validate import array, need, need_kind, numbers, read_only, restore, store_numbers, unit
 
 Contact = Literal["stick", "slip", "separate"]
@@ -78,6 +79,9 @@ class Particles:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __repr__(self) -> str:
+        return f"Particles({len(self):,} in {self.positions.shape[1]}D)"
+
     __setstate__ = restore
 
 
@@ -118,6 +122,10 @@ class Muscle:
         object.__setattr__(self, "particles", read_only(index.astype(np.int64)))
         object.__setattr__(self, "direction", unit("muscle direction", self.direction)[0])
         store_numbers(self, "muscle", "strength")
+
+    def __repr__(self) -> str:
+        count = counted(len(self.particles), "particle")
+        return f"Muscle({count}, direction={self.direction}, strength={self.strength:g} Pa)"
 
     __setstate__ = restore
 
@@ -191,3 +199,22 @@ class Scene:
         store_numbers(self, "scene", "damping", "dt")
         need(self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
         need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")
+
+    def __repr__(self) -> str:
+        return f"Scene({', '.join(f'{name}: {text}' for name, text in self._rows().items())})"
+
+    def _repr_html_(self) -> str:
+        return table("softmpm.Scene", self._rows())
+
+    def _rows(self) -> dict[str, str]:
+        particles = sum(len(body.particles) for body in self.bodies)
+        laws = {type(body.material).__name__: None for body in self.bodies}
+        return {
+            "grid": f"{' x '.join(map(str, self.grid.shape))} nodes, {self.grid.spacing:.4g} m apart",
+            "bodies": f"{counted(len(self.bodies), 'body', 'bodies')} of {counted(particles, 'particle')}, {', '.join(laws)}",
+            "muscles": str(len(self.muscles)),
+            "walls": ", ".join(wall.contact for wall in self.walls) or "0",
+            "gravity": f"{self.gravity} m/s²",
+            "damping": f"{self.damping:g} 1/s",
+            "dt": f"{self.dt:.4g} s",
+        }
