@@ -30,7 +30,7 @@ APART = 1.4
 
 
 class StabilityWarning(UserWarning):
-    """The particles of a scene are so far apart that a body does not hold together."""
+    """The particles of a body are so far apart that numerical fracture occurs."""
 
 
 class StableDt(float):
@@ -121,13 +121,13 @@ def need_stable(scene: Scene, most: float) -> None:
 
 
 def warn_sparse(scene: Scene, *, stacklevel: int = 3) -> None:
-    """Warn of bodies whose particles are too far apart to hold together."""
+    """Warn of bodies whose particles are so far apart that numerical fracture occurs."""
     for b, body in enumerate(scene.bodies):
         apart = float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim)
         if len(body.particles) > 1 and apart > APART * scene.grid.spacing:
             warnings.warn(
-                f"particles of body {b} are {apart / scene.grid.spacing:.3g} cells apart, by their volumes; beyond {APART} a body "
-                f"does not hold together. Use a spacing of half a cell, {0.5 * scene.grid.spacing:.3g} m.",
+                f"body {b}: the mean particle spacing is {apart / scene.grid.spacing:.3g} cells (from particle volumes). Above {APART} "
+                f"cells numerical fracture occurs; use a spacing of about half a cell, {0.5 * scene.grid.spacing:.3g} m.",
                 StabilityWarning,
                 stacklevel=stacklevel,
             )

@@ -9,7 +9,7 @@ import numpy as np
 
 
 def need(condition: bool, message: str) -> None:
-    """Raise ValueError unless ``condition`` holds; the message says what must hold, what came instead and what to do."""
+    """Raise ``ValueError(message)`` unless ``condition`` holds. A message states the rule, the value received and the remedy."""
     if not condition:
         raise ValueError(message)
 

@@ -1,4 +1,4 @@
-"""Neighbours at rest: the pairs of particles that must stay near each other for a body to hold together."""
+"""Neighbours at rest: pairs of particles whose separation is numerical fracture."""
 
 import numpy as np
 

@@ -25,7 +25,7 @@ class Grid:
     shape: tuple[int, ...]
     """Nodes along each axis; two axes make a plane-strain scene, three a solid one."""
     spacing: float
-    """Distance of neighbouring nodes, dx [m]."""
+    """Distance of neighbouring nodes, dx [m]. Good values: several cells across the thinnest limb."""
 
     def __post_init__(self):
         need(np.shape(self.shape) in ((2,), (3,)), f"grid shape must have 2 or 3 axes, got {self.shape!r}.")
@@ -90,7 +90,9 @@ class Body:
     """Particles made of one material."""
 
     particles: Particles
+    """From :func:`softmpm.box`, ``ball``, ``image`` or ``mesh``. Good spacing: half a cell, 4 particles per cell in 2D, 8 in 3D."""
     material: Material
+    """One of the laws, such as :class:`softmpm.NeoHookean`."""
 
     def __post_init__(self):
         need_kind("body particles", self.particles, Particles)
@@ -109,7 +111,8 @@ class Muscle:
     direction: Sequence[float]
     """Fibre direction d in the rest shape; normalised here."""
     strength: float
-    """Stress at full activation, s [Pa]."""
+    """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger muscles
+    invert particles (docs/results.md)."""
 
     def __post_init__(self):
         index = array("muscle particles", self.particles, "biufO", "whole numbers")
@@ -143,8 +146,9 @@ class Wall:
     offset: float
     """The wall's surface is n·x = offset [m]."""
     contact: Contact = "separate"
+    """Response of a node inside the wall, see above."""
     friction: float = 0.0
-    """Coulomb coefficient [-], for ``separate`` only."""
+    """Coulomb coefficient [-], for ``separate`` only. Good values: 0.3 to 1.0 for a floor that is walked on."""
 
     def __post_init__(self):
         need(
@@ -165,19 +169,23 @@ class Wall:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Scene:
-    """Everything that does not change while a robot moves."""
+    """A soft robot and its surroundings: everything that does not change while it moves."""
 
     grid: Grid
+    """Background grid; a particle that leaves it is an error."""
     bodies: Sequence[Body]
+    """At least one; their particles are numbered in this order."""
     muscles: Sequence[Muscle] = ()
+    """Actuators, in the order of the last axis of ``activation``; they may overlap."""
     walls: Sequence[Wall] = ()
     """Applied in this order; at most 64."""
     gravity: Sequence[float] | None = None
-    """Gravity g [m/s²], one number per axis; None is weightless."""
+    """Gravity g [m/s²], one number per axis, such as (0.0, -9.8) in 2D, where axis 1 points up; None is weightless."""
     damping: float = 0.0
-    """Rate at which grid velocity decays [1/s]; the same for every dt."""
+    """Rate at which grid velocity decays [1/s]; the same for every dt. 0 for free motion; an arm that should come to rest takes 6."""
     dt: float
-    """Length of one substep, Δt [s]; see :func:`softmpm.stable_dt`."""
+    """Length of one substep, Δt [s]. Good values: half of :func:`softmpm.stable_dt`, which leaves room for stretch; above it ``build``
+    refuses."""
 
     def __post_init__(self):
         need_kind("scene grid", self.grid, Grid)
