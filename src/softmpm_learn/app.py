@@ -59,7 +59,7 @@ def main(signals: Signals | None = None) -> None:
             if not group.first:
                 signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
-            register(group.tell(time.time()))
+            register(group.broadcast(time.time()))
             run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
             run(lambda config: job(config, group, signals))()
     except Exception as error:
@@ -96,9 +96,9 @@ def _run_dir(resume: str | None, fresh: str) -> str:
 
 def job(config: DictConfig, group: Group, signals: Signals) -> None:
     """One run. An error ends it with a sentence on stderr and the traceback in its folder, both from where it happened."""
-    out = Path(group.tell(HydraConfig.get().runtime.output_dir))
+    out = Path(group.broadcast(HydraConfig.get().runtime.output_dir))
     try:
-        with group.together():
+        with group.fail_together():
             conf = to_run(config)
             if conf.resume is not None:
                 conf = resumed(conf, [text.lstrip("+~") for text in HydraConfig.get().overrides.task])

@@ -3,7 +3,7 @@
 Every process holds the same policy, design and generator and simulates its share of the worlds. Gradients and figures are averaged, so
 that all take the same step. What is not the same everywhere belongs to the first process: files, the learning phase, the log.
 
-No process waits for one that has failed: what may fail in one of them stands in :meth:`Group.together`.
+No process waits for one that has failed: what may fail in one of them stands in :meth:`Group.fail_together`.
 """
 
 import os
@@ -93,12 +93,12 @@ class Group:
         dist.gather(tensor, parts)
         return torch.cat(parts, dim) if parts else None
 
-    def copy_first(self, tensors: Iterable[Tensor]) -> None:
+    def broadcast_(self, tensors: Iterable[Tensor]) -> None:
         """Each tensor takes, in place, the values that it has in the first process."""
         for tensor in tensors if self.size > 1 else ():
             dist.broadcast(tensor, src=0)
 
-    def tell(self, value: T, source: int = 0) -> T:
+    def broadcast(self, value: T, source: int = 0) -> T:
         """What ``source`` passes, in every process: plain values and tensors on the CPU."""
         values = [value]
         if self.size > 1:
@@ -111,11 +111,11 @@ class Group:
         Raises:
             OtherProcessError: In the others, if it failed.
         """
-        with self.together():
+        with self.fail_together():
             return work(*args, **kwargs) if self.first else None
 
     @contextmanager
-    def together(self, kind: type[Exception] = Exception) -> Iterator[None]:
+    def fail_together(self, kind: type[Exception] = Exception) -> Iterator[None]:
         """The block ends well in every process or in none. Inside it, no process may wait for another.
 
         Where several fail, the first of them raises its error. An error of another kind leaves at once: its process ends, and
@@ -135,7 +135,7 @@ class Group:
         failed = self.size - self._largest(0 if error is None else self.size - self.rank)
         if failed == self.size:
             return
-        message = self.tell(in_full(error), source=failed)
+        message = self.broadcast(in_full(error), source=failed)
         if error is not None and failed == self.rank:
             raise error
         raise OtherProcessError(message) from error

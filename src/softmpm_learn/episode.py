@@ -38,8 +38,8 @@ class Episode:
     running: Tensor
     """Mean cost of the control steps, shape (world,). Differentiable."""
     end: State
-    seen: Tensor | None
-    """What the observer saw, every so many control steps, shape (frame, world, ...), detached; None if it was not asked for."""
+    observations: Tensor | None
+    """Observations at regular control steps, shape (frame, world, ...), detached; None if not requested."""
     effort: Tensor
     """Mean square of the activation [-], shape (), detached."""
     decisions: "Decisions"
@@ -81,7 +81,7 @@ def run_episode(
     Args:
         params: Materials; see :class:`softmpm_learn.design.Design`.
         goal: Goal of each world [m], shape (world, dim), where it is not the task's own.
-        keep_every: Control steps between two kept looks, 0 for none.
+        keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
 
     Raises:
@@ -89,12 +89,12 @@ def run_episode(
     """
     start = state = model.rest()
     period, times = task.control_period, _times(task, model)
-    made, path, seen = Decisions(), [], []
+    made, path, observations = Decisions(), [], []
     for step in range(task.control_steps):
-        look = observer.look(model, state)
+        observation = observer.observe(model, state)
         if keep_every and step % keep_every == 0:
-            seen.append(look.detach())
-        features = observer.encode(look)
+            observations.append(observation.detach())
+        features = observer.encode(observation)
         activation = policy(features, times[step], goal)
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
@@ -115,7 +115,7 @@ def run_episode(
         final=task.objective.final(start, state, goal),
         running=task.objective.running(torch.stack(path), activations).mean(dim=0),
         end=state,
-        seen=torch.stack(seen) if seen else None,
+        observations=torch.stack(observations) if observations else None,
         effort=activations.detach().square().mean(),
         decisions=made,
     )
@@ -182,6 +182,6 @@ class ClosedLoop:
 
     def _policy_gradient(self, decisions: Decisions, adj_activations: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Of all decisions at once: layer by layer and step by step it would be many small sums."""
-        seen, times = torch.stack(decisions.features).detach(), _times(self.task, self.model)[:, None]
-        again = self.policy(seen, times, self._goal)
+        features, times = torch.stack(decisions.features).detach(), _times(self.task, self.model)[:, None]
+        again = self.policy(features, times, self._goal)
         return torch.autograd.grad(again, list(self.policy.parameters()), torch.stack(list(adj_activations)))

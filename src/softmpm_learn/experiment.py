@@ -17,9 +17,8 @@ import softmpm
 from softmpm_learn.config import RunConf
 from softmpm_learn.distributed import Group
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
-from softmpm_learn.objective import Progress as Travel
-from softmpm_learn.objective import Reach
-from softmpm_learn.progress import Progress
+from softmpm_learn.objective import Progress, Reach
+from softmpm_learn.progress import ProgressBar
 from softmpm_learn.run import Run
 from softmpm_learn.saved import save
 from softmpm_learn.stop import Signals
@@ -62,12 +61,12 @@ def run_experiment(
     group, signals = group or Group(), signals or Signals()
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(conf.device.threads)
-    with group.together():
+    with group.fail_together():
         task = make_task(conf.task)
         model = make_model(task, conf, group)
     logger.info("%s", model.describe(task.substeps))
     with contextlib.ExitStack() as held:
-        progress = held.enter_context(Progress(conf.train.iterations)) if group.first else None
+        progress = held.enter_context(ProgressBar(conf.train.iterations)) if group.first else None
         stop = held.enter_context(signals.awaited(insist=group.size == 1))
 
         def begun() -> None:
@@ -154,11 +153,11 @@ def decoded(run: Run) -> np.ndarray:
 @torch.no_grad()
 def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
     """Materials of the best robot: value of each particle and unit."""
-    now = run.actor()
+    now = run.policy_snapshot()
     if run.best["iteration"] >= 0:
-        run.load_actor(run.best)
+        run.load_policy(run.best)
     params = run.params()
-    run.load_actor(now)
+    run.load_policy(now)
     return {title: (getattr(params, name).cpu().numpy(), unit) for name, (title, unit) in DESIGN.items()}
 
 
@@ -200,7 +199,7 @@ def outcome(task: Task, out: Path) -> str:
     if episode is None:
         return ""
     start, end = episode[1]["x"][0], episode[1]["x"][-1]
-    if isinstance(task.objective, Travel):
+    if isinstance(task.objective, Progress):
         moved = float((end - start)[:, task.objective.axis].mean())
         return f"; it travelled {moved:.3f} m, {moved / task.body_length:.2f} of its length"
     if isinstance(task.objective, Reach) and task.goal is not None:

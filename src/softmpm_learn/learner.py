@@ -33,12 +33,12 @@ class Learner:
         """What a learning phase changes."""
         return [self.autoencoder] if self.target is None else [self.autoencoder, self.target]
 
-    def watch(self, first: int, seen: Tensor) -> None:
+    def watch(self, first: int, observations: Tensor) -> None:
         """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on; where there are more
         than the buffer holds, only the last are written.
         """
-        for world in range(seen.shape[1])[-self.replay.simulations :]:
-            self.replay.add(first + world, seen[:, world])
+        for world in range(observations.shape[1])[-self.replay.simulations :]:
+            self.replay.add(first + world, observations[:, world])
 
     def learn(self, generator: torch.Generator) -> dict[str, float]:
         """One learning phase; its figures for metrics.csv."""

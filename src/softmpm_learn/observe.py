@@ -1,7 +1,7 @@
 """State → features: centroids of hand-picked regions, of k-means clusters, or a learned latent of the grid velocity.
 
-An observer works in two steps, ``look`` (state → what is seen) and ``encode`` (what is seen → features), because what a learned
-observer sees is also what it learns from. Both are differentiable.
+An observer works in two steps, ``observe`` (state → observation) and ``encode`` (observation → features), because a learned
+observer also trains on the observations. Both are differentiable.
 """
 
 import math
@@ -30,15 +30,15 @@ class Observer(nn.Module, ABC):
     """Number of features."""
 
     @abstractmethod
-    def look(self, model: Model, state: State) -> Tensor:
-        """What is seen of each world, shape (world, ...)."""
+    def observe(self, model: Model, state: State) -> Tensor:
+        """Observation of each world, shape (world, ...)."""
 
     @abstractmethod
-    def encode(self, seen: Tensor) -> Tensor:
+    def encode(self, observation: Tensor) -> Tensor:
         """Features of order one, shape (world, size)."""
 
     def forward(self, model: Model, state: State) -> Tensor:
-        return self.encode(self.look(model, state))
+        return self.encode(self.observe(model, state))
 
 
 class Centroids(Observer):
@@ -64,13 +64,13 @@ class Centroids(Observer):
     def _posture(self, x: Tensor) -> Tensor:
         return self.mean @ x - x.mean(dim=1, keepdim=True)
 
-    def look(self, model: Model, state: State) -> Tensor:
+    def observe(self, model: Model, state: State) -> Tensor:
         """Posture and velocity of each region, shape (world, region, 2 · dim)."""
         posture = (self._posture(state.x) - self.rest) / (POSTURE * self.body_length)
         return torch.cat([posture, self.mean @ state.v / self.body_length], dim=-1)
 
-    def encode(self, seen: Tensor) -> Tensor:
-        return seen.flatten(start_dim=1)
+    def encode(self, observation: Tensor) -> Tensor:
+        return observation.flatten(start_dim=1)
 
 
 def clusters(positions: np.ndarray, count: int) -> list[np.ndarray]:
@@ -88,7 +88,7 @@ def clusters(positions: np.ndarray, count: int) -> list[np.ndarray]:
     return [np.flatnonzero(label == k) for k in np.unique(label)]
 
 
-class Picture:
+class VelocityImage:
     """Grid velocity as a learned observer sees it: averaged over blocks of nodes, components first.
 
     Args:
@@ -124,13 +124,13 @@ class Picture:
 class Latent(Observer):
     """Features that an encoder finds in the picture of the grid velocity; which encoder is not this class's business."""
 
-    def __init__(self, picture: Picture, encoder: nn.Module, size: int):
+    def __init__(self, picture: VelocityImage, encoder: nn.Module, size: int):
         super().__init__()
         self.picture, self.encoder, self.size = picture, encoder, size
 
-    def look(self, model: Model, state: State) -> Tensor:
+    def observe(self, model: Model, state: State) -> Tensor:
         """The picture, shape (world, dim, *nodes) [m/s]."""
         return self.picture(model, state)
 
-    def encode(self, seen: Tensor) -> Tensor:
-        return self.encoder(seen)
+    def encode(self, observation: Tensor) -> Tensor:
+        return self.encoder(observation)

@@ -10,7 +10,7 @@ from tqdm import tqdm
 logger = logging.getLogger("softmpm_learn")
 
 
-class Progress:
+class ProgressBar:
     """Call it after each iteration; the first call tells where a resumed run began. Use as a context manager."""
 
     def __init__(self, total: int, *, lines: int = 20):
@@ -41,7 +41,7 @@ class Progress:
         seconds = (time.monotonic() - self._began) / done * missing
         return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
-    def __enter__(self) -> "Progress":
+    def __enter__(self) -> "ProgressBar":
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:

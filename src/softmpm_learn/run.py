@@ -16,7 +16,7 @@ from softmpm_learn.distributed import Group
 from softmpm_learn.episode import ClosedLoop
 from softmpm_learn.identity import identity
 from softmpm_learn.learner import Learner
-from softmpm_learn.observe import Centroids, Latent, Observer, Picture, clusters
+from softmpm_learn.observe import Centroids, Latent, Observer, VelocityImage, clusters
 from softmpm_learn.policy import Goal, make_policy
 from softmpm_learn.replay import Replay
 from softmpm_learn.seeding import seeded
@@ -78,7 +78,7 @@ class Run:
         if conf.name == "kmeans":
             found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
             return Centroids(model, found, task.body_length)
-        picture = Picture(model, conf.nodes, conf.follow)
+        picture = VelocityImage(model, conf.nodes, conf.follow)
         with seeded(self.settings.train.seed):
             size, channels = conf.latent_size, list(conf.channels)
             autoencoder = Autoencoder(model.dim, picture.shape, size, channels, scale=task.body_length)
@@ -120,12 +120,12 @@ class Run:
         """What the gradient changes: policy, then design."""
         return [*self.policy.parameters(), *self.design.parameters()]
 
-    def keep_safe(self) -> None:
+    def snapshot(self) -> None:
         self.safe = [p.detach().clone() for p in self.parameters]
 
     @torch.no_grad()
-    def step_back(self) -> None:
-        """Halve the step since :meth:`keep_safe`."""
+    def backtrack(self) -> None:
+        """Halve the step since :meth:`snapshot`."""
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
 
@@ -149,14 +149,14 @@ class Run:
         """As :meth:`draw_goals`, without chance: the middle of the box."""
         return None if self._goal is None else self._goal.centre.expand(self.model.worlds, -1)
 
-    def actor(self) -> dict:
+    def policy_snapshot(self) -> dict:
         """Copies of what decides how the robot moves: policy, design and what the policy sees through."""
         parts = {"observer": self.observer, "policy": self.policy, "design": self.design}
         return {name: {k: t.clone() for k, t in part.state_dict().items()} for name, part in parts.items()}
 
-    def load_actor(self, actor: dict) -> None:
+    def load_policy(self, snapshot: dict) -> None:
         for name in ("observer", "policy", "design"):
-            getattr(self, name).load_state_dict(actor[name])
+            getattr(self, name).load_state_dict(snapshot[name])
 
     def state_dict(self) -> dict:
         return {
@@ -211,9 +211,9 @@ class Run:
                 f"the iteration is {self.iteration!r}, that of the best loss {self.best['iteration']!r}"
             )
         if self.best["iteration"] >= 0:
-            now = self.actor()
-            self.load_actor(self.best)  # compares the shapes
-            self.load_actor(now)
+            now = self.policy_snapshot()
+            self.load_policy(self.best)  # compares the shapes
+            self.load_policy(now)
 
     def about(self) -> str:
         """What a resumed run must share, as JSON."""

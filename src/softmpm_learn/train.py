@@ -4,7 +4,7 @@ for each iteration:
     optimise   simulate in closed loop, then step policy and design along the gradient of the loss,
                which passes through every substep, every activation and every encoder evaluation
     learn      every few iterations: train the autoencoder on the grid velocity of past simulations,
-               and let the target network, through which the policy looks, follow it
+               and let the target network, which the policy uses, follow it
     save       metrics, recording, checkpoint
 
 Several processes may share the worlds (see :mod:`softmpm_learn.distributed`); the first of them alone learns, from the pictures of
@@ -27,9 +27,9 @@ from softmpm import Model
 from softmpm_learn import checkpoint, files
 from softmpm_learn.distributed import Group, OtherProcessError, in_full
 from softmpm_learn.episode import Episode, run_episode
-from softmpm_learn.journal import TIMING, Journal
 from softmpm_learn.replay import ReplayError
 from softmpm_learn.run import Run, SettingsError
+from softmpm_learn.run_logger import TIMING, RunLogger
 from softmpm_learn.settings import Settings
 
 logger = logging.getLogger("softmpm_learn")
@@ -94,10 +94,10 @@ def train(
     group = group or Group()
     with contextlib.ExitStack() as held:
         group.once(lambda: held.enter_context(_entered(out)))
-        with group.together():
+        with group.fail_together():
             run = Run(task, model, settings, out, group)
         seals = _resume(run, out)
-        journal = group.once(lambda: held.enter_context(Journal(run, out, seals, begin)))
+        journal = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin)))
         return _loop(run, journal, progress, stop)
 
 
@@ -116,10 +116,10 @@ def _resume(run: Run, out: Path) -> dict:
     the other files.
     """
     group = run.group
-    content = group.tell(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
+    content = group.broadcast(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
     if content is None:
         return {}
-    with group.together():
+    with group.fail_together():
         seals = _restore(run, content, out)
     logger.info("Going on after iteration %d of %s.", run.iteration, out)
     return seals
@@ -144,18 +144,18 @@ def _restore(run: Run, content: dict, out: Path) -> dict:
         ) from error
 
 
-def _loop(run: Run, journal: Journal | None, progress, stop) -> Result:
+def _loop(run: Run, journal: RunLogger | None, progress, stop) -> Result:
     group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
     while run.iteration < last and not group.any(stop()):
         k = run.iteration
-        row, seen = optimise(run, journal, seconds)
+        row, observations = optimise(run, journal, seconds)
         with _clock(seconds, "learn"):
-            row |= learn(run, seen)
-        with group.together():
+            row |= learn(run, observations)
+        with group.fail_together():
             if journal:
                 journal.add(k, row, seconds)
         run.iteration += 1
-        with _clock(seconds, "save"), group.together():
+        with _clock(seconds, "save"), group.fail_together():
             if journal:
                 journal.save()
         if progress and group.first:
@@ -166,7 +166,7 @@ def _loop(run: Run, journal: Journal | None, progress, stop) -> Result:
 
 
 def optimise(
-    run: Run, journal: Journal | None, seconds: dict[str, float]
+    run: Run, journal: RunLogger | None, seconds: dict[str, float]
 ) -> tuple[dict[str, float], Tensor | None]:
     """One optimisation step: simulate, differentiate, move policy and design. Gives figures for metrics.csv and what was seen."""
     goal, retries = run.draw_goals(), 0
@@ -178,21 +178,23 @@ def optimise(
             if not run.safe or retries == run.settings.optimizer.retries:
                 raise TrainingError(run.iteration, in_full(error)) from error
             logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
-            run.step_back()
+            run.backtrack()
             retries += 1
     row |= {f"{name}_change": change for name, change in run.design.change().items()}
     if row["loss"] < run.best["loss"]:
-        run.best = {"loss": row["loss"], "iteration": run.iteration, **run.actor()}
-    run.keep_safe()
+        run.best = {"loss": row["loss"], "iteration": run.iteration, **run.policy_snapshot()}
+    run.snapshot()
     run.optimizer.step()
-    return row | {"retries": retries, "best": run.best["loss"]}, episode.seen
+    return row | {"retries": retries, "best": run.best["loss"]}, episode.observations
 
 
-def attempt(run: Run, goal, journal: Journal | None, seconds) -> tuple[Episode, dict[str, float]]:
+def attempt(run: Run, goal, journal: RunLogger | None, seconds) -> tuple[Episode, dict[str, float]]:
     """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
-    film = journal.film(run.iteration) if journal and journal.due(run.iteration) else contextlib.nullcontext()
+    recorded = (
+        journal.record(run.iteration) if journal and journal.due(run.iteration) else contextlib.nullcontext()
+    )
     with _clock(seconds, "episode"):
-        with _all_worlds(run), film as on_frame:
+        with _all_worlds(run), recorded as on_frame:
             episode, gradients = run.loop(goal, on_frame)
         return episode, take_gradient(run, episode, gradients)
 
@@ -200,7 +202,7 @@ def attempt(run: Run, goal, journal: Journal | None, seconds) -> tuple[Episode, 
 @contextlib.contextmanager
 def _all_worlds(run: Run) -> Iterator[None]:
     """A simulation that fails in one process fails in every one; the message has the world's number among all worlds."""
-    with run.group.together(softmpm.UnstableError):
+    with run.group.fail_together(softmpm.UnstableError):
         try:
             yield
         except softmpm.UnstableError as error:
@@ -250,31 +252,31 @@ def _length(gradients: Sequence[Tensor]) -> float:
     return math.sqrt(sum(g.double().square().sum().item() for g in gradients))
 
 
-def learn(run: Run, seen: Tensor | None) -> dict[str, float]:
+def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
     """Add the observations to the replay buffer and run a learning phase if one is due; in the first process alone.
 
     Returns its figures for metrics.csv.
     """
-    if run.learner is None or seen is None:
+    if run.learner is None or observations is None:
         return {}
-    pictures = run.group.gather(seen, dim=1)
-    with run.group.together():
+    pictures = run.group.gather(observations, dim=1)
+    with run.group.fail_together():
         if pictures is not None:
             run.learner.watch(run.iteration * run.settings.train.worlds, pictures)
     row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
         row |= run.group.once(run.learner.learn, run.generator) or {}
-        run.group.copy_first(t for network in run.learner.networks for t in network.state_dict().values())
-        run.generator.set_state(run.group.tell(run.generator.get_state()))
+        run.group.broadcast_(t for network in run.learner.networks for t in network.state_dict().values())
+        run.generator.set_state(run.group.broadcast(run.generator.get_state()))
     return row
 
 
 @torch.no_grad()
-def play_best(run: Run, journal: Journal) -> None:
+def play_best(run: Run, journal: RunLogger) -> None:
     """Record the best policy and design once more, as the episode after the last."""
-    now = run.actor()
-    run.load_actor(run.best)
-    with journal.film(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
+    now = run.policy_snapshot()
+    run.load_policy(run.best)
+    with journal.record(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
         run_episode(
             run.task,
             run.model,
@@ -284,7 +286,7 @@ def play_best(run: Run, journal: Journal) -> None:
             goal=run.middle_goals(),
             on_frame=on_frame,
         )
-    run.load_actor(now)
+    run.load_policy(now)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ import softmpm
 from softmpm_learn.design import Design
 from softmpm_learn.episode import ClosedLoop, run_episode
 from softmpm_learn.objective import Effort, Progress
-from softmpm_learn.observe import Centroids, Latent, Picture
+from softmpm_learn.observe import Centroids, Latent, VelocityImage
 from softmpm_learn.policy import make_policy
 from softmpm_learn.seeding import seeded
 from softmpm_learn.settings import DesignConf, PolicyConf
@@ -38,7 +38,7 @@ def test_equals_one_call_of_simulate(task, model):
     torch.testing.assert_close(episode.final, Progress().final(start, end, None))
     torch.testing.assert_close(episode.running, torch.full((1,), 1e-3 * (0.25 + 0.09) / 2))
     torch.testing.assert_close(episode.loss, episode.final + episode.running)
-    assert episode.effort.item() == pytest.approx((0.25 + 0.09) / 2) and episode.seen is None
+    assert episode.effort.item() == pytest.approx((0.25 + 0.09) / 2) and episode.observations is None
 
 
 def test_gradient_of_policy_and_design(task):
@@ -46,7 +46,7 @@ def test_gradient_of_policy_and_design(task):
     model = softmpm.build(task.scene, device="cpu", dtype=torch.float64, worlds=2)
     with seeded(0):
         net = nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3), nn.Tanh()).double()
-    observer = Latent(Picture(model), net, size=3)
+    observer = Latent(VelocityImage(model), net, size=3)
     policy = make_policy(PolicyConf(name="linear"), 3, 2, 0.1, seed=0).double()
     design = Design(DesignConf(), model, task.regions)
     variables = [*policy.parameters(), *design.parameters()]
@@ -91,15 +91,15 @@ def test_the_loop_gives_the_gradient_of_all_parameters(task, model, name):
 
 def test_frames_and_pictures(task, model):
     """A frame at every control step and one at the end; every second look is kept, and keeps no graph."""
-    observer = Latent(Picture(model), nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3)), size=3)
+    observer = Latent(VelocityImage(model), nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3)), size=3)
     frames = []
     episode = run_episode(
         task, model, observer, Constant([0.5, 0.5]), model.params(), keep_every=2, on_frame=frames.append
     )
     assert len(frames) == task.control_steps + 1 and frames[-1].activation is None
     np.testing.assert_allclose([f.time for f in frames], 0.016 * np.arange(7))
-    assert episode.seen.shape == (3, 1, 2, 13, 9) and not episode.seen.requires_grad
-    torch.testing.assert_close(episode.seen[1], observer.look(model, frames[2].state))
+    assert episode.observations.shape == (3, 1, 2, 13, 9) and not episode.observations.requires_grad
+    torch.testing.assert_close(episode.observations[1], observer.observe(model, frames[2].state))
     assert torch.equal(frames[-1].state.x, episode.end.x)
 
 

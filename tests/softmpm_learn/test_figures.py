@@ -10,7 +10,7 @@ from PIL import Image
 
 import softmpm
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
-from softmpm_learn.progress import Progress
+from softmpm_learn.progress import ProgressBar
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_figures_do_not_import_matplotlib_until_they_draw():
 
 def test_progress_without_a_terminal_writes_a_few_lines(caplog):
     """The first and the last iteration and every so many in between, with the loss, the best and the time left."""
-    with caplog.at_level("INFO", logger="softmpm_learn"), Progress(40, lines=4) as progress:
+    with caplog.at_level("INFO", logger="softmpm_learn"), ProgressBar(40, lines=4) as progress:
         for k in range(40):
             progress(k, loss=float((k - 30) ** 2))
     lines = [record.getMessage() for record in caplog.records]
@@ -132,7 +132,7 @@ def test_progress_without_a_terminal_writes_a_few_lines(caplog):
 def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
     """It shows how many iterations of how many are done, and the loss; a resumed run starts where it is."""
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    with Progress(10) as progress:
+    with ProgressBar(10) as progress:
         for k in range(4, 10):
             progress(k, loss=1.5)
     shown = capsys.readouterr().err

@@ -4,7 +4,7 @@ import torch
 from helpers import busy_scene
 
 import softmpm
-from softmpm_learn.observe import Centroids, Latent, Picture, clusters
+from softmpm_learn.observe import Centroids, Latent, VelocityImage, clusters
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,8 @@ def test_clusters_split_the_particles_evenly_the_same_way_each_time():
 def test_picture_averages_blocks_of_the_grid_velocity(exact):
     """A uniform motion shows as its velocity in blocks full of particles and as nothing far away; pooling is a plain mean."""
     state = exact.rest()._replace(v=torch.ones_like(exact.rest().v) * torch.tensor([0.3, -0.2]).double())
-    fine = Picture(exact, nodes=13, follow=False)(exact, state)
-    coarse = Picture(exact, nodes=7, follow=False)(exact, state)
+    fine = VelocityImage(exact, nodes=13, follow=False)(exact, state)
+    coarse = VelocityImage(exact, nodes=7, follow=False)(exact, state)
     assert fine.shape == (2, 2, 13, 9) and coarse.shape == (2, 2, 7, 5)
     torch.testing.assert_close(fine[:, :, 5, 3], torch.tensor([[0.3, -0.2]] * 2).double(), rtol=0.02, atol=0)
     assert (fine[:, :, 12] == 0).all()
@@ -57,7 +57,7 @@ def test_picture_follows_the_robot(exact):
     """With follow, a robot elsewhere looks the same; without, it does not. At the rim it is still seen, not an error."""
     state = moving(exact)
     away = state._replace(x=state.x + torch.tensor([0.13, 0.07], dtype=torch.float64))
-    follow, fixed = Picture(exact), Picture(exact, follow=False)
+    follow, fixed = VelocityImage(exact), VelocityImage(exact, follow=False)
     torch.testing.assert_close(follow(exact, away), follow(exact, state))
     assert (fixed(exact, away) - fixed(exact, state)).abs().max() > 0.05
     wide = state._replace(
@@ -71,7 +71,7 @@ def test_picture_in_three_dimensions():
     model = softmpm.build(busy_scene(3), device="cpu", worlds=2)
     rest = model.rest()
     velocity = torch.tensor([0.3, -0.2, 0.1])
-    picture = Picture(model, nodes=6, follow=False)(model, rest._replace(v=rest.v + velocity))
+    picture = VelocityImage(model, nodes=6, follow=False)(model, rest._replace(v=rest.v + velocity))
     assert picture.shape == (2, 3, 6, 6, 5)
     brightest = picture[0].flatten(1)[:, picture[0, 0].argmax()]
     torch.testing.assert_close(brightest / brightest.norm(), velocity / velocity.norm(), rtol=1e-5, atol=1e-6)
@@ -87,7 +87,7 @@ def test_features_are_differentiable(exact, kind):
         net = torch.nn.Sequential(
             torch.nn.Flatten(), torch.nn.Linear(2 * 13 * 9, 3), torch.nn.Tanh()
         ).double()
-        observer = Latent(Picture(exact), net, size=3)
+        observer = Latent(VelocityImage(exact), net, size=3)
     state, direction = moving(exact), [torch.randn_like(t) for t in exact.rest()[:4]]
     leaves = [t.clone().requires_grad_() for t in state[:4]]
     weight = torch.randn(2, observer.size, dtype=torch.float64)

@@ -14,9 +14,9 @@ import torch
 
 import softmpm
 from softmpm_learn import checkpoint, train
+from softmpm_learn.csv_log import Table
 from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
-from softmpm_learn.table import Table
 
 HERE = Path(__file__).parent
 SOURCE = HERE.parents[1] / "src"

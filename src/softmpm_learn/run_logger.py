@@ -11,9 +11,9 @@ import torch
 
 import softmpm
 from softmpm_learn import checkpoint
+from softmpm_learn.csv_log import Table
 from softmpm_learn.episode import Frame
 from softmpm_learn.run import Run
-from softmpm_learn.table import Table
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -30,7 +30,7 @@ TIMING = ["episode", "learn", "save"]
 """
 
 
-class Journal:
+class RunLogger:
     """Goes on where the run is, and begins with a checkpoint of a new one. Of several processes the first keeps it; it shows
     the first of its worlds. Use as a context manager.
 
@@ -113,21 +113,21 @@ class Journal:
         )
 
     @contextlib.contextmanager
-    def film(self, iteration: int, **about) -> Iterator[Callable[[Frame], None] | None]:
+    def record(self, iteration: int, **about) -> Iterator[Callable[[Frame], None] | None]:
         """Record an episode: gives what to call at each frame, or None if nothing is recorded."""
         if self._recorder is None:
             yield None
             return
-        with self._recorder.episode(iteration, task=self.run.task.name, **about) as film:
+        with self._recorder.episode(iteration, task=self.run.task.name, **about) as episode:
 
             def on_frame(frame: Frame) -> None:
                 with torch.no_grad():
                     velocity = softmpm.rasterize(self.run.model, frame.state).velocity
-                    film.frame(frame.time, frame.state, frame.activation, velocity, frame.features)
+                    episode.frame(frame.time, frame.state, frame.activation, velocity, frame.features)
 
             yield on_frame
 
-    def __enter__(self) -> "Journal":
+    def __enter__(self) -> "RunLogger":
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from softmpm_learn.table import Table
+from softmpm_learn.csv_log import Table
 
 
 def test_numbers_read_back_to_the_last_bit(tmp_path):
