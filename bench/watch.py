@@ -34,13 +34,13 @@ def unchecked(model: softmpm.Model):
         return True
 
     @wp.func
-    def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
+    def valid(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         return True
 
     report_of, check_of = status.report, status.check
     status.report = lambda *_: SimpleNamespace(running=running, report=report_of(spec.dim, spec.dtype).report)
-    # Nobody complains of a state that is sound:
-    status.check = lambda *_: SimpleNamespace(sound=sound, report_invalid=check_of(spec).report_invalid)
+    # Nobody complains of a state that is valid:
+    status.check = lambda *_: SimpleNamespace(valid=valid, report_invalid=check_of(spec).report_invalid)
     transfer(spec) if model.scheme == "plain" else fused(spec)
     status.report, status.check = report_of, check_of
 

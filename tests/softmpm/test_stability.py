@@ -179,7 +179,9 @@ def test_warns_of_bodies_that_do_not_hold(dim, cells, holds):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model = softmpm.build(made, device="cpu")
-    assert (not holds) == any(f"body 0: the mean particle spacing is {cells:.3g} cells" in str(one.message) for one in caught)
+    assert (not holds) == any(
+        f"body 0: the mean particle spacing is {cells:.3g} cells" in str(one.message) for one in caught
+    )
     assert all(one.category is StabilityWarning and one.filename == __file__ for one in caught)
 
     def width(state):

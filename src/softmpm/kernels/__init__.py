@@ -1,1 +1,2 @@
-"""Warp functions and kernels, specialised by what a scene contains. Each adjoint twin stands below its function."""
+"""Warp functions and kernels, specialised by what a scene contains. Each adjoint stands below its function or in
+<name>_adj.py beside it."""

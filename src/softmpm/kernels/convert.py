@@ -27,7 +27,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         fx: vec
         low: vec
         H: mat
-        sound: bool
+        valid: bool
 
     @wp.struct
     class Left:
@@ -38,9 +38,9 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def entered(scale: Scale, x: vec, v: vec, C: mat, F: mat, low_x: vec, low_F: mat) -> Entered:
-        """One particle as the kernels hold it; not sound if it is not finite or off the grid."""
+        """One particle as the kernels hold it; not valid if it is not finite or off the grid."""
         at = Entered()
-        at.sound = wp.isfinite(wp.ddot(F, F) + wp.dot(v, v) + wp.ddot(C, C))
+        at.valid = wp.isfinite(wp.ddot(F, F) + wp.dot(v, v) + wp.ddot(C, C))
         for axis in range(dim):
             exact = wp.float64(x[axis])
             if wp.static(rounds):
@@ -51,7 +51,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
             if inside:
                 at.base[axis] = int(first)
             else:
-                at.sound = False
+                at.valid = False
             at.fx[axis] = real(cell - wp.float64(at.base[axis]))
             at.low[axis] = real(cell - wp.float64(at.base[axis]) - wp.float64(at.fx[axis]))
             for other in range(dim):
@@ -104,7 +104,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         start.H[world, p] = at.H
         if wp.static(rounds):
             start.fx_low[world, p] = at.low
-        if not at.sound:
+        if not at.valid:
             report(watch, world, 0, bad_start, p)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -1,4 +1,4 @@
-"""What an observer sees on the grid, mass and velocity: P2G without any force, and its twin. Derivation: docs/math/transfer.md.
+"""Mass and velocity on the grid for observers: P2G without any force, and its adjoint. Derivation: docs/math/transfer.md.
 
 (p, m)_i += w m (v + C r, 1),   v_i = p_i / m_i where m_i > 0, else 0                   (O1)
 p̄_i = v̄_i / m_i,   m̄_i −= p̄_i·v_i
@@ -51,7 +51,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         world, p = wp.tid()
         speed = v[world, p]
         at = placed(scale, x[world, p], speed, C[world, p])
-        if not at.sound:
+        if not at.valid:
             report(watch, world, 0, bad_start, p)
         affine = scale.spacing * C[world, p]
         m = mass[p]
@@ -85,7 +85,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         world, p = wp.tid()
         speed = v[world, p]
         at = placed(scale, x[world, p], speed, C[world, p])
-        if not at.sound:
+        if not at.valid:
             report(watch, world, 0, bad_start, p)
         affine = scale.spacing * C[world, p]
         m = mass[p]

@@ -1,8 +1,8 @@
 """Binomial checkpointing: which states a long gradient stores, and which stages it recomputes.
 
-Griewank & Walther 2000, "Algorithm 799: revolve". A chain of l stages is pulled back from the last to the
+Griewank & Walther 2000, "Algorithm 799: revolve". The backward pass visits a chain of l stages from the last to the
 first; stage i needs the state before it, and s of these states can be kept at once, the first one included.
-The longest chain of which no stage runs more than r times before its own pull-back is
+The longest chain of which no stage runs more than r times before its own adjoint is
 
     β(s, r) = (s + r)! / (s! r!)                                                                     (B1)
 
@@ -12,7 +12,7 @@ and if β(s, r-1) < l ≤ β(s, r), then t(l, s) runs are needed, the sweep up t
             = min over m of  m + t(m, s) + t(l - m, s - 1)     keep the state before stage m         (B3)
 
 Our first sweep runs every stage, for the result, and ends with the state after the last one. The turn is thus
-one more stage, which costs nothing to pull back; what the backward pass runs again is
+one more stage, whose adjoint costs nothing; the backward pass recomputes
 
     t(l + 1, s) - l                                                                                  (B4)
 """
@@ -25,11 +25,11 @@ from typing import Literal, NamedTuple
 class Action(NamedTuple):
     """One move of the backward pass. Besides the kept states it has one in hand, which takes no slot."""
 
-    kind: Literal["restore", "advance", "keep", "pull_back", "drop"]
+    kind: Literal["restore", "advance", "keep", "vjp", "drop"]
     """``restore``: the kept state comes into the hand; it stays kept, so nothing may write into it.
     ``advance``: the stage runs once; the state after it is in hand.
     ``keep``: the state in hand is also put into a free slot.
-    ``pull_back``: the adjoint goes through the stage, with the state before it in hand.
+    ``vjp``: the adjoint goes through the stage, with the state before it in hand.
     ``drop``: the state is kept no longer; its slot is free."""
     stage: int
     """The stage itself, or the state before it."""
@@ -78,10 +78,10 @@ def _going_back(kept: list[int], stages: int, slots: int) -> Iterator[Action]:
             ahead = at + _split(stage + 1 - at, slots - len(kept) + 1)
             yield from (Action("advance", i) for i in range(at, ahead))
             at = ahead
-            if at < stage:  # the state before the stage itself is pulled back at once
+            if at < stage:  # the state before the stage itself is used at once
                 kept.append(at)
                 yield Action("keep", at)
-        yield Action("pull_back", stage)
+        yield Action("vjp", stage)
         if kept[-1] == stage:
             yield Action("drop", kept.pop())
 

@@ -7,8 +7,8 @@ nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes a
     schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
                chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (checkpointing.py)
 
-In a closed loop one backward pass goes through many calls, each of which also holds its start, the end of the one before. They are
-pulled back one after the other.
+In a closed loop one backward pass goes through many calls, each of which also holds its start, the end of the one before. The
+backward pass visits them one after the other.
 """
 
 import functools
@@ -137,7 +137,7 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
             continue
         runs = recomputed(len(chunks), slots)
         length = max(chunk.length for chunk in chunks)
-        # Each chunk runs forward and is pulled back, some run again between.
+        # Each chunk runs forward and backward; some are recomputed in between.
         if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
             best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
     if best is None:

@@ -38,7 +38,7 @@ def simulate(stages: int, slots: int) -> int:
             assert hand == stage and stage not in kept
             kept.add(stage)
             assert len(kept) <= slots
-        elif kind == "pull_back":
+        elif kind == "vjp":
             assert hand == stage == left - 1
             hand, left = None, stage
         else:
@@ -144,8 +144,8 @@ def test_the_first_sweep_keeps_in_order_and_fills_the_slots(stages, slots):
 def test_a_schedule_in_full():
     assert initial_checkpoints(4, 2) == (0, 2)
     assert [f"{kind} {stage}" for kind, stage in backward_schedule(4, 2)] == [
-        *["restore 2", "advance 2", "pull_back 3", "restore 2", "pull_back 2", "drop 2"],
-        *["restore 0", "advance 0", "pull_back 1", "restore 0", "pull_back 0", "drop 0"],
+        *["restore 2", "advance 2", "vjp 3", "restore 2", "vjp 2", "drop 2"],
+        *["restore 0", "advance 0", "vjp 1", "restore 0", "vjp 0", "drop 0"],
     ]
 
 

@@ -20,7 +20,7 @@ def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
     chunks = horizon.chunks(chosen.longest)
     moves = list(backward_schedule(len(chunks), chosen.slots))
     substeps = sum(chunks[move.stage].length for move in moves if move.kind == "advance")
-    return substeps, len(chunks) + sum(move.kind in ("advance", "pull_back") for move in moves)
+    return substeps, len(chunks) + sum(move.kind in ("advance", "vjp") for move in moves)
 
 
 def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:

@@ -92,7 +92,7 @@ def fused(spec: Spec) -> SimpleNamespace:
             store_node(cleared, i, node_vec())
 
     @wp.func
-    def hand_on(
+    def scatter_momentum(
         watch: wp.array(dtype=wp.int64),
         window: Window,
         place: int,
@@ -115,7 +115,7 @@ def fused(spec: Spec) -> SimpleNamespace:
             scatter(node, window.shape, first, g, b, A, m)
 
     @wp.func
-    def stay(i: int, now: Packed, then: Packed):
+    def copy_unchanged(i: int, now: Packed, then: Packed):
         """A particle of a world that failed."""
         then.base[i] = now.base[i]
         store_vec(then.rows, i, row_fx, load_vec(now.rows, i, row_fx))
@@ -129,7 +129,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         scale: Scale,
         body: Solid,
         window: Window,
-        crew: int,  # particles of a warp
+        per_warp: int,  # particles of a warp
         count: int,  # particles of one world
         total: int,  # particles of all worlds
         order: wp.array(dtype=wp.int32),
@@ -141,7 +141,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         node: Shares,
     ):
         """The first P2G of a chunk."""
-        place = particle_of(wp.tid(), crew, total)
+        place = particle_of(wp.tid(), per_warp, total)
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
@@ -156,7 +156,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         )
         if place == total:
             first = -1
-        hand_on(watch, window, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
+        scatter_momentum(watch, window, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
 
     def advance(
         # Parameters:
@@ -165,7 +165,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         window: Window,
         substep: int,
         last: bool,  # no P2G afterwards
-        crew: int,
+        per_warp: int,
         count: int,
         total: int,
         order: wp.array(dtype=wp.int32),
@@ -179,7 +179,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         node: Shares,
     ):
         # Idle lanes recompute the last particle and skip the stores, which avoids a divergent branch.
-        place = particle_of(wp.tid(), crew, total)
+        place = particle_of(wp.tid(), per_warp, total)
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
@@ -197,7 +197,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         old.H = load_mat(now.rows, i, row_H)
         new = moved(scale, origin, window.shape, old, sums.value, B)  # (T3)
         base = old.base
-        if new.sound:
+        if new.valid:
             base = new.base
         m = body.mass[world, p]
         g = centre(new.fx)
@@ -215,12 +215,14 @@ def fused(spec: Spec) -> SimpleNamespace:
                 store_vec(then.rows, i, row_v, new.v)
                 store_mat(then.rows, i, row_H, new.H)
                 store_mat(then.rows, i, row_C, new.C)
-                if not new.sound:
+                if not new.valid:
                     report_invalid(watch, scale, world, order[i], substep, new.fx, new.base, new.H)
             else:
-                stay(i, now, then)
+                copy_unchanged(i, now, then)
         if not last:
-            hand_on(watch, window, place, count, total, order, substep + 1, first, g, b, A, m, node)  # (T1)
+            scatter_momentum(
+                watch, window, place, count, total, order, substep + 1, first, g, b, A, m, node
+            )  # (T1)
 
     def by_number(kernel, bounds_of_few=None) -> dict[bool, wp.Kernel]:
         """It goes over particles: many, or few, where a warp may have the registers to wait for all that it reads at once."""

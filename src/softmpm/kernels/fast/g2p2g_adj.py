@@ -29,9 +29,9 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_
 
 @kernel_factory
 def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
-    t, one, twin = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
+    t, one, adjoint = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
-    Scale, Packed, Window, ParticleAdj = t.Scale, t.Packed, t.Window, twin.ParticleAdj
+    Scale, Packed, Window, ParticleAdj = t.Scale, t.Packed, t.Window, adjoint.ParticleAdj
     Solid, Walls, SolidAdj = (
         solid_types(spec).Solid,
         solid_types(spec).Walls,
@@ -46,7 +46,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, affine_momentum = one.rotation, one.affine_momentum
-    momentum_adj, moved_adj = twin.momentum_adj, twin.moved_adj
+    momentum_adj, moved_adj = adjoint.momentum_adj, adjoint.moved_adj
     node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
     row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
@@ -94,7 +94,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         back: int,  # substeps from the end
         start: bool,  # nothing before
         end: bool,  # nothing after
-        crew: int,
+        per_warp: int,
         count: int,
         total: int,
         order: wp.array(dtype=wp.int32),
@@ -111,7 +111,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_body: SolidAdj,
         adj_velocity: Shares,  # of the substep before
     ):
-        i = particle_of(wp.tid(), crew, total)
+        i = particle_of(wp.tid(), per_warp, total)
         first = int(-1)
         g = vec()
         b = vec()

@@ -38,11 +38,11 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         return triple(outer - real(0.5) * g, real(0.75) - square, outer + real(0.5) * g)
 
     @wp.func
-    def particle_of(thread: int, crew: int, total: int) -> int:
-        """Place of the particle that a thread has. The first ``crew`` lanes of a warp have one; to have none is ``total``."""
+    def particle_of(thread: int, per_warp: int, total: int) -> int:
+        """Place of the particle that a thread has. The first ``per_warp`` lanes of a warp have one; to have none is ``total``."""
         lane = thread % WARP
-        place = thread / WARP * crew + lane
-        if lane >= crew or place > total:
+        place = thread / WARP * per_warp + lane
+        if lane >= per_warp or place > total:
             place = total
         return place
 

@@ -37,7 +37,7 @@ def sorted_solid(spec: Spec):
 
 @kernel_factory
 def sorted_solid_adj(spec: Spec, wanted: RequestedGrads):
-    """Twin of :func:`sorted_solid` for what is wanted of the material: adds to the particle what its place found."""
+    """Adjoint of :func:`sorted_solid`: adds the material gradients of each place to those of its particle."""
     SolidAdj = solid_adj_type(spec, wanted)
 
     @wp.kernel(module=adj_module(spec, wanted) + ".sorted", enable_backward=False)

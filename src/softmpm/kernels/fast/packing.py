@@ -53,7 +53,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         at = entered(
             scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
         )
-        if not at.sound:
+        if not at.valid:
             report(watch, world, 0, bad_start, p)
         packed.base[i] = pack_base(kept_inside(watch, window, world, p, at.base))
         store_vec(packed.rows, i, row_fx, at.fx)

@@ -6,7 +6,7 @@ With the outward normal n, vₙ = v·n, v_t = v − vₙ n and Coulomb's coeffic
     slip      v' = v_t                                                                               (C2)
     separate  v' = v_t max(0, 1 + c vₙ / |v_t|) if vₙ < 0, else v                                    (C3)
 
-The twins differentiate the branch that was taken; a node held by friction passes nothing on.
+The adjoints differentiate the branch that was taken; a node held by friction has zero gradient.
 Source: Stomakhin et al. 2013, "A material point method for snow simulation", section 8.
 """
 

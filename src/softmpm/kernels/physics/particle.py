@@ -1,4 +1,4 @@
-"""What happens to one particle between two sums over the grid, with its twins: the blocks that every scheme is made of.
+"""Update of one particle between two transfers, with its adjoint: the functions that every scheme is composed of.
 
     A = m C − Δt V⁰ τ / D,  D = dx²/4                                                                (T1)
     C' = B / D,  x' = x + Δt v',  H' = H + Δt C' (I + H)         given v' = Σ w v_i, B = Σ w v_i rᵀ  (T3)
@@ -27,7 +27,7 @@ def particle(spec: Spec) -> SimpleNamespace:
     t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
     real, vec, mat, ivec, Scale, divide = t.real, t.vec, t.mat, t.ivec, t.Scale, t.divide
     Solid, rotation, stress = solid_types(spec).Solid, solid(spec).rotation, solid(spec).stress
-    sound, dim, rounds = status.check(spec).sound, spec.dim, spec.dtype == "float32"
+    valid, dim, rounds = status.check(spec).valid, spec.dim, spec.dtype == "float32"
 
     @wp.struct
     class Particle:
@@ -37,7 +37,7 @@ def particle(spec: Spec) -> SimpleNamespace:
         v: vec
         C: mat
         H: mat
-        sound: bool
+        valid: bool
 
     @wp.func
     def impulse(scale: Scale, body: Solid, world: int, p: int) -> real:
@@ -53,7 +53,7 @@ def particle(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def moved(scale: Scale, corner: ivec, shape: ivec, old: Particle, v: vec, B: mat) -> Particle:
-        """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not sound keeps its base."""
+        """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not valid keeps its base."""
         new = Particle()
         new.v = v
         new.C = scale.rate * B
@@ -68,8 +68,8 @@ def particle(spec: Spec) -> SimpleNamespace:
         for axis in range(dim):
             cells[axis] = wp.floor(new.fx[axis] - real(0.5))
             new.base[axis] = old.base[axis] + int(cells[axis])
-        new.sound = sound(scale, corner, shape, new.fx, new.base, new.H)
-        if new.sound:
+        new.valid = valid(scale, corner, shape, new.fx, new.base, new.H)
+        if new.valid:
             new.fx = new.fx - cells
         return new
 

@@ -48,7 +48,7 @@ def check(spec: Spec) -> SimpleNamespace:
     largest = 1.0e12  # of det F, and of a squared distance in cells
 
     @wp.func
-    def sound(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
+    def valid(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         """Whether the updated particle is finite, inside the window of ``shape`` nodes from ``corner``, and not collapsed.
 
         A comparison with NaN is false. No branch: it would delay the loads that the stress needs.
@@ -82,4 +82,4 @@ def check(spec: Spec) -> SimpleNamespace:
             kind = collapsed
         write(watch, world, substep, kind, p)
 
-    return SimpleNamespace(sound=sound, report_invalid=report_invalid)
+    return SimpleNamespace(valid=valid, report_invalid=report_invalid)

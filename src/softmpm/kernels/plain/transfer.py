@@ -1,4 +1,4 @@
-"""Particles to grid and back: the plain three-kernel scheme, with its twins. Derivation: docs/math/transfer.md.
+"""Particles to grid and back: the three kernels of the plain scheme, with their adjoints. Derivation: docs/math/transfer.md.
 
 With r = x_i − x_p, D = dx²/4, w = w_i(x_p), A = m C − Δt V⁰ τ / D:
 
@@ -96,7 +96,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
                 v += share
                 B += wp.outer(share, position(o) - old.fx)
             new = moved(scale, ivec(), scale.shape, old, v, B)  # (T3)
-            if not new.sound:
+            if not new.valid:
                 report_invalid(watch, scale, world, p, substep, new.fx, new.base, new.H)
                 new.base = old.base
         else:

@@ -153,11 +153,11 @@ class ChunkGraph:
         return WARP if self.few else BLOCK
 
     @functools.cached_property
-    def crew(self) -> int:
+    def particles_per_warp(self) -> int:
         """Particles assigned to each warp by the forward kernels."""
-        return self.crew_of(may_halve=self.types.dim == 2)
+        return self.particles_of_warp(may_halve=self.types.dim == 2)
 
-    def crew_of(self, may_halve: bool) -> int:
+    def particles_of_warp(self, may_halve: bool) -> int:
         """Particles assigned to each warp: one per thread or, if ``may_halve``, one per two threads for few particles.
 
         Half-populated warps walk through fewer particles each but send more reductions; bench/step.py and gradient.py measure
@@ -166,11 +166,11 @@ class ChunkGraph:
         few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
         return WARP // 2 if may_halve and few else WARP
 
-    def threads(self, crew: int) -> int:
+    def threads(self, per_warp: int) -> int:
         """Threads of a launch over particles; whole blocks on a GPU, since the lanes of a warp cooperate."""
         if self.model.device.type != "cuda":
             return self.total
-        warps = -(-self.total // crew)
+        warps = -(-self.total // per_warp)
         return -(-warps * WARP // self.block) * self.block
 
     def run(
@@ -246,9 +246,14 @@ class ChunkGraph:
     def _begin(self, launch: KernelLauncher) -> None:
         """P2G of the first substep."""
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
-        sizes = (self.crew, model.particle_count, self.total, self.order_flat)
+        sizes = (self.particles_per_warp, model.particle_count, self.total, self.order_flat)
         arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
-        launch(fused(model.spec).begin[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(
+            fused(model.spec).begin[self.few],
+            self.threads(self.particles_per_warp),
+            *arguments,
+            block_dim=self.block,
+        )
         if self.exact is not None:
             self.exact.accumulate(self, 0, self.packed[0], self._solid.mass, launch)
 
@@ -257,11 +262,16 @@ class ChunkGraph:
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (s, s + 1) if self.keep else (0, 0)
         solid = self.solid(min(s + 1, length - 1))
-        parameters = (model.scale, solid, self.window, s, s + 1 == length, self.crew)
+        parameters = (model.scale, solid, self.window, s, s + 1 == length, self.particles_per_warp)
         sizes = (model.particle_count, self.total, self.order_flat)
         states = (packed[now], self.watch, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
-        launch(fused(model.spec).advance[self.few], self.threads(self.crew), *arguments, block_dim=self.block)
+        launch(
+            fused(model.spec).advance[self.few],
+            self.threads(self.particles_per_warp),
+            *arguments,
+            block_dim=self.block,
+        )
         if self.exact is not None and s + 1 < length:
             self.exact.accumulate(self, s + 1, packed[then], self._solid.mass, launch)

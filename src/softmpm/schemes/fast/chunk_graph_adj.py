@@ -129,17 +129,17 @@ class ChunkGraphAdj:
         """Adjoint of P2G of substep ``s``, then of G2P of the substep before."""
         graph, scratch, (here, before) = self.graph, self.scratch, self._adj_nodes(s)
         model, length, exact = graph.model, graph.chunk.length, scratch.exact
-        crew = graph.crew_of(may_halve=True)
+        per_warp = graph.particles_of_warp(may_halve=True)
         sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = graph.solid(min(s, length - 1)), s == 0, s == length
-        parameters = (model.scale, solid, graph.window, length - 1 - s, start, end, crew)
+        parameters = (model.scale, solid, graph.window, length - 1 - s, start, end, per_warp)
         sizes = (model.particle_count, graph.total, graph.order_flat)
         states = (graph.packed[max(s - 1, 0)], graph.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
         out = (graph.watch, scratch.solid_struct, sink)
         kernel = fused_adj(model.spec, self.wanted).advance_adj[graph.few]
         arguments = (*parameters, *sizes, *states, *grids, *out)
-        launch(kernel, graph.threads(crew), *arguments, block_dim=graph.block)
+        launch(kernel, graph.threads(per_warp), *arguments, block_dim=graph.block)
         if exact is not None and not start:
             exact.accumulate(graph, s - 1, states[0], None, launch)
 

@@ -59,4 +59,4 @@ class FixedPointAccumulator:
         mass = self._none if mass is None else mass
         arguments = (graph.window, graph.total, states, self.shares(k), mass, self.sums(k))
         kernel = fixed(self.model.dim).push
-        launch(kernel, graph.threads(graph.crew), *arguments, block_dim=graph.block)
+        launch(kernel, graph.threads(graph.particles_per_warp), *arguments, block_dim=graph.block)

@@ -72,7 +72,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
     def spread(
         node: wp.array(dtype=node_vec),
         shape: ivec,
-        crew: int,
+        per_warp: int,
         count: int,
         first: wp.array(dtype=int),
         g: wp.array(dtype=vec),
@@ -80,7 +80,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         A: wp.array(dtype=mat),
         m: wp.array(dtype=real),
     ):
-        i = particle_of(wp.tid(), crew, count)
+        i = particle_of(wp.tid(), per_warp, count)
         p = wp.min(i, count - 1)
         at = wp.where(i < count, first[p], -1)
         scatter(node, shape, at, g[p], b[p], A[p], m[p])
@@ -240,9 +240,9 @@ def spread(bench) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dtype, limit", [("float64", LIMIT), ("float32", 1e-6)])
-@pytest.mark.parametrize("crew", [WARP, 16, 7])
+@pytest.mark.parametrize("per_warp", [WARP, 16, 7])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_scatter(dim, crew, dtype, limit, device):
+def test_scatter(dim, per_warp, dtype, limit, device):
     """w (b + A o, m) of every particle on each of its nodes (A1), added to what is there; lanes without a particle give none."""
     bench = Bench(dim, device, dtype)
     if dtype == "float32":  # what is compared is what was given
@@ -251,8 +251,8 @@ def test_scatter(dim, crew, dtype, limit, device):
     there = np.arange(bench.node.size).reshape(bench.node.shape) / bench.node.size
     node, t = bench.array(there, bench.t.aligned), bench.t
     first, shape = bench.array(bench.first, wp.int32), t.ivec(*bench.shape)
-    threads = -(-COUNT // crew) * WARP
-    bench.launch(bench.kernels.spread, threads, node, shape, crew, COUNT, first, *bench.particles())
+    threads = -(-COUNT // per_warp) * WARP
+    bench.launch(bench.kernels.spread, threads, node, shape, per_warp, COUNT, first, *bench.particles())
     close(node, there + spread(bench), limit)
 
 
