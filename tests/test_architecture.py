@@ -85,6 +85,16 @@ def test_the_simulator_imports_in_one_direction():
     graphlib.TopologicalSorter(within).prepare()  # raises CycleError
 
 
+def test_nothing_above_the_schemes_knows_one():
+    """Whoever drives a scheme imports the interface and the registry; only the Warp-native API launches plain substeps itself."""
+    knows = {"schemes.registry", "warp_arrays", "__main__"}
+    for name, imported in arrows(modules("softmpm")).items():
+        if name.startswith(("schemes.plain", "schemes.fast")) or name in knows:
+            continue
+        own = {other for other in imported if other.startswith(("schemes.plain.", "schemes.fast."))}
+        assert not own, f"{name} imports {', '.join(own)}"
+
+
 def test_only_public_names_show():
     """``dir(softmpm)`` is its public names, and none of them is also that of a module."""
     assert dir(softmpm) == sorted(softmpm.__all__)
