@@ -89,16 +89,15 @@ class Runner:
             try:
                 raise error
             finally:
-                del (
-                    error
-                )  # else it would refer to itself through this frame, and keep the frame's objects alive
+                # It would refer to itself through this frame, and keep the objects of the frame alive.
+                del error
         self.failures.errors.append(error)
         self.frozen[error.world] = first
 
     def _located(self, run: Run, words: list[int]) -> UnstableError:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
         state: Any = run.start
-        at_end, start = self.scheme.to_user(run.end), run.start if isinstance(run.start, State) else None
+        at_end, start = self.scheme.to_user(run.end), run.start if run.chunk.first == 0 else None
         found = functools.partial(failure, self.model, solid=self.solid, start=start, state=at_end)
         for s in range(run.chunk.length):
             one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
