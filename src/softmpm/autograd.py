@@ -145,7 +145,7 @@ class _Last:
 
 
 def _seen(model: Model, params: Any) -> tuple:
-    """What would differ if these tensors were others, were written to or given other memory; nothing where that cannot be told."""
+    """Identity, version and address of the parameters; empty if a change could not be detected by them."""
     if is_capturing(model) or torch._C._are_functorch_transforms_active() or not isinstance(params, Params):
         return ()
     if not all(type(p) is Tensor and not p.requires_grad and not p.is_inference() for p in params):
@@ -189,7 +189,7 @@ def _cast(model: Model, value: Any) -> Any:
 
 
 class _Call:
-    """What belongs to one call and is no tensor, which PyTorch would want to track; takes what its backward pass needs."""
+    """Data of one call that are no tensors, which PyTorch would track; receives the trail for its backward pass."""
 
     def __init__(self, differentiable: bool, failures: Failures | None):
         self.differentiable, self.failures = differentiable, failures
@@ -197,7 +197,7 @@ class _Call:
 
 
 class _Function(torch.autograd.Function):
-    """What PyTorch asks of a function beyond its gradient, and must be told that there is none."""
+    """Base of the functions below: refuses the transforms that PyTorch offers besides the gradient."""
 
     @staticmethod
     def vmap(*_):

@@ -110,7 +110,7 @@ def choose_scheme(scene: Scene, dtype: torch.dtype, worlds: int, wanted: str) ->
 
 
 def in_fixed_point(device: torch.device, dtype: torch.dtype, scheme: str, reason: str) -> bool:
-    """Whether a deterministic model has to sum in fixed point.
+    """True if a deterministic model has to sum in fixed point.
 
     Raises:
         ValueError: It would have to, and cannot.

@@ -16,7 +16,7 @@ from softmpm.validate import need
 
 
 class Sizes(Protocol):
-    """What a model says about the tensors that it takes."""
+    """Properties of a model that decide which tensors it accepts."""
 
     @property
     def dim(self) -> int: ...

@@ -20,7 +20,7 @@ MAX_SUBSTEP = 2 ** (63 - SUBSTEP_SHIFT) - 1
 
 
 class Kind(IntEnum):
-    """What failed; the order decides which failure of one particle is reported."""
+    """Kinds of failure; the order decides which failure of one particle is reported."""
 
     START = 0
     NOT_FINITE = 1

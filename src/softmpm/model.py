@@ -28,7 +28,7 @@ LAWS = {
 
 
 class Model:
-    """What does not change in time. From :func:`softmpm.build`; never modified, its workspace apart.
+    """A scene prepared for one device. From :func:`softmpm.build`; never modified, its workspace apart.
 
     Attributes:
         scene: The scene it was built from.
@@ -145,7 +145,7 @@ class Model:
         return State(x=x, v=torch.zeros_like(x), C=torch.zeros_like(eye), F=eye, low=low)
 
     def _rounded(self) -> Tensor:
-        """What rounding took off the rest positions [m], shape (particle, dim)."""
+        """Remainders of rounding the rest positions [m], shape (particle, dim)."""
         exact = torch.from_numpy(self.exact_positions).to(self.device)
         return (exact - self.positions.double()).to(self.dtype)
 
@@ -190,7 +190,7 @@ class Model:
         return f"<pre>{html.escape(self.describe())}</pre>"
 
     def describe(self, substeps: int = 1000) -> str:
-        """What was compiled for this scene, what was left out, and the memory of calls of so many substeps each."""
+        """Summary of the compiled features, the features left out, and the memory of calls of this many substeps."""
         return describe(self, substeps)
 
 

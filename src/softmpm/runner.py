@@ -51,7 +51,7 @@ class Runner:
         return Report(words)
 
     def passed(self, start: State, report: Report | None) -> bool:
-        """Whether all worlds may start; False if some were frozen instead."""
+        """True if all worlds may start, False if some were frozen instead."""
         words = [] if report is None else report.read()
         for world in failed_worlds(words):
             self._take(

@@ -1,4 +1,4 @@
-"""What moves, and what it is made of, as named tuples of tensors that PyTorch owns."""
+"""State, material and grid fields as named tuples of tensors that PyTorch owns."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""What a model's calls leave for later calls: buffers, captured graphs, derived material. No part of the model's value."""
+"""Buffers, captured graphs and derived material that a model's calls leave for later calls. No part of the model's value."""
 
 import threading
 from collections.abc import Callable, Hashable

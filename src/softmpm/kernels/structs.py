@@ -1,4 +1,4 @@
-"""What the kernels are specialised for, and the types that follow from it."""
+"""Specification of the kernels of a scene, and the Warp structs that follow from it."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ LETTER = {"stick": "k", "slip": "l", "separate": "s"}
 
 @dataclass(frozen=True, kw_only=True)
 class Spec:
-    """What a scene requires. Whatever is absent here is not compiled, not stored and not passed."""
+    """Features that a scene requires. A feature that is absent is not compiled, not stored and not passed."""
 
     dim: int
     dtype: str  # "float32" or "float64"
@@ -40,7 +40,7 @@ class Spec:
 
 @dataclass(frozen=True, kw_only=True)
 class RequestedGrads:
-    """Which gradients a backward pass computes besides those of the start; the others are not compiled or stored."""
+    """Gradients that a backward pass computes besides those of the initial state; the others are not compiled or stored."""
 
     material: bool
     activation: bool

@@ -56,7 +56,7 @@ def initial_checkpoints(stages: int, slots: int) -> tuple[int, ...]:
 
 
 def backward_schedule(stages: int, slots: int) -> Iterator[Action]:
-    """What the backward pass does with the states of :func:`initial_checkpoints`, in order; at the end none is kept.
+    """Actions of the backward pass on the states of :func:`initial_checkpoints`, in order; at the end none is stored.
 
     No schedule for as many slots has fewer ``advance``. Arguments and errors as in :func:`initial_checkpoints`.
     """
@@ -64,7 +64,7 @@ def backward_schedule(stages: int, slots: int) -> Iterator[Action]:
 
 
 def recomputed(stages: int, slots: int) -> int:
-    """How many ``advance`` :func:`backward_schedule` has, (B4); 0 if each stage has a slot."""
+    """Number of ``advance`` actions in :func:`backward_schedule` (B4); 0 if each stage has a slot."""
     _check(stages, slots)
     r = _repeats(stages + 1, slots)
     return r * (stages + 1) - _reach(slots + 1, r - 1) - stages

@@ -28,7 +28,7 @@ class Chunk:
         return slice(first, first + self.row(self.length - 1) + 1)
 
     def row(self, s: int) -> int:
-        """Which of these its substep ``s`` belongs to."""
+        """Number, among these, of the control step that substep ``s`` belongs to."""
         return (self.first % self.substeps + s) // self.substeps
 
 

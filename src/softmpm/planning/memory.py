@@ -49,7 +49,7 @@ def longest_chunk(particles: int) -> int:
 
 
 def price_of_chunk(particles: int) -> int:
-    """What each chunk is taken to cost on a GPU besides its substeps, in substeps.
+    """Estimated cost of a chunk on a GPU besides its substeps, in substeps.
 
     With few particles it is the host's time, with many that of sorting and moving them.
     """
@@ -96,7 +96,7 @@ def default_budget(device: torch.device, sizes: Sizes) -> int:
 
 
 class Plan(NamedTuple):
-    """What is kept of a call."""
+    """Memory plan of a call."""
 
     longest: int
     """Substeps of a chunk, at most."""

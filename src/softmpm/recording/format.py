@@ -1,4 +1,4 @@
-"""What is where in a recording: an HDF5 file of tables that only grow, one row at a time.
+"""Format of a recording: an HDF5 file of tables that only grow, one row at a time.
 
     episode           {iteration, attributes}       one row per recorded simulation
     scalar            {iteration, name, value}      one row per number, such as a loss
@@ -60,7 +60,7 @@ _LATENT_CHUNK, _LATENT_MOST = 64, 65536
 
 
 def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarray]:
-    """What does not change, for the particles that are recorded."""
+    """Constant data of the recorded particles."""
     scene, n = model.scene, model.particle_count
     particle = np.arange(n)
     if max_particles is not None and max_particles < n:

@@ -74,7 +74,7 @@ def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
 
 
 def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset]) -> None:
-    """What each frame names is there; frames of episodes that began meanwhile are nobody's."""
+    """Check that the rows that each frame refers to exist; frames of episodes that began meanwhile belong to none."""
     for name, table in PARTS.items():
         count = len(tables[table])
         if len(index) and not -1 <= index[name].min() <= index[name].max() < count:

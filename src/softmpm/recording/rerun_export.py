@@ -183,7 +183,7 @@ def _log_fields(stream, source: Recording, show: Show, simulation: Simulation, a
 
 
 def _log_caption(stream, source: Recording, simulation: Simulation) -> None:
-    """What is playing: the iteration, its numbers, and what the run noted about it."""
+    """Text about the simulation on display: the iteration, its numbers, and the notes of the run."""
     import rerun as rr
 
     lines = [f"# Iteration {simulation.iteration}", ""]

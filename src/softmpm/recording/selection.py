@@ -1,4 +1,4 @@
-"""Which part of a recording is shown, when, and on which scales."""
+"""Selection of the part of a recording to show, its times and its scales."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Show:
-    """What is shown of a recording."""
+    """The part of a recording to show."""
 
     simulations: list[Simulation]
     particle: np.ndarray

@@ -1,4 +1,4 @@
-"""How a recorded robot looks: colours, sizes, walls, arrows and what to frame. NumPy only."""
+"""Appearance of a recorded robot: colours, sizes, walls, arrows and camera. NumPy only."""
 
 import numpy as np
 
@@ -44,7 +44,7 @@ def radii(volume: np.ndarray, shown: float, dim: int) -> np.ndarray:
 
 
 def wall_outlines(normals: np.ndarray, offsets: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
-    """What can be seen of the surface n·x = offset of each wall.
+    """Visible part of the surface n·x = offset of each wall.
 
     Args:
         normals, offsets: Of the walls, shapes (wall, dim) and (wall,).
@@ -69,7 +69,7 @@ def wall_outlines(normals: np.ndarray, offsets: np.ndarray, upper: np.ndarray) -
 
 
 def _clip(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
-    """Where a convex polygon, or a line of two points, has n·x ≥ offset (Sutherland and Hodgman 1974)."""
+    """Part of a convex polygon, or of a line of two points, with n·x ≥ offset (Sutherland and Hodgman 1974)."""
     side = corners @ normal - offset
     kept = []
     for i, j in zip(range(len(corners)), np.roll(range(len(corners)), -1), strict=True):
@@ -116,7 +116,7 @@ def frame_box(low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> tuple[np.
 
 
 def eye(low: np.ndarray, high: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where to stand to see a 3D box, a little from above: position and target [m]."""
+    """Camera for a 3D box, a little from above: position and target [m]."""
     extent = high - low
     flat = [extent[i] if abs(up[i]) < 0.5 else np.inf for i in range(3)]
     front = np.eye(3)[int(np.argmin(flat))]  # look along the thinner horizontal axis, at the broad side

@@ -1,1 +1,1 @@
-"""What a person designs: NumPy arrays and plain SI numbers only."""
+"""The design of a robot and its surroundings: NumPy arrays and SI numbers only."""

@@ -1,4 +1,4 @@
-"""What is inside a picture: its silhouette as booleans, and how much of each lattice cell that covers."""
+"""Inside of a picture: its silhouette as booleans, and how much of each lattice cell that covers."""
 
 import os
 import struct

@@ -1,4 +1,4 @@
-"""What is inside a closed triangle mesh: where its winding number is above one half, so parts may overlap.
+"""Inside of a closed triangle mesh: where its winding number is above one half, so parts may overlap.
 
 Source: Jacobson et al. 2013, "Robust inside-outside segmentation using generalized winding numbers". Warp
 answers it on the CPU; trimesh's own test would need rtree.
@@ -50,7 +50,7 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which points (point, 3) lie inside, as booleans."""
+    """Inside test of points (point, 3), as booleans."""
     low = vertices.min(axis=0)
     unit = float(np.ptp(vertices, axis=0).max())  # the query is in float32: keep its numbers near one
     surface = wp.Mesh(

@@ -1,4 +1,4 @@
-"""What a person designs: grid, bodies with a material, muscles, walls. Plain SI numbers, checked at once.
+"""Scene description: grid, bodies with a material, muscles, walls. Plain SI numbers, checked at once.
 
 A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
 Rules that need the whole scene (particles inside the grid, muscle indices) live in ``check_scene.py``.

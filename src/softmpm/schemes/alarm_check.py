@@ -16,7 +16,7 @@ from softmpm.state import State
 
 
 def armed(model: Model) -> bool:
-    """Whether there is an alarm that :func:`check_state` or its relatives raise."""
+    """True if a model has alarms that are checked between chunks."""
     return model.neighbours.shape[1] > 0 or model.alarms.step is not None
 
 

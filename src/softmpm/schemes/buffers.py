@@ -1,4 +1,4 @@
-"""What the kernels work on, as tensors that PyTorch owns and the Warp structs that see them."""
+"""Buffers of the kernels: tensors that PyTorch owns, and the Warp structs that refer to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

@@ -144,7 +144,7 @@ class Case:
         return float(self.model.scale.collapse) + 1.0
 
     def _away(self) -> float:
-        """How far outside the grid it is [m]; at most 0 inside."""
+        """Distance outside the grid [m]; at most 0 inside."""
         dx, x = self._spacing, self.end.x[self.world, self.particle].tolist()
         ends = ((0.5 * dx, (n - 1.5) * dx) for n in self.model.scene.grid.shape)
         outside = [max(low - c, c - high) for c, (low, high) in zip(x, ends, strict=True)]

@@ -1,4 +1,4 @@
-"""How a failure that the kernels reported reaches the user: read back, put into words, raised."""
+"""From status words to errors: reading them back, composing the message, raising."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from softmpm.state import State
 
 
 class Report:
-    """Watch words on their way to the host, so that more work can be launched before they are read."""
+    """Asynchronous copy of status words to the host, so that more work can be launched before they are read."""
 
     def __init__(self, words: Tensor):
         self._event = None
@@ -25,19 +25,19 @@ class Report:
             self._event.record(torch.cuda.current_stream(words.device))
 
     def read(self) -> list[int]:
-        """Waits for the device to come to where the report was made."""
+        """Wait until the device has passed the point of the report."""
         if self._event is not None:
             self._event.synchronize()
         return self._words.tolist()
 
 
 def outgrown(words: list[int]) -> bool:
-    """Whether a particle left the part of the grid that is in memory."""
+    """True if a particle left the allocated part of the grid."""
     return any(decode(words[world])[1] is Kind.LEFT_WINDOW for world in failed_worlds(words))
 
 
 def failed_worlds(words: list[int]) -> list[int]:
-    """Worlds whose word reports something."""
+    """Worlds whose status word reports a failure."""
     return [world for world, word in enumerate(words) if word not in (NEVER, FROZEN)]
 
 

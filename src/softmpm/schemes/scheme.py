@@ -67,7 +67,7 @@ class Scheme(Protocol):
         ...
 
     def accept(self, run: Any, words: list[int]) -> bool:
-        """Whether the run stands, by its ``words``; if not, the scheme is now prepared to run the chunk again."""
+        """True if the run is valid, by its ``words``; if not, the scheme has prepared itself to run the chunk again."""
         ...
 
     def checkpoint(self, state: Any) -> Any:

@@ -144,7 +144,7 @@ class ChunkGraph:
 
     @property
     def few(self) -> bool:
-        """Whether the particles are too few to fill a GPU with blocks of full size."""
+        """True if the particles are too few to fill a GPU with blocks of full size."""
         return self.model.device.type == "cuda" and self.total <= FEW
 
     @property
@@ -213,7 +213,7 @@ class ChunkGraph:
             self._enter[start.low is not None](stream, *given)
 
     def _has(self, solid: Solid) -> bool:
-        """Whether the material is that of the previous run: the same tensor objects, which nothing else writes to."""
+        """True if the material is that of the previous run: the same tensor objects, which nothing else writes to."""
         given = (solid.mass, solid.mu, solid.lam)
         return bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
 
