@@ -86,7 +86,7 @@ class Model:
         self.strength = self._tensor([m.strength for m in scene.muscles])
         laws = np.array([self.spec.laws.index(_law(b.material)) for b in scene.bodies], dtype=np.int32)
         self.law = torch.from_numpy(np.repeat(laws, sizes)).to(device)
-        # Made now, not when first asked for: that may be while a graph is recorded, which runs nothing.
+        # Computed now, not on first use: that may be during a capture, which runs nothing.
         self._params, self._low = self._given(), self._rounded() if dtype == torch.float32 else None
         self.mass = (self._params.density * self.volume).contiguous()
         self.mass_unit = self.mass.max()

@@ -127,7 +127,7 @@ def _times(task: "Task", model: Model) -> Tensor:
 
 
 class ClosedLoop:
-    """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one recorded graph.
+    """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one captured graph.
 
     Args:
         params: Gives the materials, see :class:`softmpm_learn.design.Design`.

@@ -12,7 +12,7 @@ from softmpm import State
 
 
 class Placed:
-    """Arrays among the fields, moved to a device once: a recorded graph cannot copy from the host."""
+    """Arrays among the fields, moved to a device once: a captured graph cannot copy from the host."""
 
     @functools.cached_property
     def _placed(self) -> dict:

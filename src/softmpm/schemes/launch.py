@@ -27,7 +27,7 @@ class KernelLauncher:
 
 
 class RebindableLaunch:
-    """A recorded kernel launch whose array arguments are rebound by address before each launch.
+    """A stored kernel launch whose array arguments are rebound by address before each launch.
 
     Args:
         inputs: Inputs of the kernel, some of which are placeholders, or structs that hold placeholders.
@@ -73,7 +73,7 @@ class LaunchReplay:
             launches(KernelLauncher(self.model, stream))
         else:
             if self._graph is None:
-                self._graph = self._record(launches)
+                self._graph = self._capture(launches)
             if self._graph is None:
                 launches(KernelLauncher(self.model, stream))
             else:
@@ -87,7 +87,7 @@ class LaunchReplay:
         for command in self._list:
             command.launch()
 
-    def _record(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
+    def _capture(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
         """The captured graph; None if another thread is capturing: waiting for it could deadlock."""
         with exclusive_capture(wait=False) as turn:
             if not turn:
