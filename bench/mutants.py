@@ -37,6 +37,8 @@ TESTS = (
     "tests/softmpm/kernels",
 )
 """In the order in which they run."""
+IGNORED = "tests/softmpm/kernels/fast/test_compiled.py"
+"""Counts registers, of which the factors take some."""
 CELL = 0x7E0000000000
 """Address of the number of the mutant: kernels are compiled with it, so that it is the same in every run."""
 FACTOR = f"""
@@ -207,7 +209,7 @@ def main() -> None:
         numbers = chosen(terms, args)
         trials = Trials(numbers, report)
         options = ["-s", "-m", "not gpu", "-p", "no:randomly", "-p", "no:cacheprovider", "-p", "no:terminal"]
-        options += ["--ignore=tests/softmpm/kernels/test_compiled.py"]  # factors take registers
+        options += [f"--ignore={IGNORED}"]
         pytest.main([*options, *TESTS], plugins=[trials])
         if trials.failure[0]:
             print("no mutant ran")

@@ -9,6 +9,7 @@ from bench.adjoint_terms import terms_of, with_factors
 
 SRC = Path(__file__).parents[1] / "src" / "softmpm"
 FILES = [path for path in sorted(SRC.rglob("*.py")) if terms_of(path, path.name)]
+MUTANTS = SRC.parents[1] / "bench" / "mutants.py"
 TOY = """
 def f(a, b):
     return a + b
@@ -21,6 +22,17 @@ def f_adj(a, b, i: int):
         c[place] = a - 2 * (a + b)
     return c[place] + b
 """
+
+
+def test_the_script_names_tests_that_are_there():
+    """A path that has moved would silently leave its tests out, or the ignored one in."""
+    constants = {
+        node.targets[0].id: ast.literal_eval(node.value)
+        for node in ast.parse(MUTANTS.read_text()).body
+        if isinstance(node, ast.Assign) and node.targets[0].id in ("TESTS", "IGNORED")
+    }
+    for path in (*constants["TESTS"], constants["IGNORED"]):
+        assert (SRC.parents[1] / path).exists(), path
 
 
 def test_terms_of_a_toy(tmp_path):

@@ -233,9 +233,8 @@ class _Simulate(_Function):
         wanted = RequestedGrads(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
         about = ctx.model, ctx.horizon, ctx.trail, wanted
         inputs = *about, *ctx.saved_tensors, *adj_end[:4]
-        again = torch.is_grad_enabled() or _has_transform_or_tangent(
-            inputs[4:]
-        )  # it may be differentiated once more
+        # It may be differentiated once more:
+        again = torch.is_grad_enabled() or _has_transform_or_tangent(inputs[4:])
         adj = (_SimulateBackward.apply if again else _SimulateBackward.forward)(*inputs)
         return None, None, None, *adj, None, None
 

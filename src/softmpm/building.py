@@ -31,8 +31,8 @@ def build(
         device: Where; None takes CUDA if there is one, and says so in the log.
         dtype: ``torch.float32`` or ``torch.float64``.
         worlds: Number of independent copies of the scene that run in one launch.
-        memory_budget: Most bytes of states that ``simulate`` may keep for a backward pass, or run again at a time; None for a
-            sensible choice. ``describe`` says what it takes in all; see docs/memory.md.
+        memory_budget: Upper bound of the states that ``simulate`` may retain for a backward pass, or recompute at a time [bytes].
+            None takes a share of the device's memory; ``describe`` estimates the whole of a call. See docs/memory.md.
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
@@ -58,7 +58,7 @@ def build(
             memory_budget = int(memory_budget)
         check_whole("memory_budget, in bytes,", memory_budget)
         memory_budget = int(memory_budget)
-    if scheme not in ("auto", "fast", "plain"):
+    if scheme not in ("auto", *SCHEMES):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     if not isinstance(deterministic, (bool, np.bool_)):
         raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")

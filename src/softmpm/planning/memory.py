@@ -58,7 +58,7 @@ def price_of_chunk(particles: int) -> int:
 
 
 def state_bytes(particles: int, dim: int, real: int) -> int:
-    """Bytes of a :class:`softmpm.State` of so many particles with numbers of ``real`` bytes, what rounding took included."""
+    """Bytes of a :class:`softmpm.State`, its low-order parts included; ``real`` is the size of a number."""
     state = particles * real * (2 * dim + 2 * dim * dim)
     return state + state // 2 if real == 4 else state
 
@@ -166,7 +166,7 @@ class Footprint(Protocol):
     """Numbers of a node that a call takes at least, in 2D and 3D."""
 
     def obstacle(self, shape: Sequence[int], particles: int) -> str | None:
-        """Why the scheme cannot hold a grid of this shape with so many particles in all worlds; None if it can."""
+        """Reason why a grid of this shape, with this number of particles in all worlds, does not fit the scheme; else None."""
         ...
 
     def node_count(self, model) -> int:

@@ -15,7 +15,7 @@ from softmpm.kernels.structs import Spec, solid_types, types
 
 @kernel_factory
 def packed_alarms(spec: Spec) -> SimpleNamespace:
-    """The same for the packed particles of the fast scheme, at the end of a chunk."""
+    """Kernels that check the packed particles at the end of a chunk, and that permute the rest neighbours for it."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)
     Scale, Packed, Solid = t.Scale, t.Packed, solid_types(spec).Solid
     s, n = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype)

@@ -14,7 +14,7 @@ namespace softmpm {
 
 constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 
-// Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed.h.
+// Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed_point.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
 
 // g^2, rounded so that the weights made of it are exact and add up to one, see spline.py.

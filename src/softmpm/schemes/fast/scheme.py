@@ -36,14 +36,14 @@ STAY = {False: 4, True: 2}
 shapes, and graphs that store nothing serve calls with and without gradient in turn."""
 
 
-class _Shelf(list[Pair]):
-    """Free chunk graphs of one shape: a list that can be weakly referenced, see :func:`_put_back`."""
+class _FreeList(list[Pair]):
+    """Free chunk graphs of one shape: a list that can be weakly referenced, see :func:`_give_back`."""
 
 
-def _put_back(shelf: weakref.ref[_Shelf], pair: Pair) -> None:
+def _give_back(free: weakref.ref[_FreeList], pair: Pair) -> None:
     """Return a leased graph to its cache, if that still exists; the lease itself does not keep the cache alive."""
-    if (there := shelf()) is not None:
-        there.append(pair)
+    if (graphs := free()) is not None:
+        graphs.append(pair)
 
 
 class GraphCache:
@@ -56,15 +56,15 @@ class GraphCache:
     def __init__(self, model: Model, arrangement: ParticleLayout, unpacking: Unpacker):
         self.model, self.arrangement, self.unpacking = model, arrangement, unpacking
         # By whether they store the states inside, then by shape, the most recent last:
-        self._free: dict[bool, dict[tuple, _Shelf]] = {False: {}, True: {}}
+        self._free: dict[bool, dict[tuple, _FreeList]] = {False: {}, True: {}}
         self._scratch: dict[RequestedGrads, AdjointBuffers] = {}
         # Guards the adjoint buffers: the backward pass of this thread's calls may run in other threads.
         self.turn = threading.Lock()
 
-    def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, _Shelf]:
+    def take(self, chunk: Chunk, keep: bool) -> tuple[Pair, _FreeList]:
         """Acquire a graph, and the list that it is returned to; only this thread adds lists to the cache."""
         shapes = self._free[keep]
-        free = shapes[chunk.shape] = shapes.pop(chunk.shape, _Shelf())
+        free = shapes[chunk.shape] = shapes.pop(chunk.shape, _FreeList())
         if free:
             pair = free.pop()
             if is_capturing(self.model):
@@ -100,7 +100,7 @@ class _Lease:
     def __init__(self, pool: GraphCache, chunk: Chunk, keep: bool):
         self.pair, free = pool.take(chunk, keep)
         if not is_capturing(pool.model):  # else it belongs to the graph that is being captured
-            weakref.finalize(self, _put_back, weakref.ref(free), self.pair)
+            weakref.finalize(self, _give_back, weakref.ref(free), self.pair)
 
 
 class FastRun:

@@ -53,7 +53,7 @@ class Sorted:
     """Particles in the order of some particle layout.
 
     Args:
-        rows: Packed particles, see :class:`softmpm.kernels.types`.
+        rows: Packed particles, see kernels/structs.py.
         order: Particle at each place, shape (world, particle), int32.
     """
 
