@@ -96,8 +96,10 @@ def with_factors(source: str, terms: list[Term], first: int) -> str:
         closings[term.end] += 1
     parts = [openings[i] + letter + ")" * closings[i + 1] for i, letter in enumerate(source)]
     changed = "".join(parts)
-    imported = "in_kernel" if kernels else "on_host"
-    return f"from mutant import {imported} as factor\n" + (_with_real(changed) if kernels else changed)
+    if not kernels:
+        return "from mutant import on_host as factor\n" + changed
+    imported = "from mutant import in_kernel as factor\nfrom softmpm.kernels.structs import types\n"
+    return imported + _with_real(changed)
 
 
 def _with_real(source: str) -> str:
