@@ -26,6 +26,9 @@ STORES = {
     "mul_": 0,
 }
 """Calls that write, and which of their arguments."""
+ON_HOST = "from mutant import on_host as factor\n"
+IN_KERNELS = "from mutant import in_kernel as factor\nfrom softmpm.kernels.structs import types\n"
+"""First lines of a source with factors."""
 INTEGERS = (
     *(
         "tid",
@@ -96,10 +99,7 @@ def with_factors(source: str, terms: list[Term], first: int) -> str:
         closings[term.end] += 1
     parts = [openings[i] + letter + ")" * closings[i + 1] for i, letter in enumerate(source)]
     changed = "".join(parts)
-    if not kernels:
-        return "from mutant import on_host as factor\n" + changed
-    imported = "from mutant import in_kernel as factor\nfrom softmpm.kernels.structs import types\n"
-    return imported + _with_real(changed)
+    return IN_KERNELS + _with_real(changed) if kernels else ON_HOST + changed
 
 
 def _with_real(source: str) -> str:
