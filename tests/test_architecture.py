@@ -12,7 +12,7 @@ import softmpm
 SRC = Path(__file__).parents[1] / "src"
 LAYERS = """
     validate summary devices batches compiling workspace kernels.compile
-    state
+    state inputs
     errors
     scene planning alarms checks kernels.structs
     reference kernels.physics

@@ -12,6 +12,7 @@ from softmpm.autograd import rasterize, simulate
 from softmpm.building import build
 from softmpm.cuda_graph import Graph
 from softmpm.errors import UnstableError
+from softmpm.inputs import Inputs
 from softmpm.model import Model
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
@@ -35,6 +36,7 @@ __all__ = [
     "Graph",
     "Grid",
     "GridField",
+    "Inputs",
     "Low",
     "Model",
     "Muscle",
