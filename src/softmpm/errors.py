@@ -1,6 +1,6 @@
 """Run-time failures: how a kernel reports one, and how it reaches the user.
 
-A kernel that meets a failure lowers one 64-bit word of its world, ``watch[world]``, to (substep, kind, particle); the first
+A kernel that meets a failure lowers one 64-bit word of its world, ``words[world]``, to (substep, kind, particle); the first
 failure has the smallest word and stays. From then on that world is left as it is, so the offending value is still there when the
 word is read, and nothing is written out of bounds. Other worlds go on, unchanged.
 """
@@ -89,5 +89,5 @@ def _arrays(state: State) -> tuple:
 
 
 def decode(word: int) -> tuple[int, Kind, int]:
-    """(substep, kind, particle) of a watch word."""
+    """(substep, kind, particle) of a status word."""
     return word >> SUBSTEP_SHIFT, Kind((word >> KIND_SHIFT) & 0xF), word & 0xFFFFFFFF

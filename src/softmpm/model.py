@@ -93,28 +93,28 @@ class Model:
         self.specific_volume = self.volume / self.mass_unit
         wp.init()
         self.wp_device = wp.device_from_torch(device)
-        self.scale, self.walls = self._scale(), self._walls()
+        self.constants, self.walls = self._constants(), self._walls()
         check_room(self)
         self.neighbours = self._neighbours()
 
     def _tensor(self, values) -> Tensor:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
 
-    def _scale(self):
+    def _constants(self):
         scene, t = self.scene, types(self.spec.dim, self.spec.dtype)
-        scale = t.Scale()
-        scale.shape = t.ivec(*scene.grid.shape)
-        scale.dt = scene.dt
-        scale.spacing = scale.exact_spacing = scene.grid.spacing
-        scale.rate, scale.width = _inverse_pair(scene.grid.spacing, self.dtype)
-        scale.gravity = t.vec(*(scene.gravity or ()))
-        scale.decay = math.exp(-scene.damping * scene.dt)
+        constants = t.Constants()
+        constants.shape = t.ivec(*scene.grid.shape)
+        constants.dt = scene.dt
+        constants.spacing = constants.exact_spacing = scene.grid.spacing
+        constants.rate, constants.width = _inverse_pair(scene.grid.spacing, self.dtype)
+        constants.gravity = t.vec(*(scene.gravity or ()))
+        constants.decay = math.exp(-scene.damping * scene.dt)
         survives = all(body.material.survives_inversion for body in scene.bodies)
         alarms, least = self.alarms, -math.inf if survives else 0.0
-        scale.collapse = (least if alarms.collapse is None else alarms.collapse) - 1.0
-        scale.gap = math.inf if alarms.gap is None else alarms.gap**2
-        scale.step = math.inf if alarms.step is None else alarms.step**2
-        return scale
+        constants.collapse = (least if alarms.collapse is None else alarms.collapse) - 1.0
+        constants.gap = math.inf if alarms.gap is None else alarms.gap**2
+        constants.step = math.inf if alarms.step is None else alarms.step**2
+        return constants
 
     def _neighbours(self) -> Tensor:
         """Neighbours at rest of each particle, -1 for none, shape (particle, dim); without a column if nobody looks at them."""

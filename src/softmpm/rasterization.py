@@ -36,20 +36,20 @@ def _units(model: Model, mass: Tensor, state: State) -> Tensor:
     return torch.frexp(largest * model.particle_count / 2.0**62).exponent.double().exp2()
 
 
-def _sums(model: Model, state: State, watch: Tensor) -> Tensor:
+def _sums(model: Model, state: State, words: Tensor) -> Tensor:
     """Momentum and mass of the nodes, (world, node, dim + 1)."""
     launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
     t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.particle_count)
-    mass, words = passing(model.mass, t.real), passing(watch, wp.int64)
+    mass, status = passing(model.mass, t.real), passing(words, wp.int64)
     moving = _particles(model, *(tensor.contiguous() for tensor in (state.x, state.v, state.C)))
     shape = (model.worlds, model.node_count, model.dim + 1)
     if not model.deterministic:
         node = torch.zeros(shape, dtype=model.dtype, device=model.device)
-        launch(kernels.splat, lead, model.scale, mass, *moving, words, passing(node, t.node))
+        launch(kernels.splat, lead, model.constants, mass, *moving, status, passing(node, t.node))
         return node
     node, units = torch.zeros(shape, dtype=torch.int64, device=model.device), _units(model, model.mass, state)
     inputs = (mass, passing(units, wp.float64), *moving)
-    launch(kernels.splat_fixed, lead, model.scale, *inputs, words, passing(node, wp.int64))
+    launch(kernels.splat_fixed, lead, model.constants, *inputs, words, passing(node, wp.int64))
     momentum, mass = (unit[:, None, None] for unit in units.unbind(1))
     return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
 
@@ -57,13 +57,13 @@ def _sums(model: Model, state: State, watch: Tensor) -> Tensor:
 @on_its_gpu
 def rasterize_nodes(model: Model, state: State) -> GridField:
     """Mass (world, *nodes) and velocity (world, *nodes, dim) of what :func:`softmpm.rasterize` sees."""
-    watch = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
-    node = _sums(model, state, watch)
+    words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+    node = _sums(model, state, words)
     if is_capturing(model):
-        defer_status_check(watch)
+        defer_status_check(words)
         keep_alive(model)
     else:
-        raise_failure(model, watch.tolist(), state)
+        raise_failure(model, words.tolist(), state)
     grid = model.scene.grid.shape
     velocity = node.new_empty(model.worlds, model.dim, *grid).movedim(1, -1)  # in memory as in a picture
     field = GridField(node.new_empty(model.worlds, *grid), velocity)
@@ -88,7 +88,7 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
     adj_moving = [torch.empty_like(tensor) for tensor in moving]
     inputs = (passing(model.mass, t.real), *_particles(model, *moving), adj_node)
     lead = (model.worlds, model.particle_count)
-    launch(kernels.splat_adj, lead, model.scale, *inputs, *_particles(model, *adj_moving))
+    launch(kernels.splat_adj, lead, model.constants, *inputs, *_particles(model, *adj_moving))
     _raise_gradient_failure(model, adj, adj_moving)
     return State(*adj_moving, F=torch.empty(0))  # nothing: F does not enter
 

@@ -121,8 +121,8 @@ def _raise_failure(model: Model, state: WarpState, work: Substep, given: Solid, 
     work.stream = stream_of(model.device)
     end = work.leave(state.struct(model))
     if armed(model):
-        check_end(model, work.solid, end, work.watch, work.last)
-    raise_failure(model, work.watch_words.tolist(), end, solid=given, pull=pull)
+        check_end(model, work.solid, end, work.words_array, work.last)
+    raise_failure(model, work.words.tolist(), end, solid=given, pull=pull)
 
 
 def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
@@ -183,7 +183,7 @@ def _warp_state(model: Model, state: State, requires_grad: bool) -> WarpState:
     t = types(model.spec.dim, model.spec.dtype)
     motion, work = Motion.empty(model), Substep(model, None)
     work.enter(state, motion.struct(model))
-    raise_failure(model, work.watch_words.tolist(), state)
+    raise_failure(model, work.words.tolist(), state)
     return WarpState(
         model=model,
         base=_owned(motion.base, t.ivec, False),

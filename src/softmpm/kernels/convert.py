@@ -16,7 +16,7 @@ from softmpm.kernels.structs import types
 @kernel_factory
 def boundary(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
-    real, vec, mat, ivec, Scale, Motion = t.real, t.vec, t.mat, t.ivec, t.Scale, t.Motion
+    real, vec, mat, ivec, Constants, Motion = t.real, t.vec, t.mat, t.ivec, t.Constants, t.Motion
     report = status.report(dim, dtype).report
     bad_start, rounds = int(Kind.START), dtype == "float32"
     module = f"softmpm.boundary.d{dim}.{dtype}"
@@ -37,7 +37,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         low_f: mat
 
     @wp.func
-    def entered(scale: Scale, x: vec, v: vec, C: mat, F: mat, low_x: vec, low_F: mat) -> Entered:
+    def entered(constants: Constants, x: vec, v: vec, C: mat, F: mat, low_x: vec, low_F: mat) -> Entered:
         """One particle as the kernels hold it; not valid if it is not finite or off the grid."""
         at = Entered()
         at.valid = wp.isfinite(wp.ddot(F, F) + wp.dot(v, v) + wp.ddot(C, C))
@@ -45,9 +45,9 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
             exact = wp.float64(x[axis])
             if wp.static(rounds):
                 exact += wp.float64(low_x[axis])
-            cell = exact / scale.exact_spacing
+            cell = exact / constants.exact_spacing
             first = wp.floor(cell - wp.float64(0.5))
-            inside = first >= wp.float64(0.0) and first <= wp.float64(scale.shape[axis] - 3)
+            inside = first >= wp.float64(0.0) and first <= wp.float64(constants.shape[axis] - 3)
             if inside:
                 at.base[axis] = int(first)
             else:
@@ -62,14 +62,14 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         return at
 
     @wp.func
-    def left(scale: Scale, base: ivec, fx: vec, low: vec, H: mat) -> Left:
+    def left(constants: Constants, base: ivec, fx: vec, low: vec, H: mat) -> Left:
         """One particle as users hold it, with what rounding takes off."""
         out = Left()
         for axis in range(dim):
             cell = wp.float64(base[axis]) + wp.float64(fx[axis])
             if wp.static(rounds):
                 cell += wp.float64(low[axis])
-            exact = cell * scale.exact_spacing
+            exact = cell * constants.exact_spacing
             out.x[axis] = real(exact)
             out.low_x[axis] = real(exact - wp.float64(real(exact)))
             for other in range(dim):
@@ -81,7 +81,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def enter(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         # In:
         x: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
@@ -90,12 +90,12 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         low_x: wp.array2d(dtype=vec),
         low_F: wp.array2d(dtype=mat),
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         start: Motion,
     ):
         world, p = wp.tid()
         at = entered(
-            scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
+            constants, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
         )
         start.base[world, p] = at.base
         start.fx[world, p] = at.fx
@@ -105,12 +105,12 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         if wp.static(rounds):
             start.fx_low[world, p] = at.low
         if not at.valid:
-            report(watch, world, 0, bad_start, p)
+            report(words, world, 0, bad_start, p)
 
     @wp.kernel(module=module, enable_backward=False)
     def leave(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         # In:
         end: Motion,
         # Out:
@@ -125,7 +125,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
         low = vec()
         if wp.static(rounds):
             low = end.fx_low[world, p]
-        out = left(scale, end.base[world, p], end.fx[world, p], low, end.H[world, p])
+        out = left(constants, end.base[world, p], end.fx[world, p], low, end.H[world, p])
         x[world, p] = out.x
         v[world, p] = end.v[world, p]
         C[world, p] = end.C[world, p]

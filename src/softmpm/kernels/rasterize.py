@@ -21,7 +21,7 @@ from softmpm.kernels.structs import types
 @kernel_factory
 def raster(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
-    real, vec, mat, node_vec, Scale = t.real, t.vec, t.mat, t.node, t.Scale
+    real, vec, mat, node_vec, Constants = t.real, t.vec, t.mat, t.node, t.Constants
     Entered, entered = boundary(dim, dtype).Entered, boundary(dim, dtype).entered
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
@@ -30,30 +30,30 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     module = f"softmpm.raster.d{dim}.{dtype}"
 
     @wp.func
-    def placed(scale: Scale, x: vec, v: vec, C: mat) -> Entered:
+    def placed(constants: Constants, x: vec, v: vec, C: mat) -> Entered:
         """A particle as the kernels hold it; F does not enter and is taken as I."""
-        return entered(scale, x, v, C, wp.identity(n=dim, dtype=real), vec(), mat())
+        return entered(constants, x, v, C, wp.identity(n=dim, dtype=real), vec(), mat())
 
     @wp.kernel(module=module, enable_backward=False)
     def splat(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         mass: wp.array(dtype=real),
         # In:
         x: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         C: wp.array2d(dtype=mat),
         # Out, lowered:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         # Out, added into:
         node: wp.array2d(dtype=node_vec),
     ):
         world, p = wp.tid()
         speed = v[world, p]
-        at = placed(scale, x[world, p], speed, C[world, p])
+        at = placed(constants, x[world, p], speed, C[world, p])
         if not at.valid:
-            report(watch, world, 0, bad_start, p)
-        affine = scale.spacing * C[world, p]
+            report(words, world, 0, bad_start, p)
+        affine = constants.spacing * C[world, p]
         m = mass[p]
         w = weights(at.fx)
         for n in range(s.count):
@@ -62,14 +62,14 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
             wp.atomic_add(
                 node,
                 world,
-                node_index(at.base, o, scale.shape),
+                node_index(at.base, o, constants.shape),
                 share * pack(speed + affine * (position(o) - at.fx), real(1.0)),
             )
 
     @wp.kernel(module=module, enable_backward=False)
     def splat_fixed(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         mass: wp.array(dtype=real),
         unit: wp.array2d(dtype=wp.float64),  # of momentum and mass, (world, 2)
         # In:
@@ -77,22 +77,22 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         v: wp.array2d(dtype=vec),
         C: wp.array2d(dtype=mat),
         # Out, lowered:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         # Out, added into:
         node: wp.array3d(dtype=wp.int64),  # (world, node, dim + 1), in these units
     ):
         """As ``splat``, into integers, whose sum does not depend on the order."""
         world, p = wp.tid()
         speed = v[world, p]
-        at = placed(scale, x[world, p], speed, C[world, p])
+        at = placed(constants, x[world, p], speed, C[world, p])
         if not at.valid:
-            report(watch, world, 0, bad_start, p)
-        affine = scale.spacing * C[world, p]
+            report(words, world, 0, bad_start, p)
+        affine = constants.spacing * C[world, p]
         m = mass[p]
         w = weights(at.fx)
         for n in range(s.count):
             o = offset(n)
-            i = node_index(at.base, o, scale.shape)
+            i = node_index(at.base, o, constants.shape)
             share = m * weight(w, o)
             value = share * (speed + affine * (position(o) - at.fx))
             for axis in range(dim):
@@ -103,7 +103,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def splat_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         mass: wp.array(dtype=real),
         # In:
         x: wp.array2d(dtype=vec),
@@ -117,8 +117,8 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     ):
         world, p = wp.tid()
         speed = v[world, p]
-        at = placed(scale, x[world, p], speed, C[world, p])
-        affine = scale.spacing * C[world, p]
+        at = placed(constants, x[world, p], speed, C[world, p])
+        affine = constants.spacing * C[world, p]
         m = mass[p]
         w = weights(at.fx)
         slope = slopes(at.fx)
@@ -128,16 +128,16 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         for n in range(s.count):
             o = offset(n)
             r = position(o) - at.fx
-            adj_i = adj_node[world, node_index(at.base, o, scale.shape)]
+            adj_i = adj_node[world, node_index(at.base, o, constants.shape)]
             adj_p = momentum(adj_i)
             share = weight(w, o)
             sum_fx += (wp.dot(adj_p, speed + affine * r) + adj_i[dim]) * weight_slope(w, slope, o)
             sum_fx -= share * (wp.transpose(affine) * adj_p)
             sum_v += share * adj_p
             sum_C += wp.outer(share * adj_p, r)
-        adj_x[world, p] = (m / scale.spacing) * sum_fx
+        adj_x[world, p] = (m / constants.spacing) * sum_fx
         adj_v[world, p] = m * sum_v
-        adj_C[world, p] = (m * scale.spacing) * sum_C
+        adj_C[world, p] = (m * constants.spacing) * sum_C
 
     @wp.kernel(module=module, enable_backward=False)
     def divide(

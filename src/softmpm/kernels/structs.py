@@ -87,7 +87,7 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         def divide(a: real, b: real) -> real:
             return a / b
 
-    class Scale:
+    class Constants:
         shape: ivec  # nodes along each axis
         dt: real  # Δt [s]
         spacing: real  # dx [m]
@@ -149,7 +149,7 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
         Window=struct(Window),
         **packed_rows(dim)._asdict(),
         ivec=ivec,
-        Scale=struct(Scale),
+        Constants=struct(Constants),
         Motion=struct(Motion),
         MotionAdj=struct(MotionAdj),
     )

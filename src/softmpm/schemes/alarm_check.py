@@ -35,7 +35,7 @@ class StartCheck:
         if model.muscle_count:
             slots += slots_in(solid, ("pull",), model, t.real, model.worlds, model.muscle_count)
         neighbours, words = view(model.neighbours, wp.int32), view(self.words, wp.int64)
-        inputs = (model.scale, solid, neighbours, -1, *places, words)
+        inputs = (model.constants, solid, neighbours, -1, *places, words)
         lead = (model.worlds, model.particle_count)
         self._check = RebindableLaunch(model, state_alarms(model.spec), lead, inputs, [*slots, *places])
 
@@ -57,6 +57,6 @@ def check_end(model: Model, solid, end: State, words: wp.array, substep: int) ->
     """Launch the check of a state after ``substep``, with the struct of the material that drove it."""
     t = types(model.spec.dim, model.spec.dtype)
     x, F, neighbours = view(end.x, t.vec), view(end.F, t.mat), view(model.neighbours, wp.int32)
-    inputs = (model.scale, solid, neighbours, substep, x, F, words)
+    inputs = (model.constants, solid, neighbours, substep, x, F, words)
     lead, stream = (model.worlds, model.particle_count), stream_of(model.device)
     launch(state_alarms(model.spec), lead, inputs, device=model.wp_device, stream=stream)

@@ -141,7 +141,7 @@ class Case:
         return self.model.scene.bodies[int(self.model.body[self.particle])].material.survives_inversion
 
     def _least(self) -> float:
-        return float(self.model.scale.collapse) + 1.0
+        return float(self.model.constants.collapse) + 1.0
 
     def _away(self) -> float:
         """Distance outside the grid [m]; at most 0 inside."""

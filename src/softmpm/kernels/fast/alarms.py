@@ -17,7 +17,7 @@ from softmpm.kernels.structs import Spec, solid_types, types
 def packed_alarms(spec: Spec) -> SimpleNamespace:
     """Kernels that check the packed particles at the end of a chunk, and that permute the rest neighbours for it."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)
-    Scale, Packed, Solid = t.Scale, t.Packed, solid_types(spec).Solid
+    Constants, Packed, Solid = t.Constants, t.Packed, solid_types(spec).Solid
     s, n = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype)
     unpack_base, world_of, load_vec, load_mat = s.unpack_base, s.world_of, n.load_vec, n.load_mat
     step_is_stable, near, row_fx, row_H = one.step_is_stable, one.near, t.row_fx, t.row_h
@@ -28,7 +28,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def check(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         neighbours: wp.array3d(dtype=wp.int32),  # by place
         substep: int,
@@ -38,23 +38,23 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
         # In:
         now: Packed,
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
     ):
         i = wp.tid()
         world = world_of(i, count, total)
         p = i - world * count
-        if not ran(watch, world, substep):
+        if not ran(words, world, substep):
             return
-        if not step_is_stable(scale, body, world, p, load_mat(now.rows, i, row_H)):
-            report(watch, world, substep, step, order[i])
+        if not step_is_stable(constants, body, world, p, load_mat(now.rows, i, row_H)):
+            report(words, world, substep, step, order[i])
         base = unpack_base(now.base[i])
         fx = load_vec(now.rows, i, row_fx)
         for k in range(neighbours.shape[2]):
             q = neighbours[world, p, k]
             if q >= 0:
                 j = world * count + q
-                if not near(scale, unpack_base(now.base[j]) - base, load_vec(now.rows, j, row_fx) - fx):
-                    report(watch, world, substep, torn, order[i])
+                if not near(constants, unpack_base(now.base[j]) - base, load_vec(now.rows, j, row_fx) - fx):
+                    report(words, world, substep, torn, order[i])
 
     @wp.kernel(module=module, enable_backward=False)
     def arrange(

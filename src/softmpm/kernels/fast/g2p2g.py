@@ -2,14 +2,14 @@
 
 A substep is two launches. With M the nodes' momentum and mass, V their velocity:
 
-    begin     particles: (T1) → the first M
+    p2g_first  particles: (T1) → the first M
     grid      V ← (G1), (G2) of M,  next M ← 0
-    advance   particles: V → (T2), (T3) → new state → (T1) → next M
+    g2p2g     particles: V → (T2), (T3) → new state → (T1) → next M
 
 A node without mass keeps the V it has. Only particles read it whose weight there is zero, or too small to give it mass; V starts from
 zero, so that they read a number.
 
-A deterministic model adds up in a launch more, ``push`` of fixed_point.py, between begin or advance and grid.
+A deterministic model adds up in a launch more, ``push`` of fixed_point.py, between p2g_first or g2p2g and grid.
 
 All that is particle- or node-wise is shared with the plain scheme: kernels/physics. Adjoint: g2p2g_adj.py.
 """
@@ -33,7 +33,7 @@ from softmpm.kernels.structs import Spec, solid_types, types
 def fused(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
-    Scale, Packed, Window, Particle = t.Scale, t.Packed, t.Window, one.Particle
+    Constants, Packed, Window, Particle = t.Constants, t.Packed, t.Window, one.Particle
     Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
@@ -73,7 +73,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def grid_velocity(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         walls: Walls,
         window: Window,
         # In:
@@ -86,14 +86,14 @@ def fused(spec: Spec) -> SimpleNamespace:
         place = place_of(window, i, velocity.shape[0])  # while the node is on its way
         here = take(node, i)
         if here[dim] > real(0.0):
-            v = node_velocity(scale, walls, place, head(here), here[dim])
+            v = node_velocity(constants, walls, place, head(here), here[dim])
             store_node(velocity, i, aligned(v, real(0.0)))
         if i < cleared.shape[0]:
             store_node(cleared, i, node_vec())
 
     @wp.func
     def scatter_momentum(
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         window: Window,
         place: int,
         count: int,
@@ -110,7 +110,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         """(T1) of one particle, added to the nodes from ``first`` on. The whole warp comes here together."""
         if wp.static(exact):
             if not give(node, place, count, total, b, A):
-                report(watch, place / count, substep, not_finite, order[place])
+                report(words, place / count, substep, not_finite, order[place])
         else:
             scatter(node, window.shape, first, g, b, A, m)
 
@@ -124,9 +124,9 @@ def fused(spec: Spec) -> SimpleNamespace:
         store_mat(then.rows, i, row_H, load_mat(now.rows, i, row_H))
         store_mat(then.rows, i, row_C, load_mat(now.rows, i, row_C))
 
-    def begin(
+    def p2g_first(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         window: Window,
         per_warp: int,  # particles of a warp
@@ -136,7 +136,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         # In:
         start: Packed,
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         # Out, added into:
         node: Shares,
     ):
@@ -150,17 +150,17 @@ def fused(spec: Spec) -> SimpleNamespace:
         v = load_vec(start.rows, i, row_v)
         C = load_mat(start.rows, i, row_C)
         m = body.mass[world, p]
-        A = affine_momentum(scale, body, world, p, C, H, rotation(body, world, p, H))
+        A = affine_momentum(constants, body, world, p, C, H, rotation(body, world, p, H))
         first = world * window.count + first_node(
             unpack_base(start.base[i]), window.origin[world], window.shape
         )
         if place == total:
             first = -1
-        scatter_momentum(watch, window, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
+        scatter_momentum(words, window, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
 
-    def advance(
+    def g2p2g(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         window: Window,
         substep: int,
@@ -173,7 +173,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         velocity: wp.array(dtype=node_vec),
         now: Packed,
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         then: Packed,
         # Out, added into:
         node: Shares,
@@ -183,7 +183,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
-        alive = running(watch, world)
+        alive = running(words, world)
         origin = window.origin[world]
         held = world * window.count  # nodes of the worlds before
         old = Particle()
@@ -195,13 +195,13 @@ def fused(spec: Spec) -> SimpleNamespace:
         B = sums.outer - wp.outer(sums.value, g)
         old.low = load_vec(now.rows, i, row_low)
         old.H = load_mat(now.rows, i, row_H)
-        new = moved(scale, origin, window.shape, old, sums.value, B)  # (T3)
+        new = moved(constants, origin, window.shape, old, sums.value, B)  # (T3)
         base = old.base
         if new.valid:
             base = new.base
         m = body.mass[world, p]
         g = centre(new.fx)
-        A = affine_momentum(scale, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
+        A = affine_momentum(constants, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
         b = m * new.v - A * g
         first = held + first_node(base, origin, window.shape)
         if place == total:
@@ -216,12 +216,12 @@ def fused(spec: Spec) -> SimpleNamespace:
                 store_mat(then.rows, i, row_H, new.H)
                 store_mat(then.rows, i, row_C, new.C)
                 if not new.valid:
-                    report_invalid(watch, scale, world, order[i], substep, new.fx, new.base, new.H)
+                    report_invalid(words, constants, world, order[i], substep, new.fx, new.base, new.H)
             else:
                 copy_unchanged(i, now, then)
         if not last:
             scatter_momentum(
-                watch, window, place, count, total, order, substep + 1, first, g, b, A, m, node
+                words, window, place, count, total, order, substep + 1, first, g, b, A, m, node
             )  # (T1)
 
     def by_number(kernel, bounds_of_few=None) -> dict[bool, wp.Kernel]:
@@ -236,8 +236,8 @@ def fused(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(
         clear=clear,
         grid_velocity=grid_velocity,
-        begin=by_number(begin),
-        advance=by_number(advance, (BLOCK, 3)),
+        p2g_first=by_number(p2g_first),
+        g2p2g=by_number(g2p2g, (BLOCK, 3)),
         centre=centre,
         place_of=place_of,
     )

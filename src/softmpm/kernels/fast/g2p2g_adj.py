@@ -3,7 +3,7 @@
 From the last substep to the first, with M the nodes' momentum and mass, V their velocity and a bar for adjoints:
 
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
-    advance_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
+    g2p2g_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
 
 Nodes without mass keep their V and their V̄, as in g2p2g.py.
 
@@ -31,7 +31,7 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_
 def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one, adjoint = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
-    Scale, Packed, Window, ParticleAdj = t.Scale, t.Packed, t.Window, adjoint.ParticleAdj
+    Constants, Packed, Window, ParticleAdj = t.Constants, t.Packed, t.Window, adjoint.ParticleAdj
     Solid, Walls, SolidAdj = (
         solid_types(spec).Solid,
         solid_types(spec).Walls,
@@ -58,7 +58,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def grid_velocity_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         walls: Walls,
         window: Window,
         # In:
@@ -76,19 +76,19 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             here = load_node(node, i)
             adj_v = take(adj, i)
             if here[dim] > real(0.0):
-                back = node_velocity_adj(scale, walls, place, head(here), here[dim], head(adj_v))
+                back = node_velocity_adj(constants, walls, place, head(here), here[dim], head(adj_v))
                 leave(adj, i, aligned(back.p, back.m))
         if i < node_before.shape[0]:
             there = load_node(node_before, i)
             if there[dim] > real(0.0):
-                v = node_velocity(scale, walls, place, head(there), there[dim])
+                v = node_velocity(constants, walls, place, head(there), there[dim])
                 store_node(velocity, i, aligned(v, real(0.0)))
             if wp.static(not exact):
                 store_node(cleared, i, node_vec())
 
-    def advance_adj(
+    def g2p2g_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         window: Window,
         back: int,  # substeps from the end
@@ -106,7 +106,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         # In and out:
         adj_now: wp.array(dtype=real),
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         # Out, added into:
         adj_body: SolidAdj,
         adj_velocity: Shares,  # of the substep before
@@ -135,12 +135,12 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 g = centre(load_vec(now.rows, i, row_fx))
                 m = body.mass[world, p]
                 Q = rotation(body, world, p, H)
-                A = affine_momentum(scale, body, world, p, C, H, Q)
+                A = affine_momentum(constants, body, world, p, C, H, Q)
                 here = held + first_node(unpack_base(now.base[i]), origin, window.shape)
                 sums = gather_adj(adj_node, here, window.shape, g, m * v - A * g, A, m)
                 B = sums.outer - wp.outer(sums.value, g)
                 # (T1.adj)
-                more = momentum_adj(scale, body, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_body)
+                more = momentum_adj(constants, body, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_body)
                 adj.fx += sums.slope - wp.transpose(A) * sums.value  # (A6)
                 adj.v = more.v
                 adj.C = more.C
@@ -152,14 +152,14 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                     + wp.ddot(adj.H, adj.H)
                 )
                 if not wp.isfinite(size):
-                    report(watch, world, back, bad_gradient, order[i])
+                    report(words, world, back, bad_gradient, order[i])
             if start:
                 store_vec(adj_now, i, row_v, adj.v)
                 store_mat(adj_now, i, row_C, adj.C)
             else:
                 first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
                 g = centre(old_fx)
-                adj = moved_adj(scale, load_mat(before.rows, i, row_H), C, adj)  # (T3.adj)
+                adj = moved_adj(constants, load_mat(before.rows, i, row_H), C, adj)  # (T3.adj)
                 B = adj.C
                 b = adj.v - B * g
                 sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
@@ -173,12 +173,12 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
 
     def compiled(few: bool) -> wp.Kernel:
-        """``advance_adj`` for few particles or for many, as in g2p2g.py: with so many registers that so many blocks fit at a time."""
+        """``g2p2g_adj`` for few particles or for many, as in g2p2g.py: with so many registers that so many blocks fit at a time."""
         name, blocks = (".few", 2) if few else ("", 3)
         where = native_module(adj_module(spec, wanted) + ".fused" + name)
         options = dict(module=where, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, blocks))
-        return wp.kernel(**options)(advance_adj)
+        return wp.kernel(**options)(g2p2g_adj)
 
     return SimpleNamespace(
-        grid_velocity_adj=grid_velocity_adj, advance_adj={few: compiled(few) for few in (False, True)}
+        grid_velocity_adj=grid_velocity_adj, g2p2g_adj={few: compiled(few) for few in (False, True)}
     )

@@ -21,7 +21,7 @@ from softmpm.kernels.structs import types
 def packing(dim: int, dtype: str) -> SimpleNamespace:
     t, b, n, s = types(dim, dtype), boundary(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat
-    Scale, Packed, Window = t.Scale, t.Packed, t.Window
+    Constants, Packed, Window = t.Constants, t.Packed, t.Window
     entered, left = b.entered, b.left
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     spread_vec, spread_mat = n.spread_vec, n.spread_mat
@@ -33,7 +33,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def enter(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         window: Window,
         order: wp.array2d(dtype=wp.int32),
         # In:
@@ -44,18 +44,18 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         low_x: wp.array2d(dtype=vec),
         low_F: wp.array2d(dtype=mat),
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         packed: Packed,
     ):
         world, place = wp.tid()
         i = world * order.shape[1] + place
         p = order[world, place]
         at = entered(
-            scale, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
+            constants, x[world, p], v[world, p], C[world, p], F[world, p], low_x[world, p], low_F[world, p]
         )
         if not at.valid:
-            report(watch, world, 0, bad_start, p)
-        packed.base[i] = pack_base(kept_inside(watch, window, world, p, at.base))
+            report(words, world, 0, bad_start, p)
+        packed.base[i] = pack_base(kept_inside(words, window, world, p, at.base))
         store_vec(packed.rows, i, row_fx, at.fx)
         store_vec(packed.rows, i, row_low, at.low)
         store_vec(packed.rows, i, row_v, v[world, p])
@@ -65,7 +65,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def leave(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         order: wp.array2d(dtype=wp.int32),
         # In:
         base: wp.array(dtype=wp.int32),
@@ -83,7 +83,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         i = world * order.shape[1] + place
         row = world * order.shape[1] + order[world, place]
         out = left(
-            scale,
+            constants,
             unpack_base(base[i]),
             load_vec(rows, i, row_fx),
             load_vec(rows, i, row_low),
@@ -100,7 +100,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def positions(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         order: wp.array2d(dtype=wp.int32),
         # In:
         base: wp.array(dtype=wp.int32),
@@ -111,13 +111,15 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         """What of ``leave`` it takes to sort the particles again."""
         world, place = wp.tid()
         i = world * order.shape[1] + place
-        at = left(scale, unpack_base(base[i]), load_vec(rows, i, row_fx), load_vec(rows, i, row_low), mat())
+        at = left(
+            constants, unpack_base(base[i]), load_vec(rows, i, row_fx), load_vec(rows, i, row_low), mat()
+        )
         x[world, order[world, place]] = at.x
 
     @wp.kernel(module=module, enable_backward=False)
     def enter_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         order: wp.array2d(dtype=wp.int32),
         # In:
         adj_x: wp.array2d(dtype=vec),
@@ -131,7 +133,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         world, place = wp.tid()
         i = world * order.shape[1] + place
         p = order[world, place]
-        store_vec(adj, i, row_fx, scale.spacing * adj_x[world, p])
+        store_vec(adj, i, row_fx, constants.spacing * adj_x[world, p])
         store_vec(adj, i, row_v, adj_v[world, p])
         store_mat(adj, i, row_H, adj_F[world, p])
         store_mat(adj, i, row_C, adj_C[world, p])
@@ -139,7 +141,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def leave_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         order: wp.array2d(dtype=wp.int32),
         # In:
         adj: wp.array(dtype=real),
@@ -154,7 +156,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         total = order.shape[0] * order.shape[1]
         i = world * order.shape[1] + place
         row = world * order.shape[1] + order[world, place]
-        spread_vec(adj_x, row, load_vec(adj, i, row_fx) / scale.spacing, i, total)
+        spread_vec(adj_x, row, load_vec(adj, i, row_fx) / constants.spacing, i, total)
         spread_vec(adj_v, row, load_vec(adj, i, row_v), i, total)
         spread_mat(adj_F, row, load_mat(adj, i, row_H), i, total)
         spread_mat(adj_C, row, load_mat(adj, i, row_C), i, total)

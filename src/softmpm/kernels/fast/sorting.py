@@ -22,26 +22,26 @@ SAMPLES = 50_000
 def sorting(dim: int, dtype: str) -> SimpleNamespace:
     t, n, s = types(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, ivec = t.real, t.vec, t.ivec
-    Scale, Packed, Window = t.Scale, t.Packed, t.Window
+    Constants, Packed, Window = t.Constants, t.Packed, t.Window
     copy_rows, pack_base, unpack_base = n.copy_rows, s.pack_base, s.unpack_base
     report, left_window = status.report(dim, dtype).report, int(Kind.LEFT_WINDOW)
     module = native_module(f"softmpm.sorting.d{dim}.{dtype}")
 
     @wp.func
-    def kept_inside(watch: wp.array(dtype=wp.int64), window: Window, world: int, p: int, base: ivec) -> ivec:
+    def kept_inside(words: wp.array(dtype=wp.int64), window: Window, world: int, p: int, base: ivec) -> ivec:
         """Base node of a particle; one that is outside the window is reported, and writes to no other memory."""
         inside = base
         for axis in range(dim):
             away = base[axis] - window.origin[world][axis]
             if away < 0 or away > window.shape[axis] - 3:
                 inside[axis] = window.origin[world][axis]
-                report(watch, world, 0, left_window, p)
+                report(words, world, 0, left_window, p)
         return inside
 
     @wp.kernel(module=module, enable_backward=False)
     def locate(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         up: int,  # the axis along which bodies fall
         # In:
         x: wp.array2d(dtype=vec),
@@ -60,12 +60,12 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         base = ivec()
         on_grid = bool(True)
         for axis in range(dim):
-            last = scale.shape[axis] - 3
-            there = wp.float64(sorted_x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5)
-            cell = cell * scale.shape[axis] + wp.clamp(int(wp.floor(there)), 0, last)
+            last = constants.shape[axis] - 3
+            there = wp.float64(sorted_x[world, p][axis]) / constants.exact_spacing - wp.float64(0.5)
+            cell = cell * constants.shape[axis] + wp.clamp(int(wp.floor(there)), 0, last)
             if axis == up and there - wp.floor(there) >= wp.float64(0.5):
                 half = 1
-            here = wp.floor(wp.float64(x[world, p][axis]) / scale.exact_spacing - wp.float64(0.5))
+            here = wp.floor(wp.float64(x[world, p][axis]) / constants.exact_spacing - wp.float64(0.5))
             if here >= wp.float64(0.0) and here <= wp.float64(last):
                 base[axis] = int(here)
             else:
@@ -80,7 +80,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def centre_window(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         shape: ivec,  # nodes of the window
         # In:
         low: wp.array2d(dtype=wp.int32),
@@ -90,12 +90,12 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
     ):
         world, axis = wp.tid()
         middle = (low[world, axis] + high[world, axis] + 3 - shape[axis]) / 2
-        origin[world, axis] = wp.clamp(middle, 0, scale.shape[axis] - shape[axis])
+        origin[world, axis] = wp.clamp(middle, 0, constants.shape[axis] - shape[axis])
 
     @wp.kernel(module=module, enable_backward=False)
     def survey(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         window: Window,
         count: int,  # particles of one world
         # In:
@@ -117,7 +117,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
             if room < 2 and first > 0:
                 found[1] = wp.int64(1)
             room = first + window.shape[axis] - 3 - here[axis]
-            if room < 2 and first + window.shape[axis] < scale.shape[axis]:
+            if room < 2 and first + window.shape[axis] < constants.shape[axis]:
                 found[1] = wp.int64(1)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -140,7 +140,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         base: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=real),
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         packed: Packed,
     ):
         """Put particles from the places of one order to those of another."""
@@ -149,7 +149,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         p = order[world, place]
         i = start + place
         j = start + places[world, p]
-        packed.base[i] = pack_base(kept_inside(watch, window, world, p, unpack_base(base[j])))
+        packed.base[i] = pack_base(kept_inside(words, window, world, p, unpack_base(base[j])))
         copy_rows(rows, j, packed.rows, i)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -27,7 +27,7 @@ STEPS = {2: 3, 3: 5}
 def alarm(spec: Spec) -> SimpleNamespace:
     """Blocks of one particle: is its step stable, and is a neighbour too far away."""
     t, wanted = types(spec.dim, spec.dtype), RequestedGrads(material=False, activation=False)
-    real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
+    real, vec, mat, ivec, Constants = t.real, t.vec, t.mat, t.ivec, t.Constants
     Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
     rotation, stiffness_bound = solid(spec).rotation, solid(spec).stiffness_bound
     stress_adj = solid_adj(spec, wanted).stress_adj
@@ -65,21 +65,21 @@ def alarm(spec: Spec) -> SimpleNamespace:
         return False
 
     @wp.func
-    def step_is_stable(scale: Scale, body: Solid, world: int, p: int, H: mat) -> bool:
+    def step_is_stable(constants: Constants, body: Solid, world: int, p: int, H: mat) -> bool:
         """(W2), as K ≤ s² ρ₀ dx² / Δt²."""
-        reach = scale.spacing / scale.dt
-        limit = scale.step * body.mass[world, p] / body.volume[world, p] * reach * reach
+        reach = constants.spacing / constants.dt
+        limit = constants.step * body.mass[world, p] / body.volume[world, p] * reach * reach
         # Nearly all particles of a scene at half its stable step need no more than this:
         if not stiffness_bound(body, world, p, H) > limit:
             return True
         return not stiffer(body, world, p, H, limit)
 
     @wp.func
-    def near(scale: Scale, cells: ivec, apart: vec) -> bool:
+    def near(constants: Constants, cells: ivec, apart: vec) -> bool:
         """(W1) for two particles ``cells + apart`` from each other, in cells."""
         d = apart
         for axis in range(dim):
             d[axis] = apart[axis] + real(cells[axis])
-        return not (wp.dot(d, d) > scale.gap)
+        return not (wp.dot(d, d) > constants.gap)
 
     return SimpleNamespace(step_is_stable=step_is_stable, near=near)

@@ -20,7 +20,7 @@ from softmpm.kernels.structs import Spec, solid_types, types
 @kernel_factory
 def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, ivec, node_vec, Scale = t.real, t.vec, t.ivec, t.node, t.Scale
+    real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
     Walls = solid_types(spec).Walls
     nodes = spline(spec.dim, spec.dtype)
     node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
@@ -32,12 +32,12 @@ def grid(spec: Spec) -> SimpleNamespace:
         m: real
 
     @wp.func
-    def free_velocity(scale: Scale, u: vec) -> vec:
+    def free_velocity(constants: Constants, u: vec) -> vec:
         v = u
         if wp.static(gravity):
-            v += scale.dt * scale.gravity
+            v += constants.dt * constants.gravity
         if wp.static(damping):
-            v = scale.decay * v
+            v = constants.decay * v
         return v
 
     def after_walls(count: int) -> wp.Function:
@@ -45,16 +45,16 @@ def grid(spec: Spec) -> SimpleNamespace:
         if count == 0:
 
             @wp.func
-            def after(scale: Scale, walls: Walls, here: ivec, v: vec) -> vec:
+            def after(constants: Constants, walls: Walls, here: ivec, v: vec) -> vec:
                 return v
         else:
             before, wall = after_walls(count - 1), contact(spec, count - 1)
             inside, respond = wall.inside, wall.respond
 
             @wp.func
-            def after(scale: Scale, walls: Walls, here: ivec, v: vec) -> vec:
-                w = before(scale, walls, here, v)
-                if inside(walls, here, scale.exact_spacing):
+            def after(constants: Constants, walls: Walls, here: ivec, v: vec) -> vec:
+                w = before(constants, walls, here, v)
+                if inside(walls, here, constants.exact_spacing):
                     w = respond(walls, w)
                 return w
 
@@ -65,19 +65,19 @@ def grid(spec: Spec) -> SimpleNamespace:
         if k == len(spec.contacts):
 
             @wp.func
-            def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
+            def back(constants: Constants, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
                 return adj
         else:
             through_others, wall = after_walls_adj(k + 1), contact(spec, k)
             inside, respond, respond_adj = wall.inside, wall.respond, wall.respond_adj
 
             @wp.func
-            def back(scale: Scale, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
-                meets = inside(walls, here, scale.exact_spacing)
+            def back(constants: Constants, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
+                meets = inside(walls, here, constants.exact_spacing)
                 w = v
                 if meets:
                     w = respond(walls, v)
-                adj_v = through_others(scale, walls, here, w, adj)
+                adj_v = through_others(constants, walls, here, w, adj)
                 if meets:
                     adj_v = respond_adj(walls, v, adj_v)
                 return adj_v
@@ -87,31 +87,31 @@ def grid(spec: Spec) -> SimpleNamespace:
     after_all_walls, after_all_walls_adj = after_walls(len(spec.contacts)), after_walls_adj(0)
 
     @wp.func
-    def node_velocity(scale: Scale, walls: Walls, here: ivec, p: vec, m: real) -> vec:
+    def node_velocity(constants: Constants, walls: Walls, here: ivec, p: vec, m: real) -> vec:
         """Velocity of the node at ``here`` from its momentum and mass."""
         v = vec()
         if m > real(0.0):
-            v = after_all_walls(scale, walls, here, free_velocity(scale, p / m))  # (G1), (G2)
+            v = after_all_walls(constants, walls, here, free_velocity(constants, p / m))  # (G1), (G2)
         return v
 
     @wp.func
     def node_velocity_adj(
-        scale: Scale, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec
+        constants: Constants, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec
     ) -> NodeAdj:
         adj = NodeAdj()
         if m > real(0.0):
             u = p / m
-            adj_v = after_all_walls_adj(scale, walls, here, free_velocity(scale, u), adj_velocity)
+            adj_v = after_all_walls_adj(constants, walls, here, free_velocity(constants, u), adj_velocity)
             adj.p = adj_v / m  # (G1.adj)
             if wp.static(damping):
-                adj.p = scale.decay * adj.p
+                adj.p = constants.decay * adj.p
             adj.m = -wp.dot(adj.p, u)
         return adj
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def grid_velocity(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         walls: Walls,
         # In:
         node: wp.array2d(dtype=node_vec),
@@ -120,13 +120,13 @@ def grid(spec: Spec) -> SimpleNamespace:
     ):
         world, n = wp.tid()
         node_n = node[world, n]
-        here = node_coordinates(n, scale.shape)
-        velocity[world, n] = node_velocity(scale, walls, here, momentum(node_n), node_n[dim])
+        here = node_coordinates(n, constants.shape)
+        velocity[world, n] = node_velocity(constants, walls, here, momentum(node_n), node_n[dim])
 
     @wp.kernel(module=spec.module + ".adj", enable_backward=False)
     def grid_velocity_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         walls: Walls,
         # In:
         node: wp.array2d(dtype=node_vec),
@@ -136,8 +136,8 @@ def grid(spec: Spec) -> SimpleNamespace:
     ):
         world, n = wp.tid()
         node_n = node[world, n]
-        here = node_coordinates(n, scale.shape)
-        adj = node_velocity_adj(scale, walls, here, momentum(node_n), node_n[dim], adj_velocity[world, n])
+        here = node_coordinates(n, constants.shape)
+        adj = node_velocity_adj(constants, walls, here, momentum(node_n), node_n[dim], adj_velocity[world, n])
         adj_node[world, n] = pack(adj.p, adj.m)
 
     return SimpleNamespace(

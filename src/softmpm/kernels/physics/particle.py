@@ -25,7 +25,7 @@ from softmpm.kernels.structs import RequestedGrads, Spec, solid_adj_type, solid_
 @kernel_factory
 def particle(spec: Spec) -> SimpleNamespace:
     t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
-    real, vec, mat, ivec, Scale, divide = t.real, t.vec, t.mat, t.ivec, t.Scale, t.divide
+    real, vec, mat, ivec, Constants, divide = t.real, t.vec, t.mat, t.ivec, t.Constants, t.divide
     Solid, rotation, stress = solid_types(spec).Solid, solid(spec).rotation, solid(spec).stress
     valid, dim, rounds = status.check(spec).valid, spec.dim, spec.dtype == "float32"
 
@@ -40,25 +40,25 @@ def particle(spec: Spec) -> SimpleNamespace:
         valid: bool
 
     @wp.func
-    def impulse(scale: Scale, body: Solid, world: int, p: int) -> real:
+    def impulse(constants: Constants, body: Solid, world: int, p: int) -> real:
         """Δt V⁰ / D [m s]."""
-        return divide(real(4.0) * scale.dt * body.volume[world, p], scale.spacing * scale.spacing)
+        return divide(real(4.0) * constants.dt * body.volume[world, p], constants.spacing * constants.spacing)
 
     @wp.func
-    def affine_momentum(scale: Scale, body: Solid, world: int, p: int, C: mat, H: mat, Q: mat) -> mat:
+    def affine_momentum(constants: Constants, body: Solid, world: int, p: int, C: mat, H: mat, Q: mat) -> mat:
         """A per cell [kg m/s] (T1)."""
-        return scale.width * (
-            body.mass[world, p] * C - impulse(scale, body, world, p) * stress(body, world, p, H, Q)
+        return constants.width * (
+            body.mass[world, p] * C - impulse(constants, body, world, p) * stress(body, world, p, H, Q)
         )
 
     @wp.func
-    def moved(scale: Scale, corner: ivec, shape: ivec, old: Particle, v: vec, B: mat) -> Particle:
+    def moved(constants: Constants, corner: ivec, shape: ivec, old: Particle, v: vec, B: mat) -> Particle:
         """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not valid keeps its base."""
         new = Particle()
         new.v = v
-        new.C = scale.rate * B
-        new.H = old.H + scale.dt * (new.C + new.C * old.H)
-        step = divide(scale.dt, scale.spacing) * v
+        new.C = constants.rate * B
+        new.H = old.H + constants.dt * (new.C + new.C * old.H)
+        step = divide(constants.dt, constants.spacing) * v
         if wp.static(rounds):
             step += old.low
             new.low = step - ((old.fx + step) - old.fx)
@@ -68,7 +68,7 @@ def particle(spec: Spec) -> SimpleNamespace:
         for axis in range(dim):
             cells[axis] = wp.floor(new.fx[axis] - real(0.5))
             new.base[axis] = old.base[axis] + int(cells[axis])
-        new.valid = valid(scale, corner, shape, new.fx, new.base, new.H)
+        new.valid = valid(constants, corner, shape, new.fx, new.base, new.H)
         if new.valid:
             new.fx = new.fx - cells
         return new
@@ -86,7 +86,7 @@ def particle(spec: Spec) -> SimpleNamespace:
 @kernel_factory
 def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
-    real, vec, mat, Scale, divide = t.real, t.vec, t.mat, t.Scale, t.divide
+    real, vec, mat, Constants, divide = t.real, t.vec, t.mat, t.Constants, t.divide
     Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
     stress_adj, impulse, identity = solid_adj(spec, wanted).stress_adj, one.impulse, one.identity
 
@@ -99,7 +99,7 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
     @wp.func
     def momentum_adj(
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         world: int,
         p: int,
@@ -114,28 +114,28 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ) -> ParticleAdj:
         """(T1.adj) of v, C and H from Σ w p̄_i, Σ w m̄_i and B = Σ w p̄_i rᵀ; adds what is wanted into ``adj_body``."""
         m = body.mass[world, p]
-        adj_A = scale.spacing * B
+        adj_A = constants.spacing * B
         adj = ParticleAdj()
         adj.v = m * adj_mv
         adj.C = m * adj_A
-        adj.H = stress_adj(body, world, p, H, Q, -impulse(scale, body, world, p) * adj_A, adj_body)
+        adj.H = stress_adj(body, world, p, H, Q, -impulse(constants, body, world, p) * adj_A, adj_body)
         if wp.static(wanted.material):
             adj_body.mass[world, p] = adj_body.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
         return adj
 
     @wp.func
-    def moved_adj(scale: Scale, H: mat, new_C: mat, adj_new: ParticleAdj) -> ParticleAdj:
+    def moved_adj(constants: Constants, H: mat, new_C: mat, adj_new: ParticleAdj) -> ParticleAdj:
         """(T3.adj): adjoints of x and H before, and in ``v`` and ``C`` those of v' and B.
 
         With 4/dx and dx as they are: the paired factors cost registers, which spill, and change an adjoint by 1e-7.
         """
         adj = ParticleAdj()
         adj.fx = adj_new.fx
-        adj.v = adj_new.v + divide(scale.dt, scale.spacing) * adj_new.fx
-        adj.C = divide(real(4.0), scale.spacing) * (
-            adj_new.C + scale.dt * (adj_new.H * wp.transpose(identity() + H))
+        adj.v = adj_new.v + divide(constants.dt, constants.spacing) * adj_new.fx
+        adj.C = divide(real(4.0), constants.spacing) * (
+            adj_new.C + constants.dt * (adj_new.H * wp.transpose(identity() + H))
         )
-        adj.H = adj_new.H + scale.dt * (wp.transpose(new_C) * adj_new.H)
+        adj.H = adj_new.H + constants.dt * (wp.transpose(new_C) * adj_new.H)
         return adj
 
     return SimpleNamespace(ParticleAdj=ParticleAdj, momentum_adj=momentum_adj, moved_adj=moved_adj)

@@ -15,22 +15,22 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
     """Functions that read and write the status word of a world."""
 
     @wp.func
-    def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
-        return watch[world] == wp.int64(NEVER)
+    def running(words: wp.array(dtype=wp.int64), world: int) -> bool:
+        return words[world] == wp.int64(NEVER)
 
     @wp.func
-    def write(watch: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
+    def write(words: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
         word = (
             (wp.int64(substep) << wp.int64(SUBSTEP_SHIFT))
             | (wp.int64(kind) << wp.int64(KIND_SHIFT))
             | wp.int64(particle)
         )
-        wp.atomic_min(watch, world, word)
+        wp.atomic_min(words, world, word)
 
     @wp.func
-    def ran(watch: wp.array(dtype=wp.int64), world: int, substep: int) -> bool:
+    def ran(words: wp.array(dtype=wp.int64), world: int, substep: int) -> bool:
         """Whether the world has not failed before ``substep``."""
-        word = watch[world]
+        word = words[world]
         return word >= wp.int64(substep) << wp.int64(SUBSTEP_SHIFT) and word != wp.int64(FROZEN)
 
     return SimpleNamespace(running=running, ran=ran, report=write)
@@ -40,7 +40,7 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
 def check(spec: Spec) -> SimpleNamespace:
     """Validity of a new state: finite, on the grid, not collapsed."""
     t = types(spec.dim, spec.dtype)
-    real, vec, mat, ivec, Scale = t.real, t.vec, t.mat, t.ivec, t.Scale
+    real, vec, mat, ivec, Constants = t.real, t.vec, t.mat, t.ivec, t.Constants
     write, volume_change = report(spec.dim, spec.dtype).report, elasticity(spec.dim, spec.dtype).volume_change
     dim = spec.dim
     not_finite, left_grid, collapsed = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.COLLAPSED)
@@ -48,21 +48,21 @@ def check(spec: Spec) -> SimpleNamespace:
     largest = 1.0e12  # of det F, and of a squared distance in cells
 
     @wp.func
-    def valid(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
+    def valid(constants: Constants, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         """Whether the updated particle is finite, inside the window of ``shape`` nodes from ``corner``, and not collapsed.
 
         A comparison with NaN is false. No branch: it would delay the loads that the stress needs.
         """
         j = volume_change(H)
-        ok = int(j > scale.collapse) & int(j < real(largest)) & int(wp.dot(fx, fx) < real(largest))
+        ok = int(j > constants.collapse) & int(j < real(largest)) & int(wp.dot(fx, fx) < real(largest))
         for axis in range(dim):  # unsigned: below zero is far above as well
             ok &= int(wp.uint32(base[axis] - corner[axis]) <= wp.uint32(shape[axis] - 3))
         return ok != 0
 
     @wp.func
     def report_invalid(
-        watch: wp.array(dtype=wp.int64),
-        scale: Scale,
+        words: wp.array(dtype=wp.int64),
+        constants: Constants,
         world: int,
         p: int,
         substep: int,
@@ -73,13 +73,13 @@ def check(spec: Spec) -> SimpleNamespace:
         """Write the status word of an invalid particle. Precedence: non-finite, off the grid, collapsed."""
         kind = left_window
         for axis in range(dim):
-            if wp.uint32(base[axis]) > wp.uint32(scale.shape[axis] - 3):
+            if wp.uint32(base[axis]) > wp.uint32(constants.shape[axis] - 3):
                 kind = left_grid
         j = volume_change(H)
         if not wp.isfinite(wp.ddot(H, H) + wp.dot(fx, fx)) or not j < real(largest):
             kind = not_finite
-        elif not j > scale.collapse:
+        elif not j > constants.collapse:
             kind = collapsed
-        write(watch, world, substep, kind, p)
+        write(words, world, substep, kind, p)
 
     return SimpleNamespace(valid=valid, report_invalid=report_invalid)

@@ -14,7 +14,14 @@ from softmpm.kernels.structs import Spec, solid_types, types
 def state_alarms(spec: Spec):
     """Kernel that checks a state in the user's order, before any substep or after ``substep``."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)
-    real, vec, mat, ivec, Scale, Solid = t.real, t.vec, t.mat, t.ivec, t.Scale, solid_types(spec).Solid
+    real, vec, mat, ivec, Constants, Solid = (
+        t.real,
+        t.vec,
+        t.mat,
+        t.ivec,
+        t.Constants,
+        solid_types(spec).Solid,
+    )
     blocks = elasticity(spec.dim, spec.dtype)
     volume_change, identity = blocks.volume_change, blocks.identity
     step_is_stable, near = one.step_is_stable, one.near
@@ -22,17 +29,17 @@ def state_alarms(spec: Spec):
     start, torn, step = int(Kind.START), int(Kind.TORN), int(Kind.STEP)
 
     @wp.func
-    def on_grid(scale: Scale, x: vec) -> bool:
+    def on_grid(constants: Constants, x: vec) -> bool:
         for axis in range(spec.dim):
-            cell = x[axis] / scale.spacing
-            if not (cell >= real(0.5) and cell < real(scale.shape[axis]) - real(1.5)):
+            cell = x[axis] / constants.spacing
+            if not (cell >= real(0.5) and cell < real(constants.shape[axis]) - real(1.5)):
                 return False
         return True
 
     @wp.kernel(module=spec.module + ".alarms", enable_backward=False)
     def check(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         neighbours: wp.array2d(dtype=wp.int32),
         substep: int,  # -1 before the first
@@ -40,25 +47,25 @@ def state_alarms(spec: Spec):
         x: wp.array2d(dtype=vec),
         F: wp.array2d(dtype=mat),
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
     ):
         world, p = wp.tid()
-        if not ran(watch, world, wp.max(substep, 0)):
+        if not ran(words, world, wp.max(substep, 0)):
             return
         H = F[world, p] - identity()
-        if not step_is_stable(scale, body, world, p, H):
-            report(watch, world, wp.max(substep, 0), step, p)
+        if not step_is_stable(constants, body, world, p, H):
+            report(words, world, wp.max(substep, 0), step, p)
         for k in range(neighbours.shape[1]):
             q = neighbours[p, k]
-            if q >= 0 and not on_grid(scale, x[world, q]):
+            if q >= 0 and not on_grid(constants, x[world, q]):
                 q = -1  # that one is reported where it enters the kernels
             if (
                 q >= 0
-                and on_grid(scale, x[world, p])
-                and not near(scale, ivec(), (x[world, q] - x[world, p]) / scale.spacing)
+                and on_grid(constants, x[world, p])
+                and not near(constants, ivec(), (x[world, q] - x[world, p]) / constants.spacing)
             ):
-                report(watch, world, wp.max(substep, 0), wp.where(substep < 0, start, torn), p)
-        if substep < 0 and not volume_change(H) > scale.collapse:
-            report(watch, world, 0, start, p)
+                report(words, world, wp.max(substep, 0), wp.where(substep < 0, start, torn), p)
+        if substep < 0 and not volume_change(H) > constants.collapse:
+            report(words, world, 0, start, p)
 
     return check

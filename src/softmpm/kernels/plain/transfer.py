@@ -33,7 +33,7 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_
 @kernel_factory
 def transfer(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    vec, mat, node_vec, Scale, Motion, ivec = t.vec, t.mat, t.node, t.Scale, t.Motion, t.ivec
+    vec, mat, node_vec, Constants, Motion, ivec = t.vec, t.mat, t.node, t.Constants, t.Motion, t.ivec
     Solid, s, one = solid_types(spec).Solid, spline(spec.dim, spec.dtype), particle(spec)
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
     pack, Particle, moved = s.pack, one.Particle, one.moved
@@ -44,7 +44,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     @wp.kernel(module=spec.module, enable_backward=False)
     def p2g(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         # In:
         now: Motion,
@@ -57,25 +57,28 @@ def transfer(spec: Spec) -> SimpleNamespace:
         m = body.mass[world, p]
         mv = m * now.v[world, p]
         H = now.H[world, p]
-        A = affine_momentum(scale, body, world, p, now.C[world, p], H, rotation(body, world, p, H))
+        A = affine_momentum(constants, body, world, p, now.C[world, p], H, rotation(body, world, p, H))
         w = weights(fx)
         for n in range(s.count):  # (T1)
             o = offset(n)
             share = weight(w, o)
             wp.atomic_add(
-                node, world, node_index(base, o, scale.shape), share * pack(mv + A * (position(o) - fx), m)
+                node,
+                world,
+                node_index(base, o, constants.shape),
+                share * pack(mv + A * (position(o) - fx), m),
             )
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def g2p(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         substep: int,
         # In:
         velocity: wp.array2d(dtype=vec),
         now: Motion,
         # Out:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         then: Motion,
     ):
         world, p = wp.tid()
@@ -86,18 +89,18 @@ def transfer(spec: Spec) -> SimpleNamespace:
         if wp.static(rounds):
             old.low = now.fx_low[world, p]
         new = Particle()
-        if running(watch, world):
+        if running(words, world):
             v = vec()
             B = mat()
             w = weights(old.fx)
             for n in range(s.count):  # (T2)
                 o = offset(n)
-                share = weight(w, o) * velocity[world, node_index(old.base, o, scale.shape)]
+                share = weight(w, o) * velocity[world, node_index(old.base, o, constants.shape)]
                 v += share
                 B += wp.outer(share, position(o) - old.fx)
-            new = moved(scale, ivec(), scale.shape, old, v, B)  # (T3)
+            new = moved(constants, ivec(), constants.shape, old, v, B)  # (T3)
             if not new.valid:
-                report_invalid(watch, scale, world, p, substep, new.fx, new.base, new.H)
+                report_invalid(words, constants, world, p, substep, new.fx, new.base, new.H)
                 new.base = old.base
         else:
             new = old
@@ -118,7 +121,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
 def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.node
-    Scale, Motion, MotionAdj = t.Scale, t.Motion, t.MotionAdj
+    Constants, Motion, MotionAdj = t.Constants, t.Motion, t.MotionAdj
     Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
     s, dim, one = spline(spec.dim, spec.dtype), spec.dim, particle_adj(spec, wanted)
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
@@ -130,14 +133,14 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
     def p2g_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         body: Solid,
         substep: int,
         # In:
         now: Motion,
         adj_node: wp.array2d(dtype=node_vec),
         # Out, added into:
-        watch: wp.array(dtype=wp.int64),
+        words: wp.array(dtype=wp.int64),
         adj_body: SolidAdj,
         adj_now: MotionAdj,
     ):
@@ -149,7 +152,7 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         H = now.H[world, p]
         m = body.mass[world, p]
         Q = rotation(body, world, p, H)
-        A = affine_momentum(scale, body, world, p, C, H, Q)
+        A = affine_momentum(constants, body, world, p, C, H, Q)
         w = weights(fx)
         slope = slopes(fx)
         adj_mv = vec()
@@ -159,7 +162,7 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         for n in range(s.count):  # (T1.adj)
             o = offset(n)
             r = position(o) - fx
-            adj_i = adj_node[world, node_index(base, o, scale.shape)]
+            adj_i = adj_node[world, node_index(base, o, constants.shape)]
             adj_p = momentum(adj_i)
             share = weight(w, o)
             g = wp.dot(adj_p, m * v + A * r) + m * adj_i[dim]
@@ -167,7 +170,7 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_mv += share * adj_p
             adj_m += share * adj_i[dim]
             B += wp.outer(share * adj_p, r)
-        adj = momentum_adj(scale, body, world, p, v, C, H, Q, adj_mv, adj_m, B, adj_body)
+        adj = momentum_adj(constants, body, world, p, v, C, H, Q, adj_mv, adj_m, B, adj_body)
         adj.fx = adj_fx + adj_now.fx[world, p]
         adj.v += adj_now.v[world, p]
         adj.C += adj_now.C[world, p]
@@ -178,12 +181,12 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_now.H[world, p] = adj.H
         size = wp.dot(adj.fx, adj.fx) + wp.dot(adj.v, adj.v) + wp.ddot(adj.C, adj.C) + wp.ddot(adj.H, adj.H)
         if not wp.isfinite(size):
-            report(watch, world, substep, bad_gradient, p)
+            report(words, world, substep, bad_gradient, p)
 
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
     def g2p_adj(
         # Parameters:
-        scale: Scale,
+        constants: Constants,
         # In:
         velocity: wp.array2d(dtype=vec),
         now: Motion,
@@ -201,14 +204,14 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_new.v = adj_then.v[world, p]
         adj_new.C = adj_then.C[world, p]
         adj_new.H = adj_then.H[world, p]
-        adj = moved_adj(scale, now.H[world, p], then.C[world, p], adj_new)  # (T3.adj)
+        adj = moved_adj(constants, now.H[world, p], then.C[world, p], adj_new)  # (T3.adj)
         adj_now.H[world, p] = adj_now.H[world, p] + adj.H
         adj_fx = adj.fx
         w = weights(fx)
         slope = slopes(fx)
         for n in range(s.count):  # (T2.adj)
             o = offset(n)
-            i = node_index(base, o, scale.shape)
+            i = node_index(base, o, constants.shape)
             r = position(o) - fx
             v_i = velocity[world, i]
             adj_i = adj.v + adj.C * r

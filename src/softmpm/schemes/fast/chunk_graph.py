@@ -83,7 +83,7 @@ class ChunkGraph:
         self.velocity_array = view(self.velocity, t.aligned)
         self.order_array = view(self.order, wp.int32)
         self.order_flat = view(self.order.view(-1), wp.int32)
-        self.watch = view(self.words, wp.int64)
+        self.words_array = view(self.words, wp.int64)
         material = [self._tensor(*self.lead) for _ in range(4)]
         solid = solid_types(model.spec).Solid()
         for name, tensor in zip(("mass", "mu", "lam", "volume"), material, strict=True):
@@ -108,20 +108,20 @@ class ChunkGraph:
     def _commands(self) -> None:
         """Launches that fill the buffers from a user's state or from the final state of another chunk."""
         model, t, pack, lead = self.model, self.types, self.packing, self.lead
-        at, low = (model.scale, self.window, self.order_array), (t.vec, t.mat)
+        at, low = (model.constants, self.window, self.order_array), (t.vec, t.mat)
         state = (t.vec, t.vec, t.mat, t.mat)
         zero = torch.zeros(t.dim, t.dim, dtype=model.dtype, device=model.device)
         none = passing(zero[0].expand(*lead, -1), t.vec), passing(zero.expand(*lead, -1, -1), t.mat)
 
         def enter(*dtypes, low=()) -> RebindableLaunch:
             slots = [slot(model, dtype) for dtype in dtypes]
-            inputs = (*at, *slots, *low, self.watch, self.packed[0])
+            inputs = (*at, *slots, *low, self.words_array, self.packed[0])
             return RebindableLaunch(model, pack.enter, lead, inputs, slots)
 
         self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
         places, sort = padded(self.total), sorting(t.dim, model.spec.dtype)
         slots = [slot(model, wp.int32), slot(model, wp.int32, places), slot(model, t.real, places * t.rows)]
-        inputs = (self.window, self.order_array, *slots, self.watch, self.packed[0])
+        inputs = (self.window, self.order_array, *slots, self.words_array, self.packed[0])
         self._move = RebindableLaunch(model, sort.move, lead, inputs, slots)
         given = Solid.fixed(model)
         slots = slots_in(given, ("mass", "mu", "lam"), model, t.real)
@@ -232,24 +232,32 @@ class ChunkGraph:
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
             if self.exact is not None:
                 now, then = self.exact.sums(s), self.nothing
-            arguments = (model.scale, model.walls, self.window, now, self.velocity_array, then)
+            arguments = (model.constants, model.walls, self.window, now, self.velocity_array, then)
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
         survey = sorting(self.types.dim, model.spec.dtype).survey
-        arguments = (model.scale, self.window, model.particle_count, self.packed[-1].base)
+        arguments = (model.constants, self.window, model.particle_count, self.packed[-1].base)
         launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
         if armed(model):
             sizes = (length - 1, model.particle_count, self.total, self.order_flat)
-            given = (model.scale, self.solid(length - 1), self.arrangement.neighbours, *sizes)
-            launch(packed_alarms(model.spec).check, self.total, *given, self.packed[-1], self.watch)
+            given = (model.constants, self.solid(length - 1), self.arrangement.neighbours, *sizes)
+            launch(packed_alarms(model.spec).check, self.total, *given, self.packed[-1], self.words_array)
 
     def _begin(self, launch: KernelLauncher) -> None:
         """P2G of the first substep."""
         model, sink = self.model, self.node_arrays[0] if self.exact is None else self.exact.shares(0)
         sizes = (self.particles_per_warp, model.particle_count, self.total, self.order_flat)
-        arguments = (model.scale, self.solid(0), self.window, *sizes, self.packed[0], self.watch, sink)
+        arguments = (
+            model.constants,
+            self.solid(0),
+            self.window,
+            *sizes,
+            self.packed[0],
+            self.words_array,
+            sink,
+        )
         launch(
-            fused(model.spec).begin[self.few],
+            fused(model.spec).p2g_first[self.few],
             self.threads(self.particles_per_warp),
             *arguments,
             block_dim=self.block,
@@ -262,13 +270,13 @@ class ChunkGraph:
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (s, s + 1) if self.keep else (0, 0)
         solid = self.solid(min(s + 1, length - 1))
-        parameters = (model.scale, solid, self.window, s, s + 1 == length, self.particles_per_warp)
+        parameters = (model.constants, solid, self.window, s, s + 1 == length, self.particles_per_warp)
         sizes = (model.particle_count, self.total, self.order_flat)
-        states = (packed[now], self.watch, packed[then])
+        states = (packed[now], self.words_array, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
         arguments = (*parameters, *sizes, self.velocity_array, *states, sink)
         launch(
-            fused(model.spec).advance[self.few],
+            fused(model.spec).g2p2g[self.few],
             self.threads(self.particles_per_warp),
             *arguments,
             block_dim=self.block,

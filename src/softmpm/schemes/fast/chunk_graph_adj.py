@@ -62,7 +62,7 @@ class ChunkGraphAdj:
         graph, t, model = self.graph, self.graph.types, self.graph.model
         pack, lead, adj, at = graph.packing, graph.lead, self.scratch.adj_array, graph.order_array
         end = [slot(model, dtype) for dtype in (t.vec, t.vec, t.mat, t.mat)]
-        self._enter = RebindableLaunch(model, pack.enter_adj, lead, (model.scale, at, *end, adj), end)
+        self._enter = RebindableLaunch(model, pack.enter_adj, lead, (model.constants, at, *end, adj), end)
         given = [slot(model, wp.int32), slot(model, t.real, len(self.scratch.adj))]
         move = sorting(t.dim, model.spec.dtype).move_adj
         self._move = RebindableLaunch(model, move, lead, (at, *given, adj), given)
@@ -117,7 +117,7 @@ class ChunkGraphAdj:
             here, before = self.scratch.exact.sums(s), nothing
         last, first = s == graph.chunk.length, s == 0
         now, then = nothing if last else nodes[s], nothing if first else nodes[s - 1]
-        arguments = (model.scale, model.walls, graph.window, now, then, here, velocity, before)
+        arguments = (model.constants, model.walls, graph.window, now, then, here, velocity, before)
         kernel = fused_adj(model.spec, self.wanted).grid_velocity_adj
         launch(kernel, len(self.scratch.velocity), *arguments, block_dim=BLOCK)
 
@@ -132,12 +132,12 @@ class ChunkGraphAdj:
         per_warp = graph.particles_of_warp(may_halve=True)
         sink = before if exact is None else exact.shares(s - 1)
         solid, start, end = graph.solid(min(s, length - 1)), s == 0, s == length
-        parameters = (model.scale, solid, graph.window, length - 1 - s, start, end, per_warp)
+        parameters = (model.constants, solid, graph.window, length - 1 - s, start, end, per_warp)
         sizes = (model.particle_count, graph.total, graph.order_flat)
         states = (graph.packed[max(s - 1, 0)], graph.packed[s])
         grids = (scratch.velocity_array, here, scratch.adj_array)
-        out = (graph.watch, scratch.solid_struct, sink)
-        kernel = fused_adj(model.spec, self.wanted).advance_adj[graph.few]
+        out = (graph.words_array, scratch.solid_struct, sink)
+        kernel = fused_adj(model.spec, self.wanted).g2p2g_adj[graph.few]
         arguments = (*parameters, *sizes, *states, *grids, *out)
         launch(kernel, graph.threads(per_warp), *arguments, block_dim=graph.block)
         if exact is not None and not start:

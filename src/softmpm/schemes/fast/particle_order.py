@@ -85,7 +85,7 @@ class ParticleLayout:
         gravity = model.scene.gravity
         up = max(range(t.dim), key=lambda axis: abs(gravity[axis])) if gravity else 0
         places, found = [slot(model, t.vec) for _ in range(2)], (self._key, *self._ends)
-        inputs = (model.scale, up, *places, *(view(tensor, wp.int32) for tensor in found))
+        inputs = (model.constants, up, *places, *(view(tensor, wp.int32) for tensor in found))
         return RebindableLaunch(
             model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places
         )
@@ -107,7 +107,7 @@ class ParticleLayout:
         """Launch that centres the window on that box."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         ends = (view(tensor, wp.int32) for tensor in (*self._ends, self.origin))
-        inputs = (model.scale, t.ivec(*self.shape), *ends)
+        inputs = (model.constants, t.ivec(*self.shape), *ends)
         return RebindableLaunch(
             model, sorting(t.dim, model.spec.dtype).centre_window, self.origin.shape, inputs, ()
         )

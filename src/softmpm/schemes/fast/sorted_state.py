@@ -29,7 +29,7 @@ class Unpacker:
         spec, lead = model.spec, (model.worlds, model.particle_count)
         t, pack, places = types(spec.dim, spec.dtype), packing(spec.dim, spec.dtype), padded(math.prod(lead))
         order, base, rows = (wp.int32,), (wp.int32, places), (t.real, places * t.rows)
-        scale, end = (model.scale,), [(t.vec,), (t.vec,), (t.mat,), (t.mat,)]
+        constants, end = (model.constants,), [(t.vec,), (t.vec,), (t.mat,), (t.mat,)]
         low = [(t.vec,), (t.mat,)] if model.dtype == torch.float32 else []
         nothing = (2 - len(low)) * (None,)
 
@@ -38,9 +38,9 @@ class Unpacker:
             return RebindableLaunch(model, kernel, lead, (*parameters, *slots, *none), slots)
 
         self.invert = command(sorting(spec.dim, spec.dtype).invert, (), order, (wp.int32,))
-        self.leave = command(pack.leave, scale, order, base, rows, *end, *low, none=nothing)
-        self.positions = command(pack.positions, scale, order, base, rows, (t.vec,))
-        self.leave_adj = command(pack.leave_adj, scale, order, rows, *end)
+        self.leave = command(pack.leave, constants, order, base, rows, *end, *low, none=nothing)
+        self.positions = command(pack.positions, constants, order, base, rows, (t.vec,))
+        self.leave_adj = command(pack.leave_adj, constants, order, rows, *end)
 
     def fields(self, *axes: int) -> list[Tensor]:
         """New tensors of the shape (world, particle, ...) with so many more axes each."""

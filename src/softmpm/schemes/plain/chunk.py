@@ -43,7 +43,7 @@ class PlainRun:
         self._solid = solid  # the structs only see its tensors
         self.states = Motion.empty(model, chunk.length + 1 if keep else 2)
         self.slots = [self.states[i].struct(model) for i in range(len(self.states.base))]
-        self.step.watch_words[list(frozen)] = FROZEN
+        self.step.words[list(frozen)] = FROZEN
         self.step.enter(start, self.slots[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
@@ -52,8 +52,8 @@ class PlainRun:
             self.step.advance(self.slots[now], self.slots[then], s)
         self.end = self.step.leave(self.slots[chunk.length if keep else chunk.length % 2])
         if armed(model):
-            check_end(model, self.step.solid, self.end, self.step.watch, chunk.length - 1)
-        self.words = self.step.watch_words
+            check_end(model, self.step.solid, self.end, self.step.words_array, chunk.length - 1)
+        self.words = self.step.words
         self.outgrow: Callable[[], None] | None = None
 
     def _drive(self, s: int) -> None:
@@ -63,7 +63,7 @@ class PlainRun:
     def vjp(self, adj_end: State, adj_solid: SolidAdj, wanted: RequestedGrads) -> tuple[State, Tensor | None]:
         """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
         model, chunk, step = self.model, self.chunk, self.step
-        step.watch_words.fill_(NEVER)
+        step.words.fill_(NEVER)
         adj_pull = torch.zeros_like(self.pull) if wanted.activation and self.pull is not None else None
         adjoints = MotionAdj.zeros(model), MotionAdj.zeros(model)
         structs, adj_struct = [adj.struct(model) for adj in adjoints], adj_solid.struct(model)

@@ -37,8 +37,8 @@ class Substep:
             define(model.spec)
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
-        self.watch_words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
-        self.watch = view(self.watch_words, wp.int64)
+        self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+        self.words_array = view(self.words, wp.int64)
         self._arrays = {}
         self.last = 0  # number of the substep that was launched last
 
@@ -76,17 +76,17 @@ class Substep:
 
     def to_grid(self, now) -> None:
         """P2G and the grid stage: velocity of the nodes."""
-        scale, spec = self.model.scale, self.model.spec
+        constants, spec = self.model.constants, self.model.spec
         node, velocity = self._array("node"), self._array("velocity")
         clear(self.node)
-        self.launch(transfer(spec).p2g, self.particles, scale, self.solid, now, node)
-        self.launch(grid(spec).grid_velocity, self.nodes, scale, self.model.walls, node, velocity)
+        self.launch(transfer(spec).p2g, self.particles, constants, self.solid, now, node)
+        self.launch(grid(spec).grid_velocity, self.nodes, constants, self.model.walls, node, velocity)
 
     def advance(self, now, then, substep: int) -> None:
         """One whole substep."""
         self.last = substep
         self.to_grid(now)
-        arguments = (self.model.scale, substep, self._array("velocity"), now, self.watch, then)
+        arguments = (self.model.constants, substep, self._array("velocity"), now, self.words_array, then)
         self.launch(transfer(self.model.spec).g2p, self.particles, *arguments)
 
     def adjoint(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:
@@ -99,17 +99,26 @@ class Substep:
 
     def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now) -> None:
         velocity, adj_velocity = self._array("velocity"), self._array("adj_velocity")
-        arguments = (self.model.scale, velocity, now, then, adj_then, adj_velocity, adj_now)
+        arguments = (self.model.constants, velocity, now, then, adj_then, adj_velocity, adj_now)
         self.launch(transfer_adj(self.model.spec, wanted).g2p_adj, self.particles, *arguments)
 
     def grid_adj(self) -> None:
         model, arrays = self.model, (self._array(name) for name in ("node", "adj_velocity", "adj_node"))
-        arguments = (model.scale, model.walls, *arrays)
+        arguments = (model.constants, model.walls, *arrays)
         self.launch(grid(model.spec).grid_velocity_adj, self.nodes, *arguments)
 
     def p2g_adj(self, wanted: RequestedGrads, now, adj_now, adj_solid, substep: int) -> None:
         adj_node = self._array("adj_node")
-        arguments = (self.model.scale, self.solid, substep, now, adj_node, self.watch, adj_solid, adj_now)
+        arguments = (
+            self.model.constants,
+            self.solid,
+            substep,
+            now,
+            adj_node,
+            self.words_array,
+            adj_solid,
+            adj_now,
+        )
         self.launch(transfer_adj(self.model.spec, wanted).p2g_adj, self.particles, *arguments)
 
     def collect_pull(self, adj_solid: SolidAdj, adj_pull: Tensor) -> None:
@@ -130,7 +139,7 @@ class Substep:
             view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*start[:4], *low)
         ]
         kernel = boundary(self.model.dim, self.model.spec.dtype).enter
-        self.launch(kernel, self.particles, self.model.scale, *arrays, self.watch, motion)
+        self.launch(kernel, self.particles, self.model.constants, *arrays, self.words_array, motion)
 
     def leave(self, motion) -> State:
         """The way back, into fresh tensors."""
@@ -142,6 +151,6 @@ class Substep:
         low = out[4:] or [out[0].new_empty(0, 0, d), out[0].new_empty(0, 0, d, d)]
         arrays = [view(tensor, t.vec if tensor.ndim == 3 else t.mat) for tensor in (*out[:4], *low)]
         self.launch(
-            boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.scale, motion, *arrays
+            boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.constants, motion, *arrays
         )
         return State(*out[:4], low=Low(*out[4:]) if out[4:] else None)

@@ -41,8 +41,8 @@ def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
     """What goes over the particles."""
     spec = scene_spec(dim, law, bare)
     if which == "adjoint":
-        return fused_adj(spec, RequestedGrads(material=not bare, activation=not bare)).advance_adj[few]
-    return fused(spec).advance[few]
+        return fused_adj(spec, RequestedGrads(material=not bare, activation=not bare)).g2p2g_adj[few]
+    return fused(spec).g2p2g[few]
 
 
 def compiled(kernel) -> tuple[str, cubin.Kernel]:

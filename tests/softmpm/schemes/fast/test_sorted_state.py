@@ -125,7 +125,13 @@ def test_what_a_chunk_reports_of_its_order(dim, device):
     def report() -> list[int]:
         found = torch.zeros(2, dtype=torch.int64, device=model.device)
         window = program.arrangement.window(program.origin)
-        inputs = [model.scale, window, model.particle_count, program.packed[0].base, view(found, wp.int64)]
+        inputs = [
+            model.constants,
+            window,
+            model.particle_count,
+            program.packed[0].base,
+            view(found, wp.int64),
+        ]
         kernel = sorting(model.dim, model.spec.dtype).survey
         wp.launch(kernel, program.total, inputs, device=model.wp_device, stream=stream_of(model.device))
         return found.tolist()
