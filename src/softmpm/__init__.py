@@ -12,7 +12,7 @@ from softmpm.autograd import rasterize, simulate
 from softmpm.building import build
 from softmpm.cuda_graph import Graph
 from softmpm.errors import UnstableError
-from softmpm.inputs import Inputs
+from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
@@ -28,6 +28,7 @@ from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, w
 __version__ = "0.1.0"
 
 __all__ = [
+    "QUANTITIES",
     "Alarms",
     "BarrierCorotated",
     "Body",
@@ -43,6 +44,7 @@ __all__ = [
     "NeoHookean",
     "Params",
     "Particles",
+    "Quantity",
     "Recorder",
     "Recording",
     "Scene",

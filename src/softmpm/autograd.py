@@ -1,6 +1,7 @@
 """The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,20 +12,23 @@ from softmpm.alarms import Failures
 from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
 from softmpm.checks import (
     check_activation,
-    check_bounds,
     check_finite,
     check_horizon,
-    check_params,
+    check_inputs,
+    check_inputs_bounds,
     check_state,
+    control_steps,
 )
 from softmpm.compiling import opaque
+from softmpm.inputs import Inputs, differentiable
+from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model, check_model
 from softmpm.planning.chunks import Horizon
 from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
-from softmpm.schemes.buffers import Solid, lame, masses
 from softmpm.schemes.capture import is_capturing
+from softmpm.schemes.inputs import Values
 from softmpm.state import GridField, Low, Params, State
 
 _SECOND = (
@@ -40,6 +44,7 @@ def simulate(
     params: Params,
     *,
     substeps: int,
+    inputs: Inputs | None = None,
     failures: Failures | None = None,
 ) -> State:
     """Advance a soft robot, differentiably.
@@ -55,19 +60,21 @@ def simulate(
             to (world, particle). Differentiable. Quantities derived from parameters that need no gradient are cached by tensor
             identity and version. In-place writes through ``.data``, NumPy or Warp are not detected; pass a new tensor instead.
         substeps: Substeps of ``model.scene.dt`` [s] for each row of ``activation``.
+        inputs: Gravity, friction, forces and other quantities that take the place of the scene's; see :class:`softmpm.Inputs`.
+            Without activation they say how many control steps there are. Differentiable.
         failures: Counts the failures of single worlds, whose state is frozen or reset meanwhile; None raises the first.
 
     Returns:
         State after ``control_step * substeps * dt`` seconds, in new tensors.
 
     Raises:
-        TypeError: ``model`` is something else.
+        TypeError: ``model`` is not a :class:`softmpm.Model`.
         ValueError: An argument has a wrong shape, precision or device; names the rule and the value received.
-        UnstableError: A particle became non-finite, collapsed or left the grid, a body tore, or dt is above the running stable
-            step (:class:`softmpm.Alarms`); names world, particle, substep and limit.
+        UnstableError: A particle became non-finite, collapsed or left the grid, numerical fracture occurred, or dt is above the
+            running stable step (:class:`softmpm.Alarms`); names world, particle, substep and limit.
         torch.OutOfMemoryError: With a note of the estimated requirement. The backward pass may raise it and UnstableError as well.
     """
-    return _simulate(model, start, activation, params, substeps, failures)
+    return _simulate(model, start, activation, params, substeps, inputs, failures)
 
 
 @opaque
@@ -77,80 +84,41 @@ def _simulate(
     activation: Tensor | None,
     params: Params,
     substeps: int,
+    inputs: Inputs | None,
     failures: Failures | None,
 ) -> State:
     if torch.is_inference_mode_enabled():  # buffers that stay with the model must be ordinary tensors
         with torch.inference_mode(False), torch.no_grad():
-            return _simulate(model, start, activation, params, substeps, failures)
+            return _simulate(model, start, activation, params, substeps, inputs, failures)
     check_model(model, "simulate")
     start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
-    refuse_batches((*start[:4], activation, *(params if isinstance(params, tuple) else ())))
-    check_horizon(activation, substeps)
+    given = check_inputs(model, inputs)
+    tensors = (*start[:4], activation, *(params if isinstance(params, tuple) else ()), *given.values())
+    refuse_batches(tensors)
+    horizon = check_horizon(control_steps(activation, given), substeps)
     if not is_capturing(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
-    mu, lam, mass = _material(model, params)
-    pull, control_steps = None, 1
-    if activation is not None:
-        control_steps = activation.shape[0]
-        if model.muscle_count:
-            pull = (activation * model.strength).contiguous()
-    elif model.muscle_count:
-        pull = torch.zeros(1, model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
-    low = start.low or (None, None)
-    inputs = (pull, mu, lam, mass, *start[:4])
-    needed = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
-    call = _Call(needed, failures)
-    simulated: Any = _Simulate.apply if needed or _has_transform_or_tangent(inputs) else _Simulate.forward
-    end = simulated(model, Horizon(control_steps, substeps), call, *inputs, *low)
-    return State(*end[:4], low=Low(*end[4:6]) if model.dtype == torch.float32 else None)
+        check_inputs_bounds(given)
+    values = derive(model, activation, params, given, horizon)
+    tensors = (*values.values(), *start[:4])
+    needed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    call = _Call(model, horizon, tuple(values), needed, failures)
+    if not needed and not _has_transform_or_tangent(tensors):
+        return call.run(start, values)
+    simulated: Any = _Simulate.apply(call, *tensors, *(start.low or (None, None)))
+    return State(*simulated[:4], low=Low(*simulated[4:6]) if model.dtype == torch.float32 else None)
 
 
 def _has_transform_or_tangent(tensors: Iterable[Tensor | None]) -> bool:
-    """Whether a torch.func transform is active or a tensor carries a forward-mode tangent.
+    """True if a torch.func transform is active or a tensor carries a forward-mode tangent.
 
-    If not, and no gradient is needed, the function's ``forward`` is called directly, which skips PyTorch's preparations.
+    If not, and no gradient is needed, PyTorch's preparations are skipped.
     """
     return torch._C._are_functorch_transforms_active() or any(
         t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors
     )
-
-
-def _material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
-    """μ, λ [Pa] and mass [model.mass_unit], (world, particle) each, of ``params`` that were checked.
-
-    Those of the call before if nothing changed and nothing needs a gradient.
-    """
-    last, seen = model.workspace.get(_Last, _Last), _seen(model, params)
-    if seen and seen == last.seen:
-        return last.found
-    check_params(model, params)
-    if not is_capturing(model):  # else nothing can be read back
-        check_bounds(params, params.density * model.volume, model.mass_unit)
-    lead = (model.worlds, model.particle_count)
-    mu, lam = (term.expand(lead).contiguous() for term in lame(params))
-    found = mu, lam, masses(model, params).expand(lead).contiguous()
-    if seen:
-        last.params, last.seen, last.found = params, seen, found
-    return found
-
-
-class _Last:
-    """Material of the call before in this thread: what another one computes may not be there yet, on a stream of its own."""
-
-    params: Any = None  # held, so that nothing else takes their names in ``seen``
-    seen: tuple = ()
-    found: Any = None
-
-
-def _seen(model: Model, params: Any) -> tuple:
-    """Identity, version and address of the parameters; empty if a change could not be detected by them."""
-    if is_capturing(model) or torch._C._are_functorch_transforms_active() or not isinstance(params, Params):
-        return ()
-    if not all(type(p) is Tensor and not p.requires_grad and not p.is_inference() for p in params):
-        return ()
-    return tuple((id(p), p._version, p.data_ptr()) for p in params)
 
 
 def rasterize(model: Model, state: State) -> GridField:
@@ -188,12 +156,32 @@ def _cast(model: Model, value: Any) -> Any:
     return type(value)(*(_cast(model, part) for part in value))
 
 
+@dataclass(eq=False)
 class _Call:
-    """Data of one call that are no tensors, which PyTorch would track; receives the trail for its backward pass."""
+    """Data of one call that are no tensors, which PyTorch would track; receives the trail for its backward pass.
 
-    def __init__(self, differentiable: bool, failures: Failures | None):
-        self.differentiable, self.failures = differentiable, failures
-        self.trail: Trail | None = None
+    Attributes:
+        names: Of the inputs, in the order of the function's tensors.
+    """
+
+    model: Model
+    horizon: Horizon
+    names: tuple[str, ...]
+    differentiable: bool
+    failures: Failures | None
+    trail: Trail | None = None
+
+    def run(self, start: State, values: Values) -> State:
+        """The end, after the trail is kept."""
+        with explain_out_of_memory(self.model, self.horizon, self.differentiable):
+            given = self.model, self.horizon, start, values, self.differentiable, self.failures
+            end, self.trail = rollout(*given)
+        return end
+
+    def split(self, tensors: Sequence) -> tuple[Values, list]:
+        """Inputs by name, and the tensors behind them."""
+        count = len(self.names)
+        return dict(zip(self.names, tensors[:count], strict=True)), list(tensors[count:])
 
 
 class _Function(torch.autograd.Function):
@@ -209,20 +197,19 @@ class _Function(torch.autograd.Function):
 
 
 class _Simulate(_Function):
+    """Of a :class:`_Call`, its inputs, the start and its low-order parts."""
+
     @staticmethod
-    def forward(*inputs):
+    def forward(*given):
         # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
-        model, horizon, call, pull, mu, lam, mass, x, v, C, F, low_x, low_F = inputs
-        start = State(x, v, C, F, None if low_x is None else Low(low_x, low_F))
-        solid, needed = Solid(mass, mu, lam, pull), call.differentiable
-        with explain_out_of_memory(model, horizon, needed):
-            end, call.trail = rollout(model, horizon, start, pull, solid, needed, call.failures)
+        call, *tensors = given
+        values, (x, v, C, F, low_x, low_F) = call.split(tensors)
+        end = call.run(State(x, v, C, F, None if low_x is None else Low(low_x, low_F)), values)
         return (*end[:4], *(end.low or (None, None)))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.model, ctx.horizon, call, *tensors = inputs
-        ctx.trail = call.trail
+        ctx.call, *tensors = inputs
         ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place
@@ -230,35 +217,33 @@ class _Simulate(_Function):
     @staticmethod
     def backward(ctx, *adj_end):
         refuse_batches(adj_end)
-        wanted = RequestedGrads(material=any(ctx.needs_input_grad[4:7]), activation=ctx.needs_input_grad[3])
-        about = ctx.model, ctx.horizon, ctx.trail, wanted
-        inputs = *about, *ctx.saved_tensors, *adj_end[:4]
+        needed = dict(zip(ctx.call.names, ctx.needs_input_grad[1:], strict=False))
+        found = [one.group for one in differentiable(ctx.call.model.spec) if needed.get(one.name)]
+        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:4]
         # It may be differentiated once more:
-        again = torch.is_grad_enabled() or _has_transform_or_tangent(inputs[4:])
-        adj = (_SimulateBackward.apply if again else _SimulateBackward.forward)(*inputs)
-        return None, None, None, *adj, None, None
+        again = torch.is_grad_enabled() or _has_transform_or_tangent(given[2:])
+        return None, *(_SimulateBackward.apply if again else _SimulateBackward.forward)(*given), None, None
 
 
 class _SimulateBackward(_Function):
     """A function of its own, so that a second derivative raises instead of silently losing this term."""
 
     @staticmethod
-    def forward(*inputs):
+    def forward(*given):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
-        model, horizon, trail, wanted, pull, mu, lam, mass, *_start = inputs[:-4]
-        adj_end = inputs[-4:]
-        shapes = 2 * ((model.worlds, model.particle_count, model.dim),)
-        shapes += 2 * ((*shapes[0], model.dim),)
-        adj_end = State(
-            *(
-                mass.new_zeros(shape) if adj is None else adj
-                for adj, shape in zip(adj_end, shapes, strict=True)
-            )
+        call, wanted, *tensors = given
+        values, (x, v, C, F, _, _, *adj_end) = call.split(tensors)
+        pairs = zip(adj_end, (x, v, C, F), strict=True)
+        adj_x, adj_v, adj_C, adj_F = (torch.zeros_like(like) if adj is None else adj for adj, like in pairs)
+        adj_end = State(adj_x, adj_v, adj_C, adj_F)
+        with explain_out_of_memory(call.model, call.horizon, gradient=True):
+            adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
+        found = (adj_inputs.tensors.get(name) for name in call.names)
+        exact = (
+            adj if adj is None else adj.to(value.dtype)
+            for adj, value in zip(found, values.values(), strict=True)
         )
-        solid = Solid(mass, mu, lam, pull)
-        with explain_out_of_memory(model, horizon, gradient=True):
-            adj, adj_solid, adj_pull = rollout_adj(model, horizon, trail, pull, solid, adj_end, wanted)
-        return adj_pull, adj_solid.mu, adj_solid.lam, adj_solid.mass, *adj[:4]
+        return *exact, *adj[:4]
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -1,11 +1,14 @@
 """``build``: a scene checked, a scheme chosen, and the model of both."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 
 from softmpm.alarms import Alarms
 from softmpm.checks import check_whole
 from softmpm.devices import device_of
+from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.model import Model
 from softmpm.scene.check_scene import check_precision, check_scene
 from softmpm.scene.scene import Scene
@@ -20,6 +23,7 @@ def build(
     worlds: int = 1,
     memory_budget: int | None = None,
     scheme: str = "auto",
+    inputs: Iterable[str] = (),
     deterministic: bool = False,
     calls: int = 1,
     alarms: Alarms | None = None,
@@ -35,6 +39,8 @@ def build(
             None takes a share of the device's memory; ``describe`` estimates the whole of a call. See docs/memory.md.
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
+        inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
+            them from memory, for each world. Others are compiled as the scene has them, or left out.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
             scheme. The CPU adds in one order anyway. See docs/conventions.md.
         calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
@@ -60,6 +66,7 @@ def build(
         memory_budget = int(memory_budget)
     if scheme not in ("auto", *SCHEMES):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
+    given = check_given(scene, inputs)
     if not isinstance(deterministic, (bool, np.bool_)):
         raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
     alarms = Alarms() if alarms is None else alarms
@@ -79,12 +86,39 @@ def build(
         reason,
         SCHEMES[scheme].footprint,
         alarms,
+        given=given,
         deterministic=bool(deterministic),
         fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme, reason),
         worlds=int(worlds),
         memory_budget=memory_budget,
         calls=int(calls),
     )
+
+
+def check_given(scene: Scene, inputs: Iterable[str]) -> tuple[str, ...]:
+    """Names of the inputs that calls give, in their order.
+
+    Raises:
+        TypeError, ValueError: One is no field of :class:`softmpm.Inputs`, or the scene has nothing that it could be given to.
+    """
+    if isinstance(inputs, str):
+        raise TypeError(f"inputs must be a sequence of names, such as ({inputs!r},), got one text.")
+    names = tuple(inputs)
+    unknown = [name for name in names if name not in Inputs._fields]
+    if unknown:
+        raise ValueError(f"inputs must be among {', '.join(Inputs._fields)}, got {unknown[0]!r}.")
+    owners = {"wall": scene.walls, "muscle": scene.muscles, "driven": scene.driven}
+    if "direction" in names and not any(hasattr(muscle, "direction") for muscle in scene.muscles):
+        raise ValueError("inputs has 'direction', but the scene has no muscles with fibres; leave it out.")
+    for name in names:
+        for axis in set(QUANTITIES[name].axes) & set(owners):
+            if len(owners[axis]) == 0:
+                raise ValueError(f"inputs has {name!r}, but the scene has no {OWNED[axis]}; leave it out.")
+    # What kernels take in any case is not compiled in another way:
+    return tuple(name for name in Inputs._fields if name in names and name not in ("strength", "velocity"))
+
+
+OWNED = {"wall": "walls", "muscle": "muscles", "driven": "driven particles"}
 
 
 def choose_scheme(scene: Scene, dtype: torch.dtype, worlds: int, wanted: str) -> tuple[str, str]:

@@ -11,7 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.state import Low, State
+from softmpm.inputs import QUANTITIES, Inputs
+from softmpm.planning.chunks import Horizon
+from softmpm.state import Low, Params, State
 from softmpm.validate import need
 
 
@@ -30,6 +32,11 @@ class Sizes(Protocol):
     def dtype(self) -> torch.dtype: ...
     @property
     def device(self) -> torch.device: ...
+    @property
+    def spec(self) -> Any: ...
+    @property
+    def defaults(self) -> dict[str, Tensor]: ...
+    def shape_of(self, name: str, control_steps: int) -> tuple[int, ...]: ...
 
 
 MOST_SUBSTEPS = 100_000_000
@@ -84,20 +91,96 @@ def check_row(model: Sizes, activation: Tensor | None) -> None:
     )
 
 
-def check_horizon(activation: Tensor | None, substeps: int) -> None:
+def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
+    """Inputs that are given, by name: such as the model was built for, with shapes that broadcast, its dtype and its device."""
+    if inputs is None:
+        return {}
+    given = {name: value for name, value in _fields("inputs", inputs, Inputs._fields) if value is not None}
+    for name, value in given.items():
+        need(
+            name in model.spec.given or name == "strength" or name in model.defaults,
+            f"inputs.{name} was given, but the model's kernels do not take it; build the model with inputs=({name!r},).",
+        )
+        dtype = torch.float64 if QUANTITIES[name].double else model.dtype
+        _check_tensor(model, f"inputs.{name}", value, dtype=dtype)
+        axes, steps = QUANTITIES[name].axes, _steps(name, value)
+        want = model.shape_of(name, 1 if steps is None else steps)
+        shape = tuple(value.shape)
+        pairs = list(zip(reversed(shape), reversed(want), reversed(axes), strict=False))
+        fits = all(n in (1, full) or axis in ("pose", "control_step") for n, full, axis in pairs)
+        # With one axis less nobody can tell whether it is that of the rows or of the worlds:
+        in_doubt = axes[0] in ("pose", "control_step") and len(shape) == len(want) - 1
+        if not fits or in_doubt or len(shape) > len(want):
+            full = ", ".join(
+                axis if axis in ("pose", "control_step") else str(n)
+                for axis, n in zip(axes, want, strict=True)
+            )
+            raise ValueError(
+                f"inputs.{name} must broadcast to ({', '.join(axes)}) = ({full}), got shape {shape}"
+                + (
+                    "; give the first two axes both or neither, of size 1 where all share it."
+                    if in_doubt
+                    else "."
+                )
+            )
+    return given
+
+
+def _steps(name: str, value: Tensor) -> int | None:
+    """Control steps that an input tells; None if it serves any number."""
+    axes = QUANTITIES[name].axes
+    if value.ndim < len(axes) or len(value) == 1 or axes[0] not in ("pose", "control_step"):
+        return None
+    return len(value) - (axes[0] == "pose")
+
+
+def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
+    """Of a call: those of the activation or, without one, of the inputs, which must agree."""
+    told = {} if activation is None else {"activation": len(activation)}
+    for name, value in given.items():
+        if (steps := _steps(name, value)) is not None:
+            told[f"inputs.{name}"] = steps
+    need(
+        len(set(told.values())) <= 1,
+        "activation and inputs must have as many control steps (poses are one more), got "
+        + ", ".join(f"{steps} in {name}" for name, steps in told.items())
+        + "; one row serves all of them but in activation.",
+    )
+    return next(iter(told.values()), 1)
+
+
+@torch.no_grad()
+def check_inputs_bounds(given: dict[str, Tensor]) -> None:
+    """All inputs are finite and within their bounds. Reads back once: a GPU has to wait."""
+    if not given:
+        return
+    ends = [end.double() for value in given.values() for end in torch.aminmax(value)]
+    ends = torch.stack(ends).tolist()
+    for (name, value), low, high in zip(given.items(), ends[::2], ends[1::2], strict=True):
+        known = QUANTITIES[name]
+        least = math.nextafter(known.low, -math.inf) if known.closed else known.low
+        if not (least < low and high < known.high):
+            _demand(f"inputs.{name}", value, (value > least) & (value < known.high), known.rule)
+    normal = given.get("wall_normal")
+    if normal is not None:
+        _demand("inputs.wall_normal", normal.norm(dim=-1), normal.norm(dim=-1) > 0, "longer than 0")
+
+
+def check_horizon(steps: int, substeps: int) -> Horizon:
     """A whole number of substeps for each control step, not too many in all."""
     check_whole("substeps", substeps)
-    total = substeps * (1 if activation is None else len(activation))
+    total = substeps * steps
     need(
         total <= MOST_SUBSTEPS,
         f"a call has at most {MOST_SUBSTEPS:,} substeps, got {total:,}; call simulate several times, each from the end before.",
     )
+    return Horizon(steps, substeps)
 
 
 def check_params(model: Sizes, params: NamedTuple) -> None:
     """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
     want = (model.worlds, model.particle_count)
-    for name, value in _fields("params", params, tuple(BOUNDS)):
+    for name, value in _fields("params", params, Params._fields):
         _check_tensor(model, f"params.{name}", value)
         shape = tuple(value.shape)
         fits = all(n in (1, full) for n, full in zip(reversed(shape), reversed(want), strict=False))
@@ -123,11 +206,11 @@ def check_bounds(params: NamedTuple, mass: Tensor, unit: Tensor) -> None:
         mass: That of the particles [kg], density times volume.
         unit: In which the kernels count it [kg], shape ().
     """
-    given = [*_fields("params", params, tuple(BOUNDS)), ("mass", mass)]
+    given = [*_fields("params", params, Params._fields), ("mass", mass)]
     found = [end for _, value in given for end in torch.aminmax(value)]
     *ends, lightest, heaviest, one = torch.stack([*found, unit]).tolist()
     for (name, value), low, high in zip(given[:-1], ends[::2], ends[1::2], strict=True):
-        least, most, rule = BOUNDS[name]
+        least, most, rule = QUANTITIES[name].low, QUANTITIES[name].high, QUANTITIES[name].rule
         if not (least < low and high < most):
             _demand(f"params.{name}", value, (value > least) & (value < most), rule)
     real = torch.finfo(mass.dtype)
@@ -152,14 +235,6 @@ def check_finite(state: State | None, activation: Tensor | None) -> None:
             _demand(name, value, torch.isfinite(value), "finite")
 
 
-BOUNDS = {
-    "young": (0.0, math.inf, "finite and > 0"),
-    "poisson": (-1.0, 0.5, "in (-1, 0.5)"),
-    "density": (0.0, math.inf, "finite and > 0"),
-}
-"""Limits that each material parameter lies between."""
-
-
 def _demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
     """Raise ValueError for the first value that breaks the rule."""
     if not bool(holds.all()):
@@ -175,13 +250,24 @@ def _fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[t
         yield name, getattr(record, name)
 
 
-def _check_tensor(model: Sizes, name: str, value: Tensor, shape: tuple[int, ...] | None = None) -> None:
+def _check_tensor(
+    model: Sizes,
+    name: str,
+    value: Tensor,
+    shape: tuple[int, ...] | None = None,
+    dtype: torch.dtype | None = None,
+) -> None:
     """Precision and device are the model's; and the shape, if it is one of particles. Texts are made only when needed."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
     if value.layout != torch.strided:
         raise TypeError(f"{name} must be a dense tensor, got {value.layout}; use .to_dense().")
-    if value.dtype != model.dtype:
+    if dtype is not None and dtype != model.dtype:
+        need(
+            value.dtype == dtype,
+            f"{name} must be {dtype} in every precision, got {value.dtype}; use .to({dtype}).",
+        )
+    elif value.dtype != model.dtype:
         raise ValueError(
             f"{name} must be {model.dtype} like the model, got {value.dtype}; use .to({model.dtype}), "
             "or build the model with another dtype."

@@ -1,6 +1,7 @@
 """A model in words: what was compiled for its scene, what was left out, and the memory of a call."""
 
 from softmpm.checks import check_whole
+from softmpm.inputs import groups
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import memory
 from softmpm.scene.scene import CONTACTS
@@ -23,11 +24,14 @@ def describe(model, substeps: int) -> str:
         f"{model.particle_count} particles on {' x '.join(map(str, model.scene.grid.shape))} nodes",
         f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
         f"  muscles    {muscles if spec.muscle_slots else 'left out'}",
+        f"  driven     {f'{model.driven_count} particles' if spec.driven else 'left out'}",
         f"  walls      {contacts or 'left out'}",
         f"  friction   {has(spec.friction)}",
         f"  gravity    {has(spec.gravity)}",
         f"  damping    {has(spec.damping)}",
-        "  gradients  of the start always; of activation and material only in a backward pass that asks for them",
+        f"  viscosity  {has(spec.viscosity)}",
+        f"  inputs     {', '.join(spec.given) or 'none'} read from memory, for each world",
+        f"  gradients  of the start always; of {', '.join(groups(spec))} only in a backward pass that asks for them",
         f"  alarms     {_alarms(model)}",
         f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
         f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
@@ -63,4 +67,6 @@ def _sums(model) -> str:
         return "in fixed point: deterministic, the same bits from run to run"
     if model.device.type == "cpu":
         return "in floating point, in one order: the same bits from run to run"
+    if model.deterministic:
+        return "in the order of the particles: deterministic, the same bits from run to run"
     return "in floating point, in any order: the last bits vary; deterministic=True makes them repeat"

@@ -20,7 +20,7 @@ MAX_SUBSTEP = 2 ** (63 - SUBSTEP_SHIFT) - 1
 
 
 class Kind(IntEnum):
-    """Kinds of failure; the order decides which failure of one particle is reported."""
+    """Kinds of failure; of several within a substep, the smallest kind of a world is reported."""
 
     START = 0
     NOT_FINITE = 1
@@ -34,7 +34,7 @@ class Kind(IntEnum):
 
 
 class UnstableError(RuntimeError):
-    """A particle became non-finite, collapsed or left the grid, a body tore, dt became too large, or a gradient overflowed.
+    """A particle became non-finite, collapsed or left the grid, numerical fracture, too large a dt, or a gradient that overflowed.
 
     Attributes:
         kind: One of ``start``, ``not_finite``, ``left_grid``, ``inverted`` (det F ≤ 0), ``collapsed`` (det F below its limit),
@@ -42,7 +42,7 @@ class UnstableError(RuntimeError):
         world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite.
         substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.
         value: The offending value.
-        limit: What it had to keep to.
+        limit: The limit that it violates.
         state: State of every world at the end of the chunk (at most 128 substeps, docs/memory.md) in which one failed; that one
             stopped where it failed. None in a backward pass.
     """

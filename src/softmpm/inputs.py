@@ -1,6 +1,7 @@
-"""What a substep depends on besides the state: one table for users, one for the kernels, from which the rest of the package follows.
+"""Inputs of a substep besides the state: one table of what users pass, and one of what the kernels take.
 
-A new input is a row in each: structs, adjoints, buffers, sorting, checks, memory and the interfaces to PyTorch and Warp read them.
+A new input is a row in each table. Structs, adjoints, buffers, sorting, checks, memory and the interfaces to PyTorch and Warp are
+derived from them.
 """
 
 import math
@@ -15,15 +16,15 @@ class Inputs(NamedTuple):
     """Physical quantities that a call may give besides the state, the activation and :class:`softmpm.Params`. Differentiable.
 
     None takes the scene's value. Shapes broadcast to those below, so that one number for all worlds is a tensor without the axis
-    ``world``. An input that the scene alone would not compile is named when the model is built: ``build(scene, inputs=("friction",))``.
+    ``world``. What starts with ``control_step`` or ``pose`` has all axes, of size 1 where a value is shared, or neither that axis nor
+    ``world``: a force (5, 1, particle, dim) or (particle, dim). A tensor that lacks exactly one axis is refused. An input that the
+    scene alone would not compile is named when the model is built: ``build(scene, inputs=("friction",))``.
     """
 
     gravity: Tensor | None = None
     """g [m/s²], shape (world, dim)."""
     damping: Tensor | None = None
     """Rate at which grid velocity decays [1/s], shape (world,)."""
-    friction: Tensor | None = None
-    """Coulomb coefficient of each wall [-], shape (world, wall)."""
     wall_offset: Tensor | None = None
     """Offset of each wall [m], shape (pose, world, wall), in float64. One pose is a wall at rest; else there is one at the beginning
     and one at the end of every control step, and the wall moves between them at a constant speed."""
@@ -39,21 +40,23 @@ class Inputs(NamedTuple):
     """Viscosity η of the material [Pa s], shape (world, particle)."""
     velocity: Tensor | None = None
     """Velocity of the driven particles [m/s], shape (control_step, world, driven, dim)."""
-    force: Tensor | None = None
-    """External force on each particle [N], shape (control_step, world, particle, dim)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """What users give: the shape that it broadcasts to, by names of axes, and the bounds that it keeps."""
+    """Quantity that users pass: names of the axes that it broadcasts to, and the bounds of its values."""
 
     axes: tuple[str, ...]
     low: float = -math.inf
     high: float = math.inf
     closed: bool = False
-    """Whether the bounds themselves are allowed."""
+    """True if the bounds themselves are allowed."""
     double: bool = False
-    """Whether it is in float64 in every precision: which side of a wall a node is on must not depend on it."""
+    """True if it is float64 in every precision: the side of a wall that a node lies on must not depend on the precision."""
+    default: Callable[[Any], Any] | None = None
+    """Value of a scene, in a shape that broadcasts; None for the material, which the bodies have."""
+    needed: Callable[[Any], bool] = lambda spec: False
+    """True if the kernels of a :class:`softmpm.kernels.structs.Spec` take it although no call gives it."""
 
     @property
     def rule(self) -> str:
@@ -67,16 +70,214 @@ QUANTITIES = {
     "young": Quantity(axes=("world", "particle"), low=0.0),
     "poisson": Quantity(axes=("world", "particle"), low=-1.0, high=0.5),
     "density": Quantity(axes=("world", "particle"), low=0.0),
-    "gravity": Quantity(axes=("world", "dim")),
-    "damping": Quantity(axes=("world",), low=0.0, closed=True),
-    "friction": Quantity(axes=("world", "wall"), low=0.0, closed=True),
-    "wall_offset": Quantity(axes=("pose", "world", "wall"), double=True),
-    "wall_normal": Quantity(axes=("pose", "world", "wall", "dim"), double=True),
-    "wall_velocity": Quantity(axes=("control_step", "world", "wall", "dim")),
-    "direction": Quantity(axes=("world", "muscle", "dim")),
-    "strength": Quantity(axes=("world", "muscle")),
-    "viscosity": Quantity(axes=("world", "particle"), low=0.0, closed=True),
-    "velocity": Quantity(axes=("control_step", "world", "driven", "dim")),
-    "force": Quantity(axes=("control_step", "world", "particle", "dim")),
+    "gravity": Quantity(axes=("world", "dim"), default=lambda scene: scene.gravity),
+    "damping": Quantity(axes=("world",), low=0.0, closed=True, default=lambda scene: scene.damping),
+    "friction": Quantity(
+        axes=("world", "wall"), low=0.0, closed=True, default=lambda scene: [w.friction for w in scene.walls]
+    ),
+    "wall_offset": Quantity(
+        axes=("pose", "world", "wall"),
+        double=True,
+        default=lambda scene: [[[w.offset for w in scene.walls]]],
+        needed=lambda spec: spec.moving,
+    ),
+    "wall_normal": Quantity(
+        axes=("pose", "world", "wall", "dim"),
+        double=True,
+        default=lambda scene: [[[w.normal for w in scene.walls]]],
+        needed=lambda spec: spec.moving,
+    ),
+    "wall_velocity": Quantity(
+        axes=("control_step", "world", "wall", "dim"),
+        default=lambda scene: [0.0] * scene.grid.dim,
+        needed=lambda spec: spec.moving,
+    ),
+    "direction": Quantity(
+        axes=("world", "muscle", "dim"), default=lambda scene: [direction_of(m, scene) for m in scene.muscles]
+    ),
+    "strength": Quantity(axes=("world", "muscle"), default=lambda scene: [m.strength for m in scene.muscles]),
+    "viscosity": Quantity(
+        axes=("world", "particle"),
+        low=0.0,
+        closed=True,
+        default=lambda scene: [b.material.viscosity for b in scene.bodies for _ in range(len(b.particles))],
+        needed=lambda spec: spec.viscosity,
+    ),
+    "velocity": Quantity(
+        axes=("control_step", "world", "driven", "dim"),
+        default=lambda scene: [0.0] * scene.grid.dim,
+        needed=lambda spec: spec.driven,
+    ),
 }
-"""Of :class:`softmpm.Params` and :class:`Inputs`, by name."""
+"""Fields of :class:`softmpm.Params` and :class:`Inputs`, by name."""
+
+
+def direction_of(actuator, scene) -> tuple[float, ...]:
+    """Unit direction of an actuator, along the first axis for one without fibres."""
+    return getattr(actuator, "direction", (1.0,) + (0.0,) * (scene.grid.dim - 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Input:
+    """Input of the kernels: its count and type, the scenes that have it, and the group of gradients that it belongs to."""
+
+    name: str
+    per: Literal["particle", "slot", "muscle", "driven", "world", "wall", "substep"]
+    kind: Literal["scalar", "vector", "index"] = "scalar"
+    present: Callable[[Any], bool] = lambda spec: True
+    """True if the kernels of a :class:`softmpm.kernels.structs.Spec` take it."""
+    group: str = ""
+    """Gradients of one group are computed together; an input without a group is not differentiable."""
+    rows: bool = False
+    """True if each control step has its own values."""
+    stage: Literal["p2g", "grid", "g2p"] = "p2g"
+    """Stage of a substep that reads it."""
+    double: bool = False
+    """True if it is float64 in every precision."""
+    shared: Callable[[Any], bool] = lambda spec: False
+    """True if all worlds share it."""
+    constant: Callable[[Any], bool] = lambda spec: False
+    """True if it is passed by value with a launch, as the walls at rest are, so that no kernel waits for memory."""
+
+    @property
+    def sorted(self) -> bool:
+        """True if it is permuted with the particles when they are sorted."""
+        return self.per in ("particle", "slot")
+
+
+def _moving(spec) -> bool:
+    return spec.moving
+
+
+INPUTS = (
+    Input(name="mass", per="particle", group="material"),  # m_p / m₀, m₀ that of the heaviest particle
+    Input(name="mu", per="particle", group="material"),  # Lamé's μ [Pa]
+    Input(name="lam", per="particle", group="material"),  # Lamé's λ [Pa]
+    Input(name="volume", per="particle"),  # V⁰ / m₀ [m³/kg]
+    Input(
+        name="law", per="particle", kind="index", present=lambda spec: len(spec.laws) > 1
+    ),  # into spec.laws
+    Input(name="muscle", per="slot", kind="index", present=lambda spec: spec.muscle_slots > 0),  # or -1
+    Input(
+        name="fibre",  # unit direction d
+        per="muscle",
+        kind="vector",
+        present=lambda spec: spec.fibres,
+        group="direction",
+        shared=lambda spec: "direction" not in spec.given,
+    ),
+    Input(  # activation times strength [Pa]
+        name="active_stress",
+        per="muscle",
+        present=lambda spec: spec.muscle_slots > 0,
+        group="activation",
+        rows=True,
+    ),
+    Input(  # index into spec.actuators
+        name="actuator",
+        per="muscle",
+        kind="index",
+        present=lambda spec: len(spec.actuators) > 1,
+        shared=lambda spec: True,
+    ),
+    Input(
+        name="viscosity", per="particle", present=lambda spec: spec.viscosity, group="viscosity"
+    ),  # η [Pa s]
+    Input(
+        name="driven", per="particle", kind="index", present=lambda spec: spec.driven, stage="g2p"
+    ),  # or -1
+    Input(  # of the driven particles [m/s]
+        name="velocity",
+        per="driven",
+        kind="vector",
+        present=lambda spec: spec.driven,
+        group="velocity",
+        rows=True,
+        stage="g2p",
+    ),
+    Input(  # g [m/s²]
+        name="gravity",
+        per="world",
+        kind="vector",
+        present=lambda spec: "gravity" in spec.given,
+        group="gravity",
+        stage="grid",
+    ),
+    Input(  # exp(−damping Δt)
+        name="decay", per="world", present=lambda spec: "damping" in spec.given, group="damping", stage="grid"
+    ),
+    Input(
+        name="normal",
+        per="wall",
+        kind="vector",
+        present=lambda spec: len(spec.contacts) > 0,
+        group="wall",
+        rows=True,
+        stage="grid",
+        double=True,
+        constant=lambda spec: not spec.moving,
+    ),
+    Input(
+        name="offset",
+        per="wall",
+        present=lambda spec: len(spec.contacts) > 0,
+        rows=True,
+        stage="grid",
+        double=True,
+        constant=lambda spec: not spec.moving,
+    ),
+    Input(
+        name="friction",
+        per="wall",
+        present=lambda spec: spec.friction,
+        stage="grid",
+        constant=lambda spec: True,
+    ),
+    # How the pose of a moving wall changes in a control step, see contact.py:
+    Input(
+        name="offset_rate", per="wall", present=_moving, group="wall", rows=True, stage="grid", double=True
+    ),
+    Input(
+        name="normal_rate",
+        per="wall",
+        kind="vector",
+        present=_moving,
+        group="wall",
+        rows=True,
+        stage="grid",
+        double=True,
+    ),
+    Input(
+        name="surface_velocity",
+        per="wall",
+        kind="vector",
+        present=_moving,
+        group="wall",
+        rows=True,
+        stage="grid",
+    ),
+    Input(
+        name="elapsed", per="substep", present=_moving, stage="grid", double=True
+    ),  # of the control step [s]
+)
+"""All inputs of the kernels, in the order of the fields of the kernels' structs."""
+
+
+def present(spec) -> tuple[Input, ...]:
+    """Inputs that the kernels of this :class:`softmpm.kernels.structs.Spec` take."""
+    return tuple(one for one in INPUTS if one.present(spec))
+
+
+def stored(spec) -> tuple[Input, ...]:
+    """Inputs of :func:`present` that are stored in memory."""
+    return tuple(one for one in present(spec) if not one.constant(spec))
+
+
+def differentiable(spec) -> tuple[Input, ...]:
+    """Inputs of :func:`present` that have a gradient."""
+    return tuple(one for one in stored(spec) if one.group and not one.shared(spec))
+
+
+def groups(spec) -> tuple[str, ...]:
+    """Groups of the :func:`differentiable` inputs, in the order of the table."""
+    return tuple(dict.fromkeys(one.group for one in differentiable(spec)))

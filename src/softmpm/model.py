@@ -3,6 +3,9 @@
 import functools
 import html
 import math
+import pkgutil
+import re
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,20 +14,15 @@ from torch import Tensor
 
 from softmpm.alarms import Alarms
 from softmpm.describe import describe
-from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.inputs import QUANTITIES, direction_of, stored
+from softmpm.kernels import physics
+from softmpm.kernels.structs import Spec, types
 from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
-from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean
 from softmpm.scene.neighbours import rest_neighbours
 from softmpm.scene.scene import Scene
 from softmpm.state import Low, Params, State
 from softmpm.summary import counted
 from softmpm.workspace import Workspace
-
-LAWS = {
-    NeoHookean: "neo_hookean",
-    FixedCorotated: "fixed_corotated",
-    BarrierCorotated: "barrier_corotated",
-}
 
 
 class Model:
@@ -33,7 +31,7 @@ class Model:
     Attributes:
         scene: The scene it was built from.
         device, dtype: Where it runs and in which precision.
-        worlds, particle_count, muscle_count, dim: Sizes.
+        worlds, particle_count, muscle_count, wall_count, driven_count, dim: Sizes.
         calls: How many calls of ``simulate`` share the memory budget.
         alarms: Limits beyond which a simulation is stopped.
         neighbours: Neighbours at rest of each particle, -1 for none, shape (particle, at most dim).
@@ -43,6 +41,10 @@ class Model:
         mass_unit: Mass of the heaviest particle [kg], in which the kernels count, shape ().
         specific_volume: Rest volume per unit of mass [m³/kg], shape (particle,).
         body: Index of each particle's body, shape (particle,).
+        wall_constants: Numbers of the walls that lie in the parameters of a launch, by the names of the inputs.
+        fixed: What the scene alone decides of the kernels' inputs, by name.
+        defaults: Fields of :class:`softmpm.Inputs` that the kernels take, where a call leaves them out.
+        derived: Names of the kernels' inputs that a call decides, in their order.
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
@@ -60,6 +62,7 @@ class Model:
         footprint: Footprint,
         alarms: Alarms,
         *,
+        given: tuple[str, ...],
         deterministic: bool,
         fixed_point: bool,
         worlds: int,
@@ -71,29 +74,35 @@ class Model:
         self.dim = scene.grid.dim
         sizes = [len(body.particles) for body in scene.bodies]
         self.particle_count = sum(sizes)
-        self.muscle_count = len(scene.muscles)
+        self.muscle_count, self.wall_count = len(scene.muscles), len(scene.walls)
+        self.driven_count = len(scene.driven)
         self.node_count = math.prod(scene.grid.shape)
         self.body = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes)).to(device)
         self.exact_positions = np.concatenate([body.particles.positions for body in scene.bodies])
         self.positions = self._tensor(self.exact_positions)
         self.volume = self._tensor(np.concatenate([body.particles.volume for body in scene.bodies]))
-        slots = _muscle_slots(scene, self.particle_count)
+        slots = muscle_slots(scene, self.particle_count)
         self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
         self.deterministic, self.workspace = deterministic, Workspace()
-        self.spec = _spec(scene, dtype, slots.shape[1], fixed_point)
-        self.muscle_slots = torch.from_numpy(slots).to(device)
-        self.fibre = self._tensor([m.direction for m in scene.muscles]).reshape(-1, self.dim)
+        self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point)
         self.strength = self._tensor([m.strength for m in scene.muscles])
-        laws = np.array([self.spec.laws.index(_law(b.material)) for b in scene.bodies], dtype=np.int32)
-        self.law = torch.from_numpy(np.repeat(laws, sizes)).to(device)
         # Computed now, not on first use: that may be during a capture, which runs nothing.
         self._params, self._low = self._given(), self._rounded() if dtype == torch.float32 else None
         self.mass = (self._params.density * self.volume).contiguous()
         self.mass_unit = self.mass.max()
         self.specific_volume = self.volume / self.mass_unit
+        self.fixed, self.defaults = self._fixed(slots), self._defaults()
+        self.derived = tuple(
+            one.name for one in stored(self.spec) if one.name not in self.fixed and one.per != "substep"
+        )
+        self.wall_constants = {
+            "normal": [number for wall in scene.walls for number in wall.normal],
+            "offset": [wall.offset for wall in scene.walls],
+            "friction": [wall.friction for wall in scene.walls],
+        }
         wp.init()
         self.wp_device = wp.device_from_torch(device)
-        self.constants, self.walls = self._constants(), self._walls()
+        self.constants = self._constants()
         check_room(self)
         self.neighbours = self._neighbours()
 
@@ -117,20 +126,60 @@ class Model:
         return constants
 
     def _neighbours(self) -> Tensor:
-        """Neighbours at rest of each particle, -1 for none, shape (particle, dim); without a column if nobody looks at them."""
+        """Neighbours at rest of each particle, -1 for none, shape (particle, dim); without columns if no alarm needs them."""
         if self.alarms.gap is None:
             return torch.empty(self.particle_count, 0, dtype=torch.int32, device=self.device)
         longest = self.alarms.gap * self.scene.grid.spacing
         return torch.from_numpy(rest_neighbours(self.scene, longest)).to(self.device)
 
-    def _walls(self):
-        walls, given = solid_types(self.spec).Walls(), self.scene.walls
-        if given:
-            walls.normal = [number for w in given for number in w.normal]
-            walls.offset = [w.offset for w in given]
-        if self.spec.friction:
-            walls.friction = [w.friction for w in given]
-        return walls
+    def _fixed(self, slots: np.ndarray) -> dict[str, Tensor]:
+        """See :attr:`fixed`; in all worlds the same."""
+        scene, spec, lead = self.scene, self.spec, (self.worlds, self.particle_count)
+
+        def integers(values) -> Tensor:
+            return torch.from_numpy(np.asarray(values, dtype=np.int32)).to(self.device)
+
+        fixed = {"volume": self.specific_volume.expand(lead)}
+        if len(spec.laws) > 1:
+            laws = integers([spec.laws.index(kernel_of(body.material, LAWS)) for body in scene.bodies])
+            fixed["law"] = laws[self.body].expand(lead)
+        if spec.muscle_slots:
+            fixed["muscle"] = integers(slots).expand(*lead, -1)
+        if len(spec.actuators) > 1:
+            fixed["actuator"] = integers(
+                [spec.actuators.index(kernel_of(m, ACTUATORS)) for m in scene.muscles]
+            )
+        if spec.fibres and "direction" not in spec.given:
+            fixed["fibre"] = self._tensor([direction_of(muscle, scene) for muscle in scene.muscles])
+        if spec.driven:
+            handles = np.full(self.particle_count, -1)
+            handles[scene.driven] = np.arange(len(scene.driven))
+            fixed["driven"] = integers(handles).expand(lead)
+        return fixed
+
+    def _defaults(self) -> dict[str, Tensor]:
+        """See :attr:`defaults`."""
+        found = {}
+        for name, known in QUANTITIES.items():
+            if known.default is not None and (name in self.spec.given or known.needed(self.spec)):
+                dtype = torch.float64 if known.double else self.dtype
+                values = np.asarray(known.default(self.scene), dtype=np.float64)
+                found[name] = torch.tensor(values, dtype=dtype, device=self.device)
+        return found
+
+    def shape_of(self, name: str, control_steps: int) -> tuple[int, ...]:
+        """Full shape of a field of :class:`Params` or :class:`Inputs` in a call of so many control steps."""
+        sizes = {
+            "control_step": control_steps,
+            "pose": control_steps + 1,
+            "world": self.worlds,
+            "particle": self.particle_count,
+            "muscle": self.muscle_count,
+            "wall": self.wall_count,
+            "driven": self.driven_count,
+            "dim": self.dim,
+        }
+        return tuple(sizes[axis] for axis in QUANTITIES[name].axes)
 
     def rest(self) -> State:
         """State at rest, in every world: x at the rest positions, v = C = 0, F = I. Fresh tensors."""
@@ -206,7 +255,7 @@ def _inverse_pair(spacing: float, dtype: torch.dtype) -> tuple[float, float]:
     return min(pairs, key=lambda pair: abs(pair[0] * pair[1] - 4.0))
 
 
-def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
+def muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
     """Muscles of each particle, shape (particle, most that overlap on one), filled up with -1."""
     members = np.zeros(particle_count, dtype=np.int64)
     for muscle in scene.muscles:
@@ -219,26 +268,41 @@ def _muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
     return slots
 
 
-def _law(material: Material) -> str:
-    if type(material) not in LAWS:
-        known = ", ".join(kind.__name__ for kind in LAWS)
+LAWS, ACTUATORS = "laws", "actuators"
+
+
+def kernel_of(part: object, package: str) -> str:
+    """Name of the file of kernels/physics that has the kernels of a material or an actuator: that of its class."""
+    name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(part).__name__).lower()
+    known = [found.name for found in pkgutil.iter_modules([str(Path(physics.__file__).parent / package)])]
+    if name not in known:
         raise TypeError(
-            f"no kernel has the law {type(material).__name__}; a material must be one of {known}."
+            f"{type(part).__name__} has no kernels: kernels/physics/{package} has {', '.join(known)}, and no {name}."
         )
-    return LAWS[type(material)]
+    return name
 
 
-def _spec(scene: Scene, dtype: torch.dtype, slots: int, fixed_point: bool) -> Spec:
-    laws = {_law(body.material) for body in scene.bodies}
+def _spec(scene: Scene, dtype: torch.dtype, slots: int, given: tuple[str, ...], fixed_point: bool) -> Spec:
+
+    def has(name: str) -> bool:
+        """True if the scene has a quantity other than zero, or calls give it."""
+        default = QUANTITIES[name].default
+        return name in given or (default is not None and bool(np.any(default(scene))))
+
     return Spec(
         dim=scene.grid.dim,
         dtype=str(dtype).removeprefix("torch."),
-        laws=tuple(law for law in LAWS.values() if law in laws),
+        laws=tuple(sorted({kernel_of(body.material, LAWS) for body in scene.bodies})),
         muscle_slots=slots,
         contacts=tuple(wall.contact for wall in scene.walls),
-        friction=any(wall.friction > 0 for wall in scene.walls),
-        gravity=any(g != 0 for g in scene.gravity or ()),
-        damping=scene.damping > 0,
+        friction=has("friction"),
+        gravity=has("gravity"),
+        damping=has("damping"),
+        actuators=tuple(sorted({kernel_of(muscle, ACTUATORS) for muscle in scene.muscles})),
+        fibres=any(hasattr(muscle, "direction") for muscle in scene.muscles),
+        viscosity=has("viscosity"),
+        driven=len(scene.driven) > 0,
+        given=given,
         deterministic=fixed_point,
     )
 

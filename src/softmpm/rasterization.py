@@ -104,7 +104,7 @@ def _raise_gradient_failure(model: Model, adj: GridField, adj_moving: list[Tenso
     world, particle = bad.nonzero()[0].tolist()
     given = all(bool(torch.isfinite(tensor[world]).all()) for tensor in adj)
     cause = (
-        "It overflowed on the way back: scale the loss"
+        "It overflowed in the backward pass: scale the loss"
         if given
         else "The gradient of the loss with respect to the field came in like that: look at the loss"
     )

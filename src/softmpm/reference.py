@@ -1,161 +1,118 @@
 """The whole method again in plain PyTorch: slow, readable, the truth in tests; no code shared with kernels.
 
 Every function takes tensors with any leading axes and is differentiated by torch.autograd; meant for float64.
-Derivations and labels: docs/math/.
+The stress of a particle stands in ``reference_stress.py``, walls in ``reference_walls.py``. Derivations and labels: docs/math/.
 """
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean
-from softmpm.scene.scene import Scene, Wall
+from softmpm.inputs import QUANTITIES, Inputs
+from softmpm.reference_stress import (
+    LAWS,
+    actuator_stress,
+    actuator_tangent,
+    barrier_corotated,
+    fixed_corotated,
+    lame,
+    law_of,
+    muscle_stress,
+    muscle_tangent,
+    neo_hookean,
+    polar,
+    strains,
+    tangent,
+    viscous_stress,
+    viscous_tangent,
+)
+from softmpm.reference_walls import inside, respond, surface, wall_velocity
+from softmpm.scene.scene import Actuator, Scene
 from softmpm.state import GridField, Params, State
 
+__all__ = [
+    "LAWS",
+    "actuator_stress",
+    "actuator_tangent",
+    "barrier_corotated",
+    "fixed_corotated",
+    "g2p",
+    "grid_velocity",
+    "inside",
+    "lame",
+    "muscle_stress",
+    "muscle_tangent",
+    "neo_hookean",
+    "p2g",
+    "polar",
+    "rasterize",
+    "respond",
+    "simulate",
+    "stencil",
+    "step",
+    "strains",
+    "stress",
+    "surface",
+    "tangent",
+    "viscous_stress",
+    "viscous_tangent",
+    "wall_velocity",
+]
 
-def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
-    """μ and λ [Pa] of Young's modulus [Pa] and Poisson's ratio [-]."""
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+SCENE = Inputs()
+"""Every input is the scene's."""
 
 
-class _Polar(torch.autograd.Function):
-    """Rotation nearest to F by SVD; its derivative from the Sylvester equation Ω S + S Ω = RᵀdF − dFᵀR.
+def stress(
+    scene: Scene,
+    F: Tensor,
+    mu: Tensor,
+    lam: Tensor,
+    activation: Tensor | None,
+    C: Tensor | None = None,
+    inputs: Inputs = SCENE,
+) -> Tensor:
+    """Total τ [Pa] of each particle, (world, particle, dim, dim); ``activation`` (world, muscle) or None.
 
-    The equation is solved as one linear system in the entries of the skew matrix Ω, so that repeated
-    singular values, where the derivative of an SVD does not exist, are nothing special. Where R itself is
-    not unique (two signed singular values add up to zero) it is one of the maximisers and its derivative
-    NaN; a non-finite F gives NaN throughout.
+    ``inputs`` are those of one control step, without that axis. ``C`` belongs to the same state as ``F``; None leaves out the viscous
+    stress.
     """
-
-    @staticmethod
-    def forward(ctx, F):
-        finite = torch.isfinite(F).all(-1).all(-1)[..., None, None]
-        U, _, Vh = torch.linalg.svd(torch.where(finite, F, torch.zeros_like(F)))
-        sign = torch.ones(F.shape[:-1], dtype=F.dtype)
-        sign[..., -1] = torch.sign(torch.linalg.det(U @ Vh))  # of the smallest singular value
-        R = torch.where(finite, (U * sign[..., None, :]) @ Vh, torch.nan)
-        ctx.save_for_backward(F, R)
-        return R
-
-    @staticmethod
-    def backward(ctx, adj_R):
-        F, R = ctx.saved_tensors
-        dim = F.shape[-1]
-        basis = []
-        for i, j in itertools.combinations(range(dim), 2):
-            skew = torch.zeros(dim, dim, dtype=F.dtype)
-            skew[i, j], skew[j, i] = 1.0, -1.0
-            basis.append(skew)
-        E = torch.stack(basis)  # (k, dim, dim)
-        S = (R.mT @ F)[..., None, :, :]
-        # RᵀdF − dFᵀR = Ω S + S Ω; rows: the equation tested with each E, columns: Ω along each E
-        system = torch.einsum("kij,...lij->...kl", E, E @ S + S @ E)
-        # L = ⟨RᵀR̄, Ω⟩ = y · (system Ω) with systemᵀ y = ⟨RᵀR̄, E⟩, and F̄ = R (Σ y_k 2 E_k)
-        y, failed = torch.linalg.solve_ex(system.mT, torch.einsum("kij,...ij->...k", E, R.mT @ adj_R))
-        y = torch.where((failed == 0)[..., None], y, torch.nan)
-        return R @ (2 * torch.einsum("...k,kij->...ij", y, E))
-
-
-def polar(F: Tensor) -> Tensor:
-    """Proper rotation R that maximises tr(RᵀF), shape (..., dim, dim); also for det F < 0."""
-    return _Polar.apply(F)
-
-
-def neo_hookean(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """Kirchhoff stress τ = μ(FFᵀ − I) + λ log(J) I [Pa] (E1)."""
-    eye, J = torch.eye(F.shape[-1], dtype=F.dtype), _det(F)
-    return mu[..., None, None] * (F @ F.mT - eye) + (lam * torch.log(J))[..., None, None] * eye
-
-
-def fixed_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """Kirchhoff stress τ = 2μ(F − R)Fᵀ + λ(J − 1)J I [Pa] (E2)."""
-    eye, J = torch.eye(F.shape[-1], dtype=F.dtype), _det(F)
-    return 2 * mu[..., None, None] * (F - polar(F)) @ F.mT + (lam * (J - 1) * J)[..., None, None] * eye
-
-
-def barrier_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """Kirchhoff stress τ = 2μ(F − R)Fᵀ + λ/4 (J² − J⁻²) I [Pa] (E3)."""
-    eye, J = torch.eye(F.shape[-1], dtype=F.dtype), _det(F)
-    pressure = lam / 4 * (J**2 - J**-2)
-    return 2 * mu[..., None, None] * (F - polar(F)) @ F.mT + pressure[..., None, None] * eye
-
-
-LAWS = {NeoHookean: neo_hookean, FixedCorotated: fixed_corotated, BarrierCorotated: barrier_corotated}
-
-
-def _law(material: Material) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    if type(material) not in LAWS:
-        raise TypeError(f"the reference has no law {type(material).__name__}; add its stress to LAWS.")
-    return LAWS[type(material)]
-
-
-def tangent(material: Material, F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """Stiffness of the law against velocity gradients, A[G] = d/dε τ((I + εG) F) (W3) [Pa].
-
-    Args:
-        material: Whose law it is; its numbers play no part.
-        F: Deformation gradients, shape (..., dim, dim), float64.
-        mu, lam: Lamé's constants [Pa], shape (...).
-
-    Returns:
-        ⟨E_k, A[E_l]⟩ for the symmetric basis of :func:`strains`, shape (..., k, l).
-    """
-    basis = strains(F.shape[-1])
-    with torch.enable_grad():
-        each = F.detach().unsqueeze(-3).expand(*F.shape[:-2], *basis.shape).clone().requires_grad_()
-        tau = _law(material)(each, mu[..., None], lam[..., None])
-        (adj_F,) = torch.autograd.grad((tau * basis).sum(), each)
-    adj_G = adj_F @ F.unsqueeze(-3).mT
-    return torch.einsum("...kij,lij->...kl", adj_G, basis)
-
-
-def muscle_tangent(F: Tensor, direction: Tensor) -> Tensor:
-    """The same for a muscle of unit pull: A[G] = G f fᵀ + f fᵀ Gᵀ with f = F d."""
-    basis, f = strains(F.shape[-1]), (F @ direction[..., None])[..., 0]
-    pulled = basis @ (f[..., :, None] * f[..., None, :]).unsqueeze(-3)
-    return torch.einsum("kij,...lij->...kl", basis, pulled + pulled.mT)
-
-
-def strains(dim: int) -> Tensor:
-    """Orthonormal basis of the symmetric matrices, shape (k, dim, dim), float64."""
-    basis = []
-    for i, j in itertools.combinations_with_replacement(range(dim), 2):
-        strain = torch.zeros(dim, dim, dtype=torch.float64)
-        strain[i, j] = strain[j, i] = 1.0 if i == j else math.sqrt(0.5)
-        basis.append(strain)
-    return torch.stack(basis)
-
-
-def _det(F: Tensor) -> Tensor:
-    """det F by its polynomial, whose derivative also exists at det F = 0."""
-    if F.shape[-1] == 2:
-        return F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
-    return (F[..., 0, :] * torch.linalg.cross(F[..., 1, :], F[..., 2, :])).sum(-1)
-
-
-def muscle_stress(F: Tensor, direction: Tensor, pull: Tensor) -> Tensor:
-    """τ = p (Fd)(Fd)ᵀ [Pa] (M1)."""
-    f = (F @ direction[..., None])[..., 0]
-    return pull[..., None, None] * f[..., :, None] * f[..., None, :]
-
-
-def stress(scene: Scene, F: Tensor, mu: Tensor, lam: Tensor, activation: Tensor | None) -> Tensor:
-    """Total τ [Pa] of each particle, (world, particle, dim, dim); ``activation`` (world, muscle) or None."""
     parts, start = [], 0
     for body in scene.bodies:
         part = slice(start, start + len(body.particles))
-        parts.append(_law(body.material)(F[:, part], mu[:, part], lam[:, part]))
+        parts.append(law_of(body.material)(F[:, part], mu[:, part], lam[:, part]))
         start = part.stop
     tau = torch.cat(parts, 1)
     if activation is not None:
+        strengths = [muscle.strength for muscle in scene.muscles]
+        strength = _given(inputs.strength, strengths, F, len(F), len(strengths))
         for k, muscle in enumerate(scene.muscles):
-            index, d = torch.tensor(muscle.particles), torch.tensor(muscle.direction, dtype=F.dtype)
-            pull = (activation[:, k, None] * muscle.strength).expand(-1, len(index))
-            tau = tau.index_add(1, index, muscle_stress(F[:, index], d.expand(len(index), -1), pull))
+            index = torch.tensor(muscle.particles)
+            active_stress = (activation[:, k, None] * strength[:, k, None]).expand(-1, len(index))
+            direction = _direction(muscle, k, inputs, strength)[:, None]
+            active = actuator_stress(muscle, F[:, index], direction, active_stress)
+            tau = tau.index_add(1, index, active)
+    if C is not None:
+        eta = _given(inputs.viscosity, _of_materials(scene, "viscosity"), F, *F.shape[:2])
+        tau = tau + viscous_stress(F, C, eta)
     return tau
+
+
+def _direction(muscle: Actuator, k: int, inputs: Inputs, strength: Tensor) -> Tensor:
+    """Unit fibre direction of actuator k in each world, shape (world, dim), if it has any; ``strength`` (world, muscle) of all."""
+    if inputs.direction is None:
+        return torch.tensor(getattr(muscle, "direction", ()), dtype=strength.dtype).expand(len(strength), -1)
+    d = inputs.direction.expand(*strength.shape, -1)[:, k]
+    return d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
+
+
+def _given(value: Tensor | None, scenes: float | Sequence[float], like: Tensor, *shape: int) -> Tensor:
+    """An input in full shape: that of the call, else the scene's."""
+    value = torch.tensor(scenes, dtype=like.dtype) if value is None else value
+    return value.expand(shape)
 
 
 def stencil(scene: Scene, x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -199,41 +156,32 @@ def p2g(scene: Scene, x: Tensor, mass: Tensor, momentum: Tensor, affine: Tensor)
     return node_mass, node_momentum
 
 
-def grid_velocity(scene: Scene, mass: Tensor, momentum: Tensor) -> Tensor:
-    """Velocity of the nodes after gravity, damping and walls (G2), zero where there is no mass."""
+def grid_velocity(
+    scene: Scene,
+    mass: Tensor,
+    momentum: Tensor,
+    inputs: Inputs = SCENE,
+    time: float = 0.0,
+    duration: float = 1.0,
+) -> Tensor:
+    """Velocity of the nodes after gravity, damping and walls (G2), zero where there is no mass.
+
+    Args:
+        inputs: Of one control step, without that axis; one pose of the walls, or those at its two ends.
+        time, duration: Since the beginning of the control step, and its length [s].
+    """
     present = (mass > 0)[..., None]
     v = momentum / torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
-    v = (v + scene.dt * torch.tensor(scene.gravity, dtype=v.dtype)) * math.exp(-scene.damping * scene.dt)
-    for wall in scene.walls:
-        v = torch.where(inside(scene, wall)[:, None] & present, respond(wall, v), v)
+    worlds, dim = len(v), scene.grid.dim
+    gravity = _given(inputs.gravity, scene.gravity or (0.0,) * dim, v, worlds, dim)
+    damping = _given(inputs.damping, scene.damping, v, worlds)
+    v = (v + scene.dt * gravity[:, None]) * torch.exp(-scene.dt * damping)[:, None, None]
+    for k, wall in enumerate(scene.walls):
+        where = surface(scene, k, inputs, v, time, duration)
+        u = wall_velocity(scene, where)
+        response = u + respond(wall, v - u, where.unit[:, None])  # (C5)
+        v = torch.where(inside(scene, where)[..., None] & present, response, v)
     return torch.where(present, v, torch.zeros_like(v))
-
-
-def inside(scene: Scene, wall: Wall) -> Tensor:
-    """Nodes that a wall acts on: n·(i dx) ≤ offset, summed axis by axis in float64; shape (node,)."""
-    reach = torch.zeros((), dtype=torch.float64)
-    for n, count in zip(wall.normal, scene.grid.shape, strict=True):
-        reach = reach[..., None] + n * (torch.arange(count, dtype=torch.float64) * scene.grid.spacing)
-    return (reach <= wall.offset).flatten()
-
-
-def respond(wall: Wall, v: Tensor) -> Tensor:
-    """Velocity of a node inside a wall (C1 to C3)."""
-    n = torch.tensor(wall.normal, dtype=v.dtype)
-    if wall.contact == "stick":
-        return torch.zeros_like(v)
-    v_n = (v * n).sum(-1, keepdim=True)
-    v_t = v - v_n * n
-    if wall.contact == "slip":
-        return v_t
-    if wall.contact != "separate":
-        raise ValueError(f"the reference has no contact {wall.contact!r}; add it to respond.")
-    if wall.friction > 0:
-        squared = (v_t**2).sum(-1, keepdim=True)
-        moving = squared > (wall.friction * v_n) ** 2  # not stuck
-        speed = torch.sqrt(torch.where(moving, squared, torch.ones_like(squared)))
-        v_t = torch.where(moving, v_t * (1 + wall.friction * v_n / speed), torch.zeros_like(v_t))
-    return torch.where(v_n < 0, v_t, v)
 
 
 def g2p(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
@@ -246,35 +194,94 @@ def g2p(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
     return v, C
 
 
+def _of_materials(scene: Scene, name: str) -> list[float]:
+    """A constant of the material of each particle."""
+    return [getattr(body.material, name) for body in scene.bodies for _ in range(len(body.particles))]
+
+
 def _volume(scene: Scene, dtype: torch.dtype) -> Tensor:
     """Rest volumes V⁰ [m³], in 2D [m²], shape (particle,)."""
     return torch.cat([torch.tensor(body.particles.volume, dtype=dtype) for body in scene.bodies])
 
 
 def step(
-    scene: Scene, state: State, activation: Tensor | None, mu: Tensor, lam: Tensor, mass: Tensor
+    scene: Scene,
+    state: State,
+    activation: Tensor | None,
+    mu: Tensor,
+    lam: Tensor,
+    mass: Tensor,
+    inputs: Inputs = SCENE,
+    time: float = 0.0,
+    duration: float = 1.0,
 ) -> State:
     """One substep: P2G, grid, G2P. ``activation`` (world, muscle) or None; material (world, particle)."""
-    tau, D = stress(scene, state.F, mu, lam, activation), scene.grid.spacing**2 / 4
+    tau, D = stress(scene, state.F, mu, lam, activation, state.C, inputs), scene.grid.spacing**2 / 4
     load = scene.dt * _volume(scene, mass.dtype) / D
     affine = mass[..., None, None] * state.C - load[:, None, None] * tau
-    node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
-    v, C = g2p(scene, state.x, grid_velocity(scene, node_mass, momentum))
+    pushed = mass[..., None] * state.v
+    node_mass, momentum = p2g(scene, state.x, mass, pushed, affine)
+    v, C = g2p(scene, state.x, grid_velocity(scene, node_mass, momentum, inputs, time, duration))
+    if len(scene.driven):
+        given = _given(inputs.velocity, 0.0, v, len(v), len(scene.driven), v.shape[-1])
+        v = v.index_copy(1, torch.tensor(scene.driven), given)  # (T5)
     return State(state.x + scene.dt * v, v, C, state.F + scene.dt * C @ state.F)
 
 
 def simulate(
-    scene: Scene, start: State, activation: Tensor | None, params: Params, *, substeps: int
+    scene: Scene,
+    start: State,
+    activation: Tensor | None,
+    params: Params,
+    *,
+    substeps: int,
+    inputs: Inputs = SCENE,
 ) -> State:
-    """The contract of :func:`softmpm.simulate`, on a scene instead of a model."""
+    """The contract of :func:`softmpm.simulate`, on a scene instead of a model.
+
+    There are as many control steps as rows of ``activation``, without it as ``inputs`` has, else one.
+    """
     lead = start.x.shape[:2]
     young, poisson, density = (value.expand(lead) for value in params)
     mu, lam = lame(young, poisson)
     mass, state = density * _volume(scene, density.dtype), start
-    for row in [None] if activation is None else activation:
-        for _ in range(substeps):
-            state = step(scene, state, row, mu, lam, mass)
+    steps = _control_steps(activation, inputs)
+    for c in range(steps):
+        row, now = None if activation is None else activation[c], _of_control_step(inputs, c, steps)
+        for s in range(substeps):
+            time, duration = s * scene.dt, substeps * scene.dt
+            state = step(scene, state, row, mu, lam, mass, now, time, duration)
     return state
+
+
+def _control_steps(activation: Tensor | None, inputs: Inputs) -> int:
+    if activation is not None:
+        return len(activation)
+    counts = [1]
+    for name, value in inputs._asdict().items():
+        axes = QUANTITIES[name].axes
+        if value is not None and value.ndim == len(axes) and axes[0] in ("control_step", "pose"):
+            counts.append(len(value) - (axes[0] == "pose"))
+    return max(counts)
+
+
+def _of_control_step(inputs: Inputs, c: int, steps: int) -> Inputs:
+    """Inputs of one control step: those that have that axis without it, the poses at its two ends."""
+    now = {}
+    for name, value in inputs._asdict().items():
+        axes = QUANTITIES[name].axes
+        if value is None or value.ndim < len(axes) or axes[0] not in ("control_step", "pose"):
+            continue
+        count = steps + (axes[0] == "pose")
+        if len(value) not in (1, count):
+            raise ValueError(
+                f"inputs.{name} needs 1 or {count} rows for {steps} control steps, got {len(value)}."
+            )
+        if axes[0] == "pose":
+            now[name] = value[c : c + 2] if len(value) > 1 else value
+        else:
+            now[name] = value[c if len(value) > 1 else 0]
+    return inputs._replace(**now)
 
 
 def rasterize(scene: Scene, state: State, density: Tensor) -> GridField:

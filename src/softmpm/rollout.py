@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from softmpm.alarms import Failures
 from softmpm.errors import NEVER
@@ -17,10 +16,10 @@ from softmpm.planning import checkpointing
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import Plan, memory, plan
 from softmpm.runner import Runner
-from softmpm.schemes.buffers import Solid, SolidAdj
 from softmpm.schemes.capture import defer_status_check, exclusive_capture, is_capturing, keep_alive
 from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.failure_report import Report, raise_gradient_failure
+from softmpm.schemes.inputs import InputsAdj, Values
 from softmpm.schemes.scheme import Run
 from softmpm.state import State
 
@@ -36,9 +35,9 @@ class Trail:
     runs: list[Run] = field(default_factory=list)
     """All chunks, if every state is retained."""
     states: dict[int, Any] = field(default_factory=dict)
-    """Otherwise the checkpointed states, by the chunk that they precede, until a backward pass takes them."""
-    turn: threading.Lock = field(default_factory=threading.Lock)
-    """Held by the backward pass that is running."""
+    """Otherwise the checkpointed states, by the number of the chunk that starts from them, until a backward pass takes them."""
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    """Acquired by the backward pass that is running."""
     frozen: dict[int, int] = field(default_factory=dict)
     """Worlds that failed, and the substep from which they were inactive."""
 
@@ -48,7 +47,7 @@ class Trail:
         self.runs.append(run)
 
     @property
-    def stays(self) -> tuple[int, ...]:
+    def checkpointed(self) -> tuple[int, ...]:
         """Chunks whose initial state is checkpointed."""
         return checkpointing.initial_checkpoints(len(self.chunks), self.plan.slots) if self.plan.slots else ()
 
@@ -58,20 +57,19 @@ def rollout(
     model: Model,
     horizon: Horizon,
     start: State,
-    pull: Tensor | None,
-    solid: Solid,
+    values: Values,
     keep: bool,
     failures: Failures | None = None,
 ) -> tuple[State, Trail | None]:
     """Integrate from ``start``. Each chunk is launched before the status of the previous one is read.
 
     Args:
-        pull: Activation times strength [Pa], shape (control_step, world, muscle), or None without muscles.
+        values: Inputs that the call sets; those with rows have one row for each control step.
         keep: Whether a backward pass will follow.
-        failures: Takes the failures of single worlds; None raises them.
+        failures: Collects the failures of single worlds; None raises the first one.
 
     Returns:
-        The end as a :class:`State`, and a :class:`Trail`, or None.
+        The final state as a :class:`State`, and the :class:`Trail` if ``keep``, else None.
 
     Raises:
         UnstableError: A world failed.
@@ -79,12 +77,12 @@ def rollout(
     sizes = model.sizes()
     chosen = plan(horizon, sizes, model.budget) if keep else Plan(sizes.longest, 0, 0, 0)
     trail = Trail(chosen, horizon.chunks(chosen.longest), start)
-    runner, inside = Runner(model, pull, solid, failures), keep and chosen.keep_all
+    runner, inside = Runner(model, values, failures), keep and chosen.keep_all
     trail.frozen = runner.frozen
     check = runner.check(start)
     if is_capturing(model):
         return _captured(runner, trail, inside), trail if keep else None
-    stays = trail.stays
+    checkpointed = trail.checkpointed
     state: Any = start
     k, before = 0, None
     while k < len(trail.chunks) or before is not None:
@@ -104,7 +102,7 @@ def rollout(
             continue
         if before is not None and inside:
             trail.keep(before[0])
-        if k in stays:
+        if k in checkpointed:
             trail.states[k] = runner.scheme.checkpoint(state)
         if ahead is not None:
             state, k = ahead[0].end, k + 1
@@ -113,11 +111,11 @@ def rollout(
 
 
 def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
-    """The end, with the worlds that failed where the policy puts them."""
+    """The final state, in which the failure policy has frozen or reset the worlds that failed."""
     if runner.failures is None or not runner.frozen:
         return end
     reset = runner.failures.policy == "reset"
-    # Worlds that never ran return as they were given: the fast scheme cannot hold what is off the grid.
+    # Worlds that never ran are returned as they were given: the fast scheme cannot represent particles off the grid.
     worlds = sorted(world for world, substep in runner.frozen.items() if reset or substep == 0)
     there, end = model.rest() if reset else start.detach(), end.clone()
     for tensor, wanted in zip(end[:4], there[:4], strict=True):
@@ -128,12 +126,12 @@ def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
 
 
 def _captured(runner: Runner, trail: Trail, inside: bool) -> State:
-    """:func:`rollout` while PyTorch captures a graph: nothing is read back."""
+    """:func:`rollout` while PyTorch captures a graph, without reading anything back."""
     keep_alive(runner.model)
     state: Any = trail.start
-    stays = trail.stays
+    checkpointed = trail.checkpointed
     for k, chunk in enumerate(trail.chunks):
-        if k in stays:
+        if k in checkpointed:
             trail.states[k] = runner.scheme.checkpoint(state)
         run = runner.settle(chunk, state, inside)
         state = run.end
@@ -144,34 +142,27 @@ def _captured(runner: Runner, trail: Trail, inside: bool) -> State:
 
 @on_its_gpu
 def rollout_adj(
-    model: Model,
-    horizon: Horizon,
-    trail: Trail,
-    pull: Tensor | None,
-    solid: Solid,
-    adj_end: State,
-    wanted: RequestedGrads,
-):
+    model: Model, horizon: Horizon, trail: Trail, values: Values, adj_end: State, wanted: RequestedGrads
+) -> tuple[State, InputsAdj]:
     """Adjoint of :func:`rollout`.
 
     Returns:
-        Adjoint of the start as a :class:`State`, of the material as :class:`SolidAdj`, of ``pull`` or None.
+        Adjoint of the initial state, and those of the inputs for which gradients are requested.
 
     Raises:
         UnstableError: An adjoint is not finite.
     """
-    adj_solid = SolidAdj.zeros(model, wanted)
-    adj_pull = torch.zeros_like(pull) if wanted.activation and pull is not None else None
+    adj_inputs = InputsAdj(model, wanted, horizon.control_steps)
     adj: Any = _without(trail.frozen, adj_end)
-    reports, runner = [], Runner(model, pull, solid)
+    reports, runner = [], Runner(model, values)
     runner.frozen = trail.frozen
-    with trail.turn:
+    with trail.lock:
         for run in _inside_out(trail, runner):
-            adj, part = run.vjp(adj, adj_solid, wanted)
-            if adj_pull is not None and part is not None:
-                adj_pull[run.chunk.rows] += part
+            adj = run.vjp(adj, adj_inputs, wanted)
             if is_capturing(model):
-                defer_status_check(run.words[: model.worlds].clone())  # a second backward pass uses them anew
+                defer_status_check(
+                    run.words[: model.worlds].clone()
+                )  # a second backward pass overwrites them
             else:
                 reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
             del run  # release its buffers before the previous chunk is recomputed
@@ -181,18 +172,15 @@ def rollout_adj(
             words[world] = NEVER
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
     adj = runner.scheme.to_user(adj)
-    found = (*adj[:4], adj_solid.mass, adj_solid.mu, adj_solid.lam)
     for world in trail.frozen:  # a state off the grid has no adjoint
-        for tensor in found:
-            if tensor is not None:
-                tensor[world] = 0
-        if adj_pull is not None:
-            adj_pull[:, world] = 0
-    return adj, adj_solid, adj_pull
+        for tensor in adj[:4]:
+            tensor[world] = 0
+        adj_inputs.clear_world(world)
+    return adj, adj_inputs
 
 
 def _without(frozen: dict[int, int], adj_end: State) -> State:
-    """The adjoint of the end, contiguous, and zero for worlds that failed."""
+    """The adjoint of the final state, contiguous, and zero for worlds that failed."""
     x, v, C, F = (a.clone() if frozen else a.contiguous() for a in adj_end[:4])
     for tensor in (x, v, C, F) if frozen else ():
         tensor[sorted(frozen)] = 0
@@ -209,11 +197,11 @@ def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:
     if states:
         return states
     state: Any = trail.start
-    stays = trail.stays
-    for k in range(stays[-1] + 1):
+    checkpointed = trail.checkpointed
+    for k in range(checkpointed[-1] + 1):
         if k > 0:
             state = runner.settle(trail.chunks[k - 1], state, keep=False).end
-        if k in stays:
+        if k in checkpointed:
             states[k] = runner.scheme.checkpoint(state)
     return states
 
@@ -225,18 +213,18 @@ def _inside_out(trail: Trail, runner: Runner) -> Iterator[Run]:
         return
     states = _taken(trail, runner)
     nothing = torch.empty(0)
-    hand: Any = State(nothing, nothing, nothing, nothing)
+    current: Any = State(nothing, nothing, nothing, nothing)
     for action, k in checkpointing.backward_schedule(len(trail.chunks), trail.plan.slots):
         if action == "restore":
-            hand = states[k]
+            current = states[k]
         elif action == "advance":
-            hand = runner.settle(trail.chunks[k], hand, keep=False).end
+            current = runner.settle(trail.chunks[k], current, keep=False).end
         elif action == "keep":
-            states[k] = runner.scheme.checkpoint(hand)
+            states[k] = runner.scheme.checkpoint(current)
         elif action == "drop":
             del states[k]
         else:
-            yield runner.settle(trail.chunks[k], hand, keep=True)
+            yield runner.settle(trail.chunks[k], current, keep=True)
 
 
 @contextmanager
@@ -247,29 +235,30 @@ def explain_out_of_memory(model: Model, horizon: Horizon, gradient: bool) -> Ite
     except torch.OutOfMemoryError as error:
         with exclusive_capture(
             wait=False
-        ) as turn:  # else destroying a graph could invalidate another thread's capture
-            if turn and not is_capturing(model):
+        ) as acquired:  # else destroying a graph could invalidate another thread's capture
+            if acquired and not is_capturing(model):
                 model.workspace.release()
         error.add_note(_needs(model, horizon, gradient))
         raise
 
 
 def _needs(model: Model, horizon: Horizon, gradient: bool) -> str:
+    """A sentence with the estimated memory of a call, and how to reduce it."""
     calls = f"{model.calls} calls" if gradient and model.calls > 1 else "a call"
     call = f"{calls} of {horizon.total} substeps with {model.particle_count:,} particles in {model.worlds} world(s)"
     less = "Fewer particles or worlds take less"
     try:
         forward, kept, backward = (f"{size / 2**20:,.1f} MiB" for size in memory(model, horizon)[:3])
-    except ValueError as error:  # the budget is too small for a gradient, which was not asked for
+    except ValueError as error:  # the budget is too small for a gradient, which was not requested
         return f"softmpm: {call} did not fit; {error} {less}."
     if not gradient:
         return f"softmpm: {call} takes {forward}, by the formula of docs/memory.md. {less}."
-    untold = (
+    hint = (
         ""
         if model.calls > 1
         else " Calls of one backward pass share it once build knows how many they are (calls)."
     )
     return (
         f"softmpm: {call} and the backward pass take {backward}, {kept} of it kept in between, by the formula of docs/memory.md. "
-        f"{less}; a smaller memory_budget (softmpm.build) takes time instead.{untold}"
+        f"{less}; a smaller memory_budget (softmpm.build) takes time instead.{hint}"
     )

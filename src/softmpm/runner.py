@@ -3,73 +3,65 @@
 import functools
 from typing import Any
 
-from torch import Tensor
-
 from softmpm.alarms import Failures
 from softmpm.errors import UnstableError
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
-from softmpm.schemes.buffers import Solid
 from softmpm.schemes.capture import defer_status_check, is_capturing
 from softmpm.schemes.failure_report import Report, failed_worlds, failure
+from softmpm.schemes.inputs import Values, in_rows, strongest
 from softmpm.schemes.registry import SCHEMES
 from softmpm.schemes.scheme import Run, Scheme
 from softmpm.state import State
 
 
 class Runner:
-    """One for each call and backward pass.
+    """Runs the chunks of one call, or of one backward pass, and handles the failures of its worlds.
 
     Args:
-        pull: Activation times strength [Pa], shape (control_step, world, muscle), or None without muscles.
-        failures: Takes the failures of worlds, which then stop; None raises them.
+        values: Inputs that the call sets; those with rows have one row for each control step.
+        failures: Collects the failures of worlds, which are then frozen; None raises the first one.
 
     Attributes:
         frozen: First inactive substep of each world that failed.
     """
 
-    def __init__(self, model: Model, pull: Tensor | None, solid: Solid, failures: Failures | None = None):
-        self.model, self.pull, self.solid, self.failures = model, pull, solid, failures
+    def __init__(self, model: Model, values: Values, failures: Failures | None = None):
+        self.model, self.values, self.failures = model, values, failures
         self.frozen: dict[int, int] = {}
         self.scheme: Scheme = SCHEMES[model.scheme].of(model)
 
     def run(self, chunk: Chunk, start: Any, keep: bool) -> Run:
-        """Run a chunk from a :class:`State` or what the scheme gave as an end."""
-        pull = None if self.pull is None else self.pull[chunk.rows]
+        """Launch a chunk from a :class:`State` or from the final state of a run."""
         frozen = [world for world, substep in self.frozen.items() if chunk.first >= substep]
-        return self.scheme.run(chunk, start, pull, self.solid, keep, frozen)
+        return self.scheme.run(chunk, start, in_rows(self.values, chunk.rows), keep, frozen)
 
     def check(self, start: State) -> Report | None:
-        """Launch the check of the start of the call; see :meth:`passed`."""
+        """Launch the check of the call's initial state; :meth:`passed` evaluates the report. None if there is nothing to check."""
         if not armed(self.model) and self.model.alarms.collapse is None:
             return None
-        words = self.scheme.check_start(start, self.pull, self.solid)
+        words = self.scheme.check_start(start, self.values)
         if is_capturing(self.model):
             defer_status_check(words.clone())
             return None
         return Report(words)
 
     def passed(self, start: State, report: Report | None) -> bool:
-        """True if all worlds may start, False if some were frozen instead."""
+        """True if all worlds passed the check of the initial state, False if some were frozen instead."""
         words = [] if report is None else report.read()
         for world in failed_worlds(words):
             self._take(
-                failure(
-                    self.model, words, world, start, solid=self.solid, pull=self._strongest(), before=True
-                ),
+                failure(self.model, words, world, start, values=strongest(self.values), before=True),
                 0,
             )
         return not failed_worlds(words)
-
-    def _strongest(self) -> Tensor | None:
-        return None if self.pull is None else self.pull.amax(0)
 
     def settled(self, run: Run, report: Report) -> bool:
         """Accept a run; False if the chunk must be repeated, with a larger window or without a world that failed.
 
         Raises:
-            UnstableError: A world failed, and the failures are not taken.
+            UnstableError: A world failed, and failures are not collected.
         """
         words = report.read()
         if not self.scheme.accept(run, words):
@@ -81,15 +73,16 @@ class Runner:
         return True
 
     def _failed(self, words: list[int]) -> list[int]:
-        """Worlds that failed and were not frozen before: a start off the grid is reported each time."""
+        """Worlds that failed and are not frozen yet: an initial state off the grid is reported by every chunk."""
         return [world for world in failed_worlds(words) if world not in self.frozen]
 
     def _take(self, error: UnstableError, first: int) -> None:
+        """Raise the failure, or collect it and freeze its world from substep ``first`` on."""
         if self.failures is None:
             try:
                 raise error
             finally:
-                # It would refer to itself through this frame, and keep the objects of the frame alive.
+                # The error would refer to itself through this frame, and keep the objects of the frame alive.
                 del error
         self.failures.errors.append(error)
         self.frozen[error.world] = first
@@ -98,21 +91,21 @@ class Runner:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
         state: Any = run.start
         at_end, start = self.scheme.to_user(run.end), run.start if run.chunk.first == 0 else None
-        found = functools.partial(failure, self.model, solid=self.solid, start=start, state=at_end)
+        found = functools.partial(failure, self.model, start=start, state=at_end)
         for s in range(run.chunk.length):
             one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
             single, reported = self._single(one, state)
             if self._failed(reported):
                 world = min(self._failed(reported), key=lambda w: reported[w])
-                pull = None if self.pull is None else self.pull[one.rows][0]
-                return found(reported, world, self.scheme.to_user(single.end), first=one.first, pull=pull)
+                values = in_rows(self.values, one.rows)
+                return found(reported, world, self.scheme.to_user(single.end), first=one.first, values=values)
             state = single.end
         # Sums in another order may have avoided the failure; the report remains true.
         world = min(self._failed(words), key=lambda w: words[w])
-        return found(words, world, at_end, first=run.chunk.first, pull=self._strongest())
+        return found(words, world, at_end, first=run.chunk.first, values=strongest(self.values))
 
     def _single(self, chunk: Chunk, state: Any) -> tuple[Run, list[int]]:
-        """A run of one substep, and what it reported."""
+        """A run of one substep, repeated until the scheme accepts it, and its status words."""
         while True:
             run = self.run(chunk, state, keep=False)
             words = run.words.tolist()
@@ -120,7 +113,7 @@ class Runner:
                 return run, words[: self.model.worlds]
 
     def settle(self, chunk: Chunk, start: Any, keep: bool) -> Run:
-        """Run a chunk, and wait until it can be used."""
+        """Run a chunk, repeating it if necessary, and return the valid run."""
         while True:
             run = self.run(chunk, start, keep)
             if is_capturing(self.model):

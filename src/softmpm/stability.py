@@ -6,6 +6,10 @@ Symplectic Euler is stable for an oscillation ω while ω dt ≤ 2; ω² = 4K/(�
     dt ≤ dx · √(ρ / K)                                                                              (W2)
     K = largest eigenvalue of A,  A[G] = d/dε τ((I + εG) F) over symmetric G, muscles included       (W3)
 
+A viscosity adds damping V[G] = 2η B G B, B = FFᵀ, and takes the step below that. With the damping force of the beginning of the step,
+
+    dt² A + 2 dt V ≤ ρ dx², so (W2) with the largest eigenvalue K of A + (2/dt) V                    (W4)
+
 At rest and without muscles K = 2μ + dim·λ, or 2μ where λ < 0. Particles that share nodes oscillate no faster than the fastest of
 them would alone: the grid's kinetic energy is at least Σ m dx²/8 |C|², the particles' elastic energy at most Σ V K/2 |G|². The limit
 shrinks with stretch; half of that at rest leaves room for a stretch of 1.7 (fixed corotated) or 2.5 (neo-Hookean).
@@ -19,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.reference import lame, muscle_tangent, tangent
+from softmpm.reference import actuator_tangent, lame, tangent, viscous_tangent
 from softmpm.scene.check_scene import check_scene
 from softmpm.scene.scene import Scene
 from softmpm.state import Params
@@ -64,7 +68,7 @@ def stable_dt(
         params: Material of each particle, shapes that broadcast to (world, particle); None takes the scene's.
         stretch: Principal stretch along one axis [-], that of the muscles where there are any, the others being 1. Or the
             deformation gradient of all particles, shape (dim, dim), or of each, shape (particle, dim, dim).
-        activation: Largest size of the activation [-].
+        activation: Largest size of the activation [-], of either sign.
 
     Raises:
         ValueError: The scene breaks a rule, the stretch is not positive, or a material is outside its bounds.
@@ -84,13 +88,21 @@ def stable_dt(
 
 
 def running_limit(
-    scene: Scene, particle: int, mu: float, lam: float, density: float, F: Tensor, pulls: list[float]
+    scene: Scene,
+    particle: int,
+    mu: float,
+    lam: float,
+    density: float,
+    F: Tensor,
+    active_stress: list[float],
+    viscosity: float = 0.0,
 ) -> float:
-    """Stable step [s] of one particle alone on the grid, as it is at a moment of a run (W2).
+    """Stable step [s] of one particle alone on the grid, as it is at a moment of a run (W2), (W4).
 
     Args:
         F: Its deformation gradient, shape (dim, dim).
-        pulls: Activation times strength of each muscle of the scene [Pa].
+        active_stress: Activation times strength of each muscle and pressure of the scene [Pa].
+        viscosity: Its viscosity η [Pa s].
     """
     with torch.inference_mode(False), torch.device("cpu"):
         F = F.detach().cpu().double()
@@ -100,12 +112,14 @@ def running_limit(
             F,
             *(torch.tensor(v, dtype=torch.float64) for v in (mu, lam)),
         )
-        for muscle, pull in zip(scene.muscles, pulls, strict=True):
+        for muscle, stress in zip(scene.muscles, active_stress, strict=True):
             if particle in muscle.particles:
-                A = A + pull * muscle_tangent(F, torch.tensor(muscle.direction, dtype=torch.float64))
-        if not bool(torch.isfinite(A).all()):
+                A = A + stress * actuator_tangent(muscle, F)
+        V = viscosity * viscous_tangent(F)
+        if not bool(torch.isfinite(A).all() and torch.isfinite(V).all()):
             return math.nan
-        K = torch.linalg.eigvalsh(A)[-1].item()
+        inertia = torch.tensor(density * scene.grid.spacing**2, dtype=torch.float64)
+        K = _stiffness(A, V, inertia).item()
     return scene.grid.spacing * math.sqrt(density / K) if K > 0 else math.inf
 
 
@@ -170,7 +184,9 @@ def _deformations(scene: Scene, group: _Group, stretch: float | Tensor | np.ndar
     dim, given = scene.grid.dim, torch.as_tensor(stretch, dtype=torch.float64).detach().cpu()
     if given.ndim == 0:
         need(bool(0 < given < math.inf), f"stretch must be finite and > 0, got {stretch}.")
-        axes = [scene.muscles[m].direction for m in group.muscles] or [(1.0,) + (0.0,) * (dim - 1)]
+        muscles = [scene.muscles[m] for m in group.muscles]
+        axes = [getattr(muscle, "direction") for muscle in muscles if hasattr(muscle, "direction")]  # noqa: B009
+        axes = axes or [(1.0,) + (0.0,) * (dim - 1)]
         columns = (torch.tensor(axis, dtype=torch.float64)[:, None] for axis in axes)
         return [torch.eye(dim, dtype=torch.float64) + (given - 1) * column @ column.T for column in columns]
     if given.ndim == 2:
@@ -190,12 +206,13 @@ def _limit(
     """Stable step [s] of a group of particles, the stiffness [Pa] that sets it, and the particle."""
     material, one = scene.bodies[group.body].material, torch.ones(F.shape[:-2], dtype=torch.float64)
     A_mu, A_lam = tangent(material, F, one, 0 * one), tangent(material, F, 0 * one, one)
-    A_pull = torch.zeros_like(A_mu)
+    A_active = torch.zeros_like(A_mu)
     for m in group.muscles:
-        pull = abs(activation * scene.muscles[m].strength)
-        A_pull = A_pull + pull * muscle_tangent(
-            F, torch.tensor(scene.muscles[m].direction, dtype=torch.float64)
-        )
+        A_unit = actuator_tangent(scene.muscles[m], F)
+        stiffening = (
+            A_unit.diagonal(dim1=-2, dim2=-1).sum(-1).sign()[..., None, None]
+        )  # the sign of the activation that is stiffer
+        A_active = A_active + abs(activation * scene.muscles[m].strength) * stiffening * A_unit
     if given is None:
         rows = Params(
             *(torch.tensor([[getattr(material, name)]], dtype=torch.float64) for name in Params._fields)
@@ -203,19 +220,42 @@ def _limit(
     else:
         rows = Params(*(value[:, torch.from_numpy(group.particles)] for value in given))
     mu, lam = (value[..., None, None] for value in lame(rows.young, rows.poisson))
-    A = mu * A_mu + lam * A_lam + A_pull
+    A, V = mu * A_mu + lam * A_lam + A_active, material.viscosity * viscous_tangent(F)
     need(
-        bool(torch.isfinite(A).all()),
-        f"the stiffness of body {group.body} is beyond what a number holds; use a smaller young's modulus, strength of its muscles "
-        f"or activation, got young {rows.young.max():.4g} Pa and an active stress of up to "
-        f"{max((abs(activation * scene.muscles[m].strength) for m in group.muscles), default=0.0):.4g} Pa.",
+        bool(torch.isfinite(A).all() and torch.isfinite(V).all()),
+        f"the stiffness of body {group.body} is beyond what a number holds; use a smaller young's modulus, strength of its muscles, "
+        f"activation or viscosity, got young {rows.young.max():.4g} Pa, viscosity {material.viscosity:.4g} Pa s and an active stress "
+        f"of up to {max((abs(activation * scene.muscles[m].strength) for m in group.muscles), default=0.0):.4g} Pa.",
     )
-    K = torch.linalg.eigvalsh(A)[..., -1]  # (world, particle)
+    K = _stiffness(A, V, rows.density * scene.grid.spacing**2)  # (world, particle)
     K, density = torch.broadcast_tensors(K, rows.density)
     squared = torch.where(K > 0, density / K, math.inf)
     world, particle = divmod(int(squared.argmin()), squared.shape[1])
     dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
     return dt, K[world, particle].item(), int(group.particles[particle])
+
+
+def _stiffness(A: Tensor, V: Tensor, inertia: Tensor) -> Tensor:
+    """Largest eigenvalue K [Pa] of A + (2/dt) V where dt is the largest stable step √(ρ dx²/K) itself (W4).
+
+    The rate 1/dt is the largest fixed point of a function that does not decrease. From a rate above it, with the largest eigenvalues
+    of A and V apart, the iteration comes down to it, and halves the distance at least where A has no negative eigenvalue.
+
+    Args:
+        A, V: Stiffness [Pa] and damping [Pa s], shapes (..., k, k) that broadcast.
+        inertia: ρ dx² [Pa s²], shape that broadcasts to (...).
+    """
+    K = torch.linalg.eigvalsh(A)[..., -1]
+    damping = torch.linalg.eigvalsh(V)[..., -1]
+    if not bool((damping > 0).any()):
+        return K
+    rate = (damping + torch.hypot(damping, (K.clamp(min=0) * inertia).sqrt())) / inertia
+    for _ in range(200):
+        K = torch.linalg.eigvalsh(A + 2 * rate[..., None, None] * V)[..., -1]
+        last, rate = rate, (K.clamp(min=0) / inertia).sqrt()
+        if bool((last - rate <= 1e-14 * last).all()):
+            break
+    return K
 
 
 def _describe(
@@ -227,14 +267,20 @@ def _describe(
         text += f", young {material.young:.4g} Pa, poisson {material.poisson:.4g}, density {material.density:.4g} kg/m³"
     else:
         text += f", the given params of particle {particle}"
+    if material.viscosity > 0:
+        text += f", viscosity {material.viscosity:.4g} Pa s"
     text += ")"
     stretch, activation = loads
     if group.muscles:
-        names = " + ".join(f"muscle {m} ({scene.muscles[m].strength:.4g} Pa)" for m in group.muscles)
+        muscles = [
+            (type(scene.muscles[m]).__name__.lower(), m, scene.muscles[m].strength) for m in group.muscles
+        ]
+        names = " + ".join(f"{kind} {m} ({strength:.4g} Pa)" for kind, m, strength in muscles)
         how = "full activation" if activation == 1.0 else f"activation {activation:.4g}"
         text += f" under {names} at {how}, as at particle {particle}"
     if np.ndim(stretch) > 0:
         text += ", deformed as given"
     elif stretch != 1.0:
         text += f", stretched to {stretch:.4g}"
-    return f"{text}: stiffness {stiffness:.4g} Pa on cells of {scene.grid.spacing:.4g} m"
+    kind = "stiffness and damping equivalent to" if material.viscosity > 0 else "stiffness"
+    return f"{text}: {kind} {stiffness:.4g} Pa on cells of {scene.grid.spacing:.4g} m"

@@ -7,14 +7,17 @@ softmpm.step(model, states[0], states[1], solid, tape=tape)
 tape.backward(grads={states[1].v: ...})             # fills states[0].v.grad, solid.mu.grad, ...
 """
 
+from typing import cast
+
 import numpy as np
 import warp as wp
 
 from softmpm.errors import MAX_SUBSTEP
-from softmpm.kernels.structs import RequestedGrads, solid_adj_type, types
+from softmpm.inputs import groups
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
-from softmpm.schemes.buffers import SolidAdj, view
 from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.schemes.inputs import Accumulators, InputsAdj
 from softmpm.warp_arrays import WarpSolid, WarpState, check_own
 
 
@@ -73,15 +76,18 @@ def _advance(model: Model, state_in: WarpState, state_out: WarpState, solid: War
 @on_its_gpu
 def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
     solid.work.stream = stream_of(model.device)
-    wanted = RequestedGrads(material=True, activation=solid.pull is not None)
-    struct = solid_adj_type(model.spec, wanted)()
-    struct.mass, struct.mu, struct.lam = solid.mass.grad, solid.mu.grad, solid.lam.grad
-    slots = SolidAdj.zeros(model, RequestedGrads(material=False, activation=wanted.activation))
-    if slots.slot is not None:
-        struct.pull = view(slots.slot, types(model.spec.dim, model.spec.dtype).real)
+    wanted = RequestedGrads(groups(model.spec))
+    found, adj_inputs = Accumulators(model, wanted, 1, model.node_count), InputsAdj(model, wanted, 1)
     now, then = state_in.struct(model), state_out.struct(model)
+    structs = found.particle_struct(), found.grid_struct()
     solid.work.adjoint(
-        wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), struct, substep
+        wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), structs, substep
     )
-    if solid.pull is not None and solid.pull.grad is not None:
-        solid.work.collect_pull(slots, wp.to_torch(solid.pull.grad))
+    found.collect(0, model.fixed, solid.work.launch)
+    adj_inputs.add(found, slice(0, 1))
+    adj_inputs.add_particles(found, slice(0, 1))
+    arrays = solid.arrays()
+    for one in adj_inputs.inputs:
+        adj = adj_inputs.tensors[one.name]
+        grad = wp.to_torch(cast(wp.array, arrays[one.name].grad))
+        grad += adj[0] if one.rows else adj

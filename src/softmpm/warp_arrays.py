@@ -1,5 +1,6 @@
 """States and material in Warp arrays, for users of Warp: made from tensors, read back, checked once when they are made."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -7,14 +8,26 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.checks import check_bounds, check_finite, check_params, check_row, check_state
-from softmpm.kernels.structs import types
+from softmpm.checks import (
+    check_finite,
+    check_inputs,
+    check_inputs_bounds,
+    check_params,
+    check_row,
+    check_state,
+    control_steps,
+)
+from softmpm.inputs import INPUTS, Input, Inputs, differentiable, stored
+from softmpm.kernel_inputs import derive
+from softmpm.kernels.structs import element_type, types
 from softmpm.model import Model, check_model
+from softmpm.planning.chunks import Horizon
 from softmpm.schemes.alarm_check import armed, check_end
-from softmpm.schemes.buffers import Motion, Solid, lame, masses, view
+from softmpm.schemes.buffers import Motion, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.failure_report import raise_failure
+from softmpm.schemes.inputs import Values, grid_struct, particle_struct, shape_of
 from softmpm.schemes.plain.substep import Substep
 from softmpm.state import Params, State
 
@@ -40,13 +53,13 @@ class WarpState:
     H: wp.array
     """F − I [-]; its gradient is ∂L/∂F."""
     fx_low: wp.array | None = None
-    """What rounding took off ``fx`` (float32 only)."""
+    """Part of ``fx`` that rounding removed (float32 only)."""
 
     def __post_init__(self):
         t = types(self.model.spec.dim, self.model.spec.dtype)
         kinds = {"base": t.ivec, "fx": t.vec, "v": t.vec, "C": t.mat, "H": t.mat, "fx_low": t.vec}
         for name, array in self.arrays().items():
-            _check_array(self.model, name, array, self.model.particle_count, kinds[name])
+            _check_array(self.model, name, array, (self.model.worlds, self.model.particle_count), kinds[name])
 
     def differentiable(self) -> list[wp.array]:
         return [self.fx, self.v, self.C, self.H]
@@ -71,7 +84,7 @@ class WarpState:
 
 @dataclass(eq=False, frozen=True, kw_only=True)
 class WarpSolid:
-    """Material of all particles and pull of the muscles in Warp arrays, with the buffers that steps share.
+    """Inputs of a step in Warp arrays, with the buffers that steps share: material, active stress, and what the scene has besides.
 
     Arrays are written into (``wp.copy``), not replaced.
     """
@@ -84,26 +97,47 @@ class WarpSolid:
     """Lamé's μ [Pa], (world, particle)."""
     lam: wp.array
     """Lamé's λ [Pa], (world, particle)."""
-    pull: wp.array | None = None
+    active_stress: wp.array | None = None
     """Activation times strength [Pa], (world, muscle); None without muscles."""
+    others: Mapping[str, wp.array] = field(default_factory=dict)
+    """The other inputs that the kernels take, by their names in softmpm/inputs.py."""
     work: Substep = field(init=False)
 
     def __post_init__(self):
-        model, struct = self.model, Solid.fixed(self.model)
-        real = types(model.spec.dim, model.spec.dtype).real
-        for name, array in self.arrays().items():
-            size = model.muscle_count if name == "pull" else model.particle_count
-            _check_array(model, name, array, size, real)
-            setattr(struct, name, array)
-        object.__setattr__(self, "work", Substep(model, struct))
+        model, work = self.model, Substep(self.model)
+        work.particle_inputs, work.grid_inputs = particle_struct(model, model.fixed), grid_struct(model, {})
+        arrays = self.arrays()
+        for one in stored(model.spec):
+            if one.per == "substep":
+                work.grid_inputs.elapsed = wp.zeros(1, dtype=wp.float64, device=model.wp_device)
+            elif one.name not in model.fixed:
+                shape = _lead(model, one)
+                array = _check_array(
+                    model, one.name, arrays.get(one.name), shape, element_type(model.spec, one)
+                )
+                setattr(work.grid_inputs if one.stage == "grid" else work.particle_inputs, one.name, array)
+        object.__setattr__(self, "work", work)
+
+    @property
+    def pull(self) -> wp.array | None:
+        """Another name of :attr:`active_stress`."""
+        return self.active_stress
 
     def differentiable(self) -> list[wp.array]:
-        return list(self.arrays().values())
+        arrays = self.arrays()
+        return [arrays[one.name] for one in differentiable(self.model.spec)]
 
     def arrays(self) -> dict[str, wp.array]:
         """Every array by its name."""
-        names = ("mass", "mu", "lam", "pull")
-        return {name: getattr(self, name) for name in names[: 4 if self.model.muscle_count else 3]}
+        own = {"mass": self.mass, "mu": self.mu, "lam": self.lam}
+        own |= {} if self.active_stress is None else {"active_stress": self.active_stress}
+        return own | dict(self.others)
+
+    def values(self) -> Values:
+        """As the schemes take them: one row of what has rows."""
+        rows = {one.name for one in INPUTS if one.rows}
+        tensors = {name: wp.to_torch(array) for name, array in self.arrays().items()}
+        return {name: tensor[None] if name in rows else tensor for name, tensor in tensors.items()}
 
     def raise_failure(self, model: Model, state: WarpState) -> None:
         """Raise :class:`softmpm.UnstableError` if a step so far failed. Waits for the device.
@@ -111,18 +145,16 @@ class WarpSolid:
         Checks ``state``, which the last step gave, for torn bodies and the running step limit as well.
         """
         check_own(model, "raise_failure", solid=self, state=state)
-        mass, mu, lam = (wp.to_torch(array) for array in (self.mass, self.mu, self.lam))
-        pull = None if self.pull is None else wp.to_torch(self.pull)
-        _raise_failure(model, state, self.work, Solid(mass, mu, lam, pull), pull)
+        _raise_failure(model, state, self.work, self.values())
 
 
 @on_its_gpu
-def _raise_failure(model: Model, state: WarpState, work: Substep, given: Solid, pull: Tensor | None) -> None:
+def _raise_failure(model: Model, state: WarpState, work: Substep, values: Values) -> None:
     work.stream = stream_of(model.device)
     end = work.leave(state.struct(model))
     if armed(model):
-        check_end(model, work.solid, end, work.words_array, work.last)
-    raise_failure(model, work.words.tolist(), end, solid=given, pull=pull)
+        check_end(model, work.particle_inputs, end, work.words_array, work.last)
+    raise_failure(model, work.words.tolist(), end, values=values)
 
 
 def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
@@ -145,16 +177,22 @@ def check_own(model: Model, wants: str, **given: WarpState | WarpSolid) -> None:
             raise ValueError(f"{name} belongs to another model; make one with softmpm.{make}(model).")
 
 
-def _check_array(model: Model, name: str, array: object, size: int, dtype: type) -> None:
-    """Raise unless this is an array of the shape (world, size) and of this type on the model's device."""
+def _check_array(model: Model, name: str, array: object, shape: tuple[int, ...], dtype: type) -> wp.array:
+    """The array; raises unless it has this shape and type and is on the model's device."""
     if not isinstance(array, wp.array):
         raise TypeError(f"{name} must be a warp.array, got {type(array).__name__}.")
-    shape = (model.worlds, size)
     if array.shape != shape or array.dtype is not dtype or array.device != model.wp_device:
         raise ValueError(
             f"{name} must be {_kind(shape, dtype)} on {model.wp_device}, got {_kind(array.shape, array.dtype)} on {array.device}; "
             "softmpm.warp_state and softmpm.warp_solid make such arrays."
         )
+    return array
+
+
+def _lead(model: Model, one: Input) -> tuple[int, ...]:
+    """Axes of an input in a step, without that of a vector."""
+    shape = shape_of(model, one, 1)[1 if one.rows else 0 :]
+    return shape[:-1] if one.kind == "vector" else shape
 
 
 def _kind(shape: tuple[int, ...], dtype: Any) -> str:
@@ -181,7 +219,7 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
 @on_its_gpu
 def _warp_state(model: Model, state: State, requires_grad: bool) -> WarpState:
     t = types(model.spec.dim, model.spec.dtype)
-    motion, work = Motion.empty(model), Substep(model, None)
+    motion, work = Motion.empty(model), Substep(model)
     work.enter(state, motion.struct(model))
     raise_failure(model, work.words.tolist(), state)
     return WarpState(
@@ -203,45 +241,51 @@ def torch_state(model: Model, state: WarpState) -> State:
 
 @on_its_gpu
 def _torch_state(model: Model, state: WarpState) -> State:
-    return Substep(model, None).leave(state.struct(model))
+    return Substep(model).leave(state.struct(model))
 
 
 def warp_solid(
     model: Model,
     params: Params | None = None,
     activation: Tensor | None = None,
+    inputs: Inputs | None = None,
     *,
     requires_grad: bool = False,
 ) -> WarpSolid:
-    """Material and muscles for :func:`step`.
+    """Material, actuators and other inputs for :func:`step`.
 
     Args:
         params: As in :func:`softmpm.simulate`; None takes the scene's.
         activation: Muscle activation [-], shape (world, muscle); None is zero.
+        inputs: As in :func:`softmpm.simulate`, in one control step of one substep.
 
     Raises:
-        TypeError, ValueError: As :func:`softmpm.simulate`, for the model, the material and the activation.
+        TypeError, ValueError: As :func:`softmpm.simulate`, for the model, the material, the activation and the inputs.
     """
     check_model(model, "warp_solid")
     params = model.params() if params is None else params
     check_params(model, params)
     check_row(model, activation)
+    given = check_inputs(model, inputs)
+    row = None if activation is None else activation[None]
+    steps = control_steps(None, given)
+    if steps != 1:
+        raise ValueError(
+            f"a step takes inputs of one control step, got {steps}; take one row of each, two poses."
+        )
     if not is_capturing(model):
-        check_bounds(params, params.density * model.volume, model.mass_unit)
         check_finite(None, activation)
-    return _warp_solid(model, params, activation, requires_grad)
+        check_inputs_bounds(given)
+    return _warp_solid(model, derive(model, row, params, given, Horizon(1, 1)), requires_grad)
 
 
 @on_its_gpu
-def _warp_solid(model: Model, params: Params, activation: Tensor | None, requires_grad: bool) -> WarpSolid:
-    real, lead = types(model.spec.dim, model.spec.dtype).real, (model.worlds, model.particle_count)
-    mu, lam = (term.expand(lead) for term in lame(Params(*(p.expand(lead) for p in params))))
-    mass = masses(model, params).expand(lead)
-    pull = None
-    if model.muscle_count:
-        if activation is None:
-            activation = torch.zeros(model.worlds, model.muscle_count, dtype=model.dtype, device=model.device)
-        pull = (activation * model.strength).detach()
-    mass, mu, lam = (_owned(tensor.detach(), real, requires_grad) for tensor in (mass, mu, lam))
-    pull = None if pull is None else _owned(pull, real, requires_grad)
-    return WarpSolid(model=model, mass=mass, mu=mu, lam=lam, pull=pull)
+def _warp_solid(model: Model, values: Values, requires_grad: bool) -> WarpSolid:
+    arrays = {}
+    for one in stored(model.spec):
+        if one.name in values:
+            value = values[one.name][0] if one.rows else values[one.name]
+            needs = requires_grad and bool(one.group)
+            arrays[one.name] = _owned(value.detach(), element_type(model.spec, one), needs)
+    own = {name: arrays.pop(name) for name in ("mass", "mu", "lam", "active_stress") if name in arrays}
+    return WarpSolid(model=model, others=arrays, **own)

@@ -1,4 +1,4 @@
-"""Between what users hold (x, F) and what the kernels hold (base node and fraction, F − I). Exact to the last digit.
+"""Conversion between a user's state (x, F) and that of the kernels (base node and fraction, F − I). Exact to the last digit.
 
 base = ⌊x/dx − ½⌋,  fx = x/dx − base,  H = F − I        both ways in float64, whatever the precision of the scene.
 """
@@ -14,12 +14,12 @@ from softmpm.kernels.structs import types
 
 
 @kernel_factory
-def boundary(dim: int, dtype: str) -> SimpleNamespace:
+def conversion(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, Constants, Motion = t.real, t.vec, t.mat, t.ivec, t.Constants, t.Motion
     report = status.report(dim, dtype).report
     bad_start, rounds = int(Kind.START), dtype == "float32"
-    module = f"softmpm.boundary.d{dim}.{dtype}"
+    module = f"softmpm.conversion.d{dim}.{dtype}"
 
     @wp.struct
     class Entered:
@@ -38,7 +38,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def entered(constants: Constants, x: vec, v: vec, C: mat, F: mat, low_x: vec, low_F: mat) -> Entered:
-        """One particle as the kernels hold it; not valid if it is not finite or off the grid."""
+        """One particle in the kernels' representation; not valid if it is not finite or off the grid."""
         at = Entered()
         at.valid = wp.isfinite(wp.ddot(F, F) + wp.dot(v, v) + wp.ddot(C, C))
         for axis in range(dim):
@@ -63,7 +63,7 @@ def boundary(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def left(constants: Constants, base: ivec, fx: vec, low: vec, H: mat) -> Left:
-        """One particle as users hold it, with what rounding takes off."""
+        """One particle in the user's representation, with the low-order parts that rounding removes."""
         out = Left()
         for axis in range(dim):
             cell = wp.float64(base[axis]) + wp.float64(fx[axis])

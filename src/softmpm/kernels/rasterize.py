@@ -12,7 +12,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.convert import boundary
+from softmpm.kernels.convert import conversion
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
@@ -22,7 +22,7 @@ from softmpm.kernels.structs import types
 def raster(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
     real, vec, mat, node_vec, Constants = t.real, t.vec, t.mat, t.node, t.Constants
-    Entered, entered = boundary(dim, dtype).Entered, boundary(dim, dtype).entered
+    Entered, entered = conversion(dim, dtype).Entered, conversion(dim, dtype).entered
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
     pack, momentum, report = s.pack, s.momentum, status.report(dim, dtype).report

@@ -1,16 +1,24 @@
 """Specification of the kernels of a scene, and the Warp structs that follow from it."""
 
+import hashlib
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import warp as wp
 
+from softmpm.inputs import Input, differentiable, present
 from softmpm.kernels.compile import kernel_factory
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
-LETTER = {"stick": "k", "slip": "l", "separate": "s"}
-"""Of a wall in the name of a module, which becomes that of a file: many walls must fit."""
+
+
+def short(name: str, most: int) -> str:
+    """A name of at most so many letters, told by a digest beyond: that of a module becomes that of a file."""
+    if len(name) <= most:
+        return name
+    digest = hashlib.sha256(name.encode()).hexdigest()[:12]
+    return f"{name[: most - len(digest) - 1]}.{digest}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,31 +27,45 @@ class Spec:
 
     dim: int
     dtype: str  # "float32" or "float64"
-    laws: tuple[str, ...]  # of "neo_hookean", "fixed_corotated", "barrier_corotated"
-    muscle_slots: int  # muscles that overlap on one particle, at most; 0 is a passive scene
-    contacts: tuple[str, ...]  # of each wall: "stick", "slip" or "separate"
+    laws: tuple[str, ...]  # files of kernels/physics/laws
+    muscle_slots: int  # actuators that overlap on one particle, at most; 0 is a passive scene
+    contacts: tuple[str, ...]  # of each wall, files of kernels/physics/contacts
     friction: bool
     gravity: bool
     damping: bool
+    actuators: tuple[str, ...] = ()  # files of kernels/physics/actuators
+    fibres: bool = False  # whether an actuator has a direction
+    viscosity: bool = False
+    driven: bool = False
+    given: tuple[str, ...] = ()  # fields of softmpm.Inputs that calls give
     deterministic: bool = False  # sums over particles in fixed point
+
+    @property
+    def moving(self) -> bool:
+        """True if walls may move."""
+        return any(name.startswith("wall_") for name in self.given)
 
     @property
     def module(self) -> str:
         """Name of the Warp module that holds every kernel of this specialisation."""
-        features = [
-            name for name in ("friction", "gravity", "damping", "deterministic") if getattr(self, name)
-        ]
+        names = ("friction", "gravity", "damping", "viscosity", "driven", "deterministic")
+        features = [name for name in names if getattr(self, name)]
+        actuators = [f"{name}s" for name in self.actuators if name != "muscle"]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
-        walls = ["walls_" + "".join(LETTER[kind] for kind in self.contacts)] if self.contacts else []
-        return ".".join(["softmpm", f"d{self.dim}", self.dtype, *self.laws, *muscles, *walls, *features])
+        walls = ["walls_" + "_".join(self.contacts)] if self.contacts else []
+        given = ["given_" + "_".join(self.given)] if self.given else []
+        parts = [f"d{self.dim}", self.dtype, *self.laws, *muscles, *actuators, *walls, *features, *given]
+        return short(".".join(["softmpm", *parts]), 120)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RequestedGrads:
-    """Gradients that a backward pass computes besides those of the initial state; the others are not compiled or stored."""
+    """Groups of inputs whose gradients are computed besides that of the initial state; others are not compiled or stored."""
 
-    material: bool
-    activation: bool
+    groups: tuple[str, ...] = ()  # of softmpm.inputs.groups, in their order
+
+    def __contains__(self, group: str) -> bool:
+        return group in self.groups
 
 
 BASE_BITS = {2: 15, 3: 10}
@@ -156,56 +178,60 @@ def types(dim: int, dtype: str) -> SimpleNamespace:
 
 
 def _struct(name: str, module: str, annotations: dict):
-    return wp.struct(type(name, (), {"__annotations__": annotations}), module=module)
+    # Warp has no empty struct:
+    return wp.struct(type(name, (), {"__annotations__": annotations or {"nothing": int}}), module=module)
+
+
+def element_type(spec: Spec, one: Input):
+    """Warp type of one value of an input."""
+    t = types(spec.dim, "float64" if one.double else spec.dtype)
+    return {"scalar": t.real, "vector": t.vec, "index": wp.int32}[one.kind]
+
+
+def constant_type(spec: Spec, one: Input):
+    """Warp type of an input of all walls that lies in the struct itself."""
+    real, count = types(spec.dim, "float64" if one.double else spec.dtype).real, len(spec.contacts)
+    return wp.types.matrix((count, spec.dim), real) if one.kind == "vector" else wp.types.vector(count, real)
+
+
+AXES = {"particle": 2, "slot": 3, "muscle": 2, "driven": 2, "world": 1, "wall": 2, "substep": 1}
+"""Of an input: (world, particle), (world, particle, slot), (world, muscle), (world, driven), (world,), (world, wall), (1,)."""
+ACCUMULATOR_AXES = {"particle": 2, "muscle": 3, "driven": 2, "world": 1, "wall": 2}
+"""Of its adjoint: (world, particle), (world, particle, slot), (world, driven), (node,), (wall, node), so that no two threads of a
+launch add to the same number; nodes of all worlds count on."""
 
 
 @kernel_factory
-def solid_types(spec: Spec) -> SimpleNamespace:
-    """Structs of the material and the walls: only the fields that this scene needs."""
-    t = types(spec.dim, spec.dtype)
-    solid = dict(
-        mass=wp.array2d(dtype=t.real),  # m_p / m₀, m₀ that of the heaviest particle, (world, particle)
-        mu=wp.array2d(dtype=t.real),  # Lamé's μ [Pa], (world, particle)
-        lam=wp.array2d(dtype=t.real),  # Lamé's λ [Pa], (world, particle)
-        volume=wp.array2d(dtype=t.real),  # V⁰ / m₀ [m³/kg], (world, particle)
-    )
-    if len(spec.laws) > 1:
-        solid["law"] = wp.array2d(dtype=wp.int32)  # index into spec.laws, (world, particle)
-    if spec.muscle_slots:
-        solid["muscle"] = wp.array3d(dtype=wp.int32)  # of each slot or -1, (world, particle, slot)
-        solid["fibre"] = wp.array(dtype=t.vec)  # unit direction d, (muscle,)
-        solid["pull"] = wp.array2d(dtype=t.real)  # activation times strength [Pa], (world, muscle)
-
-    # Walls lie in the parameters of a launch, not in memory that a kernel would have to wait for.
-    count, walls = len(spec.contacts), {}
-    if count:
-        walls["normal"] = wp.types.matrix((count, spec.dim), wp.float64)
-        walls["offset"] = wp.types.vector(count, wp.float64)
-    if spec.friction:
-        walls["friction"] = wp.types.vector(count, t.real)
-    if not walls:
-        walls["nothing"] = int  # Warp has no empty struct
+def input_types(spec: Spec) -> SimpleNamespace:
+    """Structs of the inputs of particles and of nodes: only the fields that this scene needs, by :data:`softmpm.inputs.INPUTS`."""
+    fields = {"particle": {}, "grid": {}}
+    for one in present(spec):
+        array = wp.array(dtype=element_type(spec, one), ndim=AXES[one.per] - one.shared(spec))
+        kind = constant_type(spec, one) if one.constant(spec) else array
+        fields["grid" if one.stage == "grid" else "particle"][one.name] = kind
     return SimpleNamespace(
-        Solid=_struct("Solid", spec.module, solid), Walls=_struct("Walls", spec.module, walls)
+        ParticleInputs=_struct("ParticleInputs", spec.module, fields["particle"]),
+        GridInputs=_struct("GridInputs", spec.module, fields["grid"]),
     )
 
 
 @kernel_factory
-def solid_adj_type(spec: Spec, wanted: RequestedGrads):
-    """Struct of the gradients that are wanted besides those of the start."""
+def input_adj_types(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
+    """Structs of the gradients that are wanted besides those of the start."""
     t = types(spec.dim, spec.dtype)
-    fields = {}
-    if wanted.material:
-        fields |= {name: wp.array2d(dtype=t.real) for name in ("mass", "mu", "lam")}
-    if wanted.activation and spec.muscle_slots:
-        fields["pull"] = wp.array3d(dtype=t.real)  # of each slot, (world, particle, slot)
-    if not fields:
-        fields["nothing"] = int  # Warp has no empty struct
-    return _struct("SolidAdj", adj_module(spec, wanted), fields)
+    fields = {"particle": {}, "grid": {}}
+    for one in differentiable(spec):
+        if one.group in wanted:
+            dtype = t.vec if one.kind == "vector" else t.real
+            array = wp.array(dtype=dtype, ndim=ACCUMULATOR_AXES[one.per])
+            fields["grid" if one.stage == "grid" else "particle"][one.name] = array
+    module = adj_module(spec, wanted)
+    return SimpleNamespace(
+        ParticleInputsAdj=_struct("ParticleInputsAdj", module, fields["particle"]),
+        GridInputsAdj=_struct("GridInputsAdj", module, fields["grid"]),
+    )
 
 
 def adj_module(spec: Spec, wanted: RequestedGrads) -> str:
     """Name of the Warp module that holds the adjoint kernels."""
-    return ".".join(
-        [spec.module, "adj", *(name for name in ("material", "activation") if getattr(wanted, name))]
-    )
+    return ".".join([spec.module, "adj", short(".".join(wanted.groups), 40)]).rstrip(".")

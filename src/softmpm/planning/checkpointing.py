@@ -1,7 +1,7 @@
-"""Binomial checkpointing: which states a long gradient stores, and which stages it recomputes.
+"""Binomial checkpointing: which states the backward pass of a long rollout stores, and which stages it recomputes.
 
 Griewank & Walther 2000, "Algorithm 799: revolve". The backward pass visits a chain of l stages from the last to the
-first; stage i needs the state before it, and s of these states can be kept at once, the first one included.
+first; stage i needs the state before it, and s of these states can be stored at once, the first one included.
 The longest chain of which no stage runs more than r times before its own adjoint is
 
     β(s, r) = (s + r)! / (s! r!)                                                                     (B1)
@@ -9,9 +9,9 @@ The longest chain of which no stage runs more than r times before its own adjoin
 and if β(s, r-1) < l ≤ β(s, r), then t(l, s) runs are needed, the sweep up to the last stage included:
 
     t(l, s) = r l - β(s + 1, r - 1)                                                                  (B2)
-            = min over m of  m + t(m, s) + t(l - m, s - 1)     keep the state before stage m         (B3)
+            = min over m of  m + t(m, s) + t(l - m, s - 1)     store the state before stage m        (B3)
 
-Our first sweep runs every stage, for the result, and ends with the state after the last one. The turn is thus
+Here the forward pass runs every stage, for the result, and ends with the state after the last one. The reversal is thus
 one more stage, whose adjoint costs nothing; the backward pass recomputes
 
     t(l + 1, s) - l                                                                                  (B4)
@@ -23,14 +23,14 @@ from typing import Literal, NamedTuple
 
 
 class Action(NamedTuple):
-    """One move of the backward pass. Besides the kept states it has one in hand, which takes no slot."""
+    """One action of the backward pass. Besides the checkpoints there is a current state, which takes no slot."""
 
     kind: Literal["restore", "advance", "keep", "vjp", "drop"]
-    """``restore``: the kept state comes into the hand; it stays kept, so nothing may write into it.
-    ``advance``: the stage runs once; the state after it is in hand.
-    ``keep``: the state in hand is also put into a free slot.
-    ``vjp``: the adjoint goes through the stage, with the state before it in hand.
-    ``drop``: the state is kept no longer; its slot is free."""
+    """``restore``: the checkpoint becomes the current state; it remains stored, so nothing may write into it.
+    ``advance``: the stage runs once; the state after it becomes the current one.
+    ``keep``: the current state is also stored in a free slot.
+    ``vjp``: the adjoint is propagated through the stage, from the current state before it.
+    ``drop``: the checkpoint is freed, and with it its slot."""
     stage: int
     """The stage itself, or the state before it."""
 
@@ -40,7 +40,7 @@ def initial_checkpoints(stages: int, slots: int) -> tuple[int, ...]:
 
     Args:
         stages: Length of the chain.
-        slots: States that can be kept at once, the one before stage 0 included.
+        slots: States that can be stored at once, the one before stage 0 included.
 
     Raises:
         ValueError: ``stages`` or ``slots`` is less than 1.
@@ -48,7 +48,7 @@ def initial_checkpoints(stages: int, slots: int) -> tuple[int, ...]:
     _check(stages, slots)
     kept, at = [0], 0
     while len(kept) < slots:
-        at += _split(stages + 1 - at, slots - len(kept) + 1)  # the turn is one more stage
+        at += _split(stages + 1 - at, slots - len(kept) + 1)  # the reversal is one more stage
         if at == stages:
             break
         kept.append(at)
@@ -60,7 +60,7 @@ def backward_schedule(stages: int, slots: int) -> Iterator[Action]:
 
     No schedule for as many slots has fewer ``advance``. Arguments and errors as in :func:`initial_checkpoints`.
     """
-    return _going_back(list(initial_checkpoints(stages, slots)), stages, slots)
+    return _backward_actions(list(initial_checkpoints(stages, slots)), stages, slots)
 
 
 def recomputed(stages: int, slots: int) -> int:
@@ -70,7 +70,8 @@ def recomputed(stages: int, slots: int) -> int:
     return r * (stages + 1) - _reach(slots + 1, r - 1) - stages
 
 
-def _going_back(kept: list[int], stages: int, slots: int) -> Iterator[Action]:
+def _backward_actions(kept: list[int], stages: int, slots: int) -> Iterator[Action]:
+    """Actions for all stages from the last to the first; ``kept`` lists the stages whose initial state is stored."""
     for stage in reversed(range(stages)):
         at = kept[-1]
         yield Action("restore", at)
@@ -87,7 +88,7 @@ def _going_back(kept: list[int], stages: int, slots: int) -> Iterator[Action]:
 
 
 def _split(length: int, slots: int) -> int:
-    """The smallest m that attains (B3), for 2 stages or more; the largest one would keep more often."""
+    """The smallest m that attains (B3), for 2 stages or more; the largest one would store states more often."""
     r = _repeats(length, slots)
     return max(_reach(slots, max(r - 2, 0)), length - _reach(slots - 1, r))
 

@@ -7,45 +7,49 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive substeps of a call. Two chunks with the same ``shape`` differ only in what they are given."""
+    """Consecutive substeps of a call. Two chunks with the same ``shape`` differ only in their inputs."""
 
     first: int
     """Its first substep in the call."""
     length: int
     substeps: int
-    """Substeps of a control step."""
+    """Substeps per control step."""
 
     @functools.cached_property
     def shape(self) -> tuple[int, tuple[int, ...]]:
-        """Its length, and where in it control steps begin."""
+        """Length of the chunk, and the substeps in it at which a control step begins."""
         begins = range(-self.first % self.substeps, self.length, self.substeps)
         return self.length, tuple(s for s in begins if s > 0)
 
     @functools.cached_property
     def rows(self) -> slice:
-        """Control steps that it touches."""
+        """Control steps that the chunk touches."""
         first = self.first // self.substeps
         return slice(first, first + self.row(self.length - 1) + 1)
 
     def row(self, s: int) -> int:
-        """Number, among these, of the control step that substep ``s`` belongs to."""
+        """Index, within :attr:`rows`, of the control step that contains substep ``s`` of the chunk."""
         return (self.first % self.substeps + s) // self.substeps
 
 
 @dataclass(frozen=True)
 class Horizon:
-    """Control steps of equally many substeps."""
+    """Length of a call: control steps, each with the same number of substeps."""
 
     control_steps: int
     substeps: int
 
     @property
     def total(self) -> int:
+        """Number of substeps."""
         return self.control_steps * self.substeps
 
-    @functools.lru_cache(maxsize=256)  # noqa: B019 - keeps numbers, not what is simulated
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - caches numbers, not simulated states
     def chunks(self, longest: int) -> tuple[Chunk, ...]:
-        """Whole control steps as far as they fit, or equal parts of one: few shapes, so that few chunk graphs are captured."""
+        """Chunks of at most ``longest`` substeps: several whole control steps, or equal parts of one.
+
+        The chunks have few distinct shapes, so that few chunk graphs are captured.
+        """
         if self.substeps <= longest:
             length = self.substeps * (longest // self.substeps)
             starts = range(0, self.total, length)

@@ -3,12 +3,12 @@
 A call is divided into chunks. The backward pass of a chunk needs all of its intermediate states and the mass and momentum of the
 nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
 
-    keep all:  everything inside all chunks, N (S + G) and one S for each; nothing runs twice
-    schedule:  one chunk at a time is run again, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
-               chunks, s are kept, s B, and the others are found by running chunks again, as few as possible (checkpointing.py)
+    store all: all intermediate states of all chunks, N (S + G) and one S for each chunk; nothing is recomputed
+    schedule:  one chunk at a time is recomputed, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
+               chunks, s are stored, s B, and the others are recomputed with as few chunks as possible (checkpointing.py)
 
-In a closed loop one backward pass goes through many calls, each of which also holds its start, the end of the one before. The
-backward pass visits them one after the other.
+In a closed loop one backward pass covers many calls, each of which also stores its initial state, the final state of the previous
+call. The backward pass visits the calls one after the other.
 """
 
 import functools
@@ -19,39 +19,40 @@ from typing import ClassVar, NamedTuple, Protocol
 import torch
 
 from softmpm.devices import memory_of
+from softmpm.inputs import differentiable, present
 from softmpm.planning.checkpointing import recomputed
 
 LONGEST = 128
-"""Substeps of a chunk, at most: long enough to hide what a chunk costs the host, short enough to sort particles again in time."""
+"""Maximum number of substeps of a chunk: enough to hide the host's overhead per chunk, few enough to re-sort particles in time."""
 MANY, LONGEST_OF_MANY = 30_000, 64
-"""From so many particles on the host has time enough, and sorting in time is worth more."""
+"""From ``MANY`` particles on the host's overhead is hidden in any case and sorting matters more: chunks are shorter."""
 
 MARGIN = {2: 6, 3: 3}
-"""Nodes of a window around the particles' stencils, on each side, in 2D and 3D, until they leave it."""
+"""Initial margin of the window around the particles' stencils, in nodes on each side, in 2D and 3D."""
 
 
 def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int) -> tuple[int, ...]:
-    """Nodes along each axis of the part of the grid that is in memory.
+    """Nodes along each axis of the window, the part of the grid that is allocated.
 
     Args:
         grid: Nodes of the whole grid.
-        reach: How far the particles' base nodes lie apart.
+        reach: Distance between the outermost base nodes of the particles along each axis.
         margin: Nodes around their stencils on each side.
     """
     wide = [apart + 3 + 2 * margin for apart in reach]
-    wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns begin where reads from memory do
+    wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns are aligned for memory reads
     return tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
 
 
 def longest_chunk(particles: int) -> int:
-    """Substeps of a chunk, at most, for so many particles in all worlds."""
+    """Maximum number of substeps of a chunk, given the particles of all worlds."""
     return LONGEST if particles < MANY else LONGEST_OF_MANY
 
 
 def price_of_chunk(particles: int) -> int:
-    """Estimated cost of a chunk on a GPU besides its substeps, in substeps.
+    """Estimated overhead of a chunk on a GPU, in substeps.
 
-    With few particles it is the host's time, with many that of sorting and moving them.
+    With few particles it is the host's time, with many that of sorting and permuting them.
     """
     least, most = 4, 48
     return max(least, min(most, 3_000_000 // particles))
@@ -64,30 +65,30 @@ def state_bytes(particles: int, dim: int, real: int) -> int:
 
 
 class Sizes(NamedTuple):
-    """Bytes of what a call may keep, and what decides how long its chunks are."""
+    """Bytes of the states that a call may store, and the numbers that determine the length of its chunks."""
 
     inside: int
-    """State of all worlds inside a chunk."""
+    """State of all worlds inside a chunk [B]."""
     nodes: int
-    """What is kept of the nodes of all worlds for each substep."""
+    """Nodal mass and momentum of all worlds that are stored for each substep [B]."""
     between: int
-    """State of all worlds between chunks."""
+    """State of all worlds between chunks [B]."""
     start: int
-    """State of all worlds in the user's order, as a call begins or ends, with what rounding took."""
+    """Initial or final state of a call for all worlds, in the user's order, with its low-order parts [B]."""
     longest: int
-    """Substeps of a chunk, at most."""
+    """Maximum number of substeps of a chunk."""
     price: int
-    """What each chunk costs besides its substeps, in substeps."""
+    """Overhead of each chunk, in substeps."""
     calls: int
-    """How many calls share the budget."""
+    """Number of calls that share the budget."""
 
 
 def default_budget(device: torch.device, sizes: Sizes) -> int:
-    """Bytes that all calls may keep where nobody says how many.
+    """Default memory budget of all calls [B].
 
-    For one call a sixteenth of a GPU's memory, or 64 MiB on the CPU. For several as often as much, but at most 6 times, or 64 times on
-    the CPU: a :class:`softmpm.Graph` of them holds its own beside what the same calls keep outside of it, and there must be room for
-    both. The starts are there anyway: they never take what one call would have.
+    One call has a sixteenth of a GPU's memory, or 64 MiB on the CPU. Several calls have that for each, but at most 6 times as much on a
+    GPU and 64 times on the CPU: a :class:`softmpm.Graph` stores its own states beside those of the same calls outside of it, and there
+    must be room for both. The initial states exist in any case, so they never reduce the share of one call.
     """
     one, most = 64 * 2**20, 64
     if device.type == "cuda":
@@ -99,22 +100,23 @@ class Plan(NamedTuple):
     """Memory plan of a call."""
 
     longest: int
-    """Substeps of a chunk, at most."""
+    """Maximum number of substeps of a chunk."""
     slots: int
-    """States between chunks that are kept; 0 if everything is."""
+    """Number of states between chunks that are checkpointed; 0 if all intermediate states are stored."""
     kept: int
-    """Bytes kept by the forward pass, of one call."""
+    """Bytes that the forward pass of one call stores."""
     recomputed: int
-    """Bytes of what the backward pass runs again at a time."""
+    """Bytes of the chunk that the backward pass recomputes at a time."""
 
     @property
     def keep_all(self) -> bool:
+        """True if all intermediate states are stored and nothing is recomputed."""
         return self.slots == 0
 
 
 @functools.lru_cache(maxsize=256)
 def plan(horizon, sizes: Sizes, budget: int) -> Plan:
-    """The plan that takes the least time within the budget [B] of all calls.
+    """The fastest plan within the budget [B] of all calls.
 
     Args:
         horizon: A :class:`softmpm.planning.chunks.Horizon`.
@@ -127,7 +129,7 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     others = sizes.calls - 1
     if sizes.calls * everything + others * sizes.start <= budget or horizon.total == 0:
         return Plan(sizes.longest, 0, everything, 0)
-    room = budget - others * (sizes.start - sizes.between)  # the first state that is kept is the start
+    room = budget - others * (sizes.start - sizes.between)  # the first checkpoint is the initial state
     best, least = None, math.inf
     for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
@@ -150,9 +152,9 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
 
 
 def _lengths(substeps: int, longest: int) -> list[int]:
-    """Lengths of chunks to try, the longest first: halved again and again, and those that divide a control step.
+    """Candidate chunk lengths, the longest first: ``longest`` halved repeatedly, and the divisors of a control step.
 
-    These leave no shorter chunk, which would need buffers of its own.
+    Divisors leave no shorter last chunk, which would need separate buffers.
     """
     halved = (longest >> k for k in range(longest.bit_length()))
     even = (n for n in range(1, longest + 1) if substeps % n == 0)
@@ -160,64 +162,64 @@ def _lengths(substeps: int, longest: int) -> list[int]:
 
 
 class Footprint(Protocol):
-    """Memory of one scheme. Models come without a type, since they stand above this module."""
+    """Memory of one scheme. Models are passed without a type, since their module is above this one."""
 
     numbers_per_node: ClassVar[dict[int, int]]
-    """Numbers of a node that a call takes at least, in 2D and 3D."""
+    """Minimum count of stored numbers per node, in 2D and 3D."""
 
     def obstacle(self, shape: Sequence[int], particles: int) -> str | None:
         """Reason why a grid of this shape, with this number of particles in all worlds, does not fit the scheme; else None."""
         ...
 
     def node_count(self, model) -> int:
-        """Nodes of one world in memory."""
+        """Allocated nodes of one world."""
         ...
 
     def sizes(self, model) -> Sizes:
-        """Bytes of what a call may keep."""
+        """Sizes of the states that a call may store."""
         ...
 
     def buffers(self, model, horizon, chosen: Plan) -> "Buffers":
-        """Bytes of the buffers that run calls of this length, besides states that are kept."""
+        """Bytes of the buffers that calls of this length use, besides the stored states."""
         ...
 
 
 class Buffers(NamedTuple):
-    """Bytes of the buffers that run calls."""
+    """Bytes of the buffers that calls use."""
 
     forward: int
-    """Of a call without gradient."""
+    """Buffers of a call without gradient."""
     kept: int
-    """Of all calls until the backward pass."""
+    """Buffers that all calls retain until the backward pass."""
     backward: int
-    """Of the backward pass: adjoints that are passed from chunk to chunk, and what runs chunks again."""
+    """Buffers of the backward pass: adjoints that are passed from chunk to chunk, and those of recomputed chunks."""
 
 
 class Memory(NamedTuple):
-    """Bytes that the calls of one gradient take at their peak, besides what the model itself holds, and how often they run."""
+    """Peak memory of the calls of one gradient [B], besides that of the model itself, and how often each substep runs."""
 
     forward: int
-    """A call without gradient."""
+    """Memory of a call without gradient [B]."""
     kept: int
-    """What all calls keep until the backward pass."""
+    """Memory that all calls retain until the backward pass [B]."""
     backward: int
-    """Peak of the backward pass, kept states included."""
+    """Peak memory of the backward pass, stored states included [B]."""
     runs: float
-    """How often a substep runs forward, in the mean; with little memory the backward pass takes so much longer."""
+    """Mean number of forward runs of a substep: 1 if nothing is recomputed, more if memory is short."""
 
 
 def memory(model, horizon) -> Memory:
-    """Evaluates the formula of docs/memory.md for calls of one length, all gradients wanted."""
+    """Evaluate the formula of docs/memory.md for calls of one length with all gradients requested."""
     real, sizes, calls = model.dtype.itemsize, model.sizes(), model.calls
     particles = model.worlds * model.particle_count
     state = particles * real * (2 * model.dim + 2 * model.dim**2)  # adjoints of x, v, C, F
-    material, pull = 4 * particles * real, particles * model.spec.muscle_slots * real
+    material, given = input_bytes(model, horizon.control_steps), adjoint_bytes(model, horizon.control_steps)
     chosen = plan(horizon, sizes, model.budget)
     buffers = model.footprint.buffers(model, horizon, chosen)
-    # Each call but the first holds its start besides, which is one of the states that are kept if those inside are not.
+    # Each call but the first also stores its initial state, which is one of the checkpoints if intermediate states are not stored.
     starts = (calls - 1) * (sizes.start - (0 if chosen.keep_all else sizes.between))
     kept = calls * (chosen.kept + material) + buffers.kept + starts
-    adjoints = 2 * state + material + pull + 3 * sizes.nodes + buffers.backward
+    adjoints = 2 * state + given + 3 * sizes.nodes + buffers.backward
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
     chunks = len(horizon.chunks(chosen.longest))
@@ -227,8 +229,29 @@ def memory(model, horizon) -> Memory:
     )
 
 
+def input_bytes(model, control_steps: int) -> int:
+    """Bytes of the inputs of particles in a call or a chunk of this number of control steps."""
+    numbers = 0
+    for one in present(model.spec):
+        if one.per == "particle" and one.kind != "index":
+            numbers += (model.dim if one.kind == "vector" else 1) * (control_steps if one.rows else 1)
+    return model.worlds * model.particle_count * numbers * model.dtype.itemsize
+
+
+def adjoint_bytes(model, control_steps: int) -> int:
+    """Bytes of the adjoints of all inputs, in the user's order and in the accumulators of the kernels."""
+    nodes, particles, size = model.held_nodes, model.particle_count, 0
+    for one in differentiable(model.spec):
+        numbers = (model.dim if one.kind == "vector" else 1) * (control_steps if one.rows else 1)
+        if one.per == "muscle":  # summed at the end of each control step
+            numbers = model.dim if one.kind == "vector" else 1
+        places = {"particle": particles, "muscle": particles * model.spec.muscle_slots, "world": nodes}
+        size += numbers * places.get(one.per, nodes * model.wall_count if one.per == "wall" else 0)
+    return model.worlds * (size + particles) * model.dtype.itemsize
+
+
 def check_room(model) -> None:
-    """Raise ValueError if the start, the end and the grid of a call alone are more than the device has."""
+    """Raise ValueError if the initial state, the final state and the grid of a call alone exceed the device's memory."""
     room = memory_of(model.device)
     nodes = model.footprint.node_count(model)
     per_node = model.footprint.numbers_per_node[model.dim]

@@ -1,6 +1,6 @@
-"""Digest of what a recording holds, the same for equal contents however HDF5 stores them.
+"""Digest of the contents of a recording, equal for equal contents however HDF5 stores them.
 
-A run that goes on can tell by it that a file is its own: it holds the same simulations, frames and numbers, to the bit.
+A resumed run verifies with it that a file is its own: that it contains the same simulations, frames and numbers, to the bit.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Hash(Protocol):
-    """Of :mod:`hashlib`."""
+    """Hash object of :mod:`hashlib`."""
 
     def update(self, data: bytes, /) -> None: ...
 
@@ -27,23 +27,23 @@ class Content:
         self._scalars: dict[bytes, Hash] = {}
 
     def episode(self, iteration: int, attributes: bytes) -> Hash:
-        """Begin a simulation, in the place of an earlier one of this iteration; for :meth:`frame`."""
+        """Begin a simulation, which replaces an earlier one of this iteration; returns its hash for :meth:`frame`."""
         self._episodes[iteration] = hashlib.sha256(attributes)
         return self._episodes[iteration]
 
     @staticmethod
     def frame(episode: Hash, time: float, values: Mapping[str, np.ndarray]) -> None:
-        """Add one frame to its simulation."""
+        """Add one frame to the hash of its simulation."""
         episode.update(struct.pack("<d", time))
         for name in sorted(values):
             episode.update(name.encode() + np.ascontiguousarray(values[name], "<f4").tobytes())
 
     def scalar(self, iteration: int, name: bytes, value: float) -> None:
-        """Add one number."""
+        """Add one scalar."""
         self._scalars.setdefault(name, hashlib.sha256()).update(struct.pack("<qd", iteration, value))
 
     def hexdigest(self) -> str:
-        """One digest of all."""
+        """Digest of all simulations and scalars."""
         whole = hashlib.sha256()
         for key, part in [*sorted(self._episodes.items()), *sorted(self._scalars.items())]:
             whole.update(f"{key!r} {part.hexdigest()}\n".encode())

@@ -1,6 +1,6 @@
-"""The file of a recorder: begun with what is kept of an older one, then open to be appended to.
+"""File of a recorder: it begins with the retained part of an older file, and is then open for appending.
 
-The old file stays until the new one is whole; room on the disk is claimed before HDF5 writes.
+The old file remains until the new one is complete; disk space is reserved before HDF5 writes.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from softmpm.recording.format import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, c
 from softmpm.recording.reader import Recording
 
 _OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
-_PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot tear what does not cross a page
+_PAGES = {"fs_strategy": "page", "fs_page_size": 4096}  # a kill cannot leave a page half written
 _ROOM_EXTRA = 2**20  # for HDF5's own tables
 _PATIENCE = 10.0  # seconds that a reader may take to open a file
 
@@ -32,7 +32,7 @@ def begin(
     resume_before: int | None,
     content: Content,
 ) -> None:
-    """Write a recording with what is kept of the one at ``path``."""
+    """Write a new recording that begins with the simulations of the file at ``path`` before iteration ``resume_before``."""
     resumed = resume_before is not None and path.exists()
     kept = path.stat().st_size if resumed else 0
     size = sum(values.nbytes for values in static.values()) + kept
@@ -51,7 +51,7 @@ def begin(
 def _copy(
     old: Recording, file: h5py.File, static: dict[str, np.ndarray], before: int, content: Content
 ) -> None:
-    """Everything of iterations before ``before``."""
+    """Copy everything of the iterations before ``before``."""
     for name, values in static.items():
         if not np.array_equal(values, old.static[name]):
             raise ValueError(f"{old.path} records another scene ({name} differs); record to another path.")
@@ -87,9 +87,9 @@ def _copy(
 
 @contextlib.contextmanager
 def room(file: h5py.File, size: int) -> Iterator[None]:
-    """Claim room for ``size`` bytes on the disk, write, and give back the rest.
+    """Reserve ``size`` bytes on the disk for the writes inside, and release the unused rest.
 
-    HDF5 must not meet a full disk itself: after a write that failed it crashes the process.
+    HDF5 must not encounter a full disk itself: after a failed write it crashes the process.
     """
     handle, end = file.id.get_vfd_handle(), file.id.get_filesize()
     try:
@@ -106,9 +106,9 @@ def room(file: h5py.File, size: int) -> Iterator[None]:
 
 
 def open_to_append(path: Path) -> h5py.File:
-    """Open straight into reader-safe mode; a kill between "r+" and ``swmr_mode`` locks a file.
+    """Open a file directly in reader-safe mode; a kill between "r+" and ``swmr_mode`` would leave it locked.
 
-    Readers hold a lock while they open the file: waited for.
+    Readers lock the file while they open it; this waits for them.
     """
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_libver_bounds(h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
@@ -126,7 +126,7 @@ def open_to_append(path: Path) -> h5py.File:
 
 
 def put_in_place(draft: Path, path: Path) -> None:
-    """At every instant there is the old file or the finished new one."""
+    """Replace the old file by the finished new one atomically."""
     with open(draft, "rb+") as file:
         os.fsync(file.fileno())
     os.replace(draft, path)

@@ -69,6 +69,7 @@ def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarr
     for row, muscle in zip(member, scene.muscles, strict=True):
         row[muscle.particles] = 1
     bodies, dim = scene.bodies, scene.grid.dim
+    none = (0.0,) * dim  # of an actuator without fibres
     values = {
         "positions": np.concatenate([b.particles.positions for b in bodies])[particle],
         "volume": np.concatenate([b.particles.volume for b in bodies])[particle],
@@ -76,7 +77,7 @@ def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarr
         "particle": particle,
         "gravity": scene.gravity,
         "muscle": member[:, particle],
-        "muscle_direction": np.array([m.direction for m in scene.muscles]).reshape(-1, dim),
+        "muscle_direction": np.array([getattr(m, "direction", none) for m in scene.muscles]).reshape(-1, dim),
         "muscle_strength": [m.strength for m in scene.muscles],
         "wall_normal": np.array([w.normal for w in scene.walls]).reshape(-1, dim),
         "wall_offset": [w.offset for w in scene.walls],
@@ -88,7 +89,7 @@ def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarr
 
 
 def create(file: h5py.File, model: Model, static: dict[str, np.ndarray]) -> None:
-    """Everything that the file will ever have a name for; later only rows are added."""
+    """Create all attributes and tables of the file; afterwards only rows are added."""
     grid = model.scene.grid
     file.attrs["format"], file.attrs["version"] = np.bytes_(FORMAT), VERSION
     file.attrs["dt"], file.attrs["spacing"] = model.scene.dt, grid.spacing
@@ -112,7 +113,7 @@ def create(file: h5py.File, model: Model, static: dict[str, np.ndarray]) -> None
 
 
 def _create_table(file: h5py.File, name: str, dtype: np.dtype, row: tuple, most: tuple, chunk: tuple) -> None:
-    """A table without rows. One row is one chunk, which is written once: a kill cannot harm an older row."""
+    """Create an empty table. Each row is one HDF5 chunk, which is written once, so that a kill cannot damage older rows."""
     fill = np.zeros((), dtype)
     if dtype.names:
         fill[dtype.names[0]] = -1
@@ -137,7 +138,7 @@ def tables(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def put(table: h5py.Dataset, start: int, rows: np.ndarray) -> None:
-    """Write rows at ``start``, the end of a table or the remains of an attempt that failed there."""
+    """Write rows at ``start``, which is the end of a table or the first row of a failed attempt."""
     shape = (max(len(table), start + len(rows)), *rows.shape[1:])
     if table.shape != shape:
         table.resize(shape)
@@ -145,7 +146,7 @@ def put(table: h5py.Dataset, start: int, rows: np.ndarray) -> None:
 
 
 def complete(rows: np.ndarray) -> np.ndarray:
-    """Rows of a table with names, up to the first that a killed run did not finish."""
+    """Rows of a table up to the first unfinished one, which a killed run may have left."""
     names = rows.dtype.names or ("",)
     unfinished = np.flatnonzero(rows[names[0]] < 0)
     return rows[: unfinished[0]] if len(unfinished) else rows

@@ -1,8 +1,8 @@
-"""Checks that a file holds what a recorder writes, and no more than it can hold, before any of it is read.
+"""Checks, before any data is read, that a file has the format that a recorder writes and contains all that it declares.
 
-A recording may come from somebody else. Each dataset must be plain numbers inside the file (no links, no external
-or virtual data), stored as ``format.py`` stores it, and what it declares must be there: HDF5 would make up the
-rest, in memory.
+A recording may come from another person. Each dataset must be plain numbers inside the file (no links, no external
+or virtual data), stored as ``format.py`` stores it, and all declared data must be present: HDF5 would otherwise fill
+in the missing part, in memory.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ _UNFINISHED = 2**20  # bytes that a table may declare and lack: a kill between t
 
 
 def plain_dataset(path: Path, file: h5py.File, name: str, dtype: np.dtype) -> h5py.Dataset:
-    """The named dataset, if it is what a recording holds under that name and lies wholly in this file."""
+    """The named dataset; raise ValueError unless it has the format of that name and lies wholly in this file."""
     node = file
     for part in name.split("/"):
         if not isinstance(node, h5py.Group) or not isinstance(node.get(part, getlink=True), h5py.HardLink):
@@ -49,7 +49,7 @@ def _check_storage(path: Path, node: h5py.Dataset, name: str, compression: int) 
 
 
 def check_shapes(path: Path, static: dict[str, np.ndarray], tables: dict[str, h5py.Dataset]) -> None:
-    """One size for each axis, everywhere."""
+    """Check that each axis has the same size in all tables."""
     if static["positions"].ndim != 2 or static["positions"].shape[1] not in (2, 3):
         raise ValueError(f"{path}: static/positions must have shape (particle, 2 or 3).")
     size = dict(zip("pd", ((n,) for n in static["positions"].shape), strict=True))
@@ -65,7 +65,7 @@ def check_shapes(path: Path, static: dict[str, np.ndarray], tables: dict[str, h5
 
 
 def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
-    """Finite numbers, and a grid that has cells."""
+    """Check that all numbers are finite and that the grid has cells."""
     for name, values in static.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise ValueError(f"{path}: static/{name} must be finite.")
@@ -74,7 +74,7 @@ def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
 
 
 def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset]) -> None:
-    """Check that the rows that each frame refers to exist; frames of episodes that began meanwhile belong to none."""
+    """Check that the rows that each frame refers to exist; frames of episodes that began after the index was read belong to none."""
     for name, table in PARTS.items():
         count = len(tables[table])
         if len(index) and not -1 <= index[name].min() <= index[name].max() < count:

@@ -1,8 +1,8 @@
-"""Recording: read what a Recorder wrote, while it writes, after it ended or after it was killed.
+"""Recording: reads the file of a Recorder, while it is written, after it is closed or after its writer was killed.
 
-A recording may come from somebody else, so nothing in it is trusted: only the names in ``format.py`` are
-read, after the checks of ``format_checks.py``. That keeps a file from reading other files and from filling
-memory; it cannot mend faults of the HDF5 library itself.
+A recording may come from another person, so nothing in it is trusted: only the names in ``format.py`` are
+read, after the checks of ``format_checks.py``. This prevents a file from reading other files and from filling
+memory; it cannot correct faults of the HDF5 library itself.
 """
 
 import json
@@ -22,7 +22,7 @@ from softmpm.recording.superblock import readable
 from softmpm.summary import table
 
 _DAMAGE = (OSError, RuntimeError, LookupError, TypeError, AttributeError, OverflowError, MemoryError)
-"""As h5py reports what HDF5 cannot read."""
+"""Exceptions of h5py for files that HDF5 cannot read."""
 _ATTEMPTS, _PAUSE = 20, 0.02  # [s]
 _T = TypeVar("_T")
 
@@ -69,7 +69,7 @@ class Recording:
         }
 
     def _steadily(self, read: Callable[[], _T]) -> _T:
-        """The result of ``read``; again after a failure while the file changes, because a writer is at work then."""
+        """The result of ``read``, which is repeated after a failure while a writer changes the file."""
         for attempt in range(_ATTEMPTS):
             before = self._stamp()
             try:
@@ -146,7 +146,7 @@ class Recording:
         return self.static["positions"].shape[0]
 
     def attributes(self, iteration: int) -> dict:
-        """What :meth:`softmpm.Recorder.episode` was given for this simulation."""
+        """Attributes of this simulation, as passed to :meth:`softmpm.Recorder.episode`."""
         row = self._row(iteration)
         try:
             found = json.loads(bytes(self._one_row("episode", row)["attributes"]) or b"{}")
@@ -166,11 +166,11 @@ class Recording:
         return self._newest[iteration]
 
     def rows(self, iteration: int) -> np.ndarray:
-        """Rows of this simulation's frames, for :meth:`read`; of the newer one, if it was recorded twice."""
+        """Rows of this simulation's frames, for :meth:`read`; those of the newer one if it was recorded twice."""
         return np.flatnonzero(self._frame["episode"] == self._row(iteration))
 
     def recorded(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Those of ``rows`` at which this quantity was recorded."""
+        """The subset of ``rows`` at which this quantity was recorded."""
         return rows[self._frame[name][rows] >= 0] if name in PARTS else rows
 
     def read(self, name: str, rows: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

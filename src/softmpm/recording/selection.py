@@ -35,15 +35,15 @@ class Show:
     speed: float
     """Speed of the longest arrow [m/s]."""
     low: np.ndarray
-    """Lower corner of what to frame [m], shape (dim,)."""
+    """Lower corner of the box to frame [m], shape (dim,)."""
     high: np.ndarray
-    """Upper corner [m]."""
+    """Upper corner of that box [m]."""
     has: dict[str, bool]
-    """Whether there is any ``activation``, ``field``, ``latent``."""
+    """True for each of ``activation``, ``field`` and ``latent`` that was recorded."""
 
 
 def plan(source: Recording, every: int, max_particles: int | None) -> Show:
-    """Decide it for each ``every``-th frame and at most ``max_particles``."""
+    """Select each ``every``-th frame and at most ``max_particles`` particles, and choose the scales."""
     particle = np.arange(source.particle_count)
     if max_particles is not None and max_particles < len(particle):
         particle = np.sort(np.random.default_rng(0).choice(particle, max_particles, replace=False))
@@ -74,11 +74,11 @@ def _in_sequence(source: Recording, every: int) -> list[Simulation]:
 
 
 def _spread(rows: np.ndarray) -> np.ndarray:
-    """A few of them, evenly."""
+    """An evenly spaced sample of the rows."""
     return rows[:: -(-len(rows) // _SAMPLE) or 1]
 
 
 def _top(values: np.ndarray) -> float:
-    """Top of a scale: nearly the largest value, of those that are not 0; 0 if there is none."""
+    """Top of a scale: the 99th percentile of the positive values, or 0 if there are none."""
     values = values[np.isfinite(values) & (values > 0)]
     return float(np.quantile(values, 0.99)) if len(values) else 0.0

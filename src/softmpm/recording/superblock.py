@@ -1,9 +1,9 @@
-"""The first bytes of an HDF5 file: a recording whose writer still writes or was killed, as one that nobody writes.
+"""Superblock of an HDF5 file: presents a recording whose writer is active or was killed as a closed file.
 
-HDF5 marks an open file in its superblock, and reads a marked one only in a mode that waits for its writer to
-mend what does not match its checksum, for ever if the writer is dead or the file is damaged. Read as if it were
-unmarked, a damaged file is refused at once; a sound one reads the same, because the recorder leaves the file
-consistent after every write. Source: HDF5 File Format Specification 3.0, II.A, superblock version 3.
+HDF5 marks an open file in its superblock, and reads a marked file only in a mode that waits for the writer to
+correct checksum mismatches, for ever if the writer is dead or the file is damaged. Read as if it were unmarked, a
+damaged file is rejected at once; an intact one reads the same, because the recorder leaves the file consistent
+after every write. Source: HDF5 File Format Specification 3.0, II.A, superblock version 3.
 """
 
 import io
@@ -41,7 +41,7 @@ def readable(path: Path) -> "str | Unmarked":
 
 
 class Unmarked(io.RawIOBase):
-    """A file whose first bytes are others, for h5py's driver of Python files."""
+    """A file whose first bytes are replaced, for h5py's driver of Python files."""
 
     def __init__(self, path: Path, head: bytes):
         self._file, self._head = open(path, "rb", buffering=0), head  # noqa: SIM115
@@ -59,7 +59,7 @@ class Unmarked(io.RawIOBase):
         return self._file.tell()
 
     def readinto(self, buffer) -> int:
-        """Fill the whole buffer; HDF5 takes what is not filled for data."""
+        """Fill the whole buffer, since HDF5 would take unfilled bytes for data."""
         view, start, done = memoryview(buffer).cast("B"), self.tell(), 0
         while done < len(view):
             count = self._file.readinto(view[done:])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from softmpm.scene.scene import Grid, Scene
+from softmpm.scene.scene import Actuator, Grid, Scene
 from softmpm.validate import need
 
 SAME_PLACE = 1e-6
@@ -26,6 +26,7 @@ def check_scene(scene: Scene) -> None:
     _check_bodies(scene)
     _check_distinct(scene)
     _check_muscles(scene)
+    _check_indices("scene driven", np.asarray(scene.driven), scene)
     _check_walls(scene)
 
 
@@ -56,6 +57,8 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
             within(f"{name} of body {b}", getattr(material, name), least, most)
         half = float(np.nextafter(real(0.5), real(0)))
         within(f"poisson of body {b}", material.poisson, -2 * half, half)
+        if material.viscosity > 0:
+            within(f"viscosity of body {b}", material.viscosity, least, most)
         for value in ends:
             within(f"the smallest or largest volume [m³] of body {b}", value, least, most)
             within(f"the smallest or largest mass [kg] of body {b}", material.density * value, least, most)
@@ -72,7 +75,7 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
                 most,
             )
     for m, muscle in enumerate(scene.muscles):
-        within(f"strength of muscle {m}", muscle.strength, -most, most)
+        within(f"strength of {_kind(muscle)} {m}", muscle.strength, -most, most)
     for axis, gravity in enumerate(scene.gravity or ()):
         within(f"gravity along axis {axis}", gravity, -most, most)
     for w, wall in enumerate(scene.walls):
@@ -130,15 +133,25 @@ def _suspects(bins: np.ndarray) -> np.ndarray:
 
 
 def _check_muscles(scene: Scene) -> None:
-    count = sum(len(body.particles) for body in scene.bodies)
     for m, muscle in enumerate(scene.muscles):
-        low, high = muscle.particles.min(), muscle.particles.max()
-        need(
-            low >= 0 and high < count,
-            f"muscle {m} names particle {low if low < 0 else high}, but the scene's {count} particles are "
-            f"0 to {count - 1}, counted through the bodies in their order.",
-        )
-        _check_axes(f"muscle {m} direction", muscle.direction, scene.grid)
+        _check_indices(f"{_kind(muscle)} {m}", muscle.particles, scene)
+        direction = getattr(muscle, "direction", None)
+        if direction is not None:
+            _check_axes(f"muscle {m} direction", direction, scene.grid)
+
+
+def _check_indices(name: str, particles: np.ndarray, scene: Scene) -> None:
+    count = sum(len(body.particles) for body in scene.bodies)
+    low, high = particles.min(initial=0), particles.max(initial=0)
+    need(
+        low >= 0 and high < count,
+        f"{name} names particle {low if low < 0 else high}, but the scene's {count} particles are "
+        f"0 to {count - 1}, counted through the bodies in their order.",
+    )
+
+
+def _kind(actuator: Actuator) -> str:
+    return type(actuator).__name__.lower()
 
 
 def _check_walls(scene: Scene) -> None:

@@ -8,10 +8,10 @@ from softmpm.validate import need, store_numbers
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Material:
-    """Isotropic elastic solid. Use one of its laws, the subclasses below."""
+    """Isotropic elastic solid, with Kelvin-Voigt viscosity if it has any. Use one of its laws, the subclasses below."""
 
     survives_inversion: ClassVar[bool] = False
-    """Whether the stress is defined where det F ≤ 0."""
+    """True if the stress is defined where det F ≤ 0."""
 
     density: float
     """Rest density ρ₀ [kg/m³]. Differentiable."""
@@ -19,19 +19,24 @@ class Material:
     """Young's modulus E [Pa]. Differentiable."""
     poisson: float = 0.3
     """Poisson's ratio ν [-], in (-1, 0.5). Differentiable."""
+    viscosity: float = 0.0
+    """Viscosity η [Pa s]: the second Piola-Kirchhoff stress 2η times the rate of the Green strain is added. Good values:
+    η = ζ L √(ρ₀ E) / π damps the slowest stretching oscillation of a free body of length L with a damping ratio of about ζ.
+    Large values need a small step, see :func:`softmpm.stable_dt`. Differentiable."""
 
     def __post_init__(self):
         need(
             type(self) is not Material,
             "a material needs a law: use NeoHookean, FixedCorotated or BarrierCorotated.",
         )
-        store_numbers(self, "material", "density", "young", "poisson")
+        store_numbers(self, "material", "density", "young", "poisson", "viscosity")
         need(self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
         need(self.young > 0, f"young must be > 0 Pa, got {self.young}.")
         need(
             -1.0 < self.poisson < 0.5,
             f"poisson must lie in (-1, 0.5), got {self.poisson}; rubber has 0.45 to 0.49.",
         )
+        need(self.viscosity >= 0, f"viscosity must be ≥ 0 Pa s, got {self.viscosity}.")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

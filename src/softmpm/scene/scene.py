@@ -1,4 +1,4 @@
-"""Scene description: grid, bodies with a material, muscles, walls. Plain SI numbers, checked at once.
+"""Scene description: grid, bodies with a material, actuators, walls. Plain SI numbers, checked at once.
 
 A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
 Rules that need the whole scene (particles inside the grid, muscle indices) live in ``check_scene.py``.
@@ -100,37 +100,62 @@ class Body:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Muscle:
+class Actuator:
+    """Particles with a stress that follows an activation. Use one of its kinds, the subclasses below; their stresses add."""
+
+    particles: np.ndarray
+    """Indices into the model's particles: the bodies' particles in the order of the bodies."""
+    strength: float
+    """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger ones
+    stretch a body until it fractures (docs/results.md, Lessons). Differentiable."""
+
+    def __post_init__(self):
+        need(type(self) is not Actuator, "an actuator needs a kind: use Muscle.")
+        object.__setattr__(self, "particles", _indices(f"a {self._name}", self.particles))
+        store_numbers(self, self._name, "strength")
+
+    @property
+    def _name(self) -> str:
+        return type(self).__name__.lower()
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({counted(len(self.particles), 'particle')}, strength={self.strength:g} Pa)"
+
+    __setstate__ = restore
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False, repr=False)
+class Muscle(Actuator):
     """Fibres that pull (activation > 0) or push (< 0) along one material direction: τ += a s (Fd)(Fd)ᵀ.
 
     Muscles may overlap: their stresses add. Source: Spielberg et al. 2021 (Robotica), section on actuation.
     """
 
-    particles: np.ndarray
-    """Indices into the model's particles: the bodies' particles in the order of the bodies."""
     direction: Sequence[float]
-    """Fibre direction d in the rest shape; normalised here."""
-    strength: float
-    """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger muscles
-    invert particles (docs/results.md)."""
+    """Fibre direction d in the rest shape; normalised here. Differentiable."""
 
     def __post_init__(self):
-        index = array("muscle particles", self.particles, "biufO", "whole numbers")
-        need(index.ndim == 1 and index.size > 0, "a muscle needs a list of particle indices, not empty.")
-        need(
-            np.issubdtype(index.dtype, np.integer),
-            f"muscle particles must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",
-        )
-        need(len(np.unique(index)) == index.size, "a muscle names a particle twice; give each index once.")
-        object.__setattr__(self, "particles", read_only(index.astype(np.int64)))
+        Actuator.__post_init__(self)  # super() does not know a class with slots
         object.__setattr__(self, "direction", unit("muscle direction", self.direction)[0])
-        store_numbers(self, "muscle", "strength")
 
     def __repr__(self) -> str:
         count = counted(len(self.particles), "particle")
         return f"Muscle({count}, direction={self.direction}, strength={self.strength:g} Pa)"
 
     __setstate__ = restore
+
+
+def _indices(name: str, particles: object, least: int = 1) -> np.ndarray:
+    """Indices of particles, shape (k,), int64, read-only; at least so many, none twice."""
+    what = f"{name.removeprefix('a ')} particles"
+    index = array(what, particles, "biufO", "whole numbers")
+    need(index.ndim == 1 and index.size >= least, f"{name} needs a list of particle indices, not empty.")
+    need(
+        np.issubdtype(index.dtype, np.integer),
+        f"{what} must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",
+    )
+    need(len(np.unique(index)) == index.size, f"{name} names a particle twice; give each index once.")
+    return read_only(index.astype(np.int64))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -175,10 +200,13 @@ class Scene:
     """Background grid; a particle that leaves it is an error."""
     bodies: Sequence[Body]
     """At least one; their particles are numbered in this order."""
-    muscles: Sequence[Muscle] = ()
+    muscles: Sequence[Actuator] = ()
     """Actuators, in the order of the last axis of ``activation``; they may overlap."""
     walls: Sequence[Wall] = ()
     """Applied in this order; at most 64."""
+    driven: Sequence[int] | np.ndarray = ()
+    """Particles whose velocity a call gives, in the order of ``Inputs.velocity``; without Inputs.velocity they stand still (a clamp).
+    Indices into the model's particles, in any order; copied, read-only."""
     gravity: Sequence[float] | None = None
     """Gravity g [m/s²], one number per axis, such as (0.0, -9.8) in 2D, where axis 1 points up; None is weightless."""
     damping: float = 0.0
@@ -189,17 +217,22 @@ class Scene:
 
     def __post_init__(self):
         need_kind("scene grid", self.grid, Grid)
-        for name, kind in (("bodies", Body), ("muscles", Muscle), ("walls", Wall)):
+        for name, kind, called in (
+            ("bodies", Body, "Body"),
+            ("muscles", Actuator, "Muscle"),
+            ("walls", Wall, "Wall"),
+        ):
             parts = getattr(self, name)
             if isinstance(parts, kind) or not isinstance(parts, Iterable):
-                raise TypeError(
-                    f"scene {name} must be a list of {kind.__name__}, got {type(parts).__name__}."
-                )
+                raise TypeError(f"scene {name} must be a list of {called}, got {type(parts).__name__}.")
             parts = tuple(parts)
             for k, part in enumerate(parts):
-                need_kind(f"scene {name}[{k}]", part, kind)
+                if not isinstance(part, kind):
+                    raise TypeError(f"scene {name}[{k}] must be a {called}, got {type(part).__name__}.")
             object.__setattr__(self, name, parts)
         need(len(self.bodies) > 0, "a scene needs at least one body.")
+        driven = self.driven if np.size(self.driven) else np.zeros(0, dtype=np.int64)
+        object.__setattr__(self, "driven", _indices("scene driven", driven, least=0))
         dim = self.grid.dim
         gravity = (0.0,) * dim if self.gravity is None else numbers("gravity", self.gravity)
         need(len(gravity) == dim, f"gravity needs {dim} numbers, one per axis, got {self.gravity}.")
@@ -207,6 +240,8 @@ class Scene:
         store_numbers(self, "scene", "damping", "dt")
         need(self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
         need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")
+
+    __setstate__ = restore
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(f'{name}: {text}' for name, text in self._rows().items())})"
@@ -217,11 +252,13 @@ class Scene:
     def _rows(self) -> dict[str, str]:
         particles = sum(len(body.particles) for body in self.bodies)
         laws = {type(body.material).__name__: None for body in self.bodies}
+        driven = {"driven": counted(len(self.driven), "particle")} if len(self.driven) else {}
         return {
             "grid": f"{' x '.join(map(str, self.grid.shape))} nodes, {self.grid.spacing:.4g} m apart",
             "bodies": f"{counted(len(self.bodies), 'body', 'bodies')} of {counted(particles, 'particle')}, {', '.join(laws)}",
             "muscles": str(len(self.muscles)),
             "walls": ", ".join(wall.contact for wall in self.walls) or "0",
+            **driven,
             "gravity": f"{self.gravity} m/s²",
             "damping": f"{self.damping:g} 1/s",
             "dt": f"{self.dt:.4g} s",

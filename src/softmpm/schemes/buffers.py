@@ -1,4 +1,4 @@
-"""Buffers of the kernels: tensors that PyTorch owns, and the Warp structs that refer to them."""
+"""Buffers of the state: tensors that PyTorch owns, and the Warp structs that refer to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -7,9 +7,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.structs import RequestedGrads, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.state import Params
 
 
 def view(tensor: Tensor, dtype) -> wp.array:
@@ -19,7 +18,7 @@ def view(tensor: Tensor, dtype) -> wp.array:
 
 
 def _check_reach(tensor: Tensor) -> None:
-    """Warp counts the bytes from one entry of an axis to the next in 32 bits, and would go elsewhere without a word."""
+    """Raise ValueError if a stride exceeds 32 bits, in which Warp stores it [B]; Warp would silently access other memory."""
     if tensor.nbytes < 2**31:
         return
     for size, stride in zip(tensor.shape, tensor.stride(), strict=True):
@@ -31,16 +30,16 @@ def _check_reach(tensor: Tensor) -> None:
 
 
 def passing(tensor: Tensor, dtype):
-    """As :func:`view`, for one launch: cheaper to make, and cannot be a field of a struct."""
+    """As :func:`view`, for one launch: cheaper to create, but not usable as a field of a struct."""
     _check_reach(tensor)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def slot(model: Model, dtype, *size: int):
-    """As :func:`passing`, for contiguous tensors that come later, see :class:`softmpm.schemes.launch.RebindableLaunch`.
+    """Placeholder for contiguous tensors that are bound later, see :class:`softmpm.schemes.launch.RebindableLaunch`.
 
     Args:
-        size: Of the tensors, without the last axes of vectors and matrices; (world, particle) if nothing is said.
+        size: Shape of the tensors without the last axes of vectors and matrices; by default (world, particle).
     """
     shape = (*(size or (model.worlds, model.particle_count)), *getattr(dtype, "_shape_", ()))
     kind = torch.int32 if dtype is wp.int32 else model.dtype
@@ -48,7 +47,7 @@ def slot(model: Model, dtype, *size: int):
 
 
 def slots_in(struct, names: Sequence[str], model: Model, dtype, *size: int) -> list:
-    """Make fields of a struct slots, of the size that :func:`slot` takes."""
+    """Set fields of a struct to placeholders, as made by :func:`slot`, and return these."""
     held = struct.__ctype__()
     for name in names:
         setattr(held, name, slot(model, dtype, *size))
@@ -56,28 +55,16 @@ def slots_in(struct, names: Sequence[str], model: Model, dtype, *size: int) -> l
 
 
 def clear(tensor: Tensor) -> None:
-    """Set to zero; on the CPU through Warp, since PyTorch would wake its thread pool for each of many small buffers."""
+    """Set a tensor to zero; on the CPU through Warp, since PyTorch would wake its thread pool for each small buffer."""
     if tensor.device.type == "cpu":
         wp.from_torch(tensor, requires_grad=False).zero_()
     else:
         tensor.zero_()
 
 
-def lame(params: Params) -> tuple[Tensor, Tensor]:
-    """Lamé's μ = E / 2(1 + ν) and λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
-    young, poisson = params.young, params.poisson
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-
-
-def masses(model: Model, params: Params) -> Tensor:
-    """Mass of the particles in units of ``model.mass_unit``: exactly one in a uniform body, so that sums of it are not biased."""
-    mass = params.density * model.volume
-    return mass / model.mass_unit  # a tensor: by a number a GPU would multiply with the reciprocal
-
-
 @dataclass
 class Motion:
-    """State of all particles as the kernels hold it (kernels/structs.py); shapes (..., world, particle, dim[, dim])."""
+    """State of all particles in the kernels' representation (kernels/structs.py); shapes (..., world, particle, dim[, dim])."""
 
     base: Tensor
     fx: Tensor
@@ -120,7 +107,7 @@ class Motion:
 
 @dataclass
 class MotionAdj:
-    """Adjoint of a :class:`Motion`, one flat tensor so that it is cleared at once."""
+    """Adjoint of a :class:`Motion`: views of one flat tensor, so that it is cleared at once."""
 
     flat: Tensor
     fx: Tensor
@@ -142,73 +129,4 @@ class MotionAdj:
         struct = t.MotionAdj()
         for name, dtype in (("fx", t.vec), ("v", t.vec), ("C", t.mat), ("H", t.mat)):
             setattr(struct, name, view(getattr(self, name), dtype))
-        return struct
-
-
-@dataclass
-class Solid:
-    """Material of all particles: tensors (world, particle), and the pull of the muscles (world, muscle) [Pa].
-
-    Mass is in units of ``model.mass_unit``, volume in [m³] per unit of mass; μ and λ are in [Pa].
-    """
-
-    mass: Tensor
-    mu: Tensor
-    lam: Tensor
-    pull: Tensor | None
-
-    def struct(self, model: Model):
-        t, solid = types(model.spec.dim, model.spec.dtype), Solid.fixed(model)
-        for name in ("mass", "mu", "lam"):
-            setattr(solid, name, view(getattr(self, name), t.real))
-        if self.pull is not None:
-            solid.pull = view(self.pull, t.real)
-        return solid
-
-    @staticmethod
-    def fixed(model: Model):
-        """The struct with what the scene alone decides; μ, λ, mass and pull are open."""
-        t, solid = types(model.spec.dim, model.spec.dtype), solid_types(model.spec).Solid()
-        lead = (model.worlds, model.particle_count)
-        solid.volume = view(model.specific_volume.expand(lead), t.real)
-        if len(model.spec.laws) > 1:
-            solid.law = view(model.law.expand(lead), wp.int32)
-        if model.spec.muscle_slots:
-            solid.muscle = view(model.muscle_slots.expand(*lead, -1), wp.int32)
-            solid.fibre = view(model.fibre, t.vec)
-        return solid
-
-
-@dataclass
-class SolidAdj:
-    """Adjoint of a :class:`Solid`; what is not wanted is None. ``slot`` is the pull's, of each particle and slot.
-
-    Those of the material lie in one tensor, ``material``, so that they are cleared at once.
-    """
-
-    wanted: RequestedGrads
-    material: Tensor | None = None
-    mass: Tensor | None = None
-    mu: Tensor | None = None
-    lam: Tensor | None = None
-    slot: Tensor | None = None
-
-    @staticmethod
-    def zeros(model: Model, wanted: RequestedGrads) -> "SolidAdj":
-        lead, kind = (model.worlds, model.particle_count), {"dtype": model.dtype, "device": model.device}
-        adj = SolidAdj(wanted)
-        if wanted.material:
-            adj.material = torch.zeros(3, *lead, **kind)
-            adj.mass, adj.mu, adj.lam = adj.material
-        if wanted.activation:
-            adj.slot = torch.zeros(*lead, model.spec.muscle_slots, **kind)
-        return adj
-
-    def struct(self, model: Model):
-        t, struct = types(model.spec.dim, model.spec.dtype), solid_adj_type(model.spec, self.wanted)()
-        if self.wanted.material:
-            for name in ("mass", "mu", "lam"):
-                setattr(struct, name, view(getattr(self, name), t.real))
-        if self.slot is not None:
-            struct.pull = view(self.slot, t.real)
         return struct

@@ -12,7 +12,7 @@ from softmpm.schemes.failure_report import outgrown
 
 
 def is_capturing(model: Model) -> bool:
-    """Whether PyTorch captures a CUDA graph on the current stream; nothing may wait for the device then."""
+    """True while PyTorch captures a CUDA graph on the current stream; the host must not wait for the device then."""
     return model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
 
@@ -68,6 +68,7 @@ _open: list[GraphResources] = []
 
 @contextlib.contextmanager
 def collected_resources() -> Iterator[GraphResources]:
+    """Collect the resources of the graph that is captured inside."""
     _open.append(GraphResources())
     try:
         yield _open[-1]
@@ -81,7 +82,7 @@ def defer_status_check(words: torch.Tensor, outgrow: Callable[[], None] | None =
 
 
 def keep_alive(used: object) -> None:
-    """Keep an object alive as long as the graph that is being captured."""
+    """Keep an object alive for as long as the graph that is being captured."""
     _resources().uses.append(used)
 
 

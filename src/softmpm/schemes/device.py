@@ -1,4 +1,4 @@
-"""PyTorch's current GPU and stream, as Warp must see them."""
+"""PyTorch's current GPU and stream, for Warp."""
 
 import functools
 from collections.abc import Callable
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def on_its_gpu(work: Callable[Concatenate[Model, P], T]) -> Callable[Concatenate[Model, P], T]:
-    """Work for a model, whose GPU is PyTorch's current one meanwhile: Warp makes it so and would leave it so."""
+    """Decorator that makes the model's GPU the current one for a function and restores the previous one, which Warp would not."""
 
     @functools.wraps(work)
     def working(model: Model, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -25,7 +25,7 @@ def on_its_gpu(work: Callable[Concatenate[Model, P], T]) -> Callable[Concatenate
 
 
 def stream_of(device: torch.device) -> wp.Stream | None:
-    """PyTorch's current stream as Warp sees it; None on the CPU."""
+    """PyTorch's current stream as a Warp stream; None on the CPU."""
     if device.type != "cuda":
         return None
     return _known_stream(device, torch.cuda.current_stream(device).cuda_stream)
@@ -33,5 +33,5 @@ def stream_of(device: torch.device) -> wp.Stream | None:
 
 @functools.lru_cache(maxsize=None)
 def _known_stream(device: torch.device, handle: int) -> wp.Stream:
-    """Made once for each: Warp registers a stream when it is made, and takes it off when it goes."""
+    """The Warp stream of a handle, created once: Warp registers a stream on creation and unregisters it on deletion."""
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)

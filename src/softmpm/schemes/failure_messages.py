@@ -6,11 +6,10 @@ Each remedy is tried in tests/softmpm/test_remedies.py.
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from softmpm.errors import Kind
 from softmpm.model import Model
-from softmpm.schemes.buffers import Solid
+from softmpm.schemes.inputs import Values
 from softmpm.stability import running_limit
 from softmpm.state import State
 
@@ -25,8 +24,7 @@ class Case:
 
     Args:
         end: State in which its world stopped.
-        solid: Material of the call, if it is at hand.
-        pull: Activation times strength of each world and muscle [Pa], if it is at hand.
+        values: Inputs of the call in one control step, if they are at hand.
     """
 
     model: Model
@@ -34,8 +32,7 @@ class Case:
     world: int
     particle: int
     end: State
-    solid: Solid | None = None
-    pull: Tensor | None = None
+    values: Values | None = None
 
     def explain(self) -> tuple[str, str, str, str]:
         """Kind of the failure, the value found, the limit and the remedy."""
@@ -163,10 +160,15 @@ class Case:
         ]
 
     def _running_limit(self) -> float:
-        model, solid, p = self.model, self.solid, self.particle
-        if solid is None:
+        model, values, p = self.model, self.values, self.particle
+        if values is None:
             return float("nan")
-        mu, lam, mass = (tensor[self.world, p].item() for tensor in (solid.mu, solid.lam, solid.mass))
-        pulls = [0.0] * model.muscle_count if self.pull is None else self.pull[self.world].tolist()
+        mu, lam, mass = (values[name][self.world, p].item() for name in ("mu", "lam", "mass"))
+        active_stress, viscosity = [0.0] * model.muscle_count, 0.0
+        if "active_stress" in values:
+            active_stress = values["active_stress"][0, self.world].tolist()
+        if "viscosity" in values:
+            viscosity = values["viscosity"][self.world, p].item()
         density = mass / model.specific_volume[p].item()
-        return running_limit(model.scene, p, mu, lam, density, self.end.F[self.world, p], pulls)
+        F = self.end.F[self.world, p]
+        return running_limit(model.scene, p, mu, lam, density, F, active_stress, viscosity)

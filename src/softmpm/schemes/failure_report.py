@@ -1,12 +1,12 @@
-"""From status words to errors: reading them back, composing the message, raising."""
+"""Errors from status words: reads the words back, composes the message and raises."""
 
 import torch
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER, Kind, UnstableError, decode
 from softmpm.model import Model
-from softmpm.schemes.buffers import Solid
 from softmpm.schemes.failure_messages import Case
+from softmpm.schemes.inputs import Values
 from softmpm.state import State
 
 
@@ -21,11 +21,11 @@ class Report:
             self._words = torch.empty(words.shape, dtype=words.dtype, device="cpu", pin_memory=True)
             self._words.copy_(words, non_blocking=True)
             self._event = torch.cuda.Event()
-            # Unasked, PyTorch would take the stream of the current GPU:
+            # By default PyTorch would take the stream of the current GPU:
             self._event.record(torch.cuda.current_stream(words.device))
 
     def read(self) -> list[int]:
-        """Wait until the device has passed the point of the report."""
+        """Wait until the device has reached the report, and return the words."""
         if self._event is not None:
             self._event.synchronize()
         return self._words.tolist()
@@ -49,21 +49,20 @@ def failure(
     *,
     first: int = 0,
     start: State | None = None,
-    solid: Solid | None = None,
-    pull: Tensor | None = None,
+    values: Values | None = None,
     state: State | None = None,
     before: bool = False,
 ) -> UnstableError:
     """The failure of a world as an error.
 
     Args:
-        words: One for each world.
+        words: Status words, one for each world.
         end: State in which the worlds stopped.
         first: Substep of the call that the kernels counted as 0.
-        start: State of the call before it, if it is at hand: for worlds that never ran.
-        solid, pull: Material, and activation times strength of each world and muscle [Pa], if they are at hand.
-        state: What the error holds as its state; ``end`` if None.
-        before: Whether the start itself was checked, before any substep.
+        start: Initial state of the call, if available: the state of worlds that never ran.
+        values: Inputs of the call in one control step, if available.
+        state: State that the error carries; ``end`` if None.
+        before: True if the initial state itself was checked, before any substep.
     """
     substep, kind, particle = decode(words[world])
     substep += first
@@ -73,7 +72,7 @@ def failure(
             _never_ran(end, start, unmoved),
             None if state is None else _never_ran(state, start, unmoved),
         )
-    name, value, limit, advice = Case(model, kind, world, particle, end, solid, pull).explain()
+    name, value, limit, advice = Case(model, kind, world, particle, end, values).explain()
     where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
     time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
     more = len(failed_worlds(words)) - 1
@@ -92,18 +91,18 @@ def failure(
 
 
 def raise_failure(model: Model, words: list[int], end: State, **about) -> None:
-    """Raise what the kernels reported first, if anything; ``about`` as for :func:`failure`."""
+    """Raise the first failure that the kernels reported, if any; ``about`` as for :func:`failure`."""
     failed = failed_worlds(words)
     if failed:
         raise failure(model, words, min(failed, key=lambda world: words[world]), end, **about)
 
 
 def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last: int, total: int) -> None:
-    """Raise what the adjoint kernels reported, if anything.
+    """Raise the first failure that the adjoint kernels reported, if any.
 
     Args:
-        words: One for each world.
-        adj_end: Adjoint of the end of the call.
+        words: Status words, one for each world.
+        adj_end: Adjoint of the final state of the call.
         last: Substep of the call from which the kernels counted backward.
         total: Substeps of the call.
     """
@@ -114,7 +113,7 @@ def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last:
     substep, limit = last - back, "gradients must be finite"
     given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end[:4])
     cause = (
-        "It overflowed on the way back: shorten the horizon or scale the loss"
+        "It overflowed in the backward pass: shorten the horizon or scale the loss"
         if given
         else ("The gradient of the loss with respect to the end state came in like that: look at the loss")
     )
@@ -131,7 +130,7 @@ def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last:
 
 
 def _never_ran(end: State, start: State, worlds: list[int]) -> State:
-    """These worlds as they were given: the fast scheme cannot hold what is off the grid."""
+    """The final state, with the initial one for these worlds: the fast scheme cannot represent particles off the grid."""
     if not worlds:
         return end
     given, start = end.clone(), start.detach()

@@ -1,4 +1,4 @@
-"""Repeated kernel launches: single ones with other arrays each time, and lists on fixed arrays, captured as CUDA graphs."""
+"""Repeated kernel launches: single launches that are rebound to new arrays, and lists on fixed arrays, captured as CUDA graphs."""
 
 import functools
 import threading
@@ -83,16 +83,18 @@ class LaunchReplay:
         if self._list is None:
             collected = []
             launches(KernelLauncher(self.model, None, collected))
-            self._list = collected  # only now: an interruption, while they compile, would leave a part of it
-        for command in self._list:
-            command.launch()
+            self._list = (
+                collected  # only now: an interruption during compilation would leave an incomplete list
+            )
+        for collected_launch in self._list:
+            collected_launch.launch()
 
     def _capture(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
         """The captured graph; None if another thread is capturing: waiting for it could deadlock."""
-        with exclusive_capture(wait=False) as turn:
-            if not turn:
+        with exclusive_capture(wait=False) as acquired:
+            if not acquired:
                 return None
-            stream = _recorder(self.model.device)
+            stream = _capture_stream(self.model.device)
             with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
                 launches(KernelLauncher(self.model, stream))
             assert capture.graph is not None
@@ -100,8 +102,8 @@ class LaunchReplay:
 
 
 @functools.lru_cache(maxsize=None)
-def _recorder(device: torch.device) -> wp.Stream:
-    """Stream on which chunk graphs are captured, one at a time. PyTorch reuses the streams of its pools, and what another thread
-    launches on a capturing stream would become part of the graph; the pool of high priority is hardly used.
+def _capture_stream(device: torch.device) -> wp.Stream:
+    """Stream on which chunk graphs are captured, one at a time. PyTorch reuses the streams of its pools, and launches of another
+    thread on a capturing stream would become part of the graph; the high-priority pool is rarely used.
     """
     return wp.stream_from_torch(torch.cuda.Stream(device, priority=-1))

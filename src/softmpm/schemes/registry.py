@@ -1,4 +1,4 @@
-"""The schemes by name."""
+"""Registry of the schemes by name."""
 
 from softmpm.schemes.fast.scheme import Fast
 from softmpm.schemes.plain.chunk import Plain

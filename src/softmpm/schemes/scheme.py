@@ -1,4 +1,4 @@
-"""The interface of a scheme: all that ``runner`` and ``rollout`` know of how substeps run."""
+"""Interface of a scheme, through which ``runner`` and ``rollout`` run substeps."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Protocol, Self
@@ -9,17 +9,17 @@ from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
-from softmpm.schemes.buffers import Solid, SolidAdj
+from softmpm.schemes.inputs import InputsAdj, Values
 from softmpm.state import State
 
 
 class Run(Protocol):
-    """A chunk that has been launched. Its buffers are in use as long as it or its end lives.
+    """A chunk that has been launched. Its buffers are in use as long as it or its final state is referenced.
 
     Attributes:
-        start, end: State before and after it, as a :class:`State` or in the scheme's own representation.
-        words: Status words (errors.py), one for each world, and behind them what :meth:`Scheme.accept` reads.
-        outgrow: To be called when a replay of the captured graph reports that a particle left the window; None without one.
+        start, end: Initial and final state, as a :class:`State` or in the scheme's own representation.
+        words: Status words (errors.py), one for each world, followed by further numbers for :meth:`Scheme.accept`.
+        outgrow: To be called when a replay of the captured graph reports that a particle left the window; None without a window.
     """
 
     chunk: Chunk
@@ -28,52 +28,51 @@ class Run(Protocol):
     words: Tensor
     outgrow: Callable[[], None] | None
 
-    def vjp(self, adj_end: Any, adj_solid: SolidAdj, wanted: RequestedGrads) -> tuple[Any, Tensor | None]:
-        """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``. Needs a run that kept its states."""
+    def vjp(self, adj_end: Any, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Any:
+        """Adjoint of the initial state; those of the inputs are added into ``adj_inputs``. The run must have stored its states."""
         ...
 
 
 class Scheme(Protocol):
-    """Runs chunks of substeps of one model in one thread on one stream."""
+    """Runs chunks of substeps of one model, in one thread on one stream."""
 
     footprint: ClassVar[Footprint]
 
     @classmethod
     def of(cls, model: Model) -> Self:
-        """The scheme that runs this model here; it may keep buffers in the model's workspace."""
+        """The scheme of this model for the current thread and stream; it may cache buffers in the model's workspace."""
         ...
 
-    def check_start(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
-        """Launch the alarms of a call's start. Returns their status words, which the next check overwrites."""
+    def check_start(self, start: State, values: Values) -> Tensor:
+        """Launch the alarms on a call's initial state. Returns their status words, which the next check overwrites."""
         ...
 
     def run(
         self,
         chunk: Chunk,
         start: Any,
-        pull: Tensor | None,
-        solid: Solid,
+        values: Values,
         keep: bool,
         frozen: Sequence[int] = (),
     ) -> Run:
         """Launch a chunk.
 
         Args:
-            start: A :class:`State`, or the end of a run of this scheme.
-            pull: Activation times strength [Pa] in the control steps of the chunk, shape (control_step, world, muscle).
-            keep: Whether to keep the states inside for :meth:`Run.vjp`.
-            frozen: Worlds that stay as they are.
+            start: A :class:`State`, or the final state of a run of this scheme.
+            values: Inputs that the call sets; those with rows have one row for each control step of the chunk.
+            keep: Whether to store the intermediate states for :meth:`Run.vjp`.
+            frozen: Worlds whose state does not change.
         """
         ...
 
     def accept(self, run: Any, words: list[int]) -> bool:
-        """True if the run is valid, by its ``words``; if not, the scheme has prepared itself to run the chunk again."""
+        """True if the ``words`` of a run show that it is valid; if not, the scheme is ready to repeat the chunk."""
         ...
 
     def checkpoint(self, state: Any) -> Any:
-        """A start or end in memory of its own, so that no run's buffers stay in use for it."""
+        """A copy of an initial or final state in separate memory, so that it does not keep the buffers of a run in use."""
         ...
 
     def to_user(self, state: Any) -> State:
-        """A start, an end or an adjoint as a :class:`State` in the user's order."""
+        """An initial state, a final state or an adjoint as a :class:`State` in the user's order."""
         ...

@@ -10,14 +10,14 @@ from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import native, native_module
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.alarms import alarm
-from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
 def packed_alarms(spec: Spec) -> SimpleNamespace:
     """Kernels that check the packed particles at the end of a chunk, and that permute the rest neighbours for it."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)
-    Constants, Packed, Solid = t.Constants, t.Packed, solid_types(spec).Solid
+    Constants, Packed, ParticleInputs = t.Constants, t.Packed, input_types(spec).ParticleInputs
     s, n = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype)
     unpack_base, world_of, load_vec, load_mat = s.unpack_base, s.world_of, n.load_vec, n.load_mat
     step_is_stable, near, row_fx, row_H = one.step_is_stable, one.near, t.row_fx, t.row_h
@@ -29,7 +29,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
     def check(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         neighbours: wp.array3d(dtype=wp.int32),  # by place
         substep: int,
         count: int,  # particles of one world
@@ -45,7 +45,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
         p = i - world * count
         if not ran(words, world, substep):
             return
-        if not step_is_stable(constants, body, world, p, load_mat(now.rows, i, row_H)):
+        if not step_is_stable(constants, inputs, world, p, load_mat(now.rows, i, row_H)):
             report(words, world, substep, step, order[i])
         base = unpack_base(now.base[i])
         fx = load_vec(now.rows, i, row_fx)
@@ -57,7 +57,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
                     report(words, world, substep, torn, order[i])
 
     @wp.kernel(module=module, enable_backward=False)
-    def arrange(
+    def permute_neighbours(
         # In:
         order: wp.array2d(dtype=wp.int32),
         places: wp.array2d(dtype=wp.int32),  # inverse of the order
@@ -65,7 +65,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
         # Out:
         by_place: wp.array3d(dtype=wp.int32),
     ):
-        """Put the neighbours into the order of the packed particles."""
+        """Permute the rest neighbours into the order of the packed particles, as places in memory."""
         world, place = wp.tid()
         p = order[world, place]
         for k in range(neighbours.shape[1]):
@@ -74,4 +74,4 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
                 q = places[world, q]
             by_place[world, place, k] = q
 
-    return SimpleNamespace(check=check, arrange=arrange)
+    return SimpleNamespace(check=check, permute_neighbours=permute_neighbours)

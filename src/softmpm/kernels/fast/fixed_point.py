@@ -1,8 +1,8 @@
-"""Sums over particles in fixed point, the same from run to run: what takes the place of ``scatter`` in the fast scheme.
+"""Fixed-point sums over particles, identical from run to run: the deterministic replacement of ``scatter`` in the fast scheme.
 
-A particle's share of a sum is (b + A o, m), see scatter.h. The unit of the sums follows from the largest share (fixed_point.h), so
-there is a step more: ``give`` keeps b and A and notes their size, ``push`` adds up, ``take`` reads a node and clears it,
-``leave`` keeps what is made of it.
+The contribution of a particle is (b + A o, m), see scatter.h. The unit of the sums follows from the largest contribution
+(fixed_point.h), so an additional pass is needed: ``give`` stores b and A and their magnitude, ``push`` accumulates, ``take`` reads a
+node and clears it, ``leave`` stores the result for later readers.
 """
 
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ from softmpm.kernels.structs import types
 
 @kernel_factory
 def fixed(dim: int) -> SimpleNamespace:
-    """In single precision: double has more digits than such sums keep."""
+    """Kernels and functions of the fixed-point sums, in single precision: double has more digits than these sums resolve."""
     t, n, s = types(dim, "float32"), native(dim, "float32"), stencil(dim, "float32")
     vec, mat, ivec, node_vec, Packed, Window = t.vec, t.mat, t.ivec, t.aligned, t.Packed, t.Window
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
@@ -37,7 +37,7 @@ def fixed(dim: int) -> SimpleNamespace:
         fixed: wp.array(dtype=wp.int64)  # (world, node, 4)
         largest: wp.array(dtype=float)  # as above
         other_largest: wp.array(dtype=float)  # that of the next sums
-        node: wp.array(dtype=node_vec)  # where their reader leaves what it makes of them
+        node: wp.array(dtype=node_vec)  # the sums as floats, stored by ``leave``
 
     @wp.func_native("softmpm::raise_largest(largest.data, slot, value);")
     def raise_largest(largest: wp.array(dtype=float), slot: int, value: float): ...
@@ -69,7 +69,7 @@ def fixed(dim: int) -> SimpleNamespace:
 
     @wp.func
     def give(to: Shares, i: int, count: int, total: int, b: vec, A: mat) -> bool:
-        """Keep a particle's share for ``push``; whether it can be added up. The whole warp comes here together."""
+        """Store a particle's contribution for ``push``; False if it overflows. All lanes of a warp must call this together."""
         world = int(-1)
         size = float(0.0)
         if i < total:
@@ -89,7 +89,7 @@ def fixed(dim: int) -> SimpleNamespace:
 
     @wp.func
     def take(sums: Sums, i: int) -> node_vec:
-        """The sum of node ``i``, left for its readers and cleared."""
+        """Read the sum of node ``i``, store it as floats for later readers, and clear it."""
         if i < sums.other_largest.shape[0] / 2:
             sums.other_largest[2 * i] = float(0.0)  # the largest mass stays
         sum = take_fixed(sums.fixed, sums.largest, sums.nodes, sums.particles, i)

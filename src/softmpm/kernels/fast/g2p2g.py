@@ -1,17 +1,17 @@
 """The fast scheme: G2P and the next P2G in one kernel, particles sorted by cell, sums taken by warps. Derivation: docs/math/scatter.md.
 
-A substep is two launches. With M the nodes' momentum and mass, V their velocity:
+A substep is two launches. With M the momentum and mass of the nodes, and V their velocity:
 
     p2g_first  particles: (T1) → the first M
     grid      V ← (G1), (G2) of M,  next M ← 0
     g2p2g     particles: V → (T2), (T3) → new state → (T1) → next M
 
-A node without mass keeps the V it has. Only particles read it whose weight there is zero, or too small to give it mass; V starts from
-zero, so that they read a number.
+A node without mass retains its previous V. The only particles that read it have zero weight there, or too little to give it mass; V is
+initialised to zero, so that they read a finite number.
 
-A deterministic model adds up in a launch more, ``push`` of fixed_point.py, between p2g_first or g2p2g and grid.
+A deterministic model accumulates in an additional launch, ``push`` of fixed_point.py, between p2g_first or g2p2g and grid.
 
-All that is particle- or node-wise is shared with the plain scheme: kernels/physics. Adjoint: g2p2g_adj.py.
+All functions of a single particle or node are shared with the plain scheme: kernels/physics. Adjoint: g2p2g_adj.py.
 """
 
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ from softmpm.kernels.fast.native import BLOCK, native, native_module
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.particle import particle
-from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
@@ -34,14 +34,15 @@ def fused(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
     Constants, Packed, Window, Particle = t.Constants, t.Packed, t.Window, one.Particle
-    Solid, Walls = solid_types(spec).Solid, solid_types(spec).Walls
+    ParticleInputs, GridInputs = input_types(spec).ParticleInputs, input_types(spec).GridInputs
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     particle_of, world_of = s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
-    rotation, affine_momentum, moved = one.rotation, one.affine_momentum, one.moved
+    rotation, moved = one.rotation, one.moved
+    linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum
     node_velocity = grid(spec).node_velocity
     running, report_invalid = status.report(spec.dim, spec.dtype).running, status.check(spec).report_invalid
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
@@ -53,28 +54,27 @@ def fused(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def centre(fx: vec) -> vec:
-        """From the distance to the base node to that from the middle node, in cells."""
+        """Distance from the middle node of the stencil, given that from the base node, in cells."""
         g = fx
         for axis in range(dim):
             g[axis] = fx[axis] - real(1.0)
         return g
 
     @wp.func
-    def place_of(window: Window, i: int, total: int) -> t.ivec:
-        """Coordinates on the grid of node ``i`` of all ``total`` in memory."""
-        world = world_of(i, window.count, total)
+    def place_of(window: Window, world: int, i: int) -> t.ivec:
+        """Grid coordinates of node ``i`` of all allocated nodes."""
         return coordinates(i - world * window.count, window.shape) + window.origin[world]
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def clear(node: wp.array(dtype=node_vec)):
-        """The first M, and V before it."""
+        """Clear the first M, and V before the first substep."""
         store_node(node, wp.tid(), node_vec())
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def grid_velocity(
         # Parameters:
         constants: Constants,
-        walls: Walls,
+        inputs: GridInputs,
         window: Window,
         # In:
         node: Sums,
@@ -83,10 +83,11 @@ def fused(spec: Spec) -> SimpleNamespace:
         cleared: wp.array(dtype=node_vec),
     ):
         i = wp.tid()
-        place = place_of(window, i, velocity.shape[0])  # while the node is on its way
+        world = world_of(i, window.count, velocity.shape[0])
+        place = place_of(window, world, i)  # computed while the node is being loaded
         here = take(node, i)
         if here[dim] > real(0.0):
-            v = node_velocity(constants, walls, place, head(here), here[dim])
+            v = node_velocity(constants, inputs, world, place, head(here), here[dim])
             store_node(velocity, i, aligned(v, real(0.0)))
         if i < cleared.shape[0]:
             store_node(cleared, i, node_vec())
@@ -107,7 +108,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         m: real,
         node: Shares,
     ):
-        """(T1) of one particle, added to the nodes from ``first`` on. The whole warp comes here together."""
+        """Add (T1) of one particle to its nodes, the first of which is ``first``. All lanes of a warp must call this together."""
         if wp.static(exact):
             if not give(node, place, count, total, b, A):
                 report(words, place / count, substep, not_finite, order[place])
@@ -116,7 +117,7 @@ def fused(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def copy_unchanged(i: int, now: Packed, then: Packed):
-        """A particle of a world that failed."""
+        """Copy a particle of a failed world unchanged."""
         then.base[i] = now.base[i]
         store_vec(then.rows, i, row_fx, load_vec(now.rows, i, row_fx))
         store_vec(then.rows, i, row_low, load_vec(now.rows, i, row_low))
@@ -127,7 +128,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     def p2g_first(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         window: Window,
         per_warp: int,  # particles of a warp
         count: int,  # particles of one world
@@ -140,7 +141,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         # Out, added into:
         node: Shares,
     ):
-        """The first P2G of a chunk."""
+        """First P2G of a chunk."""
         place = particle_of(wp.tid(), per_warp, total)
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
@@ -149,19 +150,20 @@ def fused(spec: Spec) -> SimpleNamespace:
         g = centre(load_vec(start.rows, i, row_fx))
         v = load_vec(start.rows, i, row_v)
         C = load_mat(start.rows, i, row_C)
-        m = body.mass[world, p]
-        A = affine_momentum(constants, body, world, p, C, H, rotation(body, world, p, H))
+        m = inputs.mass[world, p]
+        A = affine_momentum(constants, inputs, world, p, C, H, rotation(inputs, world, p, H))
+        b = linear_momentum(constants, inputs, world, p, v) - A * g
         first = world * window.count + first_node(
             unpack_base(start.base[i]), window.origin[world], window.shape
         )
         if place == total:
             first = -1
-        scatter_momentum(words, window, place, count, total, order, 0, first, g, m * v - A * g, A, m, node)
+        scatter_momentum(words, window, place, count, total, order, 0, first, g, b, A, m, node)
 
     def g2p2g(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         window: Window,
         substep: int,
         last: bool,  # no P2G afterwards
@@ -195,14 +197,14 @@ def fused(spec: Spec) -> SimpleNamespace:
         B = sums.outer - wp.outer(sums.value, g)
         old.low = load_vec(now.rows, i, row_low)
         old.H = load_mat(now.rows, i, row_H)
-        new = moved(constants, origin, window.shape, old, sums.value, B)  # (T3)
+        new = moved(constants, inputs, world, p, origin, window.shape, old, sums.value, B)  # (T3)
         base = old.base
         if new.valid:
             base = new.base
-        m = body.mass[world, p]
+        m = inputs.mass[world, p]
         g = centre(new.fx)
-        A = affine_momentum(constants, body, world, p, new.C, new.H, rotation(body, world, p, new.H))
-        b = m * new.v - A * g
+        A = affine_momentum(constants, inputs, world, p, new.C, new.H, rotation(inputs, world, p, new.H))
+        b = linear_momentum(constants, inputs, world, p, new.v) - A * g
         first = held + first_node(base, origin, window.shape)
         if place == total:
             first = -1
@@ -225,7 +227,7 @@ def fused(spec: Spec) -> SimpleNamespace:
             )  # (T1)
 
     def by_number(kernel, bounds_of_few=None) -> dict[bool, wp.Kernel]:
-        """It goes over particles: many, or few, where a warp may have the registers to wait for all that it reads at once."""
+        """Two variants of a kernel, for many particles and for few: the latter has registers to wait for all loads at once."""
         few = native_module(spec.module + ".fused.few")
         options = dict(enable_backward=False, grid_stride=False)
         return {

@@ -1,13 +1,13 @@
-"""The adjoint of the fast scheme, with the same sums over warps. Derivation: docs/math/scatter.md.
+"""Adjoint kernels of the fast scheme, with the same sums over warps. Derivation: docs/math/scatter.md.
 
-From the last substep to the first, with M the nodes' momentum and mass, V their velocity and a bar for adjoints:
+From the last substep to the first, with M the momentum and mass of the nodes, V their velocity and a bar for adjoints:
 
     grid_adj      M̄ ← (G1.adj) of V̄, in place;  V ← (G1), (G2) of the M before;  the V̄ before ← 0
     g2p2g_adj   particles: M̄ → (T1.adj) → adjoint of the state → (T3.adj), (T2.adj) → the V̄ before
 
-Nodes without mass keep their V and their V̄, as in g2p2g.py.
+Nodes without mass retain their V and their V̄, as in g2p2g.py.
 
-A deterministic model adds up in a launch more, ``push`` of fixed_point.py, between the two.
+A deterministic model accumulates in an additional launch, ``push`` of fixed_point.py, between the two.
 """
 
 from types import SimpleNamespace
@@ -22,9 +22,9 @@ from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.gather_adj import stencil_adj
 from softmpm.kernels.fast.native import BLOCK, native, native_module
 from softmpm.kernels.physics import status
-from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.physics.grid import grid, grid_adj
 from softmpm.kernels.physics.particle import particle, particle_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -32,11 +32,9 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one, adjoint = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
     Constants, Packed, Window, ParticleAdj = t.Constants, t.Packed, t.Window, adjoint.ParticleAdj
-    Solid, Walls, SolidAdj = (
-        solid_types(spec).Solid,
-        solid_types(spec).Walls,
-        solid_adj_type(spec, wanted),
-    )
+    ParticleInputs, GridInputs = input_types(spec).ParticleInputs, input_types(spec).GridInputs
+    adj_types = input_adj_types(spec, wanted)
+    ParticleInputsAdj, GridInputsAdj = adj_types.ParticleInputsAdj, adj_types.GridInputsAdj
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
     sums_adj, first_node, unpack_base = stencil_adj(spec.dim, spec.dtype), s.first_node, s.unpack_base
     gather_adj, slope_adj = sums_adj.gather_adj, sums_adj.slope_adj
@@ -45,9 +43,10 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     particle_of, world_of = s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
-    rotation, affine_momentum = one.rotation, one.affine_momentum
+    rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
+    gather, driven = s.gather, spec.driven
     momentum_adj, moved_adj = adjoint.momentum_adj, adjoint.moved_adj
-    node_velocity, node_velocity_adj = grid(spec).node_velocity, grid(spec).node_velocity_adj
+    node_velocity, node_velocity_adj = grid(spec).node_velocity, grid_adj(spec, wanted).node_velocity_adj
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
     row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
     exact, give = spec.deterministic, fixed(dim).give
@@ -59,7 +58,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     def grid_velocity_adj(
         # Parameters:
         constants: Constants,
-        walls: Walls,
+        inputs: GridInputs,
         window: Window,
         # In:
         node: wp.array(dtype=node_vec),  # of this substep; empty after the last
@@ -69,19 +68,24 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         # Out:
         velocity: wp.array(dtype=node_vec),  # of the substep before
         cleared: wp.array(dtype=node_vec),
+        # Out, added into:
+        adj_inputs: GridInputsAdj,
     ):
         i = wp.tid()
-        place = place_of(window, i, velocity.shape[0])
+        world = world_of(i, window.count, velocity.shape[0])
+        place = place_of(window, world, i)
         if i < node.shape[0]:
             here = load_node(node, i)
             adj_v = take(adj, i)
             if here[dim] > real(0.0):
-                back = node_velocity_adj(constants, walls, place, head(here), here[dim], head(adj_v))
+                back = node_velocity_adj(
+                    constants, inputs, world, place, head(here), here[dim], head(adj_v), i, adj_inputs
+                )
                 leave(adj, i, aligned(back.p, back.m))
         if i < node_before.shape[0]:
             there = load_node(node_before, i)
             if there[dim] > real(0.0):
-                v = node_velocity(constants, walls, place, head(there), there[dim])
+                v = node_velocity(constants, inputs, world, place, head(there), there[dim])
                 store_node(velocity, i, aligned(v, real(0.0)))
             if wp.static(not exact):
                 store_node(cleared, i, node_vec())
@@ -89,7 +93,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     def g2p2g_adj(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         window: Window,
         back: int,  # substeps from the end
         start: bool,  # nothing before
@@ -108,7 +112,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         # Out:
         words: wp.array(dtype=wp.int64),
         # Out, added into:
-        adj_body: SolidAdj,
+        adj_inputs: ParticleInputsAdj,
         adj_velocity: Shares,  # of the substep before
     ):
         i = particle_of(wp.tid(), per_warp, total)
@@ -133,14 +137,17 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             else:
                 H = load_mat(now.rows, i, row_H)
                 g = centre(load_vec(now.rows, i, row_fx))
-                m = body.mass[world, p]
-                Q = rotation(body, world, p, H)
-                A = affine_momentum(constants, body, world, p, C, H, Q)
+                m = inputs.mass[world, p]
+                Q = rotation(inputs, world, p, H)
+                A = affine_momentum(constants, inputs, world, p, C, H, Q)
                 here = held + first_node(unpack_base(now.base[i]), origin, window.shape)
-                sums = gather_adj(adj_node, here, window.shape, g, m * v - A * g, A, m)
+                mv = linear_momentum(constants, inputs, world, p, v)
+                sums = gather_adj(adj_node, here, window.shape, g, mv - A * g, A, m)
                 B = sums.outer - wp.outer(sums.value, g)
                 # (T1.adj)
-                more = momentum_adj(constants, body, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_body)
+                more = momentum_adj(
+                    constants, inputs, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_inputs
+                )
                 adj.fx += sums.slope - wp.transpose(A) * sums.value  # (A6)
                 adj.v = more.v
                 adj.C = more.C
@@ -159,7 +166,12 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             else:
                 first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
                 g = centre(old_fx)
-                adj = moved_adj(constants, load_mat(before.rows, i, row_H), C, adj)  # (T3.adj)
+                adj = moved_adj(
+                    constants, inputs, world, p, load_mat(before.rows, i, row_H), C, adj, adj_inputs
+                )  # (T3.adj)
+                if wp.static(driven):
+                    # The velocity of a driven particle is not that of the nodes around it.
+                    v = gather(velocity, first, window.shape, g).value
                 B = adj.C
                 b = adj.v - B * g
                 sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
@@ -173,7 +185,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
 
     def compiled(few: bool) -> wp.Kernel:
-        """``g2p2g_adj`` for few particles or for many, as in g2p2g.py: with so many registers that so many blocks fit at a time."""
+        """``g2p2g_adj`` for few particles or for many, as in g2p2g.py; registers are limited so that ``blocks`` blocks fit."""
         name, blocks = (".few", 2) if few else ("", 3)
         where = native_module(adj_module(spec, wanted) + ".fused" + name)
         options = dict(module=where, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, blocks))

@@ -1,11 +1,11 @@
-"""Sums over the 3^dim nodes of a particle, taken axis by axis. Derivation: docs/math/scatter.md.
+"""Gather: sums over the 3^dim nodes of a particle, axis by axis. Derivation: docs/math/scatter.md.
 
-Here g is the distance from the middle node in cells, -1/2 ≤ g < 1/2, and o in {-1, 0, 1} counts from it, r = o − g:
+Here g is the distance from the middle node in cells, -1/2 ≤ g < 1/2, and o in {-1, 0, 1} is the offset of a node from it, r = o − g:
 
     w₋₁ = ½ (½ − g)²,  w₀ = ¾ − g²,  w₊₁ = ½ (½ + g)²                                               (A2)
 
 The weights are products, so the sums along z are taken first, then those along y, then along x: 3 + 9 + 27 terms with few
-factors each. With Σ w v oᵀ the sum that (T2) wants is Σ w v rᵀ = Σ w v oᵀ − (Σ w v) gᵀ, with |g| ≤ ½ without harm to rounding.
+factors each. (T2) needs Σ w v rᵀ, which is Σ w v oᵀ − (Σ w v) gᵀ; since |g| ≤ ½, the subtraction loses no accuracy.
 """
 
 from types import SimpleNamespace
@@ -39,7 +39,7 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def particle_of(thread: int, per_warp: int, total: int) -> int:
-        """Place of the particle that a thread has. The first ``per_warp`` lanes of a warp have one; to have none is ``total``."""
+        """Place of a thread's particle. The first ``per_warp`` lanes of a warp have one; for other lanes it is ``total``."""
         lane = thread % WARP
         place = thread / WARP * per_warp + lane
         if lane >= per_warp or place > total:
@@ -48,7 +48,7 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def world_of(place: int, count: int, total: int) -> int:
-        """World of a particle, ``count`` in each; one world is worth asking for, since a GPU divides slowly."""
+        """World of a particle, with ``count`` particles in each; a single world is a special case, since division is slow on a GPU."""
         if count == total:
             return 0
         return place / count

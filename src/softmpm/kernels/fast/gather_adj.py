@@ -1,6 +1,6 @@
-"""Adjoint of the sums over the nodes of a particle, axis by axis as well. Derivation: docs/math/scatter.md.
+"""Adjoint of the gather, axis by axis as well. Derivation: docs/math/scatter.md.
 
-What a particle's weights are multiplied with is a number s at each of its nodes, so that their adjoint is a sum over slopes:
+The weights of a particle are multiplied by a number s at each of its nodes, so their adjoint is a sum over the slopes of the weights:
 
     Σ s ∇w,   w₋₁' = g − ½,  w₀' = −2g,  w₊₁' = g + ½                                                (A2), (A5)
 """
@@ -28,7 +28,7 @@ def stencil_adj(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def weights(g: real) -> triple:
-        """Made of the slopes, which saves registers that would spill: an adjoint gains nothing from sums of exactly one."""
+        """Weights from the same terms as the slopes, which avoids register spills; in an adjoint they need not sum to exactly one."""
         low = real(0.5) - g
         high = real(0.5) + g
         return triple(real(0.5) * low * low, real(0.75) - g * g, real(0.5) * high * high)

@@ -1,6 +1,6 @@
 """Native functions that Warp's language cannot express: 16-byte loads and reductions, sums over a warp. Code: scatter.h, fixed_point.h.
 
-Everything has a plain form as well, for the CPU, for double precision and for GPUs before sm_90, chosen when it is compiled.
+Each function also has a plain form for the CPU, for double precision and for GPUs before sm_90, selected at compile time.
 """
 
 from pathlib import Path
@@ -13,22 +13,22 @@ from softmpm.kernels.structs import types
 
 HEADERS = [Path(__file__).with_name(name) for name in ("scatter.h", "fixed_point.h")]
 WARP = 32
-"""Threads that work together, and particles of a block of packed rows."""
+"""Threads per warp, and particles per block of packed rows."""
 BLOCK = 128
-"""Threads of a block."""
+"""Threads per block."""
 FEW, VERY_FEW = 20_000, 10_000
 """Up to ``FEW`` particles: separate kernels with one-warp blocks. Up to ``VERY_FEW``: half-populated warps."""
 
 
 def padded(particles: int) -> int:
-    """Places that packed particles take, which come in whole warps."""
+    """Number of places of the packed particles: their count rounded up to whole warps."""
     return -(-particles // WARP) * WARP
 
 
 def native_module(name: str) -> str:
-    """Give the Warp module of this name what native functions need; returns the name.
+    """Set the compile options of the Warp module of this name, as native functions need them; returns the name.
 
-    Machine code of the very GPU ("cubin"): PTX would be that of the oldest GPU in the machine, without 16-byte reductions.
+    Machine code is compiled for each GPU ("cubin"): PTX would be that of the oldest GPU in the machine, without 16-byte reductions.
     """
     source = "".join(header.read_text() for header in HEADERS)
     build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)

@@ -1,6 +1,6 @@
-"""Between what users hold and the packed, sorted particles of the fast scheme. Exact to the last digit, as kernels/convert.py.
+"""Conversion between a user's state and the packed particles of the fast scheme. Exact to the last digit, as in kernels/convert.py.
 
-``order`` names, for each place in the packed particles, the particle of its world that stands there.
+``order`` contains the particle of the world at each place in the packed particles.
 """
 
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.convert import boundary
+from softmpm.kernels.convert import conversion
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import native, native_module
 from softmpm.kernels.fast.sorting import sorting
@@ -19,7 +19,7 @@ from softmpm.kernels.structs import types
 
 @kernel_factory
 def packing(dim: int, dtype: str) -> SimpleNamespace:
-    t, b, n, s = types(dim, dtype), boundary(dim, dtype), native(dim, dtype), stencil(dim, dtype)
+    t, b, n, s = types(dim, dtype), conversion(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat
     Constants, Packed, Window = t.Constants, t.Packed, t.Window
     entered, left = b.entered, b.left
@@ -108,7 +108,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         # Out:
         x: wp.array2d(dtype=vec),
     ):
-        """What of ``leave`` it takes to sort the particles again."""
+        """The positions alone, as in ``leave``, from which particles are re-sorted."""
         world, place = wp.tid()
         i = world * order.shape[1] + place
         at = left(

@@ -1,4 +1,4 @@
-// Adding what particles give to the nodes of a grid, and reading nodes and packed particles. Derivation: docs/math/scatter.md.
+// Scatter of the contributions of particles to the nodes of a grid; loads of nodes and of packed particles. Derivation: docs/math/scatter.md.
 //
 // A particle gives node o of its 3^DIM stencil, o along each axis in {-1, 0, 1} from the middle node, the vector
 //
@@ -68,8 +68,8 @@ struct Weight {
     CUDA_CALLABLE inline float operator()(float g, float square) const { return level + bend * square + lean * g; }
 };
 
-// Where this lane's particle stands among those of its warp, sorted by their first nodes; lanes without a particle, which come last,
-// stay last. An order of all particles grows stale as they move, but those of a warp stay near each other: sorted anew they still
+// Rank of this lane's particle among those of its warp, sorted by their first nodes; lanes without a particle, which come last,
+// stay last. An order of all particles grows stale as they move, but those of a warp stay near each other: re-sorted they still
 // share their nodes.
 CUDA_CALLABLE inline int sorted_place(int first)
 {
@@ -98,7 +98,7 @@ CUDA_CALLABLE inline int sorted_place(int first)
 // What a lane owns of the nodes around the cell that the walk is in, and how a particle lies in shared memory for it.
 template <int DIM, class Sink> struct Owner;
 
-// Three dimensions: a column of three nodes along z, which is handed on when the next cell is the one above.
+// Three dimensions: a column of three nodes along z, whose sums are carried to the next cell if that is the one above.
 template <class Sink> struct Owner<3, Sink> {
     static constexpr int WIDTH = 5;  // float4 per particle: 80 bytes, free of bank conflicts when sorted
     Weight wx, wy;
@@ -137,7 +137,7 @@ template <class Sink> struct Owner<3, Sink> {
         float w = wx(q[1].w, q[4].y) * wy(q[2].w, q[4].z), w0 = w * q[3].w, w2 = w * q[4].x, w1 = w - (w0 + w2), m = q[0].w;
         float x = q[0].x + q[1].x * fx + q[2].x * fy, y = q[0].y + q[1].y * fx + q[2].y * fy, z = q[0].z + q[1].z * fx + q[2].z * fy;
         float x0 = x - q[3].x, y0 = y - q[3].y, z0 = z - q[3].z, x2 = x + q[3].x, y2 = y + q[3].y, z2 = z + q[3].z;
-        // In each branch, not behind them: sums that are handed on and added to at once take no copies.
+        // In each branch, not behind them: sums that are carried and added to at once take no copies.
         auto gain = [&](const float4& b, const float4& c, const float4& a) {
             below = make_float4(b.x + w0 * x0, b.y + w0 * y0, b.z + w0 * z0, b.w + w0 * m);
             middle = make_float4(c.x + w1 * x, c.y + w1 * y, c.z + w1 * z, c.w + w1 * m);

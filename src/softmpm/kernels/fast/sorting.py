@@ -1,6 +1,6 @@
-"""The order of the particles: keys to sort by, how good it still is, how to pass from one to another; and where the window goes.
+"""Particle order and grid window: sort keys, staleness of an order, permutation from one order to another, position of the window.
 
-``order`` names, for each place in the packed particles, the particle of its world that stands there.
+``order`` contains the particle of the world at each place in the packed particles.
 """
 
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from softmpm.kernels.physics import status
 from softmpm.kernels.structs import types
 
 SAMPLES = 50_000
-"""Particles of which it is counted whether their cell is another one than that of the particle before."""
+"""Approximate number of particles that are sampled to count changes of cell along the order."""
 
 
 @kernel_factory
@@ -29,7 +29,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def kept_inside(words: wp.array(dtype=wp.int64), window: Window, world: int, p: int, base: ivec) -> ivec:
-        """Base node of a particle; one that is outside the window is reported, and writes to no other memory."""
+        """Base node of a particle, clamped to the window; a particle outside of it is reported and accesses no other memory."""
         inside = base
         for axis in range(dim):
             away = base[axis] - window.origin[world][axis]
@@ -45,15 +45,15 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         up: int,  # the axis along which bodies fall
         # In:
         x: wp.array2d(dtype=vec),
-        sorted_x: wp.array2d(dtype=vec),  # what the order follows
+        sorted_x: wp.array2d(dtype=vec),  # positions to sort by
         # Out:
-        # It grows with the cell, along the last axis first, and is odd in the upper half of a cell.
+        # Increases with the cell, along the last axis first, and is odd in the upper half of a cell.
         key: wp.array2d(dtype=wp.int32),
         # Out, lowered and raised:
         low: wp.array2d(dtype=wp.int32),
         high: wp.array2d(dtype=wp.int32),
     ):
-        """Where particles are: keys to sort by, and the first and last base node of each world along each axis."""
+        """Compute the sort keys of the particles, and the first and last base node of each world along each axis."""
         world, p = wp.tid()
         cell = int(0)
         half = int(0)
@@ -104,7 +104,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         # Cells met going along the order; then whether a particle is near the window's edge.
         found: wp.array(dtype=wp.int64),
     ):
-        """How good order and window still are."""
+        """Count the changes of cell along the order, and detect a particle near the window's edge."""
         i = wp.tid()
         world = i / count
         sample = 1 + count * window.origin.shape[0] / SAMPLES  # all of few particles, some warps of many
@@ -143,7 +143,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         words: wp.array(dtype=wp.int64),
         packed: Packed,
     ):
-        """Put particles from the places of one order to those of another."""
+        """Permute packed particles from one order to another."""
         world, place = wp.tid()
         start = world * order.shape[1]
         p = order[world, place]
@@ -162,7 +162,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         # Out:
         rows: wp.array(dtype=real),
     ):
-        """The same for adjoints, which have rows only."""
+        """Permute packed adjoints, which have no base nodes, from one order to another."""
         world, place = wp.tid()
         start = world * order.shape[1]
         copy_rows(from_rows, start + places[world, order[world, place]], rows, start + place)

@@ -15,9 +15,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.physics.elasticity import elasticity
-from softmpm.kernels.physics.stress import solid, solid_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, solid_adj_type, solid_types, types
+from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.stress import total_stress, total_stress_adj
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 STEPS = {2: 3, 3: 5}
 """Of Lanczos' iteration. In 2D there are three symmetric G, in 3D six, the last of which no longer moves K by 1 %."""
@@ -26,18 +26,29 @@ STEPS = {2: 3, 3: 5}
 @kernel_factory
 def alarm(spec: Spec) -> SimpleNamespace:
     """Blocks of one particle: is its step stable, and is a neighbour too far away."""
-    t, wanted = types(spec.dim, spec.dtype), RequestedGrads(material=False, activation=False)
+    t, wanted = types(spec.dim, spec.dtype), RequestedGrads()
     real, vec, mat, ivec, Constants = t.real, t.vec, t.mat, t.ivec, t.Constants
-    Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
-    rotation, stiffness_bound = solid(spec).rotation, solid(spec).stiffness_bound
-    stress_adj = solid_adj(spec, wanted).stress_adj
-    identity, dim, steps = elasticity(spec.dim, spec.dtype).identity, spec.dim, STEPS[spec.dim]
+    ParticleInputs, ParticleInputsAdj = (
+        input_types(spec).ParticleInputs,
+        input_adj_types(spec, wanted).ParticleInputsAdj,
+    )
+    total, stress_adj = total_stress(spec), total_stress_adj(spec, wanted).stress_adj
+    rotation, stiffness_bound, largest_square = total.rotation, total.stiffness_bound, total.largest_square
+    identity, dim, steps = kinematics(spec.dim, spec.dtype).identity, spec.dim, STEPS[spec.dim]
+    viscous = spec.viscosity
 
     @wp.func
-    def stiffer(body: Solid, world: int, p: int, H: mat, limit: real) -> bool:
-        """Whether K > ``limit`` [Pa] (W3); false where K is not a number, which is another alarm's business."""
+    def viscous_rate(constants: Constants, inputs: ParticleInputs, world: int, p: int) -> real:
+        """4 η s / Δt [Pa], by which B G B counts as stiffness (W4)."""
+        if wp.static(viscous):
+            return real(4.0) * inputs.viscosity[world, p] * wp.sqrt(constants.step) / constants.dt
+        return real(0.0)
+
+    @wp.func
+    def stiffer(inputs: ParticleInputs, world: int, p: int, H: mat, limit: real, rate: real) -> bool:
+        """True if K > ``limit`` [Pa] (W3), viscosity included; false if K is not a number, which another alarm reports."""
         F = identity() + H
-        Q = rotation(body, world, p, H)
+        Q = rotation(inputs, world, p, H)
         G = F * wp.transpose(F)
         G = G / wp.sqrt(wp.ddot(G, G))
         for i in range(dim):
@@ -52,8 +63,11 @@ def alarm(spec: Spec) -> SimpleNamespace:
         beta = real(0.0)
         pivot = real(1.0)
         for _step in range(steps):
-            A = stress_adj(body, world, p, H, Q, G, SolidAdj()) * wp.transpose(F)
+            A = stress_adj(inputs, world, p, H, Q, G, ParticleInputsAdj()) * wp.transpose(F)
             A = real(0.5) * (A + wp.transpose(A))
+            if wp.static(viscous):
+                B = F * wp.transpose(F)
+                A += rate * (B * G * B)
             alpha = wp.ddot(G, A)
             pivot = alpha - limit - beta * beta / pivot
             if pivot > real(0.0):
@@ -65,14 +79,20 @@ def alarm(spec: Spec) -> SimpleNamespace:
         return False
 
     @wp.func
-    def step_is_stable(constants: Constants, body: Solid, world: int, p: int, H: mat) -> bool:
+    def step_is_stable(constants: Constants, inputs: ParticleInputs, world: int, p: int, H: mat) -> bool:
         """(W2), as K ≤ s² ρ₀ dx² / Δt²."""
         reach = constants.spacing / constants.dt
-        limit = constants.step * body.mass[world, p] / body.volume[world, p] * reach * reach
+        limit = constants.step * inputs.mass[world, p] / inputs.volume[world, p] * reach * reach
+        rate = viscous_rate(constants, inputs, world, p)
+        bound = stiffness_bound(inputs, world, p, H)
+        if wp.static(viscous):
+            F = identity() + H
+            square = largest_square(F * wp.transpose(F))
+            bound += rate * square * square
         # Nearly all particles of a scene at half its stable step need no more than this:
-        if not stiffness_bound(body, world, p, H) > limit:
+        if not bound > limit:
             return True
-        return not stiffer(body, world, p, H, limit)
+        return not stiffer(inputs, world, p, H, limit, rate)
 
     @wp.func
     def near(constants: Constants, cells: ivec, apart: vec) -> bool:

@@ -1,13 +1,15 @@
-"""Contact of one grid node with one wall, and its adjoint. Derivation: docs/math/grid.md.
+"""One wall at one grid node: whether the node is inside, how the wall moves there, the response, and the adjoint of all three.
 
-With the outward normal n, vₙ = v·n, v_t = v − vₙ n and Coulomb's coefficient c:
+A wall at rest has n·x ≤ o inside. A wall that moves has, t seconds after the beginning of a control step,
 
-    stick     v' = 0                                                                                 (C1)
-    slip      v' = v_t                                                                               (C2)
-    separate  v' = v_t max(0, 1 + c vₙ / |v_t|) if vₙ < 0, else v                                    (C3)
+    a = n + t ṅ,   a·x ≤ o + t ȯ inside,   n̂ = a / |a|                                              (C4)
+    u = ((ȯ − ṅ·x) / |a|) n̂ + w,   v' = u + respond(v − u)                                          (C5)
 
-The adjoints differentiate the branch that was taken; a node held by friction has zero gradient.
-Source: Stomakhin et al. 2013, "A material point method for snow simulation", section 8.
+with the velocity w of its surface. With r̄ and n̄ from the response (contacts/) and ū = v̄' − r̄, r = (ȯ − ṅ·x) / |a|:
+
+    v̄ = r̄,   w̄ = ū,   r̄_u = n̂·ū,   ȱ = r̄_u / |a|,   n̄ += r ū,                                     (C5.adj)
+    ā = (n̄ − (n̂·n̄) n̂ − r r̄_u n̂) / |a|,   ṅ̄ = t ā − (r̄_u / |a|) x
+Derivation: docs/math/grid.md.
 """
 
 from types import SimpleNamespace
@@ -15,85 +17,126 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.kernels.physics.contacts import response, response_adj
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
-def contact(spec: Spec, k: int) -> SimpleNamespace:
+def wall(spec: Spec, k: int) -> SimpleNamespace:
     """Wall number ``k``."""
     t = types(spec.dim, spec.dtype)
-    real, vec, ivec = t.real, t.vec, t.ivec
-    Walls = solid_types(spec).Walls
-    kind = spec.contacts[k]
-    if kind not in ("stick", "slip", "separate"):
-        raise ValueError(f"wall {k} has the contact {kind!r}, which has no response here; add its formula.")
-    stick, slip = kind == "stick", kind == "slip"
-    rough = spec.friction
+    vec, ivec = t.vec, t.ivec
+    exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
+    respond, moving = response(spec, k), spec.moving
 
     @wp.func
-    def inside(walls: Walls, node: ivec, spacing: wp.float64) -> bool:
+    def place(node: ivec, spacing: wp.float64) -> exact_vec:
+        x = exact_vec()
+        for axis in range(spec.dim):
+            x[axis] = wp.float64(node[axis]) * spacing
+        return x
+
+    @wp.func
+    def plane(inputs: GridInputs, world: int) -> exact_vec:
+        """a of (C4)."""
+        return inputs.normal[world, k] + inputs.elapsed[0] * inputs.normal_rate[world, k]
+
+    @wp.func
+    def inside(inputs: GridInputs, world: int, node: ivec, spacing: wp.float64) -> bool:
         """Decided in float64, so that both precisions put a node on the surface to the same side."""
         reach = wp.float64(0.0)
-        for axis in range(spec.dim):
-            reach += walls.normal[k, axis] * (wp.float64(node[axis]) * spacing)
-        return reach <= walls.offset[k]
+        if wp.static(moving):
+            a = plane(inputs, world)
+            for axis in range(spec.dim):
+                reach += a[axis] * (wp.float64(node[axis]) * spacing)
+            return reach <= inputs.offset[world, k] + inputs.elapsed[0] * inputs.offset_rate[world, k]
+        else:
+            for axis in range(spec.dim):
+                reach += inputs.normal[k, axis] * (wp.float64(node[axis]) * spacing)
+            return reach <= inputs.offset[k]
 
     @wp.func
-    def normal(walls: Walls) -> vec:
-        return vec(walls.normal[k])
+    def normal(inputs: GridInputs, world: int) -> vec:
+        if wp.static(moving):
+            return vec(wp.normalize(plane(inputs, world)))  # (C4)
+        else:
+            return vec(inputs.normal[k])
 
     @wp.func
-    def slide(walls: Walls, v_n: real, v_t: vec) -> vec:
-        """Tangential velocity that friction leaves, for v_n < 0."""
-        if wp.static(rough):
-            limit = -walls.friction[k] * v_n
-            if limit > real(0.0):
-                speed = wp.length(v_t)
-                if speed <= limit:
-                    return vec()
-                return v_t * (real(1.0) - limit / speed)
-        return v_t
+    def velocity(inputs: GridInputs, world: int, node: ivec, spacing: wp.float64) -> vec:
+        """u of (C5)."""
+        a = plane(inputs, world)
+        speed = inputs.offset_rate[world, k] - wp.dot(inputs.normal_rate[world, k], place(node, spacing))
+        return vec(speed / wp.dot(a, a) * a) + inputs.surface_velocity[world, k]
 
     @wp.func
-    def slide_adj(walls: Walls, v_n: real, v_t: vec, adj: vec, n: vec) -> vec:
-        """∂L/∂v through v_t and v_n (C3); ``adj`` lies in the tangent plane."""
-        if wp.static(rough):
-            c = walls.friction[k]
-            limit = -c * v_n
-            if limit > real(0.0):
-                speed = wp.length(v_t)
-                if speed <= limit:
-                    return vec()
-                along = wp.dot(adj, v_t) / speed
-                return (
-                    adj * (real(1.0) - limit / speed)
-                    + (along * limit / (speed * speed)) * v_t
-                    + (c * along) * n
-                )
-        return adj
+    def meet(inputs: GridInputs, world: int, node: ivec, spacing: wp.float64, v: vec) -> vec:
+        """Velocity after the wall of a node inside it."""
+        if wp.static(moving):
+            u = velocity(inputs, world, node, spacing)
+            return u + respond(inputs, world, normal(inputs, world), v - u)  # (C5)
+        else:
+            return respond(inputs, world, normal(inputs, world), v)
+
+    return SimpleNamespace(
+        inside=inside, meet=meet, normal=normal, velocity=velocity, plane=plane, place=place
+    )
+
+
+@kernel_factory
+def wall_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
+    """Adjoint of ``meet`` of wall number ``k``: that of v; adds those of the wall's inputs at node ``i`` into ``adj_inputs``."""
+    t, w = types(spec.dim, spec.dtype), wall(spec, k)
+    real, vec, ivec, GridInputs = t.real, t.vec, t.ivec, input_types(spec).GridInputs
+    GridInputsAdj = input_adj_types(spec, wanted).GridInputsAdj
+    normal, velocity, plane, place = w.normal, w.velocity, w.plane, w.place
+    respond_adj, moving = response_adj(spec, wanted, k), spec.moving
 
     @wp.func
-    def respond(walls: Walls, v: vec) -> vec:
-        if wp.static(stick):
-            return vec()  # (C1)
-        n = normal(walls)
-        v_n = wp.dot(v, n)
-        if wp.static(slip):
-            return v - v_n * n  # (C2)
-        if v_n < real(0.0):
-            return slide(walls, v_n, v - v_n * n)  # (C3)
-        return v
+    def motion_adj(
+        inputs: GridInputs,
+        world: int,
+        node: ivec,
+        spacing: wp.float64,
+        adj_n: vec,
+        adj_u: vec,
+        i: int,
+        adj_inputs: GridInputsAdj,
+    ):
+        """(C5.adj)"""
+        a = plane(inputs, world)
+        length = real(wp.length(a))
+        n = normal(inputs, world)
+        x = vec(place(node, spacing))
+        rate = (real(inputs.offset_rate[world, k]) - wp.dot(vec(inputs.normal_rate[world, k]), x)) / length
+        adj_rate = wp.dot(n, adj_u)
+        adj_unit = adj_n + rate * adj_u
+        adj_a = (adj_unit - (wp.dot(adj_unit, n) + rate * adj_rate) * n) / length
+        adj_inputs.offset_rate[k, i] = adj_inputs.offset_rate[k, i] + adj_rate / length
+        adj_inputs.normal[k, i] = adj_inputs.normal[k, i] + adj_a
+        adj_normal_rate = real(inputs.elapsed[0]) * adj_a - (adj_rate / length) * x
+        adj_inputs.normal_rate[k, i] = adj_inputs.normal_rate[k, i] + adj_normal_rate
+        adj_inputs.surface_velocity[k, i] = adj_inputs.surface_velocity[k, i] + adj_u
 
     @wp.func
-    def respond_adj(walls: Walls, v: vec, adj: vec) -> vec:
-        if wp.static(stick):
-            return vec()
-        n = normal(walls)
-        v_n = wp.dot(v, n)
-        if wp.static(slip):
-            return adj - wp.dot(adj, n) * n
-        if v_n < real(0.0):
-            return slide_adj(walls, v_n, v - v_n * n, adj - wp.dot(adj, n) * n, n)
-        return adj
+    def meet_adj(
+        inputs: GridInputs,
+        world: int,
+        node: ivec,
+        spacing: wp.float64,
+        v: vec,
+        adj: vec,
+        i: int,
+        adj_inputs: GridInputsAdj,
+    ) -> vec:
+        if wp.static(moving):
+            u = velocity(inputs, world, node, spacing)
+            back = respond_adj(inputs, world, normal(inputs, world), v - u, adj, i, adj_inputs)
+            if wp.static("wall" in wanted):
+                motion_adj(inputs, world, node, spacing, back.n, adj - back.v, i, adj_inputs)
+            return back.v
+        else:
+            still = respond_adj(inputs, world, normal(inputs, world), v, adj, i, adj_inputs)
+            return still.v
 
-    return SimpleNamespace(inside=inside, respond=respond, respond_adj=respond_adj)
+    return meet_adj

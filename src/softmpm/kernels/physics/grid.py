@@ -3,6 +3,7 @@
     u = p / m                                                                                        (G1)
     v = W_k(... W_1(exp(−γ Δt) (u + Δt g)))   with the walls W_1 … W_k in the order of the scene     (G2)
     p̄ = exp(−γ Δt) v̄₀ / m,  m̄ = −p̄ · u        v̄₀ being the adjoint before the walls               (G1.adj)
+    ḡ = Σ Δt m p̄,  adjoint of exp(−γ Δt) = Σ v̄₀·(u + Δt g)        over the nodes of a world
 
 Empty nodes get zero in both directions; in the fast scheme they keep what they held (kernels/fast/g2p2g.py).
 """
@@ -12,32 +13,41 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.physics.contact import contact
+from softmpm.kernels.physics.contact import wall, wall_adj
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
 @kernel_factory
 def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
-    Walls = solid_types(spec).Walls
+    GridInputs, dim, given = input_types(spec).GridInputs, spec.dim, spec.given
     nodes = spline(spec.dim, spec.dtype)
-    node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
-    dim, gravity, damping = spec.dim, spec.gravity, spec.damping
-
-    @wp.struct
-    class NodeAdj:
-        p: vec
-        m: real
+    node_coordinates, momentum = nodes.node_coordinates, nodes.momentum
 
     @wp.func
-    def free_velocity(constants: Constants, u: vec) -> vec:
+    def gravity(constants: Constants, inputs: GridInputs, world: int) -> vec:
+        if wp.static("gravity" in given):
+            return inputs.gravity[world]
+        else:
+            return constants.gravity
+
+    @wp.func
+    def decay(constants: Constants, inputs: GridInputs, world: int) -> real:
+        """exp(−γ Δt)."""
+        if wp.static("damping" in given):
+            return inputs.decay[world]
+        else:
+            return constants.decay
+
+    @wp.func
+    def free_velocity(constants: Constants, inputs: GridInputs, world: int, u: vec) -> vec:
         v = u
-        if wp.static(gravity):
-            v += constants.dt * constants.gravity
-        if wp.static(damping):
-            v = constants.decay * v
+        if wp.static(spec.gravity):
+            v += constants.dt * gravity(constants, inputs, world)
+        if wp.static(spec.damping):
+            v = decay(constants, inputs, world) * v
         return v
 
     def after_walls(count: int) -> wp.Function:
@@ -45,74 +55,39 @@ def grid(spec: Spec) -> SimpleNamespace:
         if count == 0:
 
             @wp.func
-            def after(constants: Constants, walls: Walls, here: ivec, v: vec) -> vec:
+            def after(constants: Constants, inputs: GridInputs, world: int, here: ivec, v: vec) -> vec:
                 return v
         else:
-            before, wall = after_walls(count - 1), contact(spec, count - 1)
-            inside, respond = wall.inside, wall.respond
+            before, last = after_walls(count - 1), wall(spec, count - 1)
+            inside, meet = last.inside, last.meet
 
             @wp.func
-            def after(constants: Constants, walls: Walls, here: ivec, v: vec) -> vec:
-                w = before(constants, walls, here, v)
-                if inside(walls, here, constants.exact_spacing):
-                    w = respond(walls, w)
+            def after(constants: Constants, inputs: GridInputs, world: int, here: ivec, v: vec) -> vec:
+                w = before(constants, inputs, world, here, v)
+                if inside(inputs, world, here, constants.exact_spacing):
+                    w = meet(inputs, world, here, constants.exact_spacing, w)
                 return w
 
         return after
 
-    def after_walls_adj(k: int) -> wp.Function:
-        """Adjoint of the velocity before wall ``k``, from that of the velocity after all walls."""
-        if k == len(spec.contacts):
-
-            @wp.func
-            def back(constants: Constants, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
-                return adj
-        else:
-            through_others, wall = after_walls_adj(k + 1), contact(spec, k)
-            inside, respond, respond_adj = wall.inside, wall.respond, wall.respond_adj
-
-            @wp.func
-            def back(constants: Constants, walls: Walls, here: ivec, v: vec, adj: vec) -> vec:
-                meets = inside(walls, here, constants.exact_spacing)
-                w = v
-                if meets:
-                    w = respond(walls, v)
-                adj_v = through_others(constants, walls, here, w, adj)
-                if meets:
-                    adj_v = respond_adj(walls, v, adj_v)
-                return adj_v
-
-        return back
-
-    after_all_walls, after_all_walls_adj = after_walls(len(spec.contacts)), after_walls_adj(0)
+    after_all_walls = after_walls(len(spec.contacts))
 
     @wp.func
-    def node_velocity(constants: Constants, walls: Walls, here: ivec, p: vec, m: real) -> vec:
+    def node_velocity(
+        constants: Constants, inputs: GridInputs, world: int, here: ivec, p: vec, m: real
+    ) -> vec:
         """Velocity of the node at ``here`` from its momentum and mass."""
         v = vec()
         if m > real(0.0):
-            v = after_all_walls(constants, walls, here, free_velocity(constants, p / m))  # (G1), (G2)
+            free = free_velocity(constants, inputs, world, p / m)  # (G1)
+            v = after_all_walls(constants, inputs, world, here, free)  # (G2)
         return v
-
-    @wp.func
-    def node_velocity_adj(
-        constants: Constants, walls: Walls, here: ivec, p: vec, m: real, adj_velocity: vec
-    ) -> NodeAdj:
-        adj = NodeAdj()
-        if m > real(0.0):
-            u = p / m
-            adj_v = after_all_walls_adj(constants, walls, here, free_velocity(constants, u), adj_velocity)
-            adj.p = adj_v / m  # (G1.adj)
-            if wp.static(damping):
-                adj.p = constants.decay * adj.p
-            adj.m = -wp.dot(adj.p, u)
-        return adj
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def grid_velocity(
         # Parameters:
         constants: Constants,
-        walls: Walls,
+        inputs: GridInputs,
         # In:
         node: wp.array2d(dtype=node_vec),
         # Out:
@@ -121,28 +96,133 @@ def grid(spec: Spec) -> SimpleNamespace:
         world, n = wp.tid()
         node_n = node[world, n]
         here = node_coordinates(n, constants.shape)
-        velocity[world, n] = node_velocity(constants, walls, here, momentum(node_n), node_n[dim])
+        velocity[world, n] = node_velocity(constants, inputs, world, here, momentum(node_n), node_n[dim])
 
-    @wp.kernel(module=spec.module + ".adj", enable_backward=False)
+    return SimpleNamespace(
+        gravity=gravity,
+        decay=decay,
+        free_velocity=free_velocity,
+        node_velocity=node_velocity,
+        grid_velocity=grid_velocity,
+    )
+
+
+@kernel_factory
+def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
+    t, forward = types(spec.dim, spec.dtype), grid(spec)
+    real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
+    GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
+    nodes, dim = spline(spec.dim, spec.dtype), spec.dim
+    node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
+    gravity, decay, free_velocity = forward.gravity, forward.decay, forward.free_velocity
+    damped = spec.damping
+
+    @wp.struct
+    class NodeAdj:
+        p: vec
+        m: real
+
+    def after_walls_adj(k: int) -> wp.Function:
+        """Adjoint of the velocity before wall ``k``, from that of the velocity after all walls."""
+        if k == len(spec.contacts):
+
+            @wp.func
+            def back(
+                constants: Constants,
+                inputs: GridInputs,
+                world: int,
+                here: ivec,
+                v: vec,
+                adj: vec,
+                i: int,
+                adj_inputs: GridInputsAdj,
+            ) -> vec:
+                return adj
+        else:
+            through_others, inside, meet = after_walls_adj(k + 1), wall(spec, k).inside, wall(spec, k).meet
+            meet_adj = wall_adj(spec, wanted, k)
+
+            @wp.func
+            def back(
+                constants: Constants,
+                inputs: GridInputs,
+                world: int,
+                here: ivec,
+                v: vec,
+                adj: vec,
+                i: int,
+                adj_inputs: GridInputsAdj,
+            ) -> vec:
+                meets = inside(inputs, world, here, constants.exact_spacing)
+                w = v
+                if meets:
+                    w = meet(inputs, world, here, constants.exact_spacing, v)
+                adj_v = through_others(constants, inputs, world, here, w, adj, i, adj_inputs)
+                if meets:
+                    adj_v = meet_adj(inputs, world, here, constants.exact_spacing, v, adj_v, i, adj_inputs)
+                return adj_v
+
+        return back
+
+    after_all_walls_adj = after_walls_adj(0)
+
+    @wp.func
+    def node_velocity_adj(
+        constants: Constants,
+        inputs: GridInputs,
+        world: int,
+        here: ivec,
+        p: vec,
+        m: real,
+        adj_velocity: vec,
+        i: int,
+        adj_inputs: GridInputsAdj,
+    ) -> NodeAdj:
+        """Adjoint of ``node_velocity``; adds what is wanted at node ``i`` of all worlds into ``adj_inputs``."""
+        adj = NodeAdj()
+        if m > real(0.0):
+            u = p / m
+            free = free_velocity(constants, inputs, world, u)
+            adj_v = after_all_walls_adj(constants, inputs, world, here, free, adj_velocity, i, adj_inputs)
+            adj.p = adj_v / m  # (G1.adj)
+            if wp.static(damped):
+                adj.p = decay(constants, inputs, world) * adj.p
+            adj.m = -wp.dot(adj.p, u)
+            if wp.static("damping" in wanted):
+                driven = u + constants.dt * gravity(constants, inputs, world)
+                adj_inputs.decay[i] = adj_inputs.decay[i] + wp.dot(adj_v, driven)
+            if wp.static("gravity" in wanted):
+                adj_inputs.gravity[i] = adj_inputs.gravity[i] + (m * constants.dt) * adj.p
+        return adj
+
+    @wp.kernel(module=adj_module(spec, wanted) + ".grid", enable_backward=False)
     def grid_velocity_adj(
         # Parameters:
         constants: Constants,
-        walls: Walls,
+        inputs: GridInputs,
         # In:
         node: wp.array2d(dtype=node_vec),
         adj_velocity: wp.array2d(dtype=vec),
         # Out:
         adj_node: wp.array2d(dtype=node_vec),
+        # Out, added into:
+        adj_inputs: GridInputsAdj,
     ):
         world, n = wp.tid()
         node_n = node[world, n]
         here = node_coordinates(n, constants.shape)
-        adj = node_velocity_adj(constants, walls, here, momentum(node_n), node_n[dim], adj_velocity[world, n])
+        i = world * node.shape[1] + n
+        adj = node_velocity_adj(
+            constants,
+            inputs,
+            world,
+            here,
+            momentum(node_n),
+            node_n[dim],
+            adj_velocity[world, n],
+            i,
+            adj_inputs,
+        )
         adj_node[world, n] = pack(adj.p, adj.m)
 
-    return SimpleNamespace(
-        node_velocity=node_velocity,
-        node_velocity_adj=node_velocity_adj,
-        grid_velocity=grid_velocity,
-        grid_velocity_adj=grid_velocity_adj,
-    )
+    return SimpleNamespace(node_velocity_adj=node_velocity_adj, grid_velocity_adj=grid_velocity_adj)

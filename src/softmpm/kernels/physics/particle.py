@@ -6,9 +6,9 @@
     v̄ += m Σ w p̄_i,  Ā = Σ w p̄_i rᵀ,  C̄ += m Ā,  τ̄ = −(Δt V⁰ / D) Ā,  m̄ += Σ w (p̄_i·(v + C r) + m̄_i)   (T1.adj)
     v̄' += Δt x̄',  C̄' += Δt H̄' (I + H)ᵀ,  H̄ += H̄' + Δt C'ᵀ H̄',  x̄ += x̄'                              (T3.adj)
 
-Lengths in here count in cells: fx = x/dx − base, B and A are per cell. The factors 4/dx and dx on the way of C are chosen together
-(model.py), since their rounding would let a free body spin up or down. In float32 fx is a compensated sum: what adding Δt v'/dx
-loses is kept and added in the next step. Symbols and sources: kernels/plain/transfer.py. Derivation: docs/math/transfer.md.
+Lengths here are in cells: fx = x/dx − base, and B and A are per cell. The factors 4/dx and dx of C are chosen together (model.py),
+since their rounding would let a free body spin up or down. In float32 fx is a compensated sum: the rounding error of adding Δt v'/dx
+is stored and added in the next step. Symbols and sources: kernels/plain/transfer.py. Derivation: docs/math/transfer.md.
 """
 
 from types import SimpleNamespace
@@ -17,17 +17,21 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
-from softmpm.kernels.physics.elasticity import elasticity
-from softmpm.kernels.physics.stress import solid, solid_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, solid_adj_type, solid_types, types
+from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.stress import total_stress, total_stress_adj
+from softmpm.kernels.physics.viscosity import viscosity
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
 def particle(spec: Spec) -> SimpleNamespace:
-    t, laws = types(spec.dim, spec.dtype), elasticity(spec.dim, spec.dtype)
+    t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
     real, vec, mat, ivec, Constants, divide = t.real, t.vec, t.mat, t.ivec, t.Constants, t.divide
-    Solid, rotation, stress = solid_types(spec).Solid, solid(spec).rotation, solid(spec).stress
+    ParticleInputs, total = input_types(spec).ParticleInputs, total_stress(spec)
+    rotation, stress, identity = total.rotation, total.stress, k.identity
     valid, dim, rounds = status.check(spec).valid, spec.dim, spec.dtype == "float32"
+    viscous, driven = spec.viscosity, spec.driven
+    viscous_stress = viscosity(spec.dim, spec.dtype).viscous_stress
 
     @wp.struct
     class Particle:
@@ -40,25 +44,52 @@ def particle(spec: Spec) -> SimpleNamespace:
         valid: bool
 
     @wp.func
-    def impulse(constants: Constants, body: Solid, world: int, p: int) -> real:
+    def impulse(constants: Constants, inputs: ParticleInputs, world: int, p: int) -> real:
         """Δt V⁰ / D [m s]."""
-        return divide(real(4.0) * constants.dt * body.volume[world, p], constants.spacing * constants.spacing)
-
-    @wp.func
-    def affine_momentum(constants: Constants, body: Solid, world: int, p: int, C: mat, H: mat, Q: mat) -> mat:
-        """A per cell [kg m/s] (T1)."""
-        return constants.width * (
-            body.mass[world, p] * C - impulse(constants, body, world, p) * stress(body, world, p, H, Q)
+        return divide(
+            real(4.0) * constants.dt * inputs.volume[world, p], constants.spacing * constants.spacing
         )
 
     @wp.func
-    def moved(constants: Constants, corner: ivec, shape: ivec, old: Particle, v: vec, B: mat) -> Particle:
+    def linear_momentum(constants: Constants, inputs: ParticleInputs, world: int, p: int, v: vec) -> vec:
+        """m v (T1)."""
+        return inputs.mass[world, p] * v
+
+    @wp.func
+    def affine_momentum(
+        constants: Constants, inputs: ParticleInputs, world: int, p: int, C: mat, H: mat, Q: mat
+    ) -> mat:
+        """A per cell [kg m/s] (T1)."""
+        if wp.static(viscous):
+            tau = stress(inputs, world, p, H, Q)
+            tau += viscous_stress(identity() + H, C, inputs.viscosity[world, p])
+            return constants.width * (inputs.mass[world, p] * C - impulse(constants, inputs, world, p) * tau)
+        return constants.width * (
+            inputs.mass[world, p] * C - impulse(constants, inputs, world, p) * stress(inputs, world, p, H, Q)
+        )
+
+    @wp.func
+    def moved(
+        constants: Constants,
+        inputs: ParticleInputs,
+        world: int,
+        p: int,
+        corner: ivec,
+        shape: ivec,
+        old: Particle,
+        v: vec,
+        B: mat,
+    ) -> Particle:
         """(T3). The base must stay on the ``shape`` nodes from ``corner`` on; what is not valid keeps its base."""
         new = Particle()
         new.v = v
+        if wp.static(driven):
+            handle = inputs.driven[world, p]
+            if handle >= 0:
+                new.v = inputs.velocity[world, handle]
         new.C = constants.rate * B
         new.H = old.H + constants.dt * (new.C + new.C * old.H)
-        step = divide(constants.dt, constants.spacing) * v
+        step = divide(constants.dt, constants.spacing) * new.v
         if wp.static(rounds):
             step += old.low
             new.low = step - ((old.fx + step) - old.fx)
@@ -77,9 +108,10 @@ def particle(spec: Spec) -> SimpleNamespace:
         Particle=Particle,
         impulse=impulse,
         rotation=rotation,
+        linear_momentum=linear_momentum,
         affine_momentum=affine_momentum,
         moved=moved,
-        identity=laws.identity,
+        identity=identity,
     )
 
 
@@ -87,8 +119,14 @@ def particle(spec: Spec) -> SimpleNamespace:
 def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, Constants, divide = t.real, t.vec, t.mat, t.Constants, t.divide
-    Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
-    stress_adj, impulse, identity = solid_adj(spec, wanted).stress_adj, one.impulse, one.identity
+    ParticleInputs, ParticleInputsAdj = (
+        input_types(spec).ParticleInputs,
+        input_adj_types(spec, wanted).ParticleInputsAdj,
+    )
+    stress_adj, impulse, identity = total_stress_adj(spec, wanted).stress_adj, one.impulse, one.identity
+    viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
+    material, viscous, driven = "material" in wanted, spec.viscosity, spec.driven
+    steered = "velocity" in wanted
 
     @wp.struct
     class ParticleAdj:
@@ -100,7 +138,7 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     @wp.func
     def momentum_adj(
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         world: int,
         p: int,
         v: vec,
@@ -110,24 +148,43 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_mv: vec,
         adj_m: real,
         B: mat,
-        adj_body: SolidAdj,
+        adj_inputs: ParticleInputsAdj,
     ) -> ParticleAdj:
-        """(T1.adj) of v, C and H from Σ w p̄_i, Σ w m̄_i and B = Σ w p̄_i rᵀ; adds what is wanted into ``adj_body``."""
-        m = body.mass[world, p]
+        """(T1.adj) of v, C and H from Σ w p̄_i, Σ w m̄_i and B = Σ w p̄_i rᵀ; adds what is wanted into ``adj_inputs``."""
+        m = inputs.mass[world, p]
         adj_A = constants.spacing * B
         adj = ParticleAdj()
         adj.v = m * adj_mv
         adj.C = m * adj_A
-        adj.H = stress_adj(body, world, p, H, Q, -impulse(constants, body, world, p) * adj_A, adj_body)
-        if wp.static(wanted.material):
-            adj_body.mass[world, p] = adj_body.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
+        adj_tau = -impulse(constants, inputs, world, p) * adj_A
+        adj.H = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
+        if wp.static(viscous):
+            adj_viscous = viscous_stress_adj(identity() + H, C, inputs.viscosity[world, p], adj_tau)
+            adj.C += adj_viscous.C
+            adj.H += adj_viscous.F
+            if wp.static("viscosity" in wanted):
+                adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + adj_viscous.eta
+        if wp.static(material):
+            adj_inputs.mass[world, p] = (
+                adj_inputs.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
+            )
         return adj
 
     @wp.func
-    def moved_adj(constants: Constants, H: mat, new_C: mat, adj_new: ParticleAdj) -> ParticleAdj:
-        """(T3.adj): adjoints of x and H before, and in ``v`` and ``C`` those of v' and B.
+    def moved_adj(
+        constants: Constants,
+        inputs: ParticleInputs,
+        world: int,
+        p: int,
+        H: mat,
+        new_C: mat,
+        adj_new: ParticleAdj,
+        adj_inputs: ParticleInputsAdj,
+    ) -> ParticleAdj:
+        """(T3.adj): adjoints of x and H before, and in ``v`` and ``C`` those of Σ w v_i and B.
 
-        With 4/dx and dx as they are: the paired factors cost registers, which spill, and change an adjoint by 1e-7.
+        Uses 4/dx and dx instead of the rounded pair ``rate`` and ``width``: the pair would change an adjoint by 1e-7 only, and costs
+        registers.
         """
         adj = ParticleAdj()
         adj.fx = adj_new.fx
@@ -136,6 +193,12 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_new.C + constants.dt * (adj_new.H * wp.transpose(identity() + H))
         )
         adj.H = adj_new.H + constants.dt * (wp.transpose(new_C) * adj_new.H)
+        if wp.static(driven):
+            handle = inputs.driven[world, p]
+            if handle >= 0:
+                if wp.static(steered):
+                    adj_inputs.velocity[world, handle] = adj_inputs.velocity[world, handle] + adj.v
+                adj.v = vec()
         return adj
 
     return SimpleNamespace(ParticleAdj=ParticleAdj, momentum_adj=momentum_adj, moved_adj=moved_adj)

@@ -6,7 +6,7 @@ import warp as wp
 
 from softmpm.errors import FROZEN, KIND_SHIFT, NEVER, SUBSTEP_SHIFT, Kind
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.physics.elasticity import elasticity
+from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.structs import Spec, types
 
 
@@ -29,7 +29,7 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def ran(words: wp.array(dtype=wp.int64), world: int, substep: int) -> bool:
-        """Whether the world has not failed before ``substep``."""
+        """True if the world has not failed before ``substep``."""
         word = words[world]
         return word >= wp.int64(substep) << wp.int64(SUBSTEP_SHIFT) and word != wp.int64(FROZEN)
 
@@ -41,7 +41,7 @@ def check(spec: Spec) -> SimpleNamespace:
     """Validity of a new state: finite, on the grid, not collapsed."""
     t = types(spec.dim, spec.dtype)
     real, vec, mat, ivec, Constants = t.real, t.vec, t.mat, t.ivec, t.Constants
-    write, volume_change = report(spec.dim, spec.dtype).report, elasticity(spec.dim, spec.dtype).volume_change
+    write, volume_change = report(spec.dim, spec.dtype).report, kinematics(spec.dim, spec.dtype).volume_change
     dim = spec.dim
     not_finite, left_grid, collapsed = int(Kind.NOT_FINITE), int(Kind.LEFT_GRID), int(Kind.COLLAPSED)
     left_window = int(Kind.LEFT_WINDOW)
@@ -49,7 +49,7 @@ def check(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def valid(constants: Constants, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
-        """Whether the updated particle is finite, inside the window of ``shape`` nodes from ``corner``, and not collapsed.
+        """True if the updated particle is finite, inside the window of ``shape`` nodes from ``corner``, and not collapsed.
 
         A comparison with NaN is false. No branch: it would delay the loads that the stress needs.
         """
@@ -70,7 +70,7 @@ def check(spec: Spec) -> SimpleNamespace:
         base: ivec,
         H: mat,
     ):
-        """Write the status word of an invalid particle. Precedence: non-finite, off the grid, collapsed."""
+        """Write the status word of an invalid particle. Precedence: non-finite, collapsed, off the grid, outside the window."""
         kind = left_window
         for axis in range(dim):
             if wp.uint32(base[axis]) > wp.uint32(constants.shape[axis] - 3):

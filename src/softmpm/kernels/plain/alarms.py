@@ -6,23 +6,17 @@ from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.alarms import alarm
-from softmpm.kernels.physics.elasticity import elasticity
-from softmpm.kernels.structs import Spec, solid_types, types
+from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
 def state_alarms(spec: Spec):
     """Kernel that checks a state in the user's order, before any substep or after ``substep``."""
     t, one = types(spec.dim, spec.dtype), alarm(spec)
-    real, vec, mat, ivec, Constants, Solid = (
-        t.real,
-        t.vec,
-        t.mat,
-        t.ivec,
-        t.Constants,
-        solid_types(spec).Solid,
-    )
-    blocks = elasticity(spec.dim, spec.dtype)
+    real, vec, mat, ivec, Constants = t.real, t.vec, t.mat, t.ivec, t.Constants
+    ParticleInputs = input_types(spec).ParticleInputs
+    blocks = kinematics(spec.dim, spec.dtype)
     volume_change, identity = blocks.volume_change, blocks.identity
     step_is_stable, near = one.step_is_stable, one.near
     ran, report = status.report(spec.dim, spec.dtype).ran, status.report(spec.dim, spec.dtype).report
@@ -40,7 +34,7 @@ def state_alarms(spec: Spec):
     def check(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         neighbours: wp.array2d(dtype=wp.int32),
         substep: int,  # -1 before the first
         # In:
@@ -53,7 +47,7 @@ def state_alarms(spec: Spec):
         if not ran(words, world, wp.max(substep, 0)):
             return
         H = F[world, p] - identity()
-        if not step_is_stable(constants, body, world, p, H):
+        if not step_is_stable(constants, inputs, world, p, H):
             report(words, world, wp.max(substep, 0), step, p)
         for k in range(neighbours.shape[1]):
             q = neighbours[p, k]

@@ -27,17 +27,17 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.particle import particle, particle_adj
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, solid_adj_type, solid_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
 @kernel_factory
 def transfer(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     vec, mat, node_vec, Constants, Motion, ivec = t.vec, t.mat, t.node, t.Constants, t.Motion, t.ivec
-    Solid, s, one = solid_types(spec).Solid, spline(spec.dim, spec.dtype), particle(spec)
+    ParticleInputs, s, one = input_types(spec).ParticleInputs, spline(spec.dim, spec.dtype), particle(spec)
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
     pack, Particle, moved = s.pack, one.Particle, one.moved
-    rotation, affine_momentum = one.rotation, one.affine_momentum
+    rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
     running, rounds = status.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
     report_invalid = status.check(spec).report_invalid
 
@@ -45,7 +45,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     def p2g(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         # In:
         now: Motion,
         # Out, added into:
@@ -54,10 +54,10 @@ def transfer(spec: Spec) -> SimpleNamespace:
         world, p = wp.tid()
         base = now.base[world, p]  # valid also in a world that failed: it was not moved
         fx = now.fx[world, p]
-        m = body.mass[world, p]
-        mv = m * now.v[world, p]
+        m = inputs.mass[world, p]
+        mv = linear_momentum(constants, inputs, world, p, now.v[world, p])
         H = now.H[world, p]
-        A = affine_momentum(constants, body, world, p, now.C[world, p], H, rotation(body, world, p, H))
+        A = affine_momentum(constants, inputs, world, p, now.C[world, p], H, rotation(inputs, world, p, H))
         w = weights(fx)
         for n in range(s.count):  # (T1)
             o = offset(n)
@@ -73,6 +73,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
     def g2p(
         # Parameters:
         constants: Constants,
+        inputs: ParticleInputs,
         substep: int,
         # In:
         velocity: wp.array2d(dtype=vec),
@@ -98,7 +99,7 @@ def transfer(spec: Spec) -> SimpleNamespace:
                 share = weight(w, o) * velocity[world, node_index(old.base, o, constants.shape)]
                 v += share
                 B += wp.outer(share, position(o) - old.fx)
-            new = moved(constants, ivec(), constants.shape, old, v, B)  # (T3)
+            new = moved(constants, inputs, world, p, ivec(), constants.shape, old, v, B)  # (T3)
             if not new.valid:
                 report_invalid(words, constants, world, p, substep, new.fx, new.base, new.H)
                 new.base = old.base
@@ -122,26 +123,31 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.node
     Constants, Motion, MotionAdj = t.Constants, t.Motion, t.MotionAdj
-    Solid, SolidAdj = solid_types(spec).Solid, solid_adj_type(spec, wanted)
+    ParticleInputs, ParticleInputsAdj = (
+        input_types(spec).ParticleInputs,
+        input_adj_types(spec, wanted).ParticleInputsAdj,
+    )
     s, dim, one = spline(spec.dim, spec.dtype), spec.dim, particle_adj(spec, wanted)
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index, momentum = s.weight, s.weight_slope, s.node_index, s.momentum
     ParticleAdj, momentum_adj, moved_adj = one.ParticleAdj, one.momentum_adj, one.moved_adj
-    rotation, affine_momentum = particle(spec).rotation, particle(spec).affine_momentum
+    of_particle = particle(spec)
+    rotation, linear_momentum = of_particle.rotation, of_particle.linear_momentum
+    affine_momentum = of_particle.affine_momentum
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
 
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
     def p2g_adj(
         # Parameters:
         constants: Constants,
-        body: Solid,
+        inputs: ParticleInputs,
         substep: int,
         # In:
         now: Motion,
         adj_node: wp.array2d(dtype=node_vec),
         # Out, added into:
         words: wp.array(dtype=wp.int64),
-        adj_body: SolidAdj,
+        adj_inputs: ParticleInputsAdj,
         adj_now: MotionAdj,
     ):
         world, p = wp.tid()
@@ -150,9 +156,10 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         v = now.v[world, p]
         C = now.C[world, p]
         H = now.H[world, p]
-        m = body.mass[world, p]
-        Q = rotation(body, world, p, H)
-        A = affine_momentum(constants, body, world, p, C, H, Q)
+        m = inputs.mass[world, p]
+        mv = linear_momentum(constants, inputs, world, p, v)
+        Q = rotation(inputs, world, p, H)
+        A = affine_momentum(constants, inputs, world, p, C, H, Q)
         w = weights(fx)
         slope = slopes(fx)
         adj_mv = vec()
@@ -165,12 +172,12 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_i = adj_node[world, node_index(base, o, constants.shape)]
             adj_p = momentum(adj_i)
             share = weight(w, o)
-            g = wp.dot(adj_p, m * v + A * r) + m * adj_i[dim]
+            g = wp.dot(adj_p, mv + A * r) + m * adj_i[dim]
             adj_fx += g * weight_slope(w, slope, o) - share * (wp.transpose(A) * adj_p)
             adj_mv += share * adj_p
             adj_m += share * adj_i[dim]
             B += wp.outer(share * adj_p, r)
-        adj = momentum_adj(constants, body, world, p, v, C, H, Q, adj_mv, adj_m, B, adj_body)
+        adj = momentum_adj(constants, inputs, world, p, v, C, H, Q, adj_mv, adj_m, B, adj_inputs)
         adj.fx = adj_fx + adj_now.fx[world, p]
         adj.v += adj_now.v[world, p]
         adj.C += adj_now.C[world, p]
@@ -187,12 +194,14 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     def g2p_adj(
         # Parameters:
         constants: Constants,
+        inputs: ParticleInputs,
         # In:
         velocity: wp.array2d(dtype=vec),
         now: Motion,
         then: Motion,
         adj_then: MotionAdj,
         # Out, added into:
+        adj_inputs: ParticleInputsAdj,
         adj_velocity: wp.array2d(dtype=vec),
         adj_now: MotionAdj,
     ):
@@ -204,7 +213,9 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_new.v = adj_then.v[world, p]
         adj_new.C = adj_then.C[world, p]
         adj_new.H = adj_then.H[world, p]
-        adj = moved_adj(constants, now.H[world, p], then.C[world, p], adj_new)  # (T3.adj)
+        adj = moved_adj(
+            constants, inputs, world, p, now.H[world, p], then.C[world, p], adj_new, adj_inputs
+        )  # (T3.adj)
         adj_now.H[world, p] = adj_now.H[world, p] + adj.H
         adj_fx = adj.fx
         w = weights(fx)

@@ -1,7 +1,7 @@
 """A chunk graph: the launches of one chunk of the fast scheme on fixed buffers, captured once and replayed.
 
 A captured graph refers to addresses, so everything that changes between calls is first copied into the graph's buffers: the initial
-state, the material, the pull of the muscles. A chunk graph is leased to one call: until its backward pass has run if it stores states,
+state and the inputs (sorted_inputs.py). A chunk graph is leased to one call: until its backward pass has run if it stores states,
 otherwise until no later chunk reads its final state.
 """
 
@@ -10,38 +10,42 @@ from collections.abc import Sequence
 
 import torch
 import warp as wp
-from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
 from softmpm.kernels.fast.alarms import packed_alarms
 from softmpm.kernels.fast.g2p2g import fused
-from softmpm.kernels.fast.material_order import sorted_solid
 from softmpm.kernels.fast.native import BLOCK, FEW, VERY_FEW, WARP, padded
 from softmpm.kernels.fast.packing import packing
 from softmpm.kernels.fast.sorting import sorting
-from softmpm.kernels.structs import solid_types, types
+from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
-from softmpm.schemes.buffers import Solid, passing, slot, slots_in, view
+from softmpm.schemes.buffers import passing, slot, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.particle_order import ParticleLayout
+from softmpm.schemes.fast.sorted_inputs import SortedInputs
 from softmpm.schemes.fast.sorted_state import SortedState
+from softmpm.schemes.inputs import Values
 from softmpm.schemes.launch import KernelLauncher, LaunchReplay, RebindableLaunch
 from softmpm.state import State
 
 
 class ChunkGraph:
-    """One shape of chunk on one particle layout."""
+    """Captured launches of the chunks of one shape on one particle layout.
 
-    def __init__(self, model: Model, arrangement: ParticleLayout, chunk: Chunk, keep: bool):
-        self.model, self.arrangement, self.chunk, self.keep = model, arrangement, chunk, keep
+    Args:
+        keep: Whether to store the intermediate states, which :class:`ChunkGraphAdj` needs.
+    """
+
+    def __init__(self, model: Model, layout: ParticleLayout, chunk: Chunk, keep: bool):
+        self.model, self.layout, self.chunk, self.keep = model, layout, chunk, keep
         self.types = t = types(model.spec.dim, model.spec.dtype)
         self.lead = (model.worlds, model.particle_count)
         self.total = model.worlds * model.particle_count
-        places = padded(self.total)
+        padded_count = padded(self.total)
 
         def tensor(*size, dtype=model.dtype):
             return torch.empty(*size, dtype=dtype, device=model.device)
@@ -53,26 +57,25 @@ class ChunkGraph:
         self._no_status = torch.full_like(self.words, NEVER)
         self._no_status[-2:].zero_()
         self._version = -1  # of the layout that order and origin were copied from
-        # Tensors that the sorted material was copied from, if they need no gradient:
-        self._given: tuple[Tensor, ...] = ()
+        self.inputs = SortedInputs(model, chunk, self.order)
         slots, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
-        self.base = tensor(slots, places, dtype=torch.int32)
-        self.rows = tensor(slots, places * t.rows)
-        self.nodes = tensor(grids, model.worlds * arrangement.node_count, 4)
-        self.velocity = tensor(model.worlds * arrangement.node_count, 4)
-        rows = chunk.row(chunk.length - 1) + 1
-        self.pull = tensor(rows, model.worlds, model.muscle_count) if model.muscle_count else None
+        self.base = tensor(slots, padded_count, dtype=torch.int32)
+        self.rows = tensor(slots, padded_count * t.rows)
+        self.nodes = tensor(grids, model.worlds * layout.node_count, 4)
+        self.velocity = tensor(model.worlds * layout.node_count, 4)
         self._structs()
         self.exact = None
         if model.spec.deterministic:
-            self.exact = FixedPointAccumulator(model, view(tensor(places * t.rows), t.real), self.node_arrays)
+            self.exact = FixedPointAccumulator(
+                model, view(tensor(padded_count * t.rows), t.real), self.node_arrays
+            )
         self._forward = LaunchReplay(model)
-        self._commands()
+        self._build_launches()
 
     def _structs(self) -> None:
-        """Warp structs of the buffers."""
-        model, t = self.model, self.types
-        self.window = self.arrangement.window(self.origin)
+        """Build the Warp structs that refer to the buffers."""
+        t = self.types
+        self.window = self.layout.window(self.origin)
         self.packed = []
         for base, rows in zip(self.base, self.rows, strict=True):
             packed = t.Packed()
@@ -82,31 +85,12 @@ class ChunkGraph:
         self.nothing = view(self._tensor(0, 4), t.aligned)
         self.velocity_array = view(self.velocity, t.aligned)
         self.order_array = view(self.order, wp.int32)
+        self._mass = view(self.inputs.values["mass"], t.real)
         self.order_flat = view(self.order.view(-1), wp.int32)
         self.words_array = view(self.words, wp.int64)
-        material = [self._tensor(*self.lead) for _ in range(4)]
-        solid = solid_types(model.spec).Solid()
-        for name, tensor in zip(("mass", "mu", "lam", "volume"), material, strict=True):
-            setattr(solid, name, view(tensor, t.real))
-        if len(model.spec.laws) > 1:
-            solid.law = view(self._tensor(*self.lead, dtype=torch.int32), wp.int32)
-        if model.spec.muscle_slots:
-            slots = self._tensor(*self.lead, model.spec.muscle_slots, dtype=torch.int32)
-            self.muscle_array = view(slots, wp.int32)
-            solid.muscle, solid.fibre = self.muscle_array, view(model.fibre, t.vec)
-        self._solid = solid
-        self.solids = []
-        for row in self.pull if self.pull is not None else [None]:
-            solid = solid_types(model.spec).Solid()
-            for name in solid_types(model.spec).Solid.vars:
-                if name != "pull":
-                    setattr(solid, name, getattr(self._solid, name))
-            if row is not None:
-                solid.pull = view(row, t.real)
-            self.solids.append(solid)
 
-    def _commands(self) -> None:
-        """Launches that fill the buffers from a user's state or from the final state of another chunk."""
+    def _build_launches(self) -> None:
+        """Build the launches that fill the buffers from a user's state or from the final state of another chunk."""
         model, t, pack, lead = self.model, self.types, self.packing, self.lead
         at, low = (model.constants, self.window, self.order_array), (t.vec, t.mat)
         state = (t.vec, t.vec, t.mat, t.mat)
@@ -119,14 +103,14 @@ class ChunkGraph:
             return RebindableLaunch(model, pack.enter, lead, inputs, slots)
 
         self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
-        places, sort = padded(self.total), sorting(t.dim, model.spec.dtype)
-        slots = [slot(model, wp.int32), slot(model, wp.int32, places), slot(model, t.real, places * t.rows)]
+        padded_count, sort = padded(self.total), sorting(t.dim, model.spec.dtype)
+        slots = [
+            slot(model, wp.int32),
+            slot(model, wp.int32, padded_count),
+            slot(model, t.real, padded_count * t.rows),
+        ]
         inputs = (self.window, self.order_array, *slots, self.words_array, self.packed[0])
         self._move = RebindableLaunch(model, sort.move, lead, inputs, slots)
-        given = Solid.fixed(model)
-        slots = slots_in(given, ("mass", "mu", "lam"), model, t.real)
-        inputs = (self.order_array, given, self._solid)
-        self._sort = RebindableLaunch(model, sorted_solid(model.spec), lead, inputs, slots)
 
     @property
     def bytes(self) -> int:
@@ -138,10 +122,6 @@ class ChunkGraph:
         """Reset all status words."""
         self.words.copy_(self._no_status)
 
-    def solid(self, s: int):
-        """Material and pull of substep ``s``."""
-        return self.solids[self.chunk.row(s) if self.pull is not None else 0]
-
     @property
     def few(self) -> bool:
         """True if the particles are too few to fill a GPU with blocks of full size."""
@@ -149,7 +129,7 @@ class ChunkGraph:
 
     @property
     def block(self) -> int:
-        """Threads of a block in launches over particles."""
+        """Threads per block of launches over particles."""
         return WARP if self.few else BLOCK
 
     @functools.cached_property
@@ -160,7 +140,7 @@ class ChunkGraph:
     def particles_of_warp(self, may_halve: bool) -> int:
         """Particles assigned to each warp: one per thread or, if ``may_halve``, one per two threads for few particles.
 
-        Half-populated warps walk through fewer particles each but send more reductions; bench/step.py and gradient.py measure
+        Half-populated warps process fewer particles each but send more reductions; bench/step.py and gradient.py measure
         which is faster.
         """
         few = self.model.device.type == "cuda" and self.exact is None and self.total <= VERY_FEW
@@ -174,34 +154,30 @@ class ChunkGraph:
         return -(-warps * WARP // self.block) * self.block
 
     def run(
-        self, start: State | SortedState, pull: Tensor | None, solid: Solid, frozen: Sequence[int] = ()
+        self, chunk: Chunk, start: State | SortedState, values: Values, frozen: Sequence[int] = ()
     ) -> None:
         """Launch all substeps from ``start``. The final state is the last of :attr:`base` and :attr:`rows`.
 
         Args:
+            chunk: Of this graph's shape.
+            values: Inputs that the call decides; those with rows have one for each control step of the chunk.
             frozen: Worlds whose particles do not move.
         """
         stream = stream_of(self.model.device)
-        moved = is_capturing(self.model) or self._version != self.arrangement.version
+        moved = is_capturing(self.model) or self._version != self.layout.version
         if moved:
-            self._version, self._given = -1, ()  # until the material is in this order too
-            self.order.copy_(self.arrangement.order)
-            self.origin.copy_(self.arrangement.origin)
-            self.arrangement.place_neighbours()
+            self._version = -1  # until the inputs are in this order too
+            self.order.copy_(self.layout.order)
+            self.origin.copy_(self.layout.origin)
+            self.layout.place_neighbours()
         self.reset_status()
         if frozen:
             self.words[list(frozen)] = FROZEN
-        if self.pull is not None and pull is not None:
-            self.pull.copy_(pull)
-        if not self._has(solid):
-            self._given = ()
-            self._sort(stream, solid.mass, solid.mu, solid.lam)
-            given = (solid.mass, solid.mu, solid.lam)
-            self._given = () if any(tensor.requires_grad for tensor in given) else given
-            self._version = self.arrangement.version
+        self.inputs.take(stream, chunk, values, moved)
+        self._version = self.layout.version
         self._take(stream, start)
         if self.exact is not None:
-            self.exact.begin(solid.mass)
+            self.exact.begin(values["mass"])
         self._forward.run(stream, self._launch_all)
 
     def _take(self, stream: wp.Stream | None, start: State | SortedState) -> None:
@@ -211,11 +187,6 @@ class ChunkGraph:
         else:
             given = [tensor.contiguous() for tensor in (*start[:4], *(start.low or ()))]
             self._enter[start.low is not None](stream, *given)
-
-    def _has(self, solid: Solid) -> bool:
-        """True if the material is that of the previous run: the same tensor objects, which nothing else writes to."""
-        given = (solid.mass, solid.mu, solid.lam)
-        return bool(self._given) and all(a is b for a, b in zip(given, self._given, strict=True))
 
     @property
     def packing(self):
@@ -232,7 +203,8 @@ class ChunkGraph:
             now, then = nodes[s % len(nodes)], nodes[(s + 1) % len(nodes)] if s + 1 < length else self.nothing
             if self.exact is not None:
                 now, then = self.exact.sums(s), self.nothing
-            arguments = (model.constants, model.walls, self.window, now, self.velocity_array, then)
+            inputs = self.inputs.grid_struct(s)
+            arguments = (model.constants, inputs, self.window, now, self.velocity_array, then)
             launch(kernels.grid_velocity, held, *arguments, block_dim=BLOCK)
             self._advance(s, launch)
         survey = sorting(self.types.dim, model.spec.dtype).survey
@@ -240,7 +212,8 @@ class ChunkGraph:
         launch(survey, self.total, *arguments, view(self.words[-2:], wp.int64))
         if armed(model):
             sizes = (length - 1, model.particle_count, self.total, self.order_flat)
-            given = (model.constants, self.solid(length - 1), self.arrangement.neighbours, *sizes)
+            inputs = self.inputs.particle_struct(length - 1, length - 1)
+            given = (model.constants, inputs, self.layout.neighbours, *sizes)
             launch(packed_alarms(model.spec).check, self.total, *given, self.packed[-1], self.words_array)
 
     def _begin(self, launch: KernelLauncher) -> None:
@@ -249,7 +222,7 @@ class ChunkGraph:
         sizes = (self.particles_per_warp, model.particle_count, self.total, self.order_flat)
         arguments = (
             model.constants,
-            self.solid(0),
+            self.inputs.particle_struct(0, 0),
             self.window,
             *sizes,
             self.packed[0],
@@ -263,14 +236,14 @@ class ChunkGraph:
             block_dim=self.block,
         )
         if self.exact is not None:
-            self.exact.accumulate(self, 0, self.packed[0], self._solid.mass, launch)
+            self.exact.accumulate(self, 0, self.packed[0], self._mass, launch)
 
     def _advance(self, s: int, launch: KernelLauncher) -> None:
         """G2P of substep ``s`` and P2G of the next."""
         model, packed, nodes, length = self.model, self.packed, self.node_arrays, self.chunk.length
         now, then = (s, s + 1) if self.keep else (0, 0)
-        solid = self.solid(min(s + 1, length - 1))
-        parameters = (model.constants, solid, self.window, s, s + 1 == length, self.particles_per_warp)
+        inputs = self.inputs.particle_struct(s + 1, s)
+        parameters = (model.constants, inputs, self.window, s, s + 1 == length, self.particles_per_warp)
         sizes = (model.particle_count, self.total, self.order_flat)
         states = (packed[now], self.words_array, packed[then])
         sink = nodes[(s + 1) % len(nodes)] if self.exact is None else self.exact.shares(s + 1)
@@ -282,4 +255,4 @@ class ChunkGraph:
             block_dim=self.block,
         )
         if self.exact is not None and s + 1 < length:
-            self.exact.accumulate(self, s + 1, packed[then], self._solid.mass, launch)
+            self.exact.accumulate(self, s + 1, packed[then], self._mass, launch)

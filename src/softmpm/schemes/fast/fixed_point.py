@@ -42,7 +42,7 @@ class FixedPointAccumulator:
 
     def begin(self, mass: Tensor | None) -> None:
         """Prepare sum 0 with the masses (world, particle) that enter the sums, or None."""
-        clear(self.fixed)  # the reader of a sum clears it, but a run may have been interrupted
+        clear(self.fixed)  # reading a sum clears it, but a run may have been interrupted
         clear(self.largest)
         if mass is not None:
             self.largest[..., 1] = mass.amax(1)
@@ -52,6 +52,7 @@ class FixedPointAccumulator:
         return self._shares[k % 2]
 
     def sums(self, k: int):
+        """Struct of sum ``k`` for the kernels that read it."""
         return self._sums[k % len(self._sums)]
 
     def accumulate(self, graph, k: int, states, mass: wp.array | None, launch: KernelLauncher) -> None:

@@ -1,4 +1,4 @@
-"""Memory of the fast scheme: packed particles, and the nodes around them."""
+"""Memory of the fast scheme: packed particles, and the grid nodes near them."""
 
 import math
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from softmpm.planning.memory import (
     Buffers,
     Plan,
     Sizes,
+    input_bytes,
     longest_chunk,
     price_of_chunk,
     state_bytes,
@@ -21,7 +22,7 @@ from softmpm.planning.memory import (
 
 
 class FastFootprint:
-    """See :class:`softmpm.planning.memory.Footprint`."""
+    """Memory of the fast scheme; see :class:`softmpm.planning.memory.Footprint`."""
 
     numbers_per_node: ClassVar[dict[int, int]] = {2: 8, 3: 8}  # momentum and mass, velocity: 4 each
 
@@ -42,7 +43,7 @@ class FastFootprint:
     def sizes(self, model) -> Sizes:
         real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
         inside = particles * (4 + real * packed_rows(d).rows)
-        between = inside + 4 * particles  # and their order
+        between = inside + 4 * particles  # and the order
         nodes = model.worlds * model.held_nodes * 4 * real
         price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
         start = state_bytes(particles, d, real)
@@ -50,27 +51,29 @@ class FastFootprint:
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         sizes = model.sizes()
-        material = 4 * model.worlds * model.particle_count * model.dtype.itemsize
+        material = input_bytes(model, 1)
         fixed_point = 2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0
         graph = material + sizes.nodes + fixed_point
         small = graph + sizes.inside + 2 * sizes.nodes
         forward = small * _at_once(horizon, sizes.longest)
-        handed = 2 * sizes.inside  # adjoints in the order of the chunk before, and their copy
+        passed = 2 * sizes.inside  # adjoints in the order of the previous chunk, and their copy
         if chosen.keep_all:
             kept = model.calls * graph * len(horizon.chunks(chosen.longest))
-            return Buffers(forward, kept, handed)
+            return Buffers(forward, kept, passed)
         kept = graph * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
-        # PyTorch has a thread for the backward passes on a GPU, which runs chunks again in buffers of its own.
-        again = 2 * small if model.device.type == "cuda" else 0
-        return Buffers(forward, kept, handed + again)
+        # PyTorch runs backward passes on a GPU in a thread of their own, whose recomputed chunks have separate buffers.
+        recomputed = 2 * small if model.device.type == "cuda" else 0
+        return Buffers(forward, kept, passed + recomputed)
 
 
 def _shapes(horizon, longest: int) -> int:
+    """Number of distinct chunk shapes."""
     return len({chunk.shape for chunk in horizon.chunks(longest)})
 
 
 def _at_once(horizon, longest: int) -> int:
-    """Chunk graphs that keep nothing inside: one that runs, one launched ahead, one that holds the start of the first, and one of
-    another shape that waits.
+    """Number of chunk graphs in use at once that do not store their intermediate states.
+
+    One is running, one has been launched ahead, one contains the initial state of the first, and one of another shape may be cached.
     """
     return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))

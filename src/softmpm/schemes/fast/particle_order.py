@@ -1,8 +1,8 @@
 """Particle order and grid window of the fast scheme: particles are sorted by cell, and only nodes near them are allocated.
 
-Both may be out of date without affecting results. A stale order costs speed only; particles are sorted again when neighbours in
-memory share their cell too rarely. The window is the allocated part of the grid, at a separate place in each world, and it is centred
-again when a particle comes near its edge. If a particle leaves it, the chunk is repeated: with the window centred on its initial
+Both may be out of date without affecting results. A stale order costs speed only; particles are re-sorted when neighbours in
+memory share their cell too rarely. The window is the allocated part of the grid, at a separate place in each world, and it is
+re-centred when a particle comes near its edge. If a particle leaves it, the chunk is repeated: with the window centred on its initial
 state or, if it was already centred or this is not the first time, with a larger window. A captured graph cannot do this: after a replay
 in which a particle left, the window is enlarged and the graph captured again. The cost of a substep is proportional to the window, not
 to the grid.
@@ -27,7 +27,7 @@ from softmpm.schemes.failure_report import Report
 from softmpm.schemes.launch import RebindableLaunch
 
 STALE, STALE_FEW = 1.5, 3.0
-"""Sort again when the number of changes of cell along the order has grown by this factor; with few particles it matters less."""
+"""Re-sort when the number of changes of cell along the order has grown by this factor; with few particles the order matters less."""
 
 
 class ParticleLayout:
@@ -43,7 +43,7 @@ class ParticleLayout:
         origin: First node of the window, shape (world, dim), int32.
         shape: Nodes of the window along each axis.
         version: Number of updates.
-        stale: Whether the particles should be sorted again.
+        stale: Whether the particles should be re-sorted.
         left: Whether a particle has left the window before.
         outgrown: Whether the window must be enlarged, because a particle left it inside a captured graph.
     """
@@ -51,7 +51,7 @@ class ParticleLayout:
     def __init__(self, model: Model, x: Tensor, before: "ParticleLayout | None" = None):
         self.model, self.version = model, 0
         self._margin = 2 * before._margin + 1 if before else MARGIN[model.dim]
-        self._fresh: Report | None = None  # changes of cell along the order when it was new
+        self._fresh: Report | None = None  # changes of cell along the order just after sorting
         self.stale = self.left = self.outgrown = False
 
         def integers(*size):
@@ -62,16 +62,16 @@ class ParticleLayout:
         self._key = torch.empty_like(self.order)
         by_place = integers(model.worlds, *model.neighbours.shape)
         self.neighbours = view(by_place, wp.int32)
-        self._arrange = self._arranging(by_place)
+        self._place_neighbours = self._neighbour_launches(by_place)
         self._ends = integers(2, model.worlds, model.dim)
-        self._find = self._finding()
+        self._find = self._locate_launch()
         grid = model.scene.grid.shape
         self._locate(x)
         low, high = self._ends.tolist()  # waits for the device
         apart = [[max(0, h - b) for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
         wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)], self._margin)
         self.shape = tuple(max(sizes) for sizes in zip(wide, before.shape if before else wide, strict=True))
-        self._centre = self._centring()
+        self._centre = self._centre_launch()
         self.resort(x)
 
     @property
@@ -79,7 +79,7 @@ class ParticleLayout:
         """Nodes of one world in memory."""
         return math.prod(self.shape)
 
-    def _finding(self) -> RebindableLaunch:
+    def _locate_launch(self) -> RebindableLaunch:
         """Launch that computes the sort keys and the bounding box of the particles."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         gravity = model.scene.gravity
@@ -90,21 +90,24 @@ class ParticleLayout:
             model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places
         )
 
-    def _arranging(self, by_place: Tensor) -> list[RebindableLaunch]:
-        """See :meth:`place_neighbours`."""
+    def _neighbour_launches(self, by_place: Tensor) -> list[RebindableLaunch]:
+        """Launches of :meth:`place_neighbours`; none without rest neighbours."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         if by_place.shape[2] == 0:
             return []
         places, order = view(torch.empty_like(self.order), wp.int32), view(self.order, wp.int32)
-        invert, arrange = sorting(t.dim, model.spec.dtype).invert, packed_alarms(model.spec).arrange
+        invert, permute = (
+            sorting(t.dim, model.spec.dtype).invert,
+            packed_alarms(model.spec).permute_neighbours,
+        )
         given = (order, places, view(model.neighbours, wp.int32), self.neighbours)
         return [
             RebindableLaunch(model, invert, self.order.shape, (order, places), ()),
-            RebindableLaunch(model, arrange, self.order.shape, given, ()),
+            RebindableLaunch(model, permute, self.order.shape, given, ()),
         ]
 
-    def _centring(self) -> RebindableLaunch:
-        """Launch that centres the window on that box."""
+    def _centre_launch(self) -> RebindableLaunch:
+        """Launch that centres the window on the bounding box."""
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         ends = (view(tensor, wp.int32) for tensor in (*self._ends, self.origin))
         inputs = (model.constants, t.ivec(*self.shape), *ends)
@@ -140,8 +143,8 @@ class ParticleLayout:
 
     def place_neighbours(self) -> None:
         """Permute the lists of rest neighbours into the present order."""
-        for command in self._arrange:
-            command(stream_of(self.model.device))
+        for launch in self._place_neighbours:
+            launch(stream_of(self.model.device))
 
     def grown(self, x: Tensor) -> "ParticleLayout":
         """A layout with a larger window."""
@@ -152,14 +155,19 @@ class ParticleLayout:
         self.outgrown = True
 
     def update_staleness(self, cells: int, near_edge: bool) -> None:
-        """Decide whether to sort again, from the changes of cell along the order and whether a particle is near the window's edge."""
+        """Decide whether to re-sort.
+
+        Args:
+            cells: Changes of cell along the order.
+            near_edge: Whether a particle is near the window's edge.
+        """
         assert self._fresh is not None
         limit = STALE_FEW if self.order.numel() <= FEW else STALE
         scattered = self.model.device.type == "cuda" and cells > limit * self._fresh.read()[0]
         self.stale = near_edge or scattered
 
     def window(self, origin: Tensor):
-        """Struct for the kernels."""
+        """The window as a struct for the kernels; ``origin`` is its first node in each world."""
         t = types(self.model.spec.dim, self.model.spec.dtype)
         window = t.Window()
         window.shape, window.count = t.ivec(*self.shape), self.node_count

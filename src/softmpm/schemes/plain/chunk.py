@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
@@ -12,7 +11,8 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.alarm_check import StartCheck, armed, check_end
-from softmpm.schemes.buffers import Motion, MotionAdj, Solid, SolidAdj, clear
+from softmpm.schemes.buffers import Motion, MotionAdj, clear
+from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, elapsed, grid_struct, particle_struct
 from softmpm.schemes.plain.footprint import PlainFootprint
 from softmpm.schemes.plain.substep import Substep
 from softmpm.state import State
@@ -22,7 +22,7 @@ class PlainRun:
     """One chunk that ran.
 
     Attributes:
-        start, end: State before and after it; the end is handed over once the run is kept.
+        start, end: State before and after it; the end is passed on once the run is kept.
         words: Status words, see errors.py; shape (world,).
         outgrow: None, since the whole grid is in memory.
     """
@@ -32,55 +32,65 @@ class PlainRun:
         model: Model,
         chunk: Chunk,
         start: State,
-        pull: Tensor | None,
-        solid: Solid,
+        values: Values,
         keep: bool,
         frozen: Sequence[int] = (),
     ):
-        self.model, self.chunk, self.start, self.pull = model, chunk, start, pull
-        self.row = None if pull is None else torch.empty_like(pull[0])
-        self.step = Substep(model, Solid(solid.mass, solid.mu, solid.lam, self.row).struct(model))
-        self._solid = solid  # the structs only see its tensors
+        self.model, self.chunk, self.start = model, chunk, start
+        self._values = model.fixed | values  # the structs only see their tensors
+        if model.spec.moving:
+            self._values["elapsed"] = elapsed(model, chunk.first, chunk.length, chunk.substeps)
+        self.step = Substep(model)
         self.states = Motion.empty(model, chunk.length + 1 if keep else 2)
         self.slots = [self.states[i].struct(model) for i in range(len(self.states.base))]
-        self.step.words[list(frozen)] = FROZEN
+        if frozen:
+            self.step.words[list(frozen)] = FROZEN
         self.step.enter(start, self.slots[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
-            if s == 0 or chunk.row(s) != chunk.row(s - 1):
-                self._drive(s)
+            self._use_inputs(s, s - 1)
             self.step.advance(self.slots[now], self.slots[then], s)
         self.end = self.step.leave(self.slots[chunk.length if keep else chunk.length % 2])
         if armed(model):
-            check_end(model, self.step.solid, self.end, self.step.words_array, chunk.length - 1)
+            check_end(model, self.step.particle_inputs, self.end, self.step.words_array, chunk.length - 1)
         self.words = self.step.words
         self.outgrow: Callable[[], None] | None = None
 
-    def _drive(self, s: int) -> None:
-        if self.row is not None and self.pull is not None:
-            self.row.copy_(self.pull[self.chunk.row(s)])
+    def _use_inputs(self, s: int, before: int) -> None:
+        """Set the structs of substep ``s``, unless those of the substep that ran before it serve."""
+        row = self.chunk.row(s)
+        same = 0 <= before < self.chunk.length and row == self.chunk.row(before)
+        if not same:
+            self.step.particle_inputs = particle_struct(self.model, self._values, row, row)
+        if not same or self.model.spec.moving:
+            self.step.grid_inputs = grid_struct(self.model, self._values, row, s)
 
-    def vjp(self, adj_end: State, adj_solid: SolidAdj, wanted: RequestedGrads) -> tuple[State, Tensor | None]:
-        """Adjoint of the start and of the pull; adds that of the material into ``adj_solid``."""
+    def vjp(self, adj_end: State, adj_inputs: InputsAdj, wanted: RequestedGrads) -> State:
+        """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         model, chunk, step = self.model, self.chunk, self.step
         step.words.fill_(NEVER)
-        adj_pull = torch.zeros_like(self.pull) if wanted.activation and self.pull is not None else None
+        rows = chunk.row(chunk.length - 1) + 1
+        found = Accumulators(model, wanted, rows, model.node_count)
         adjoints = MotionAdj.zeros(model), MotionAdj.zeros(model)
-        structs, adj_struct = [adj.struct(model) for adj in adjoints], adj_solid.struct(model)
+        structs = [adj.struct(model) for adj in adjoints]
         then = adjoints[chunk.length % 2]
         then.fx.copy_(adj_end.x).mul_(model.scene.grid.spacing)
         then.v.copy_(adj_end.v)
         then.C.copy_(adj_end.C)
         then.H.copy_(adj_end.F)
         for s in reversed(range(chunk.length)):
-            self._drive(s)
+            row = chunk.row(s)
+            self._use_inputs(s, s + 1)
             clear(adjoints[s % 2].flat)
             states = self.slots[s], self.slots[s + 1], structs[(s + 1) % 2], structs[s % 2]
-            step.adjoint(wanted, *states, adj_struct, chunk.length - 1 - s)
-            if adj_pull is not None and (s == 0 or chunk.row(s) != chunk.row(s - 1)):
-                step.collect_pull(adj_solid, adj_pull[chunk.row(s)])
+            inputs = found.particle_struct(row, row), found.grid_struct(row)
+            step.adjoint(wanted, *states, inputs, chunk.length - 1 - s)
+            if s == 0 or row != chunk.row(s - 1):
+                found.collect(row, model.fixed, step.launch)
+        adj_inputs.add(found, chunk.rows)
+        adj_inputs.add_particles(found, chunk.rows)
         start = adjoints[0]
-        return State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H), adj_pull
+        return State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H)
 
 
 class Plain:
@@ -99,15 +109,14 @@ class Plain:
         self,
         chunk: Chunk,
         start: State,
-        pull: Tensor | None,
-        solid: Solid,
+        values: Values,
         keep: bool,
         frozen: Sequence[int] = (),
     ) -> PlainRun:
-        return PlainRun(self.model, chunk, start, pull, solid, keep, frozen)
+        return PlainRun(self.model, chunk, start, values, keep, frozen)
 
-    def check_start(self, start: State, pull: Tensor | None, solid: Solid) -> Tensor:
-        return StartCheck(self.model)(start, pull, solid)
+    def check_start(self, start: State, values: Values) -> Tensor:
+        return StartCheck(self.model)(start, values)
 
     def accept(self, run: PlainRun, words: list[int]) -> bool:
         return True

@@ -5,6 +5,7 @@ stream and are never recorded on a ``wp.Tape`` by themselves: :func:`softmpm.ste
 """
 
 import functools
+from typing import Any
 
 import torch
 import warp as wp
@@ -12,13 +13,12 @@ from torch import Tensor
 
 from softmpm.errors import NEVER
 from softmpm.kernels.compile import launch
-from softmpm.kernels.convert import boundary
-from softmpm.kernels.physics.actuation_sum import collect_pull, collectors
-from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.convert import conversion
+from softmpm.kernels.physics.grid import grid, grid_adj
 from softmpm.kernels.plain.transfer import transfer, transfer_adj
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
-from softmpm.schemes.buffers import SolidAdj, clear, view
+from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.device import stream_of
 from softmpm.state import Low, State
 
@@ -26,12 +26,16 @@ from softmpm.state import Low, State
 class Substep:
     """The launches of one substep, on grid buffers of its own that are made when first used.
 
-    Args:
-        solid: Struct of a :class:`Solid`; None if only :meth:`enter` and :meth:`leave` are wanted.
+    Attributes:
+        particle_inputs, grid_inputs: Structs of the inputs, set before a substep; none are needed for :meth:`enter` and :meth:`leave`.
+        words, words_array: Status words of the worlds, see errors.py.
     """
 
-    def __init__(self, model: Model, solid):
-        self.model, self.solid, self.stream = model, solid, stream_of(model.device)
+    particle_inputs: Any
+    grid_inputs: Any
+
+    def __init__(self, model: Model):
+        self.model, self.stream = model, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
         for define in (transfer, grid):  # all of a module before it is first loaded: it is compiled once
             define(model.spec)
@@ -79,56 +83,45 @@ class Substep:
         constants, spec = self.model.constants, self.model.spec
         node, velocity = self._array("node"), self._array("velocity")
         clear(self.node)
-        self.launch(transfer(spec).p2g, self.particles, constants, self.solid, now, node)
-        self.launch(grid(spec).grid_velocity, self.nodes, constants, self.model.walls, node, velocity)
+        self.launch(transfer(spec).p2g, self.particles, constants, self.particle_inputs, now, node)
+        self.launch(grid(spec).grid_velocity, self.nodes, constants, self.grid_inputs, node, velocity)
 
     def advance(self, now, then, substep: int) -> None:
         """One whole substep."""
         self.last = substep
         self.to_grid(now)
-        arguments = (self.model.constants, substep, self._array("velocity"), now, self.words_array, then)
-        self.launch(transfer(self.model.spec).g2p, self.particles, *arguments)
+        arguments = (self.model.constants, self.particle_inputs, substep, self._array("velocity"), now)
+        self.launch(transfer(self.model.spec).g2p, self.particles, *arguments, self.words_array, then)
 
-    def adjoint(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_solid, substep: int) -> None:
-        """Adjoint of :meth:`advance`: adds into ``adj_now`` and ``adj_solid``. The grid is computed again."""
+    def adjoint(
+        self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs: tuple, substep: int
+    ) -> None:
+        """Adjoint of :meth:`advance`. The grid is recomputed.
+
+        Args:
+            adj_now, adj_inputs: Added into; the latter are the structs of the inputs of particles and of nodes.
+        """
+        adj_particle_inputs, adj_grid_inputs = adj_inputs
         self.to_grid(now)
         clear(self.adj_velocity)
-        self.g2p_adj(wanted, now, then, adj_then, adj_now)
-        self.grid_adj()
-        self.p2g_adj(wanted, now, adj_now, adj_solid, substep)
+        self.g2p_adj(wanted, now, then, adj_then, adj_now, adj_particle_inputs)
+        self.grid_adj(wanted, adj_grid_inputs)
+        self.p2g_adj(wanted, now, adj_now, adj_particle_inputs, substep)
 
-    def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now) -> None:
-        velocity, adj_velocity = self._array("velocity"), self._array("adj_velocity")
-        arguments = (self.model.constants, velocity, now, then, adj_then, adj_velocity, adj_now)
+    def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs) -> None:
+        arrays = (self._array("velocity"), now, then, adj_then, adj_inputs, self._array("adj_velocity"))
+        arguments = (self.model.constants, self.particle_inputs, *arrays, adj_now)
         self.launch(transfer_adj(self.model.spec, wanted).g2p_adj, self.particles, *arguments)
 
-    def grid_adj(self) -> None:
-        model, arrays = self.model, (self._array(name) for name in ("node", "adj_velocity", "adj_node"))
-        arguments = (model.constants, model.walls, *arrays)
-        self.launch(grid(model.spec).grid_velocity_adj, self.nodes, *arguments)
+    def grid_adj(self, wanted: RequestedGrads, adj_inputs) -> None:
+        arrays = (self._array(name) for name in ("node", "adj_velocity", "adj_node"))
+        arguments = (self.model.constants, self.grid_inputs, *arrays, adj_inputs)
+        self.launch(grid_adj(self.model.spec, wanted).grid_velocity_adj, self.nodes, *arguments)
 
-    def p2g_adj(self, wanted: RequestedGrads, now, adj_now, adj_solid, substep: int) -> None:
-        adj_node = self._array("adj_node")
-        arguments = (
-            self.model.constants,
-            self.solid,
-            substep,
-            now,
-            adj_node,
-            self.words_array,
-            adj_solid,
-            adj_now,
-        )
+    def p2g_adj(self, wanted: RequestedGrads, now, adj_now, adj_inputs, substep: int) -> None:
+        parameters = (self.model.constants, self.particle_inputs, substep, now, self._array("adj_node"))
+        arguments = (*parameters, self.words_array, adj_inputs, adj_now)
         self.launch(transfer_adj(self.model.spec, wanted).p2g_adj, self.particles, *arguments)
-
-    def collect_pull(self, adj_solid: SolidAdj, adj_pull: Tensor) -> None:
-        """Add what the particles found for the muscles' pull into ``adj_pull`` (world, muscle) and start afresh."""
-        if adj_solid.slot is None:
-            raise ValueError("the adjoint of the pull was not asked for.")
-        slots = self.model.muscle_slots.expand(*adj_solid.slot.shape)
-        real, muscles = self.types.real, view(slots, wp.int32)
-        arrays = (muscles, view(adj_solid.slot, real), view(adj_pull, real))
-        self.launch(collect_pull(self.model.spec), collectors(adj_solid.slot.shape), *arrays)
 
     def enter(self, start: State, motion) -> None:
         """From what users hold to what the kernels hold."""
@@ -138,11 +131,11 @@ class Substep:
         arrays = [
             view(tensor.contiguous(), t.vec if tensor.ndim == 3 else t.mat) for tensor in (*start[:4], *low)
         ]
-        kernel = boundary(self.model.dim, self.model.spec.dtype).enter
+        kernel = conversion(self.model.dim, self.model.spec.dtype).enter
         self.launch(kernel, self.particles, self.model.constants, *arrays, self.words_array, motion)
 
     def leave(self, motion) -> State:
-        """The way back, into fresh tensors."""
+        """Inverse of :meth:`enter`, into new tensors."""
         t, lead, d = self.types, self.particles, self.model.dim
         vectors = [(*lead, d), (*lead, d), (*lead, d, d), (*lead, d, d)]
         if self.model.dtype == torch.float32:
@@ -151,6 +144,10 @@ class Substep:
         low = out[4:] or [out[0].new_empty(0, 0, d), out[0].new_empty(0, 0, d, d)]
         arrays = [view(tensor, t.vec if tensor.ndim == 3 else t.mat) for tensor in (*out[:4], *low)]
         self.launch(
-            boundary(self.model.dim, self.model.spec.dtype).leave, lead, self.model.constants, motion, *arrays
+            conversion(self.model.dim, self.model.spec.dtype).leave,
+            lead,
+            self.model.constants,
+            motion,
+            *arrays,
         )
         return State(*out[:4], low=Low(*out[4:]) if out[4:] else None)

@@ -1,4 +1,4 @@
-"""Adjoint of a muscle's pull: the sum over its particles."""
+"""Adjoints of an actuator: sums over the slots of its particles."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -13,24 +13,24 @@ COLLECTORS = 8_192
 
 
 def collectors(slots: Sequence[int]) -> tuple[int, int, int]:
-    """Threads of :func:`collect_pull` for slots (world, particle, slot)."""
+    """Threads of :func:`collect_slots` for slots (world, particle, slot)."""
     worlds, particles, count = slots
     return worlds, min(particles, COLLECTORS), count
 
 
 @kernel_factory
-def collect_pull(spec: Spec):
-    """Kernel that adds the pull's adjoint of every particle and slot to that of its muscle, and clears it."""
+def collect_slots(spec: Spec):
+    """Kernel that adds the adjoint of every particle and slot to that of its actuator, and clears it."""
     t = types(spec.dim, spec.dtype)
 
-    @wp.kernel(module=spec.module + ".pull", enable_backward=False)
+    @wp.kernel(module=spec.module + ".slots", enable_backward=False)
     def collect(
         # In:
         muscle: wp.array3d(dtype=wp.int32),
         # In, cleared:
         adj_slot: wp.array3d(dtype=t.real),
         # Out, added into:
-        adj_pull: wp.array2d(dtype=t.real),
+        adj_muscle: wp.array2d(dtype=t.real),
     ):
         world, n, slot = wp.tid()
         last = int(-1)
@@ -39,27 +39,27 @@ def collect_pull(spec: Spec):
             k = muscle[world, p, slot]
             if k != last:
                 if last >= 0:
-                    wp.atomic_add(adj_pull, world, last, total)
+                    wp.atomic_add(adj_muscle, world, last, total)
                 last = k
                 total = t.real(0.0)
             if k >= 0:
                 total += adj_slot[world, p, slot]
                 adj_slot[world, p, slot] = t.real(0.0)
         if last >= 0:
-            wp.atomic_add(adj_pull, world, last, total)
+            wp.atomic_add(adj_muscle, world, last, total)
 
     return collect
 
 
 PARTS = 256
-"""Partial sums of a muscle's pull, each of every 256th particle."""
+"""Partial sums of an actuator, each of every 256th particle."""
 
 
 @kernel_factory
-def collect_pull_in_order(spec: Spec) -> SimpleNamespace:
-    """As :func:`collect_pull`, in an order that is always the same: ``parts`` of each muscle, then their ``total``."""
+def collect_slots_in_order(spec: Spec) -> SimpleNamespace:
+    """As :func:`collect_slots`, in an order that is always the same: ``parts`` of each actuator, then their ``total``."""
     t = types(spec.dim, spec.dtype)
-    module = spec.module + ".pull"
+    module = spec.module + ".slots"
 
     @wp.kernel(module=module, enable_backward=False)
     def parts(
@@ -84,10 +84,10 @@ def collect_pull_in_order(spec: Spec) -> SimpleNamespace:
         # In:
         part: wp.array3d(dtype=t.real),
         # Out, added into:
-        adj_pull: wp.array2d(dtype=t.real),
+        adj_muscle: wp.array2d(dtype=t.real),
     ):
         world, k = wp.tid()
         for n in range(PARTS):
-            adj_pull[world, k] = adj_pull[world, k] + part[world, k, n]
+            adj_muscle[world, k] = adj_muscle[world, k] + part[world, k, n]
 
     return SimpleNamespace(parts=parts, total=total)

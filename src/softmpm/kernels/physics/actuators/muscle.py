@@ -1,0 +1,43 @@
+"""Stress of a muscle and its adjoint. Derivation: docs/math/elasticity.md.
+
+    τ = p f fᵀ,  f = F d = d + H d                                                                   (M1)
+    p̄ = fᵀ τ̄ f,  F̄ = p (τ̄ + τ̄ᵀ) f dᵀ,  d̄ = p Fᵀ (τ̄ + τ̄ᵀ) f                                         (M1.adj)
+
+with the unit direction d in the rest shape and the active stress p [Pa]: positive contracts. Source: Spielberg et al. 2021 (Robotica).
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.physics.actuators import actuator_adj_type
+from softmpm.kernels.structs import types
+
+
+@kernel_factory
+def actuator(dim: int, dtype: str) -> SimpleNamespace:
+    t, ActuatorAdj = types(dim, dtype), actuator_adj_type(dim, dtype)
+    real, vec, mat = t.real, t.vec, t.mat
+
+    @wp.func
+    def stress(H: mat, fibre: vec, p: real) -> mat:
+        f = fibre + H * fibre
+        return p * wp.outer(f, f)
+
+    @wp.func
+    def stress_adj(H: mat, fibre: vec, p: real, adj_tau: mat) -> ActuatorAdj:
+        f = fibre + H * fibre
+        adj = ActuatorAdj()
+        adj.F = p * wp.outer((adj_tau + wp.transpose(adj_tau)) * f, fibre)
+        adj.active_stress = wp.dot(f, adj_tau * f)
+        adj_f = p * ((adj_tau + wp.transpose(adj_tau)) * f)
+        adj.fibre = adj_f + wp.transpose(H) * adj_f
+        return adj
+
+    @wp.func
+    def bound(F: mat, j: real, fibre: vec, p: real) -> real:
+        f = F * fibre
+        return real(2.0) * wp.max(p, real(0.0)) * wp.dot(f, f)
+
+    return SimpleNamespace(stress=stress, stress_adj=stress_adj, bound=bound)

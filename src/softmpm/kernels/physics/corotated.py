@@ -1,0 +1,59 @@
+"""Corotated laws: the common part of those that differ in their pressure only. Derivation: docs/math/elasticity.md.
+
+    τ = 2μ S + λ p(j) I,   S = (H − Q) Fᵀ = U + U Hᵀ,   U = H − Q
+    F̄ = 2μ T (2F − R) + λ p' tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,   T = (τ̄ + τ̄ᵀ) / 2
+    μ̄ = 2 ⟨T F, F − R⟩,   λ̄ = tr(τ̄) p(j)
+    K ≤ 2μ max(2s² − s, 0) + d max(λ J p', 0)            with the largest principal stretch s, in d dimensions
+
+Forward and adjoint of a particle share Q. S is symmetric but for rounding, which would turn a free body: the half below the diagonal
+stands for both. Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity".
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.laws import law_adj_type
+from softmpm.kernels.physics.polar import polar
+from softmpm.kernels.structs import types
+
+
+def corotated(dim: int, dtype: str, pressure: wp.Function, pressure_slope: wp.Function) -> SimpleNamespace:
+    """Functions of the law with the pressure λ p(j), from p and p' = ∂p/∂J."""
+    t, k, LawAdj = types(dim, dtype), kinematics(dim, dtype), law_adj_type(dim, dtype)
+    real, mat = t.real, t.mat
+    identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
+    rotation, rotation_adj = polar(dim, dtype).rotation, polar(dim, dtype).rotation_adj
+
+    @wp.func
+    def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
+        U = H - Q
+        S = U + U * wp.transpose(H)
+        for i in range(dim):
+            for k in range(i):
+                S[k, i] = S[i, k]
+        return real(2.0) * mu * S + lam * pressure(volume_change(H)) * identity()
+
+    @wp.func
+    def stress_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> LawAdj:
+        F = identity() + H
+        j = volume_change(H)
+        trace = wp.trace(adj_tau)
+        T = real(0.5) * (adj_tau + wp.transpose(adj_tau))
+        TF = T * F
+        two_mu = real(2.0) * mu
+        adj = LawAdj()
+        adj.F = two_mu * (TF + T * (H - Q)) + (lam * pressure_slope(j) * trace) * cofactor(F)
+        adj.F += rotation_adj(H, Q, -two_mu * TF)
+        adj.mu = real(2.0) * wp.ddot(TF, H - Q)
+        adj.lam = trace * pressure(j)
+        return adj
+
+    @wp.func
+    def bound(square: real, j: real, trace: real, mu: real, lam: real) -> real:
+        shape = wp.max(real(2.0) * square - wp.sqrt(square), real(0.0))
+        volume = wp.max(lam * (real(1.0) + j) * pressure_slope(j), real(0.0))
+        return real(2.0) * mu * shape + real(dim) * volume
+
+    return SimpleNamespace(rotation=rotation, stress=stress, stress_adj=stress_adj, bound=bound)

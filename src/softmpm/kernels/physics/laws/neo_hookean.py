@@ -1,0 +1,45 @@
+"""Neo-Hookean solid, and its adjoint. Source: Hu et al. 2019 ("ChainQueen").
+
+τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                                          (E1)
+F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
+K ≤ 2μ s² + d max(λ, 0)                              with the largest principal stretch s, in d dimensions
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.laws import law_adj_type, no_rotation
+from softmpm.kernels.structs import types
+
+
+@kernel_factory
+def law(dim: int, dtype: str) -> SimpleNamespace:
+    t, k, LawAdj = types(dim, dtype), kinematics(dim, dtype), law_adj_type(dim, dtype)
+    real, mat, divide = t.real, t.mat, t.divide
+    identity, cofactor, volume_change, log1p = k.identity, k.cofactor, k.volume_change, k.log1p
+
+    @wp.func
+    def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
+        return mu * (H + wp.transpose(H) + H * wp.transpose(H)) + lam * log1p(volume_change(H)) * identity()
+
+    @wp.func
+    def stress_adj(H: mat, Q: mat, mu: real, lam: real, adj_tau: mat) -> LawAdj:
+        F = identity() + H
+        j = volume_change(H)
+        trace = wp.trace(adj_tau)
+        adj = LawAdj()
+        adj.F = mu * (adj_tau + wp.transpose(adj_tau)) * F + divide(lam * trace, real(1.0) + j) * cofactor(F)
+        adj.mu = wp.ddot(adj_tau, H + wp.transpose(H) + H * wp.transpose(H))
+        adj.lam = trace * log1p(j)
+        return adj
+
+    @wp.func
+    def bound(square: real, j: real, trace: real, mu: real, lam: real) -> real:
+        return real(2.0) * mu * square + real(dim) * wp.max(lam, real(0.0))
+
+    return SimpleNamespace(
+        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound
+    )
