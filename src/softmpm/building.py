@@ -41,8 +41,8 @@ def build(
             docs/performance.md.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
-        deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower. Needs the fast
-            scheme. The CPU adds in one order anyway. See docs/conventions.md.
+        deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower, and in the plain scheme
+            and ``step`` much slower: float32 and the fast scheme are best. The CPU adds in one order anyway. See docs/conventions.md.
         calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
             budget. If there are more, they keep more.
         alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
@@ -88,7 +88,7 @@ def build(
         alarms,
         given=given,
         deterministic=bool(deterministic),
-        fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme, reason),
+        fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme),
         worlds=int(worlds),
         memory_budget=memory_budget,
         calls=int(calls),
@@ -143,18 +143,19 @@ def choose_scheme(scene: Scene, dtype: torch.dtype, worlds: int, wanted: str) ->
     return "fast", "single precision"
 
 
-def in_fixed_point(device: torch.device, dtype: torch.dtype, scheme: str, reason: str) -> bool:
-    """True if a deterministic model has to sum in fixed point.
+def in_fixed_point(device: torch.device, dtype: torch.dtype, scheme: str) -> bool:
+    """True if a deterministic model sums in fixed point, as the fast scheme does; the plain scheme sums in the order of the particles.
 
     Raises:
         ValueError: It would have to, and cannot.
     """
-    if scheme == "fast" and dtype == torch.float32:
+    if scheme == "plain":
+        return False
+    if dtype == torch.float32:
         return True
     if device.type == "cpu":
         return False
     raise ValueError(
-        "deterministic=True needs torch.float32 and the fast scheme on a GPU, because only its sums are in fixed point; "
-        f"got {dtype} and scheme {scheme!r} ({reason}). Change these, or use device='cpu', which adds in one order, or build "
-        "without it."
+        f"deterministic=True and scheme='fast' need torch.float32 on a GPU, because its fixed point has fewer digits than {dtype}; use "
+        "scheme='auto' or 'plain', which sums in the order of the particles."
     )

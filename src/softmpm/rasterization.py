@@ -8,7 +8,7 @@ from softmpm.errors import NEVER, UnstableError
 from softmpm.kernels.rasterize import raster
 from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.schemes.buffers import passing
+from softmpm.schemes.buffers import passing, view
 from softmpm.schemes.capture import defer_status_check, is_capturing, keep_alive
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.failure_report import raise_failure
@@ -43,13 +43,14 @@ def _sums(model: Model, state: State, words: Tensor) -> Tensor:
     mass, status = passing(model.mass, t.real), passing(words, wp.int64)
     moving = _particles(model, *(tensor.contiguous() for tensor in (state.x, state.v, state.C)))
     shape = (model.worlds, model.node_count, model.dim + 1)
-    if not model.deterministic:
+    if not model.deterministic or model.dtype == torch.float64:
+        splat = kernels.splat_in_order if model.deterministic else kernels.splat
         node = torch.zeros(shape, dtype=model.dtype, device=model.device)
-        launch(kernels.splat, lead, model.constants, mass, *moving, status, passing(node, t.node))
+        launch(splat, lead, model.constants, mass, *moving, status, view(node, t.node))
         return node
     node, units = torch.zeros(shape, dtype=torch.int64, device=model.device), _units(model, model.mass, state)
     inputs = (mass, passing(units, wp.float64), *moving)
-    launch(kernels.splat_fixed, lead, model.constants, *inputs, words, passing(node, wp.int64))
+    launch(kernels.splat_fixed, lead, model.constants, *inputs, status, passing(node, wp.int64))
     momentum, mass = (unit[:, None, None] for unit in units.unbind(1))
     return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
 

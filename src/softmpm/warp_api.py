@@ -41,7 +41,8 @@ def step(
 
     Raises:
         TypeError, ValueError: A state or ``solid`` is of another model or has other arrays; the two states are the same; a tape is
-            given and an array carries no gradient; or the model is deterministic and on a GPU.
+            given and an array carries no gradient.
+        RuntimeError: The model is deterministic, and a CUDA graph is being captured.
     """
     check_own(model, "step", solid=solid, state_in=state_in, state_out=state_out)
     if state_in.v.ptr == state_out.v.ptr:
@@ -52,11 +53,6 @@ def step(
     whole = isinstance(substep, (int, np.integer)) and not isinstance(substep, bool)
     if not whole or not 0 <= substep <= MAX_SUBSTEP:
         raise ValueError(f"substep must be a whole number from 0 to {MAX_SUBSTEP:,}, got {substep!r}.")
-    if model.deterministic and model.device.type == "cuda":
-        raise ValueError(
-            "step adds in floating point, in any order, but the model was built with deterministic=True; use softmpm.simulate, "
-            "or a model built without it."
-        )
     arrays = [*state_in.differentiable(), *state_out.differentiable(), *solid.differentiable()]
     if tape is not None and any(array.grad is None for array in arrays):
         raise ValueError(

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import in_order, kernel_factory
 from softmpm.kernels.convert import conversion
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.spline import spline
@@ -34,7 +34,6 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         """A particle as the kernels hold it; F does not enter and is taken as I."""
         return entered(constants, x, v, C, wp.identity(n=dim, dtype=real), vec(), mat())
 
-    @wp.kernel(module=module, enable_backward=False)
     def splat(
         # Parameters:
         constants: Constants,
@@ -81,7 +80,10 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         # Out, added into:
         node: wp.array3d(dtype=wp.int64),  # (world, node, dim + 1), in these units
     ):
-        """As ``splat``, into integers, whose sum does not depend on the order."""
+        """As ``splat``, into integers, whose sum does not depend on the order.
+
+        A CUDA graph may hold it, unlike ``splat_in_order``; the digits do for float32.
+        """
         world, p = wp.tid()
         speed = v[world, p]
         at = placed(constants, x[world, p], speed, C[world, p])
@@ -174,5 +176,10 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         adj_node[world, i] = pack(adj_p, adj_m)
 
     return SimpleNamespace(
-        splat=splat, splat_fixed=splat_fixed, splat_adj=splat_adj, divide=divide, divide_adj=divide_adj
+        splat=wp.kernel(splat, module=module, enable_backward=False),
+        splat_in_order=wp.kernel(splat, module=in_order(module, s.count), enable_backward=False),
+        splat_fixed=splat_fixed,
+        splat_adj=splat_adj,
+        divide=divide,
+        divide_adj=divide_adj,
     )

@@ -23,25 +23,37 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import in_order, kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.particle import particle, particle_adj
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
-@kernel_factory
-def transfer(spec: Spec) -> SimpleNamespace:
-    t = types(spec.dim, spec.dtype)
-    vec, mat, node_vec, Constants, Motion, ivec = t.vec, t.mat, t.node, t.Constants, t.Motion, t.ivec
-    ParticleInputs, s, one = input_types(spec).ParticleInputs, spline(spec.dim, spec.dtype), particle(spec)
-    weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
-    pack, Particle, moved = s.pack, one.Particle, one.moved
-    rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
-    running, rounds = status.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
-    report_invalid = status.check(spec).report_invalid
+def transfer(spec: Spec, ordered: bool = False) -> SimpleNamespace:
+    """Both kernels; ``ordered``: a GPU adds to a node in the order of the particles."""
+    return SimpleNamespace(p2g=_p2g(spec, ordered), g2p=_g2p(spec))
 
-    @wp.kernel(module=spec.module, enable_backward=False)
+
+def transfer_adj(spec: Spec, wanted: RequestedGrads, ordered: bool = False) -> SimpleNamespace:
+    """Their adjoints, likewise."""
+    return SimpleNamespace(p2g_adj=_p2g_adj(spec, wanted), g2p_adj=_g2p_adj(spec, wanted, ordered))
+
+
+@kernel_factory
+def _p2g(spec: Spec, ordered: bool):
+    t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle(spec)
+    node_vec, Constants, Motion, ParticleInputs = (
+        t.node,
+        t.Constants,
+        t.Motion,
+        input_types(spec).ParticleInputs,
+    )
+    weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
+    rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
+    pack, module = s.pack, in_order(spec.module, s.count) if ordered else spec.module
+
+    @wp.kernel(module=module, enable_backward=False)
     def p2g(
         # Parameters:
         constants: Constants,
@@ -68,6 +80,18 @@ def transfer(spec: Spec) -> SimpleNamespace:
                 node_index(base, o, constants.shape),
                 share * pack(mv + A * (position(o) - fx), m),
             )
+
+    return p2g
+
+
+@kernel_factory
+def _g2p(spec: Spec):
+    t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle(spec)
+    vec, mat, ivec, Constants, Motion = t.vec, t.mat, t.ivec, t.Constants, t.Motion
+    weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
+    ParticleInputs, Particle, moved = input_types(spec).ParticleInputs, one.Particle, one.moved
+    running, rounds = status.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
+    report_invalid = status.check(spec).report_invalid
 
     @wp.kernel(module=spec.module, enable_backward=False)
     def g2p(
@@ -115,25 +139,22 @@ def transfer(spec: Spec) -> SimpleNamespace:
         if wp.static(rounds):
             then.fx_low[world, p] = new.low
 
-    return SimpleNamespace(p2g=p2g, g2p=g2p)
+    return g2p
 
 
 @kernel_factory
-def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
-    t = types(spec.dim, spec.dtype)
-    real, vec, mat, node_vec = t.real, t.vec, t.mat, t.node
+def _p2g_adj(spec: Spec, wanted: RequestedGrads):
+    t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle(spec)
+    real, vec, mat, node_vec, dim = t.real, t.vec, t.mat, t.node, spec.dim
     Constants, Motion, MotionAdj = t.Constants, t.Motion, t.MotionAdj
     ParticleInputs, ParticleInputsAdj = (
         input_types(spec).ParticleInputs,
         input_adj_types(spec, wanted).ParticleInputsAdj,
     )
-    s, dim, one = spline(spec.dim, spec.dtype), spec.dim, particle_adj(spec, wanted)
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index, momentum = s.weight, s.weight_slope, s.node_index, s.momentum
-    ParticleAdj, momentum_adj, moved_adj = one.ParticleAdj, one.momentum_adj, one.moved_adj
-    of_particle = particle(spec)
-    rotation, linear_momentum = of_particle.rotation, of_particle.linear_momentum
-    affine_momentum = of_particle.affine_momentum
+    rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
+    momentum_adj = particle_adj(spec, wanted).momentum_adj
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
 
     @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
@@ -190,7 +211,23 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if not wp.isfinite(size):
             report(words, world, substep, bad_gradient, p)
 
-    @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
+    return p2g_adj
+
+
+@kernel_factory
+def _g2p_adj(spec: Spec, wanted: RequestedGrads, ordered: bool):
+    t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle_adj(spec, wanted)
+    vec, Constants, Motion, MotionAdj = t.vec, t.Constants, t.Motion, t.MotionAdj
+    ParticleInputs, ParticleInputsAdj = (
+        input_types(spec).ParticleInputs,
+        input_adj_types(spec, wanted).ParticleInputsAdj,
+    )
+    weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
+    weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
+    ParticleAdj, moved_adj, module = one.ParticleAdj, one.moved_adj, adj_module(spec, wanted)
+    module = in_order(module, s.count) if ordered else module
+
+    @wp.kernel(module=module, enable_backward=False)
     def g2p_adj(
         # Parameters:
         constants: Constants,
@@ -231,4 +268,4 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_fx += wp.dot(v_i, adj_i) * weight_slope(w, slope, o) - share * (wp.transpose(adj.C) * v_i)
         adj_now.fx[world, p] = adj_now.fx[world, p] + adj_fx
 
-    return SimpleNamespace(p2g_adj=p2g_adj, g2p_adj=g2p_adj)
+    return g2p_adj

@@ -25,5 +25,16 @@ class PlainFootprint:
         return Sizes(inside, 0, start, start, longest_chunk(particles), price, model.calls)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
-        inside = model.sizes().inside
-        return Buffers(2 * inside, 0, inside)
+        inside, terms = model.sizes().inside, term_bytes(model)
+        return Buffers(2 * inside + terms, 0, inside + terms)
+
+
+def term_bytes(model) -> int:
+    """Bytes of the terms that a deterministic model on a GPU sorts before it adds them up, see kernels/compile.py.
+
+    Each has a key and an index, both twice for the sort, and the momentum and mass that a particle gives to a node.
+    """
+    if not model.deterministic or model.device.type == "cpu":
+        return 0
+    terms = model.worlds * model.particle_count * 3**model.dim
+    return terms * (2 * (8 + 4) + (model.dim + 1) * model.dtype.itemsize)

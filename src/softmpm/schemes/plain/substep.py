@@ -37,8 +37,10 @@ class Substep:
     def __init__(self, model: Model):
         self.model, self.stream = model, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
-        for define in (transfer, grid):  # all of a module before it is first loaded: it is compiled once
-            define(model.spec)
+        self.ordered = model.deterministic and model.device.type == "cuda"  # the CPU adds in one order anyway
+        # All of a module before it is first loaded: it is compiled once.
+        self.transfer = transfer(model.spec, self.ordered)
+        grid(model.spec)
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
@@ -83,7 +85,7 @@ class Substep:
         constants, spec = self.model.constants, self.model.spec
         node, velocity = self._array("node"), self._array("velocity")
         clear(self.node)
-        self.launch(transfer(spec).p2g, self.particles, constants, self.particle_inputs, now, node)
+        self.launch(self.transfer.p2g, self.particles, constants, self.particle_inputs, now, node)
         self.launch(grid(spec).grid_velocity, self.nodes, constants, self.grid_inputs, node, velocity)
 
     def advance(self, now, then, substep: int) -> None:
@@ -91,7 +93,7 @@ class Substep:
         self.last = substep
         self.to_grid(now)
         arguments = (self.model.constants, self.particle_inputs, substep, self._array("velocity"), now)
-        self.launch(transfer(self.model.spec).g2p, self.particles, *arguments, self.words_array, then)
+        self.launch(self.transfer.g2p, self.particles, *arguments, self.words_array, then)
 
     def adjoint(
         self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs: tuple, substep: int
@@ -111,7 +113,8 @@ class Substep:
     def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs) -> None:
         arrays = (self._array("velocity"), now, then, adj_then, adj_inputs, self._array("adj_velocity"))
         arguments = (self.model.constants, self.particle_inputs, *arrays, adj_now)
-        self.launch(transfer_adj(self.model.spec, wanted).g2p_adj, self.particles, *arguments)
+        kernel = transfer_adj(self.model.spec, wanted, self.ordered).g2p_adj
+        self.launch(kernel, self.particles, *arguments)
 
     def grid_adj(self, wanted: RequestedGrads, adj_inputs) -> None:
         arrays = (self._array(name) for name in ("node", "adj_velocity", "adj_node"))
@@ -121,7 +124,8 @@ class Substep:
     def p2g_adj(self, wanted: RequestedGrads, now, adj_now, adj_inputs, substep: int) -> None:
         parameters = (self.model.constants, self.particle_inputs, substep, now, self._array("adj_node"))
         arguments = (*parameters, self.words_array, adj_inputs, adj_now)
-        self.launch(transfer_adj(self.model.spec, wanted).p2g_adj, self.particles, *arguments)
+        kernel = transfer_adj(self.model.spec, wanted, self.ordered).p2g_adj
+        self.launch(kernel, self.particles, *arguments)
 
     def enter(self, start: State, motion) -> None:
         """From what users hold to what the kernels hold."""
