@@ -17,7 +17,7 @@ from softmpm.model import Model
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
-from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean
+from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
@@ -50,6 +50,7 @@ __all__ = [
     "Scene",
     "StabilityWarning",
     "StableDt",
+    "StableNeoHookean",
     "State",
     "UnstableError",
     "Wall",

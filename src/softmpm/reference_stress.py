@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean
+from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Actuator, Muscle
 
 
@@ -81,8 +81,22 @@ def barrier_corotated(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     return 2 * mu[..., None, None] * (F - polar(F)) @ F.mT + pressure[..., None, None] * eye
 
 
+def stable_neo_hookean(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Kirchhoff stress P Fᵀ [Pa] of the energy of Smith et al. 2018, with their constants of (μ, λ) (E5).
+
+    ψ = m/2 (I − 3) + l/2 (J − a)² − m/2 log(I + 1), where I is the squared norm of the deformation gradient in three dimensions:
+    in plane strain the third stretch is 1.
+    """
+    m, l = 4 / 3 * mu, lam + 5 / 6 * mu
+    a, J = 1 + 3 / 4 * m / l, det(F)
+    squared = (F**2).sum((-2, -1)) + (3 - F.shape[-1])
+    P_F = (m * (1 - 1 / (squared + 1)))[..., None, None] * F @ F.mT
+    return P_F + (l * (J - a) * J)[..., None, None] * torch.eye(F.shape[-1], dtype=F.dtype)
+
+
 LAWS = {
     NeoHookean: neo_hookean,
+    StableNeoHookean: stable_neo_hookean,
     FixedCorotated: fixed_corotated,
     BarrierCorotated: barrier_corotated,
 }

@@ -27,7 +27,7 @@ class Material:
     def __post_init__(self):
         need(
             type(self) is not Material,
-            "a material needs a law: use NeoHookean, FixedCorotated or BarrierCorotated.",
+            "a material needs a law: use NeoHookean, StableNeoHookean, FixedCorotated or BarrierCorotated.",
         )
         store_numbers(self, "material", "density", "young", "poisson", "viscosity")
         need(self.density > 0, f"density must be > 0 kg/m³, got {self.density}.")
@@ -45,6 +45,18 @@ class NeoHookean(Material):
 
     Source: Hu et al. 2019, "ChainQueen", section III. Good values: E 10 to 1e6 Pa, ν 0.2 to 0.45.
     """
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StableNeoHookean(Material):
+    """Stable neo-Hookean solid, a polynomial in J and a fraction in |F|². Defined through inversion, without a rotation or a logarithm.
+
+    τ = μ [(1 + k) FFᵀ − I] + [(λ + 5/6 μ) J − μ] (J − 1) I with k = s / (12 + 3s), s = |F|² − d. For flesh and other nearly
+    incompressible solids; agrees with linear elasticity of (E, ν) at rest. Source: Smith, de Goes, Kim 2018, "Stable Neo-Hookean
+    Flesh Simulation". Good values: E 10 to 1e6 Pa, ν 0.2 to 0.49.
+    """
+
+    survives_inversion: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
