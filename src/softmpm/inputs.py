@@ -25,6 +25,8 @@ class Inputs(NamedTuple):
     """g [m/s²], shape (world, dim)."""
     damping: Tensor | None = None
     """Rate at which grid velocity decays [1/s], shape (world,)."""
+    friction: Tensor | None = None
+    """Coulomb coefficient of each wall [-], shape (world, wall)."""
     wall_offset: Tensor | None = None
     """Offset of each wall [m], shape (pose, world, wall), in float64. One pose is a wall at rest; else there is one at the beginning
     and one at the end of every control step, and the wall moves between them at a constant speed."""
@@ -230,8 +232,9 @@ INPUTS = (
         name="friction",
         per="wall",
         present=lambda spec: spec.friction,
+        group="friction",
         stage="grid",
-        constant=lambda spec: True,
+        constant=lambda spec: "friction" not in spec.given,
     ),
     # How the pose of a moving wall changes in a control step, see contact.py:
     Input(

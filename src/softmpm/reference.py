@@ -176,10 +176,11 @@ def grid_velocity(
     gravity = _given(inputs.gravity, scene.gravity or (0.0,) * dim, v, worlds, dim)
     damping = _given(inputs.damping, scene.damping, v, worlds)
     v = (v + scene.dt * gravity[:, None]) * torch.exp(-scene.dt * damping)[:, None, None]
+    friction = _given(inputs.friction, [wall.friction for wall in scene.walls], v, worlds, len(scene.walls))
     for k, wall in enumerate(scene.walls):
         where = surface(scene, k, inputs, v, time, duration)
         u = wall_velocity(scene, where)
-        response = u + respond(wall, v - u, where.unit[:, None])  # (C5)
+        response = u + respond(wall, v - u, friction[:, k, None, None], where.unit[:, None])  # (C5)
         v = torch.where(inside(scene, where)[..., None] & present, response, v)
     return torch.where(present, v, torch.zeros_like(v))
 

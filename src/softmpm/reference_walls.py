@@ -89,7 +89,7 @@ def wall_velocity(scene: Scene, wall: Surface) -> Tensor:
     return (approach / _length(wall.normal))[..., None] * wall.unit[:, None] + wall.slide[:, None]
 
 
-def respond(wall: Wall, v: Tensor, normal: Tensor | None = None) -> Tensor:
+def respond(wall: Wall, v: Tensor, friction: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
     """Velocity of a node inside a wall at rest (C1 to C3); ``friction`` and ``normal`` broadcast to v, None is the wall's."""
     n = torch.tensor(wall.normal, dtype=v.dtype) if normal is None else normal
     if wall.contact == "stick":
@@ -100,7 +100,7 @@ def respond(wall: Wall, v: Tensor, normal: Tensor | None = None) -> Tensor:
         return v_t
     if wall.contact != "separate":
         raise ValueError(f"the reference has no contact {wall.contact!r}; add it to respond.")
-    c = torch.tensor(wall.friction, dtype=v.dtype)
+    c = torch.tensor(wall.friction, dtype=v.dtype) if friction is None else friction
     squared = (v_t**2).sum(-1, keepdim=True)
     sliding = squared > (c * v_n) ** 2
     speed = torch.sqrt(torch.where(sliding, squared, torch.ones_like(squared)))

@@ -15,11 +15,14 @@ from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input
 @kernel_factory
 def friction(spec: Spec, k: int) -> wp.Function:
     """Coulomb's coefficient of wall ``k`` in a world."""
-    real, GridInputs = types(spec.dim, spec.dtype).real, input_types(spec).GridInputs
+    real, GridInputs, given = types(spec.dim, spec.dtype).real, input_types(spec).GridInputs, spec.given
 
     @wp.func
     def friction_of(inputs: GridInputs, world: int) -> real:
-        return inputs.friction[k]
+        if wp.static("friction" in given):
+            return inputs.friction[world, k]
+        else:
+            return inputs.friction[k]
 
     return friction_of
 
@@ -85,6 +88,10 @@ def response_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
         if wp.static(rough):
             c = friction_of(inputs, world)
             limit = -c * v_n
+            if wp.static("friction" in wanted):
+                if wp.length(v_t) > limit:
+                    adj_c = v_n * wp.dot(adj, v_t) / wp.length(v_t)
+                    adj_inputs.friction[k, i] = adj_inputs.friction[k, i] + adj_c
             if limit > real(0.0):
                 speed = wp.length(v_t)
                 if speed <= limit:
