@@ -18,7 +18,7 @@ from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import GridField, Low, Params, State
@@ -44,6 +44,7 @@ __all__ = [
     "NeoHookean",
     "Params",
     "Particles",
+    "Pressure",
     "Quantity",
     "Recorder",
     "Recording",

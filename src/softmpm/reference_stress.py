@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Actuator, Muscle
+from softmpm.scene.scene import Actuator, Muscle, Pressure
 
 
 def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,6 +135,12 @@ def muscle_tangent(F: Tensor, direction: Tensor) -> Tensor:
     return torch.einsum("kij,...lij->...kl", basis, turned + turned.mT)
 
 
+def pressure_tangent(F: Tensor, direction: Tensor | None = None) -> Tensor:
+    """The same for a unit pressure: A[G] = −J tr(G) I."""
+    trace = strains(F.shape[-1]).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return -det(F)[..., None, None] * torch.outer(trace, trace)
+
+
 def viscous_stress(F: Tensor, C: Tensor, viscosity: Tensor) -> Tensor:
     """τ = F S Fᵀ = 2η B D B [Pa] for the second Piola-Kirchhoff stress S = 2η Ė, with B = FFᵀ and D = sym(C) (E6)."""
     B, D = F @ F.mT, (C + C.mT) / 2
@@ -170,7 +176,12 @@ def muscle_stress(F: Tensor, direction: Tensor, active_stress: Tensor) -> Tensor
     return active_stress[..., None, None] * f[..., :, None] * f[..., None, :]
 
 
-ACTUATORS = {Muscle: (muscle_stress, muscle_tangent)}
+def pressure_stress(F: Tensor, direction: Tensor | None, pressure: Tensor) -> Tensor:
+    """τ = −p J I [Pa] (M2)."""
+    return -(pressure * det(F))[..., None, None] * torch.eye(F.shape[-1], dtype=F.dtype)
+
+
+ACTUATORS = {Muscle: (muscle_stress, muscle_tangent), Pressure: (pressure_stress, pressure_tangent)}
 """Stress and tangent of each kind, which may not look at the fibre direction."""
 
 

@@ -110,7 +110,7 @@ class Actuator:
     stretch a body until it fractures (docs/results.md, Lessons). Differentiable."""
 
     def __post_init__(self):
-        need(type(self) is not Actuator, "an actuator needs a kind: use Muscle.")
+        need(type(self) is not Actuator, "an actuator needs a kind: use Muscle or Pressure.")
         object.__setattr__(self, "particles", _indices(f"a {self._name}", self.particles))
         store_numbers(self, self._name, "strength")
 
@@ -141,6 +141,16 @@ class Muscle(Actuator):
     def __repr__(self) -> str:
         count = counted(len(self.particles), "particle")
         return f"Muscle({count}, direction={self.direction}, strength={self.strength:g} Pa)"
+
+    __setstate__ = restore
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False, repr=False)
+class Pressure(Actuator):
+    """Pressure that expands (activation > 0) or contracts (< 0) alike in all directions: τ −= a s J I, a Cauchy stress of −a s.
+
+    A pneumatic chamber filled with a soft material, or tissue that swells. In a plane-strain scene it also presses out of the plane.
+    """
 
     __setstate__ = restore
 
@@ -201,7 +211,7 @@ class Scene:
     bodies: Sequence[Body]
     """At least one; their particles are numbered in this order."""
     muscles: Sequence[Actuator] = ()
-    """Actuators, in the order of the last axis of ``activation``; they may overlap."""
+    """Actuators, each a :class:`Muscle` or a :class:`Pressure`, in the order of the last axis of ``activation``; they may overlap."""
     walls: Sequence[Wall] = ()
     """Applied in this order; at most 64."""
     driven: Sequence[int] | np.ndarray = ()
@@ -219,7 +229,7 @@ class Scene:
         need_kind("scene grid", self.grid, Grid)
         for name, kind, called in (
             ("bodies", Body, "Body"),
-            ("muscles", Actuator, "Muscle"),
+            ("muscles", Actuator, "Muscle or Pressure"),
             ("walls", Wall, "Wall"),
         ):
             parts = getattr(self, name)
