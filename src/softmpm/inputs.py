@@ -42,6 +42,8 @@ class Inputs(NamedTuple):
     """Viscosity η of the material [Pa s], shape (world, particle)."""
     velocity: Tensor | None = None
     """Velocity of the driven particles [m/s], shape (control_step, world, driven, dim)."""
+    force: Tensor | None = None
+    """External force on each particle [N], shape (control_step, world, particle, dim)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +111,9 @@ QUANTITIES = {
         axes=("control_step", "world", "driven", "dim"),
         default=lambda scene: [0.0] * scene.grid.dim,
         needed=lambda spec: spec.driven,
+    ),
+    "force": Quantity(
+        axes=("control_step", "world", "particle", "dim"), default=lambda scene: [0.0] * scene.grid.dim
     ),
 }
 """Fields of :class:`softmpm.Params` and :class:`Inputs`, by name."""
@@ -185,6 +190,14 @@ INPUTS = (
     Input(
         name="viscosity", per="particle", present=lambda spec: spec.viscosity, group="viscosity"
     ),  # η [Pa s]
+    Input(  # f / m₀ [m/s²]
+        name="force",
+        per="particle",
+        kind="vector",
+        present=lambda spec: "force" in spec.given,
+        group="force",
+        rows=True,
+    ),
     Input(
         name="driven", per="particle", kind="index", present=lambda spec: spec.driven, stage="g2p"
     ),  # or -1

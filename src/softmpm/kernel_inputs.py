@@ -42,6 +42,8 @@ def derive(
             found["fibre"] = value / value.norm(dim=-1, keepdim=True)
         elif name == "damping":
             found["decay"] = torch.exp(-value * model.scene.dt)
+        elif name == "force":
+            found["force"] = value / model.mass_unit
         elif name == "wall_velocity":
             found["surface_velocity"] = value
         elif name not in ("strength", "wall_offset", "wall_normal"):

@@ -221,6 +221,8 @@ def step(
     load = scene.dt * _volume(scene, mass.dtype) / D
     affine = mass[..., None, None] * state.C - load[:, None, None] * tau
     pushed = mass[..., None] * state.v
+    if inputs.force is not None:
+        pushed = pushed + scene.dt * inputs.force.expand(state.v.shape)  # (T4)
     node_mass, momentum = p2g(scene, state.x, mass, pushed, affine)
     v, C = g2p(scene, state.x, grid_velocity(scene, node_mass, momentum, inputs, time, duration))
     if len(scene.driven):

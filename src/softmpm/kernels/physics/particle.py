@@ -30,7 +30,7 @@ def particle(spec: Spec) -> SimpleNamespace:
     ParticleInputs, total = input_types(spec).ParticleInputs, total_stress(spec)
     rotation, stress, identity = total.rotation, total.stress, k.identity
     valid, dim, rounds = status.check(spec).valid, spec.dim, spec.dtype == "float32"
-    viscous, driven = spec.viscosity, spec.driven
+    viscous, forced, driven = spec.viscosity, "force" in spec.given, spec.driven
     viscous_stress = viscosity(spec.dim, spec.dtype).viscous_stress
 
     @wp.struct
@@ -52,7 +52,9 @@ def particle(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def linear_momentum(constants: Constants, inputs: ParticleInputs, world: int, p: int, v: vec) -> vec:
-        """m v (T1)."""
+        """m v + Δt f (T1)."""
+        if wp.static(forced):
+            return inputs.mass[world, p] * v + constants.dt * inputs.force[world, p]
         return inputs.mass[world, p] * v
 
     @wp.func
@@ -126,7 +128,7 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     stress_adj, impulse, identity = total_stress_adj(spec, wanted).stress_adj, one.impulse, one.identity
     viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
     material, viscous, driven = "material" in wanted, spec.viscosity, spec.driven
-    steered = "velocity" in wanted
+    forced, steered = "force" in wanted, "velocity" in wanted
 
     @wp.struct
     class ParticleAdj:
@@ -168,6 +170,8 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_inputs.mass[world, p] = (
                 adj_inputs.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
             )
+        if wp.static(forced):
+            adj_inputs.force[world, p] = adj_inputs.force[world, p] + constants.dt * adj_mv
         return adj
 
     @wp.func
