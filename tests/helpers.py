@@ -13,6 +13,7 @@ LAWS = {
     "neo_hookean": softmpm.NeoHookean,
     "fixed_corotated": softmpm.FixedCorotated,
     "barrier_corotated": softmpm.BarrierCorotated,
+    "stable_neo_hookean": softmpm.StableNeoHookean,
 }
 KINDS = {
     "single precision": dict(scheme="fast"),
@@ -134,7 +135,7 @@ def assert_relative(got, want, limit: float, what: str = "") -> None:
 
 
 def little_memory(model) -> dict[str, int]:
-    """Settings with which a call of 3 times 7 substeps keeps one state and runs chunks again."""
+    """Settings with which a call of 3 times 7 substeps stores one state and recomputes chunks."""
     sizes = model.sizes()
     budget = 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between
     assert not plan(Horizon(3, 7), sizes, budget).keep_all

@@ -90,13 +90,13 @@ def test_factors_keep_the_source(path):
 @pytest.mark.parametrize(
     "file, function, text",
     [
-        ("particle.py", "moved_adj", "scale.dt * (wp.transpose(new_C) * adj_new.H)"),
+        ("particle.py", "moved_adj", "constants.dt * (wp.transpose(new_C) * adj_new.H)"),
         ("particle.py", "momentum_adj", "wp.ddot(adj_A, C)"),
-        ("elasticity.py", "soft_pressure_slope", "real(2.0) * j"),
+        ("fixed_corotated.py", "pressure_slope", "real(2.0) * j"),
         ("polar.py", "rotation_adj", "c * (adj_R[1, 0] - adj_R[0, 1])"),
-        ("contact.py", "slide_adj", "(c * along) * n"),
+        ("separate.py", "slide_adj", "(c * along) * n"),
         ("gather_adj.py", "sums_adj", "wy[2] * tr"),
-        ("packing.py", "leave_adj", "load_vec(adj, i, row_fx) / scale.spacing"),
+        ("packing.py", "leave_adj", "load_vec(adj, i, row_fx) / constants.spacing"),
         ("chunk.py", "vjp", "start.fx / model.scene.grid.spacing"),
     ],
 )

@@ -50,7 +50,7 @@ FAULTY_TENSORS: dict[str, Callable[[torch.Tensor], Any]] = {
     "complex": lambda t: t.to(torch.complex64),
     "sparse": lambda t: t.to_sparse(),
 }
-"""What no call may take for any of its tensors."""
+"""Values that every call must refuse for each of its tensors."""
 _FAULTY_MATERIAL = {"young": (0.0, -80.0), "poisson": (0.5, -1.0, 0.7), "density": (0.0, -1.0)}
 _FAULTY_SUBSTEPS = (0, -3, 2.5, True, None, "5", torch.nan)
 _FAULTY_RECORDS: dict[str, Callable[[Any], Any]] = {
@@ -59,7 +59,7 @@ _FAULTY_RECORDS: dict[str, Callable[[Any], Any]] = {
     "dict": lambda r: {"x": r},
 }
 _ODD_VALUES = (1e-30, -1e20, 1e30, 3e38, 1e200, -1.0, 0.0)
-"""Finite, so that a call may take them: it must say by name what came of it, or return finite numbers."""
+"""Finite values that a call may accept: it must raise an error that names the cause, or return finite numbers."""
 
 
 def _one(tensor: torch.Tensor, number: float) -> torch.Tensor:

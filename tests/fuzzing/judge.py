@@ -1,4 +1,4 @@
-"""Run a plan and judge what came of it: a result that is finite and right, or a refusal that names what was wrong."""
+"""Run a plan and judge the outcome: a result that is finite and right, or a refusal that names the fault."""
 
 import dataclasses
 import math
@@ -78,7 +78,7 @@ def perform(plan: Plan) -> Verdict:
 
 
 def _enters(plan: Plan) -> bool:
-    """Whether what is faulty is an argument of the call at all."""
+    """True if the faulty value is an argument of the call."""
     return plan["way"] == "simulate" or plan["fault"][1] in ("x", "v", "C", "state", "model")
 
 

@@ -217,7 +217,7 @@ def _work(scene: softmpm.Scene, start: softmpm.State, end: softmpm.State, activa
 
 
 def confirmed(model: softmpm.Model, error: softmpm.UnstableError) -> bool:
-    """Whether what the error names is there to be seen in its state."""
+    """True if the state of the error shows the failure that it names."""
     state, dx = error.state, model.scene.grid.spacing
     x, F = state.x[error.world].double(), state.F[error.world].double()
     if error.kind in ("inverted", "collapsed"):

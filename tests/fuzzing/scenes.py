@@ -20,7 +20,7 @@ BOTH = ("neo_hookean", "fixed_corotated")
 
 @dataclasses.dataclass(frozen=True)
 class Special:
-    """What a scene is compiled for."""
+    """Properties of a scene that its kernels are compiled for."""
 
     dim: int
     dtype: torch.dtype

@@ -1,4 +1,4 @@
-"""What a case came to."""
+"""Outcome of a case."""
 
 import dataclasses
 

@@ -111,7 +111,7 @@ def _spoil(plan: Plan, given: Stepping, fault: list) -> bool:
 
 
 def _foreign(plan: Plan, given: Stepping, where: str, whose: str) -> bool:
-    """What another model made of the same plan, in one place."""
+    """Pass an object of another model, built from the same plan, in one place."""
     worlds = given.model.worlds + {"fewer worlds": -1, "more worlds": 1}.get(whose, 0)
     special = plan["scene"]["special"] if whose not in SPECIALS else whose
     if worlds == 0 or (special == plan["scene"]["special"] and worlds == given.model.worlds):

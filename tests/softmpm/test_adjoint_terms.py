@@ -10,7 +10,7 @@ from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, d
 
 import softmpm
 from softmpm import reference
-from softmpm.kernels.physics.actuation_sum import COLLECTORS
+from softmpm.kernels.physics.slot_sum import COLLECTORS
 
 
 def walled_scene(dim: int) -> softmpm.Scene:
@@ -72,13 +72,13 @@ def test_gradients_add_up_over_chunks(scheme):
 
 
 def test_gradients_in_fixed_point_are_the_references():
-    """A deterministic model sums the pull of muscles in an order of its own: ≤ 2e-4 for each input, in single precision."""
+    """A deterministic model sums the adjoints of active stresses in a fixed order: ≤ 2e-4 for each input, in single precision."""
     model = build(walled_scene(2), deterministic=True, worlds=2)
     assert_gradients_are_the_references(model, busy_inputs(model), 3, 2e-4)
 
 
 def test_step_adds_to_gradients_that_are_there():
-    """The adjoint of a step is added to every ``grad`` of the state before and of the solid, whatever these hold."""
+    """The adjoint of a step is added to every ``grad`` of the previous state and of the solid, whatever its values."""
     model = build(walled_scene(2), dtype=torch.float64)
     solid = softmpm.warp_solid(model, requires_grad=True)
     now, then = (softmpm.warp_state(model, requires_grad=True) for _ in range(2))
@@ -97,8 +97,8 @@ def test_step_adds_to_gradients_that_are_there():
         torch.testing.assert_close(added, alone, rtol=1e-12, atol=1e-12)
 
 
-def test_the_pull_of_many_particles(scheme):
-    """More particles than threads collect the pull, in muscles that follow each other in one slot: ≤ 1e-10."""
+def test_the_active_stress_of_many_particles(scheme):
+    """More particles than threads sum the adjoint of active stress, in muscles that follow each other in one slot: ≤ 1e-10."""
     side = int(np.ceil(np.sqrt(1.2 * COLLECTORS)))
     body = softmpm.box((0.3, 0.3), (0.8, 0.8), 0.5 / side)
     parts = np.array_split(np.arange(len(body)), 3)

@@ -60,7 +60,7 @@ def test_a_whole_body_raises_nothing(scheme, device):
 
 @pytest.mark.parametrize("law", list(LAWS))
 def test_a_collapsing_body_is_named_in_every_law(law, scheme, device):
-    """A pull of six times Young's modulus is named before the bar is a point; fixed corotated bodies collapse without a word."""
+    """An active stress of six times Young's modulus raises before the bar is a point; fixed corotated bodies collapse silently."""
     model = softmpm.build(bar(law), device=device, scheme=scheme, alarms=softmpm.Alarms(step=None))
     activation = torch.full((1, 1, 2), 20.0, device=model.device)
     with pytest.raises(softmpm.UnstableError) as caught:
@@ -132,8 +132,10 @@ def test_step_alarm_is_the_largest_eigenvalue(law, dim, poisson, device):
     F[np.linalg.det(F) < 0, 0] *= -1
     mu, lam = 50.0 / (1 + poisson), 100.0 * poisson / ((1 + poisson) * (1 - 2 * poisson))
     for activation in (0.0, 1.0):
-        pulls = [activation * muscle.strength for muscle in muscles]
-        unit = [running_limit(scene, p, mu, lam, 1.0, torch.from_numpy(F[p]), pulls) for p in range(count)]
+        active_stress = [activation * muscle.strength for muscle in muscles]
+        unit = [
+            running_limit(scene, p, mu, lam, 1.0, torch.from_numpy(F[p]), active_stress) for p in range(count)
+        ]
         limit = torch.tensor(unit).clamp(max=1.0).to(model.device)  # at a density of 1 kg/m³
         start, given = model.rest(), torch.full((1, count, 2), activation, device=model.device)
         start.F[:] = torch.from_numpy(F).to(start.F)

@@ -94,7 +94,7 @@ def test_an_input_changed_in_place_before_backward_raises(model):
 
 
 def test_rounding_of_a_start_changed_in_place_before_backward_raises(device):
-    """What a state carries besides its four tensors is guarded as they are: going back may start there again."""
+    """The low-order parts of a state are guarded like its four tensors: the backward pass may recompute from them."""
     model = softmpm.build(busy_scene(2), device=device)
     inputs = busy_inputs(model)
     start = run(softmpm.simulate, model, inputs, 2)
@@ -229,7 +229,7 @@ def test_material_changed_in_place_is_seen(scheme):
 
 @pytest.mark.parametrize("name, bad", [("young", -1.0), ("poisson", 0.5), ("density", float("nan"))])
 def test_material_that_turns_impossible_is_refused(name, bad, scheme, device):
-    """Numbers are not read again for tensors that nobody wrote to; a write is seen, also through a view."""
+    """Values are not read back for tensors without a write; a write is detected, also through a view."""
     model = softmpm.build(busy_scene(2), device=device, scheme=scheme)
     params = softmpm.Params(*(p.clone() for p in model.params()))
     for _ in range(2):
@@ -276,7 +276,7 @@ def test_it_works_in_inference_mode(scheme):
     [(torch.nan, "look at the loss"), (torch.inf, "look at the loss"), (3e38, "scale the loss")],
 )
 def test_rasterize_stops_gradients_that_are_not_finite(number, cause, device):
-    """As simulate does, with world and particle: a NaN from a loss, or a number that overflows on the way."""
+    """As simulate does, with world and particle: a NaN from a loss, or a number that overflows in the adjoint."""
     model = softmpm.build(busy_scene(2, per_law=4), device=device, worlds=2)
     rest = model.rest()
     field = softmpm.rasterize(model, rest._replace(v=rest.v.requires_grad_()))
@@ -341,7 +341,7 @@ def test_batches_of_material_and_activation_lead_to_worlds(model):
 
 
 def test_worlds_are_the_rows_of_a_jacobian(model):
-    """What the message recommends: a world for each output gives the rows that a loop gives."""
+    """The remedy of the message: a world for each output gives the rows that a loop gives."""
     scene, outputs = model.scene, 3
     many = softmpm.build(scene, device="cpu", dtype=torch.float64, worlds=outputs)
     v = many.rest().v.requires_grad_()

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from softmpm.checks import (
-    BOUNDS,
     check_activation,
     check_bounds,
     check_finite,
@@ -112,7 +111,7 @@ def test_kind_precision_and_device(name):
 
 
 def test_wrong_records():
-    """What is not a State or Params is named."""
+    """An argument that is not a State or Params is named."""
     with pytest.raises(TypeError, match="state must be a softmpm.State, got Params"):
         check_state(MODEL, params())
     with pytest.raises(TypeError, match="params must be a softmpm.Params, got State"):
@@ -135,7 +134,7 @@ def test_not_finite(name, bad):
     tensor.view(-1)[-1] = bad
     index = ", ".join(str(n - 1) for n in tensor.shape)
     check = partial(check_bounds, material, torch.ones(2, 3), ONE)
-    if name not in BOUNDS:
+    if name not in Params._fields:
         check = partial(check_finite, start, activation)
     with pytest.raises(
         ValueError, match=re.escape(f"{name}[{index}] is {bad:g}" if index else f"{name} is {bad:g}")

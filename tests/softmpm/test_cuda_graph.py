@@ -16,22 +16,22 @@ from softmpm.schemes.fast import chunk_graph
 from softmpm.schemes.fast import scheme as fast_scheme
 
 
-def test_one_records_at_a_time():
-    """Without the collector meanwhile. A second one waits, or finds that it is not its turn."""
-    turns = queue.Queue()
+def test_one_captures_at_a_time():
+    """The garbage collector is disabled meanwhile. A second capture waits, or does not acquire the lock."""
+    acquisitions = queue.Queue()
 
     def another():
         for wait in (False, True):
-            with capture.exclusive_capture(wait) as turn:
-                turns.put((turn, gc.isenabled()))
+            with capture.exclusive_capture(wait) as acquired:
+                acquisitions.put((acquired, gc.isenabled()))
 
     thread = threading.Thread(target=another, daemon=True)
     with capture.exclusive_capture(wait=True):
         thread.start()
-        assert turns.get(timeout=10) == (False, False)
+        assert acquisitions.get(timeout=10) == (False, False)
         with pytest.raises(queue.Empty):
-            turns.get(timeout=0.05)
-    assert turns.get(timeout=10) == (True, False)
+            acquisitions.get(timeout=0.05)
+    assert acquisitions.get(timeout=10) == (True, False)
     thread.join(timeout=10)
     assert gc.isenabled()
 
@@ -44,16 +44,16 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
     run(softmpm.simulate, built, inputs, 5).x.sum().backward()
     for module in (autograd, fast_scheme, chunk_graph, rollout, runner):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
-    with capture.collected_resources() as ledger:
+    with capture.collected_resources() as resources:
         end = run(softmpm.simulate, built, inputs, 5)
         torch.autograd.grad((end.x[0, 1] * torch.inf).sum(), inputs["v"], retain_graph=True)
         torch.autograd.grad(end.x.sum(), inputs["v"])
-    *forward, first, second = (words.tolist() == [NEVER] for words, _ in ledger.words)
+    *forward, first, second = (words.tolist() == [NEVER] for words, _ in resources.words)
     assert all(forward) and second and not first
 
 
 def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
-    """What it lacked may be what a call makes that is not recorded, so one of those comes first."""
+    """The missing objects may be built by a call outside of a capture, so such a call comes first."""
     graph, did = softmpm.Graph(lambda: None, torch.device("cpu")), []
     graph._stream = object()
 

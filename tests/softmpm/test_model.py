@@ -19,10 +19,12 @@ from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradien
 
 import softmpm
 from softmpm import autograd
-from softmpm.kernels.structs import RequestedGrads, adj_module, solid_types
+from softmpm.inputs import groups
+from softmpm.kernels.structs import RequestedGrads, adj_module, input_types
 from softmpm.planning.chunks import Horizon
 from softmpm.scene.scene import CONTACTS
-from softmpm.schemes.buffers import SolidAdj, passing
+from softmpm.schemes.buffers import passing
+from softmpm.schemes.inputs import Accumulators
 from softmpm.schemes.plain.substep import Substep
 
 
@@ -39,14 +41,19 @@ def fields(struct) -> set[str]:
 
 def test_what_a_scene_lacks_is_not_passed():
     """No argument for muscles, laws, walls or friction that are not there."""
-    plain = solid_types(softmpm.build(plain_scene(), device="cpu").spec)
-    assert fields(plain.Solid) == {"mass", "mu", "lam", "volume"}
-    assert fields(plain.Walls) == {"nothing"}
-    busy = solid_types(softmpm.build(busy_scene(2), device="cpu").spec)
-    assert fields(busy.Solid) - fields(plain.Solid) == {"law", "muscle", "fibre", "pull"}
-    assert fields(busy.Walls) == {"normal", "offset", "friction"}
+    plain = input_types(softmpm.build(plain_scene(), device="cpu").spec)
+    assert fields(plain.ParticleInputs) == {"mass", "mu", "lam", "volume"}
+    assert fields(plain.GridInputs) == {"nothing"}
+    busy = input_types(softmpm.build(busy_scene(2), device="cpu").spec)
+    assert fields(busy.ParticleInputs) - fields(plain.ParticleInputs) == {
+        "law",
+        "muscle",
+        "fibre",
+        "active_stress",
+    }
+    assert fields(busy.GridInputs) == {"normal", "offset", "friction"}
     one = softmpm.build(plain_scene(walls=[softmpm.Wall(normal=(0, 1), offset=0.3)]), device="cpu").spec
-    assert fields(solid_types(one).Walls) == {"normal", "offset"}
+    assert fields(input_types(one).GridInputs) == {"normal", "offset"}
 
 
 def test_what_a_scene_lacks_is_not_compiled(tmp_path):
@@ -54,7 +61,7 @@ def test_what_a_scene_lacks_is_not_compiled(tmp_path):
     words = {
         "log": "neo_hookean",
         "_polar2": "fixed_corotated",
-        "muscle_stress": "muscles",
+        "active_stress_by": "muscles",
         "slide": "walls",
     }
     scenes = {
@@ -76,7 +83,7 @@ def test_what_a_scene_lacks_is_not_compiled(tmp_path):
 
 def _source(model, folder) -> str:
     """C++ that Warp generates for the kernels of a forward substep."""
-    Substep(model, None)  # defines them
+    Substep(model)  # defines them
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*-march=native")  # the binary is not kept
         wp.compile_aot_module(model.spec.module, device="cpu", module_dir=folder)
@@ -84,21 +91,20 @@ def _source(model, folder) -> str:
 
 
 def test_what_a_scene_lacks_is_not_stored():
-    """Bytes of the adjoint follow what is asked for; a passive scene has no pull, a model without laws mixed no index."""
+    """Bytes of the adjoint follow the requested gradients; a passive scene stores no active stress, a model of one law no index."""
     model = softmpm.build(busy_scene(2), device="cpu")
-    nothing, everything = (
-        SolidAdj.zeros(model, RequestedGrads(material=w, activation=w)) for w in (False, True)
-    )
-    assert all(getattr(nothing, name) is None for name in ("mass", "mu", "lam", "slot"))
-    assert everything.slot.shape == (1, model.particle_count, 2)
+    wanted = RequestedGrads(), RequestedGrads(("material", "activation"))
+    nothing, everything = (Accumulators(model, w, 1, model.node_count) for w in wanted)
+    assert not nothing.tensors and len(nothing.scalars) == 0
+    assert everything.tensors["active_stress"].shape == (1, model.particle_count, 2)
     passive = softmpm.build(plain_scene(), device="cpu")
-    assert passive.muscle_slots.numel() == 0 and passive.sizes().inside == 12 * (4 + 4 * (2 + 2 + 2 + 8))
+    assert set(passive.fixed) == {"volume"} and passive.sizes().inside == 12 * (4 + 4 * (2 + 2 + 2 + 8))
     plain = softmpm.build(plain_scene(), device="cpu", scheme="plain")
     assert plain.sizes()[:3] == (12 * (4 * 2 + 4 * (2 + 4 + 8)), 0, 12 * 4 * 12 * 1.5)
 
 
 def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):
-    """P2G, grid, G2P; the adjoint computes the grid again and adds G2P, grid and P2G twins."""
+    """P2G, grid, G2P; the adjoint recomputes the grid and adds the adjoints of G2P, grid and P2G."""
     counted = []
     launch = Substep.launch
     monkeypatch.setattr(
@@ -121,8 +127,8 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
     a = softmpm.build(busy_scene(2, seed=0), device="cpu").spec
     b = softmpm.build(busy_scene(2, seed=5, dt=2e-3), device="cpu").spec
     assert a == b and a.module == b.module
-    wanted = RequestedGrads(material=True, activation=False)
-    assert adj_module(a, wanted) != adj_module(a, RequestedGrads(material=False, activation=False))
+    wanted = RequestedGrads(("material",))
+    assert adj_module(a, wanted) != adj_module(a, RequestedGrads())
 
 
 def test_modules_of_many_walls_have_names_short_enough_for_files():
@@ -130,7 +136,7 @@ def test_modules_of_many_walls_have_names_short_enough_for_files():
     kinds = itertools.islice(itertools.cycle(CONTACTS), 64)
     walls = [softmpm.Wall(normal=(0, 1), offset=0.3, contact=kind) for kind in kinds]
     spec = softmpm.build(busy_scene(2, walls=walls), device="cpu", deterministic=True).spec
-    name = adj_module(spec, RequestedGrads(material=True, activation=True)) + ".fused.few"
+    name = adj_module(spec, RequestedGrads(groups(spec))) + ".fused.few"
     assert len(f"wp_{name}_1234567_p1234567_t123456789012345") <= 255
     fewer = dataclasses.replace(spec, contacts=spec.contacts[1:])
     assert spec.module != fewer.module
@@ -241,7 +247,7 @@ def test_two_models_in_two_threads_give_what_they_give_alone(device):
 
 @pytest.mark.parametrize("scheme", ["plain", "fast"])
 def test_threads_may_all_be_the_first(scheme):
-    """To define, compile and load the same kernels, which nobody has used before in their process."""
+    """To define, compile and load the same kernels, which are not in use yet in their process."""
     code = f"""
 import sys, threading, torch, softmpm
 from helpers import busy_inputs, busy_scene, gradients
@@ -400,7 +406,7 @@ def test_shapes_of_what_a_model_gives():
 
 
 def test_results_are_of_the_promised_types():
-    """What functions return can be named: for annotations and for isinstance."""
+    """Types of returned objects are public: for annotations and for isinstance."""
     model = softmpm.build(busy_scene(2), device="cpu")
     end = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1)
     assert isinstance(end, softmpm.State) and isinstance(end.low, softmpm.Low)

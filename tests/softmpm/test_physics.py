@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import softmpm
-from softmpm.schemes.buffers import masses
+from softmpm.kernel_inputs import masses
 
 
 def block(dim=2, law=softmpm.NeoHookean, cells=3, dx=0.1, shape=None, lower=None, **scene):
@@ -88,21 +88,19 @@ def test_a_quarter_turn_of_the_scene_turns_the_result():
 
 
 def test_a_muscle_shortens_a_free_block_to_the_exact_equilibrium():
-    """At rest under constant pull, τ(F) = 0: F follows from two scalar equations. Sign and direction of actuation."""
-    pull, mu, lam = 10.0, 50.0 / 2.6, 50.0 * 0.3 / (1.3 * 0.4)
+    """At rest under constant active stress, τ(F) = 0: F follows from two scalar equations. Sign and direction of actuation."""
+    p, mu, lam = 10.0, 50.0 / 2.6, 50.0 * 0.3 / (1.3 * 0.4)
     every = np.arange(36)
-    scene = block(
-        muscles=[softmpm.Muscle(particles=every, direction=(0.0, 1.0), strength=pull)], damping=40.0
-    )
+    scene = block(muscles=[softmpm.Muscle(particles=every, direction=(0.0, 1.0), strength=p)], damping=40.0)
     model = softmpm.build(scene, device="cpu", dtype=torch.float64)
     activation = torch.ones(1, 1, 1, dtype=torch.float64)
     end = softmpm.simulate(model, model.rest(), activation, model.params(), substeps=4000)
-    a, b = 1.0, 1.0  # F = diag(a, b): μ(a² − 1) + λ log ab = 0, μ(b² − 1) + λ log ab + pull b² = 0
+    a, b = 1.0, 1.0  # F = diag(a, b): μ(a² − 1) + λ log ab = 0, μ(b² − 1) + λ log ab + p b² = 0
     for _ in range(60):
         r = np.array(
-            [mu * (a * a - 1) + lam * np.log(a * b), mu * (b * b - 1) + lam * np.log(a * b) + pull * b * b]
+            [mu * (a * a - 1) + lam * np.log(a * b), mu * (b * b - 1) + lam * np.log(a * b) + p * b * b]
         )
-        J = np.array([[2 * mu * a + lam / a, lam / b], [lam / a, 2 * (mu + pull) * b + lam / b]])
+        J = np.array([[2 * mu * a + lam / a, lam / b], [lam / a, 2 * (mu + p) * b + lam / b]])
         a, b = np.array([a, b]) - np.linalg.solve(J, r)
     assert b < 0.9 < 1.0 < a
     got = end.F[0].mean(0)
@@ -110,7 +108,7 @@ def test_a_muscle_shortens_a_free_block_to_the_exact_equilibrium():
 
 
 def test_walls_do_what_their_names_say(device):
-    """On the nodes of a wall: stick stops, slip keeps the tangent, separate lets go, friction slows by c vₙ."""
+    """On the nodes of a wall: stick stops, slip keeps the tangent, separate lets nodes leave, friction slows by c vₙ."""
     for contact, friction, inward, outward in (
         ("stick", 0.0, (0.0, 0.0), (0.0, 0.0)),
         ("slip", 0.0, (1.0, 0.0), (1.0, 0.0)),

@@ -1,4 +1,4 @@
-"""What float32 must keep: small motions, and the answer of float64."""
+"""Accuracy of float32: it resolves small motions and agrees with float64."""
 
 import numpy as np
 import torch

@@ -1,88 +1,18 @@
 """The float64 reference against laws of physics and central differences: it leans on no kernel."""
 
-import itertools
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
+from reference_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, shaken, tiny
 
 from softmpm import reference
-from softmpm.scene.materials import FixedCorotated, NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm.inputs import Inputs
+from softmpm.scene.materials import NeoHookean
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Wall
 from softmpm.state import Params, State
-
-DX = 0.1
-DIMS = pytest.mark.parametrize("dim", [2, 3])
-MATERIALS = {"neo_hookean": NeoHookean, "fixed_corotated": FixedCorotated}
-
-
-def f64(values) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def randn(*shape, seed=0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def difference(f, at: torch.Tensor, d: torch.Tensor, h: float) -> torch.Tensor:
-    """Directional derivative by a central difference of sixth order."""
-    terms = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
-    return sum(c * (f(at + k * h * d) - f(at - k * h * d)) for k, c in terms) / h
-
-
-def tiny(dim: int, laws=("neo_hookean", "fixed_corotated"), **changes) -> Scene:
-    """Two small bodies that share nodes; nothing else unless asked for."""
-    lattice = np.array(list(itertools.product(*(range(n) for n in (3, 2, 2)[:dim]))), dtype=float)
-    rng, bodies = np.random.default_rng(0), []
-    for corner, law in ((0.37, laws[0]), (0.5, laws[-1])):
-        material = MATERIALS[law](density=1.2, young=80.0, poisson=0.3)
-        positions = corner + 0.05 * lattice + rng.uniform(-0.01, 0.01, lattice.shape)
-        bodies.append(Body(Particles(positions, rng.uniform(0.5, 1.5, len(lattice)) * 0.05**dim), material))
-    settings = dict(grid=Grid(shape=(11, 10, 12)[:dim], spacing=DX), bodies=bodies, dt=1e-3)
-    return Scene(**(settings | changes))
-
-
-def full(dim: int, laws=("neo_hookean", "fixed_corotated")) -> Scene:
-    """:func:`tiny` with everything a scene may have: overlapping muscles, three kinds of wall, damping."""
-    count, up = (12, 24)[dim - 2], (0.0, 1.0, 0.0)[:dim]
-    return tiny(
-        dim,
-        laws,
-        muscles=[
-            Muscle(particles=np.arange(count * 2 // 3), direction=(0.0, 1.0, 0.3)[:dim], strength=10.0),
-            Muscle(particles=np.arange(count // 3, count), direction=(1.0, 0.5, 0.2)[:dim], strength=8.0),
-        ],
-        walls=[
-            Wall(normal=up, offset=0.41, contact="separate", friction=0.4),
-            Wall(normal=(-1.0, 0.3, 0.1)[:dim], offset=-0.45, contact="slip"),
-            Wall(normal=(1.0, 0.0, 0.0)[:dim], offset=0.3, contact="stick"),
-        ],
-        gravity=(0.3, -9.8, 0.2)[:dim],
-        damping=0.7,
-    )
-
-
-def rest(scene: Scene, worlds=1) -> tuple[State, Params]:
-    x = torch.from_numpy(np.concatenate([body.particles.positions for body in scene.bodies]))
-    x = x.expand(worlds, *x.shape)
-    F = torch.eye(x.shape[-1], dtype=torch.float64).expand(*x.shape, x.shape[-1])
-    materials = [body.material for body in scene.bodies for _ in range(len(body.particles))]
-    columns = ([getattr(m, name) for m in materials] for name in Params._fields)
-    return State(x, torch.zeros_like(x), torch.zeros_like(F), F), Params(*(f64(c) for c in columns))
-
-
-def shaken(scene: Scene, worlds=1, noise=1.0) -> tuple[State, Params]:
-    """A random state and material near the scene's."""
-    (x, v, C, F, _low), params = rest(scene, worlds)
-    by = [noise * randn(*t.shape, seed=30 + k) for k, t in enumerate((x, v, C, F))]
-    start = State(x + 0.01 * by[0], 0.5 * by[1], 2.0 * by[2], F + 0.1 * by[3])
-    factor = 1 + 0.1 * randn(3, *x.shape[:2], seed=40)
-    return start, Params(*(value * factor[k] for k, value in enumerate(params)))
-
-
-def masses(scene: Scene, params: Params) -> torch.Tensor:
-    return params.density * torch.from_numpy(np.concatenate([b.particles.volume for b in scene.bodies]))
 
 
 @DIMS
@@ -184,6 +114,40 @@ def test_free_motion_keeps_momentum_and_spin(dim):
     assert (end.v - start.v).abs().max() > 0.1, "nothing happened"
 
 
+@DIMS
+def test_viscosity_dissipates_and_keeps_spin(dim):
+    """A viscous free body keeps Σ m v and its spin to rounding and loses energy; ``inputs.viscosity`` overrides the material's."""
+    scene = tiny(dim)
+    start, params = shaken(scene, noise=0.3)
+    mass, count = masses(scene, params)[..., None], start.x.shape[1]
+
+    def spin(s):
+        A = (mass[..., None] * (s.x[..., :, None] * s.v[..., None, :] + DX**2 / 4 * s.C.mT)).sum(1)
+        return A - A.mT
+
+    bodies = [
+        dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=0.5))
+        for body in scene.bodies
+    ]
+    viscous = dataclasses.replace(scene, bodies=bodies)
+    end = reference.simulate(viscous, start, None, params, substeps=30)
+    scale = (mass * start.v.abs()).sum()
+    assert (mass * (end.v - start.v)).sum(1).abs().max() <= 1e-13 * scale
+    assert (spin(end) - spin(start)).abs().max() <= 1e-13 * scale
+    eta = torch.full((1, count), 0.5).double()
+    given = reference.simulate(scene, start, None, params, substeps=30, inputs=Inputs(viscosity=eta))
+    assert all(torch.equal(a, b) for a, b in zip(given[:4], end[:4], strict=True))
+    none = reference.simulate(viscous, start, None, params, substeps=30, inputs=Inputs(viscosity=0 * eta))
+    elastic = reference.simulate(scene, start, None, params, substeps=30)
+    assert all(torch.equal(a, b) for a, b in zip(none[:4], elastic[:4], strict=True))
+
+    def relative_speed(s):
+        mean = (mass * s.v).sum(1, keepdim=True) / mass.sum(1, keepdim=True)
+        return (mass * ((s.v - mean) ** 2 + DX**2 / 4 * (s.C**2).sum(-1))).sum().item()
+
+    assert relative_speed(end) < 0.7 * relative_speed(elastic)
+
+
 def test_a_quarter_turn_of_the_scene_turns_the_result():
     """Axes swapped as (x, y) → (L − y, x): catches mixed axes and nodes."""
     scene = tiny(2, grid=Grid(shape=(11, 11), spacing=DX))
@@ -243,7 +207,7 @@ def test_a_muscle_contracts_along_its_fibre():
     ],
 )
 def test_contact_of_a_node(wall, v, want):
-    """What each contact leaves of a velocity above a floor, and on the same floor turned."""
+    """Velocity after each kind of contact, above a floor and on the same floor turned."""
     v, want = f64(v), f64(want)
     for Q in (f64([[1.0, 0.0], [0.0, 1.0]]), f64([[0.8, 0.6], [-0.6, 0.8]])):
         normal = tuple(Q[:, 1].tolist())
@@ -372,3 +336,22 @@ def test_a_particle_outside_the_grid_is_an_error(where):
     x[1, 5, 1] = where
     with pytest.raises(ValueError, match="particle 5 of world 1 must stay half a cell inside the grid"):
         reference.simulate(scene, start._replace(x=x), None, params, substeps=1)
+
+
+@DIMS
+@pytest.mark.parametrize("strength", [15.0, -15.0])
+def test_pressure_expands_a_free_body_alike_in_all_directions(dim, strength):
+    """A particle alone comes to rest where its law balances the pressure, μ(s² − 1) + λ log J = p J for F = s I; negative contracts."""
+    material = NeoHookean(density=1.0, young=100.0, poisson=0.3)
+    body = Body(Particles(np.full((1, dim), 0.47), 1e-3), material)
+    chamber = Pressure(particles=[0], strength=strength)
+    scene = tiny(dim, bodies=[body], muscles=[chamber], damping=60.0)
+    start, params = rest(scene)
+    end = reference.simulate(scene, start, f64([[[1.0]]]), params, substeps=600)
+    F = end.F[0, 0]
+    stretch = F[0, 0]
+    torch.testing.assert_close(F, stretch * torch.eye(dim).double(), rtol=0, atol=1e-10)
+    mu, lam = reference.lame(params.young, params.poisson)
+    J = stretch**dim
+    assert abs(mu[0] * (stretch**2 - 1) + lam[0] * J.log() - strength * J) < 1e-6
+    assert (stretch > 1.02) if strength > 0 else (stretch < 0.98)

@@ -8,11 +8,13 @@ import warnings
 
 import numpy as np
 import pytest
+import torch
 
 import softmpm
-from softmpm.scene.materials import FixedCorotated, NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene
-from softmpm.stability import StabilityWarning, need_stable, stable_dt
+from softmpm import reference
+from softmpm.scene.materials import FixedCorotated, NeoHookean, StableNeoHookean
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene
+from softmpm.stability import StabilityWarning, need_stable, running_limit, stable_dt
 
 DX, RHO = 0.1, 2.0
 
@@ -54,19 +56,24 @@ def tau(F, material, muscles):
 
 
 def growth(material, muscles, dim, dt, steps, rng):
-    """How far the strain of one particle, alone on the grid, grows from 1e-9: the whole step in NumPy."""
+    """Growth of the strain of one particle, alone on the grid, from 1e-9: the whole step in NumPy."""
     x, v, C, F = rng.uniform(0.3, 0.4, dim), np.zeros(dim), np.zeros((dim, dim)), np.eye(dim)
     noise = rng.normal(size=(dim, dim))
     F, held, largest = F + 1e-9 * (noise + noise.T), tau(F, material, muscles), 0.0
+    eta = material.viscosity
     for _ in range(steps):
         w, r, _ = stencil(x)
         force = (
-            (tau(F, material, muscles) - held) * 4 / (material.density * DX**2)
+            (tau(F, material, muscles) - held + eta * F @ F.T @ (C + C.T) @ F @ F.T)
+            * 4
+            / (material.density * DX**2)
         )  # about the activated state
         node_v = v + r @ (C - dt * force).T  # the node's mass is w m: both weights cancel
         v, C = w @ node_v, 4 / DX**2 * np.einsum("n,ni,nj->ij", w, node_v, r)
         x, F = x + dt * v, (np.eye(dim) + dt * C) @ F
         largest = max(largest, np.abs(F - np.eye(dim)).max() / 1e-9)
+        if largest > 1e4:
+            break
     return largest
 
 
@@ -83,6 +90,78 @@ def test_limit_of_a_particle_alone(law, dim, poisson, actuation):
     rng = np.random.default_rng(1)
     assert growth(material, muscles, dim, 0.99 * limit, 300, rng) < 100
     assert growth(material, muscles, dim, 1.01 * limit, 60, rng) > 1000
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("actuation", [(), (150.0, -60.0)])
+@pytest.mark.parametrize("viscosity", [0.05, 0.5, 20.0])
+def test_limit_of_a_viscous_particle(dim, actuation, viscosity):
+    """The same with a viscosity that takes little, half or nearly all of the step: the limit is neither too large nor too small."""
+    material = StableNeoHookean(density=RHO, young=100.0, viscosity=viscosity)
+    plain = NeoHookean(density=RHO, young=100.0, viscosity=viscosity)  # the same at rest
+    muscles = [
+        muscle(d[:dim], s) for d, s in zip(((0.6, 0.8, 0.0), (0.2, 1.0, -0.7)), actuation, strict=False)
+    ]
+    limit = stable_dt(scene(material, dim, muscles))
+    assert f"viscosity {viscosity:g} Pa s): stiffness and damping" in limit.limit or actuation
+    assert limit == pytest.approx(stable_dt(scene(plain, dim, muscles)), rel=1e-12)
+    rng = np.random.default_rng(1)
+    assert growth(plain, muscles, dim, 0.99 * limit, 300, rng) < 100
+    assert (
+        growth(plain, muscles, dim, 1.01 * limit, 1200, rng) > 1000
+    )  # each substep multiplies by 1.02 at least
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_closed_form_of_a_viscous_particle(dim):
+    """At rest K dt² + 4η dt = ρ dx², with the elastic stiffness K; running_limit agrees, and falls as a stretch grows."""
+    mu, lam = 50.0 / 1.3, 30.0 / (1.3 * 0.4)
+    for viscosity in (0.0, 1e-3, 1.0, 1e3):
+        made = scene(NeoHookean(density=RHO, young=100.0, viscosity=viscosity), dim)
+        dt = stable_dt(made)
+        assert (dim * lam + 2 * mu) * dt**2 + 4 * viscosity * dt == pytest.approx(RHO * DX**2, rel=1e-12)
+        limits = [
+            running_limit(made, 0, mu, lam, RHO, s * torch.eye(dim, dtype=torch.float64), [], viscosity)
+            for s in (1.0, 1.5, 2.0)
+        ]
+        assert limits[0] == pytest.approx(dt, rel=1e-12) and limits[0] > limits[1] > limits[2]
+        deformed = stable_dt(made, stretch=2.0 * torch.eye(dim))
+        assert limits[2] == pytest.approx(deformed, rel=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_limit_under_pressure(dim):
+    """Suction adds d p J to the stiffness, pressure of either sign counts as suction in stable_dt and has its sign in running_limit."""
+    material, mu, lam = NeoHookean(density=RHO, young=100.0), 50.0 / 1.3, 30.0 / (1.3 * 0.4)
+    chamber, fibres = Pressure(particles=[0, 2], strength=20.0), muscle((1.0, 0.5, 0.2)[:dim], 15.0, (1,))
+    made = scene(material, dim, [fibres, chamber])
+    dt, at_rest = stable_dt(made), torch.eye(dim, dtype=torch.float64)
+    assert dt == pytest.approx(DX * math.sqrt(RHO / (2 * mu + dim * (lam + 20.0))), rel=1e-12)
+    assert "under pressure 1 (20 Pa) at full activation" in dt.limit
+    for pressure in (20.0, -20.0):
+        got = running_limit(made, 2, mu, lam, RHO, at_rest, [15.0, pressure])
+        K = max(2 * mu + dim * (lam - pressure), 2 * mu)
+        assert got == pytest.approx(DX * math.sqrt(RHO / K), rel=1e-12)
+    F = 1.2 * at_rest
+    stretched = 2 * mu * 1.44 + dim * (lam + 20.0 * 1.2**dim)
+    assert stable_dt(made, stretch=F) == pytest.approx(DX * math.sqrt(RHO / stretched), rel=1e-12)
+    assert stable_dt(made, stretch=1.2) < dt
+
+
+def test_viscous_limit_is_the_largest_step():
+    """For random stretched particles, Δt² A + 2Δt V reaches ρ dx² at the limit to 1e-12, and at no smaller step, by a scan."""
+    rng, rows = np.random.default_rng(3), 40
+    F = torch.from_numpy(np.eye(3) + 0.4 * rng.normal(size=(rows, 3, 3)))
+    made = scene(StableNeoHookean(density=RHO, young=100.0, viscosity=0.3), 3, count=rows)
+    mu, lam = (torch.tensor(v, dtype=torch.float64) for v in (50.0 / 1.3, 30.0 / (1.3 * 0.4)))
+    for p in range(rows):
+        A = reference.tangent(made.bodies[0].material, F[p], mu, lam)
+        V = 0.3 * reference.viscous_tangent(F[p])
+        dt = running_limit(made, p, mu.item(), lam.item(), RHO, F[p], [], 0.3)
+        scan = torch.tensor([*np.linspace(0.01, 0.999, 60), 1.0], dtype=torch.float64)[:, None, None] * dt
+        reach = torch.linalg.eigvalsh(scan**2 * A + 2 * scan * V)[:, -1] / (RHO * DX**2)
+        assert reach[-1] == pytest.approx(1.0, rel=1e-12)
+        assert reach[:-1].max() < 1
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -147,10 +226,10 @@ def test_names_what_limits():
     plain = stable_dt(made)
     assert "body 1 (FixedCorotated, young 25 Pa, poisson 0.2, density 1 kg/m³)" in plain.limit
     assert "muscle" not in plain.limit
-    pulls = [muscle((0, 1), 6.0, (0, 1, 2)), muscle((1, 0), 1.0, (4,)), muscle((0, 1), -7.0, (2, 3))]
-    pulled = stable_dt(dataclasses.replace(made, muscles=pulls))
-    assert "body 0 (NeoHookean, young 10 Pa" in pulled.limit and pulled < plain
-    assert "under muscle 0 (6 Pa) + muscle 2 (-7 Pa) at full activation, as at particle 2" in pulled.limit
+    muscles = [muscle((0, 1), 6.0, (0, 1, 2)), muscle((1, 0), 1.0, (4,)), muscle((0, 1), -7.0, (2, 3))]
+    driven = stable_dt(dataclasses.replace(made, muscles=muscles))
+    assert "body 0 (NeoHookean, young 10 Pa" in driven.limit and driven < plain
+    assert "under muscle 0 (6 Pa) + muscle 2 (-7 Pa) at full activation, as at particle 2" in driven.limit
 
 
 def test_each_particle_has_its_own_muscles():
@@ -168,7 +247,7 @@ def test_each_particle_has_its_own_muscles():
 @pytest.mark.parametrize("cells, holds", [(1.0, True), (4 / 3, True), (1.5, False), (2.4, False)])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_warns_of_bodies_that_do_not_hold(dim, cells, holds):
-    """A body that is pulled apart comes back beyond its rest; where it does not, build says that its particles are too far apart."""
+    """A body that is driven apart comes back beyond its rest; where it does not, build says that its particles are too far apart."""
     block = softmpm.box((8 / 32,) * dim, (20 / 32,) * dim, spacing=cells / 32)
     made = Scene(
         grid=Grid(shape=(32,) * dim, spacing=1 / 32),
@@ -189,7 +268,7 @@ def test_warns_of_bodies_that_do_not_hold(dim, cells, holds):
         return float((arm * rest).sum() / (rest * rest).sum())
 
     state = model.rest()
-    state.v[:] = state.x - state.x.mean(dim=1, keepdim=True)  # 1 /s: all of it is pulled apart alike
+    state.v[:] = state.x - state.x.mean(dim=1, keepdim=True)  # 1 /s: all of it is driven apart alike
     widths = []
     for _ in range(int(0.2 / (10 * made.dt))):
         state = softmpm.simulate(model, state, None, model.params(), substeps=10)
@@ -241,8 +320,8 @@ def test_a_scene_that_cannot_be_built_has_no_limit(particles, direction, said):
 
 def test_a_stiffness_beyond_all_numbers_is_named():
     """Instead of an error of the eigenvalue solver."""
-    pull = muscle((1, 0), 1e308)
+    fibres = muscle((1, 0), 1e308)
     with pytest.raises(
         ValueError, match=r"stiffness of body 0 is beyond .* active stress of up to 1e\+308 Pa"
     ):
-        stable_dt(scene(NeoHookean(density=1.0, young=10.0), muscles=[pull, pull]))
+        stable_dt(scene(NeoHookean(density=1.0, young=10.0), muscles=[fibres, fibres]))

@@ -104,7 +104,7 @@ def test_step_advances_like_simulate(device):
 
 
 def test_the_adjoint_runs_where_pytorch_works_by_then(monkeypatch):
-    """A tape goes back on the current stream, as PyTorch does, which need not be that of the steps."""
+    """The backward pass of a tape runs on the current stream, as in PyTorch, which need not be that of the steps."""
     model, current, used = softmpm.build(busy_scene(2), device="cpu"), [None], []
     states = [softmpm.warp_state(model, requires_grad=True) for _ in range(2)]
     solid, tape = softmpm.warp_solid(model, requires_grad=True), wp.Tape()

@@ -93,7 +93,7 @@ def test_warp_solid_checks_the_material(model, name, bad):
 
 
 def test_warp_solid_checks_shapes_types_and_the_activation(model):
-    """What is read past its end, in another precision, or not finite is refused by name."""
+    """Arrays that are too short, of another precision or not finite are refused by name."""
     params = model.params()
     for given, said in (
         ((params._replace(young=params.young[:3]),), "params.young must broadcast"),

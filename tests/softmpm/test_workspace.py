@@ -1,4 +1,4 @@
-"""What calls leave for later calls is kept by key and thread, and freed on request."""
+"""Buffers cached for later calls are stored by key and thread, and freed on request."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""What a CUDA binary says about its kernels: registers and local memory, read from its ELF sections without the CUDA toolkit.
+"""Resource usage of the kernels of a CUDA binary: registers and local memory, read from its ELF sections without the CUDA toolkit.
 
 The section ``.nv.info`` is a list of attributes, each a format, a number, a size and the value; those below hold the index of a
 symbol and what is said about it.

@@ -87,7 +87,7 @@ def shortest(stages: int, slots: int) -> int:
             todo.appendleft((advances, kept, hand, left - 1))
         if hand < stages:
             todo.append((advances + 1, kept, hand + 1, left))
-    raise AssertionError("no way back")
+    raise AssertionError("no schedule")
 
 
 def test_small_chains_are_pulled_back_at_the_least_cost():

@@ -15,8 +15,8 @@ from softmpm.planning.memory import Plan, Sizes, default_budget, plan, price_of_
 SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4, calls=1)
 
 
-def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
-    """Substeps that run again before their pull-back, and how many chunks run in all, by going through the moves."""
+def recomputations(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
+    """Number of substeps that are recomputed, and of chunks that run in all, counted along the schedule."""
     chunks = horizon.chunks(chosen.longest)
     moves = list(backward_schedule(len(chunks), chosen.slots))
     substeps = sum(chunks[move.stage].length for move in moves if move.kind == "advance")
@@ -25,14 +25,14 @@ def again(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
 
 def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
     """In substeps."""
-    substeps, chunks = again(chosen, horizon)
+    substeps, chunks = recomputations(chosen, horizon)
     return substeps + sizes.price * chunks
 
 
 @pytest.mark.parametrize("calls", [1, 5])
 @pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
 def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
-    """What all calls keep and what is run again fit, shorter last chunks included; with more memory it takes no longer."""
+    """Stored and recomputed states of all calls fit, shorter last chunks included; more memory never costs time."""
     times, sizes = [], SIZES._replace(calls=calls)
     for budget in np.geomspace(600 + 200 * calls, 100_000 * calls, 20).astype(int):
         chosen = plan(horizon, sizes, int(budget))
@@ -48,7 +48,7 @@ def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
 
 
 def test_calls_share_a_budget():
-    """Five calls keep everything with five times what one needs for that and four starts, not with less."""
+    """Five calls store all states with five times the memory of one and four initial states, not with less."""
     horizon, sizes = Horizon(1, 64), SIZES._replace(calls=5)
     everything = 5 * plan(horizon, SIZES, 10**9).kept + 4 * 130
     assert plan(horizon, sizes, everything).keep_all and not plan(horizon, sizes, everything - 1).keep_all
@@ -67,13 +67,13 @@ def test_without_a_budget_several_calls_may_keep_more(device, one, most, monkeyp
 
 
 def test_the_price_of_a_chunk_makes_chunks_longer():
-    """Where memory is short, many short chunks run least again; what each costs besides decides against them."""
+    """If memory is short, many short chunks minimise recomputation, unless the overhead of each is large."""
     horizon, budget = Horizon(1, 64), 64 * 110 // 5
     free, dear = (plan(horizon, SIZES._replace(price=price), budget) for price in (0, 10))
     assert free.longest < dear.longest
     assert (
-        again(free, horizon)[0] < again(dear, horizon)[0]
-        and again(free, horizon)[1] > again(dear, horizon)[1]
+        recomputations(free, horizon)[0] < recomputations(dear, horizon)[0]
+        and recomputations(free, horizon)[1] > recomputations(dear, horizon)[1]
     )
     for sizes, better, worse in (
         (SIZES._replace(price=0), free, dear),

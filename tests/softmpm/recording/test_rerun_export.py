@@ -165,7 +165,7 @@ def test_from_the_command_line(tmp_path, monkeypatch, capsys):
 
 
 def test_a_failed_conversion_keeps_the_old_file(tmp_path):
-    """What was converted before stays until the new file is whole."""
+    """The previous conversion remains until the new file is complete."""
     source, rrd = make(tmp_path / "run.h5"), tmp_path / "run.rrd"
     before = softmpm.to_rerun(source).read_bytes()
     whole = source.read_bytes()

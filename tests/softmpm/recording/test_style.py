@@ -14,18 +14,18 @@ def unpack(colours: np.ndarray) -> np.ndarray:
 
 def test_muscles_are_red_when_they_pull_and_blue_when_they_push():
     """One muscle tints its particles, two that overlap add, opposite ones cancel, a passive particle stays grey."""
-    rest, pull, push, both, against, none = unpack(
+    rest, contract, extend, both, against, none = unpack(
         style.activation_colours(
             STATIC, np.array([(0, 0), (1, 0), (-1, 0), (0.5, 0.5), (1, -1), (np.nan, np.nan)])
         )
     )
     red, blue = (colour.astype(int).tolist() for colour in (style.CONTRACT, style.EXTEND))
-    assert pull[0].tolist() == red and push[0].tolist() == blue
+    assert contract[0].tolist() == red and extend[0].tolist() == blue
     assert both[1].tolist() == red and not np.array_equal(both[0], red)
     assert both[0, 0] - both[0, 2] == both[2, 0] - both[2, 2] > 50
     assert np.array_equal(against[1], rest[1])
     assert np.array_equal(none, rest) and np.ptp(rest[0]) < 20
-    assert (rest[0] < rest[3]).all() and all(np.array_equal(c[3], rest[3]) for c in (pull, push, both))
+    assert (rest[0] < rest[3]).all() and all(np.array_equal(c[3], rest[3]) for c in (contract, extend, both))
 
 
 def test_strain_is_shown_from_dark_to_bright():
@@ -79,7 +79,7 @@ def test_arrows_stand_on_moving_nodes_and_keep_to_scale():
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)])
 def test_the_camera_stands_in_front_and_above(up):
-    """It looks at the middle from above, with the long horizontal axis x to the right."""
+    """The camera faces the middle from above, with the long horizontal axis x to the right."""
     up, low = np.array(up, float), np.zeros(3)
     high = np.array([3.0, 1.0, 1.0])
     position, target = style.eye(low, high, up)

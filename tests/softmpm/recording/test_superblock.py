@@ -65,7 +65,7 @@ def test_a_flipped_bit_is_refused_at_once(killed, where):
 
 @pytest.mark.parametrize("flags", [1, 4, 5, 255])
 def test_a_damaged_mark_is_refused(killed, flags):
-    """A closed file that only looks open, because its flags were damaged, does not match its checksum."""
+    """A closed file with damaged flags, which mark it as open, does not match its checksum."""
     data = bytearray(killed.with_name("live.h5").read_bytes())
     data[11] = flags
     killed.write_bytes(data)

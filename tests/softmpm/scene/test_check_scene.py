@@ -11,7 +11,7 @@ import softmpm
 from softmpm.scene import check_scene as checks
 from softmpm.scene.check_scene import check_precision, check_scene
 from softmpm.scene.materials import NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 from softmpm.scene.shapes import box
 
 SOFT = NeoHookean(density=1.0, young=10.0)
@@ -74,6 +74,11 @@ def test_muscles_name_particles_of_the_scene():
         "3 particles are 0 to 2",
     )
     refused(scene(*bodies, muscles=[muscle(0, -1)]), "muscle 0 names particle -1")
+    chamber = Pressure(particles=[3], strength=1.0)
+    refused(scene(*bodies, muscles=[muscle(0), chamber]), "pressure 1 names particle 3")
+    check_scene(scene(*bodies, driven=[2, 0]))
+    refused(scene(*bodies, driven=[0, 3]), "scene driven names particle 3")
+    refused(scene(*bodies, driven=[-1]), "scene driven names particle -1")
 
 
 @pytest.mark.parametrize("grid_spacing", [0.1, 1 / 7, 1 / 64])
@@ -100,7 +105,7 @@ def test_rounding_hides_no_copy(sign):
 
 
 def test_numbers_that_agree_by_chance_are_no_particle_twice(monkeypatch):
-    """What the rows are told apart by first need not tell them apart."""
+    """The number by which rows are first compared may be equal for different rows."""
     monkeypatch.setattr(checks, "MIXERS", (0, 1, 0))
     one, other = body((0.25, 0.5)), body((0.75, 0.5))
     check_scene(scene(one, other))
@@ -137,7 +142,7 @@ def test_walls_can_be_counted():
 
 
 def test_acceptable_scene_in_space():
-    """A 3D scene that keeps every rule passes."""
+    """A 3D scene that satisfies every rule passes."""
     muscle = Muscle(particles=np.arange(8), direction=(0, 1, 0), strength=1.0)
     made = scene(
         Body(box((0.5,) * 3, (0.625,) * 3, DX / 2), SOFT),
@@ -177,6 +182,12 @@ def soft(**changes) -> Body:
             lambda: scene(soft(), muscles=[Muscle(particles=[0], direction=(1, 0), strength=1e39)]),
             "strength of muscle 0 of 1e+39 is inf",
         ),
+        (
+            lambda: scene(soft(), muscles=[Pressure(particles=[0], strength=-1e39)]),
+            "strength of pressure 0 of -1e+39 is -inf",
+        ),
+        (lambda: scene(soft(viscosity=1e39)), "viscosity of body 0 of 1e+39 is inf"),
+        (lambda: scene(soft(viscosity=1e-50)), "viscosity of body 0 of 1e-50 is 0"),
     ],
 )
 def test_what_single_precision_takes_away(made, said):

@@ -133,7 +133,7 @@ def test_grey_arrays_and_threshold():
     ],
 )
 def test_refuses(source, changes, message):
-    """What is no silhouette is refused, with what to try instead."""
+    """An image that is no silhouette is refused, with a remedy."""
     settings = dict(lower=(0, 0), height=3.0, spacing=0.05) | changes
     with pytest.raises(ValueError, match=message):
         image(source, **settings)

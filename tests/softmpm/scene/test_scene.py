@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 from softmpm.scene.materials import FixedCorotated, Material, NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm.scene.scene import Actuator, Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 
 SOFT = dict(density=1.0, young=10.0)
+
+
+def pressure(**changes) -> Pressure:
+    return Pressure(**(dict(particles=[0], strength=2.0) | changes))
 
 
 def scene(**changes) -> Scene:
@@ -35,17 +39,23 @@ def scene(**changes) -> Scene:
         (lambda: Particles(np.zeros((3, 2)), [1, 1, np.inf]), "volume must be finite; particle 2 is not"),
         (lambda: Particles(np.zeros((3, 2)), np.nan), "volume must be finite; particle 0 is not"),
         (lambda: Particles(np.zeros((2, 2)), [1.0, 0.0]), "volume must be > 0, got 0"),
-        (lambda: Material(**SOFT), "use NeoHookean, FixedCorotated or BarrierCorotated"),
+        (lambda: Material(**SOFT), "use NeoHookean, StableNeoHookean, FixedCorotated or BarrierCorotated"),
         (lambda: NeoHookean(density=0.0, young=1.0), "density must be > 0"),
         (lambda: NeoHookean(density=np.nan, young=1.0), "density must be finite"),
         (lambda: NeoHookean(density=1.0, young=-1.0), "young must be > 0 Pa, got -1"),
         (lambda: FixedCorotated(**SOFT, poisson=0.5), r"poisson must lie in \(-1, 0.5\), got 0.5"),
         (lambda: FixedCorotated(**SOFT, poisson=-1.0), r"poisson must lie in \(-1, 0.5\)"),
+        (lambda: NeoHookean(**SOFT, viscosity=-1.0), "viscosity must be ≥ 0 Pa s, got -1"),
+        (lambda: NeoHookean(**SOFT, viscosity=np.inf), "material viscosity must be finite"),
         (lambda: Muscle(particles=[], direction=(1, 0), strength=1), "not empty"),
         (lambda: Muscle(particles=[[0, 1]], direction=(1, 0), strength=1), "list of particle indices"),
         (lambda: Muscle(particles=[True, False], direction=(1, 0), strength=1), "np.flatnonzero"),
         (lambda: Muscle(particles=[0.0, 1.0], direction=(1, 0), strength=1), "whole numbers, got float64"),
         (lambda: Muscle(particles=[2, 1, 2], direction=(1, 0), strength=1), "names a particle twice"),
+        (lambda: Actuator(particles=[0], strength=1), "an actuator needs a kind: use Muscle or Pressure"),
+        (lambda: pressure(particles=[]), "a pressure needs a list of particle indices, not empty"),
+        (lambda: pressure(particles=[1, 1]), "a pressure names a particle twice"),
+        (lambda: pressure(strength=np.nan), "pressure strength must be finite"),
         (lambda: Muscle(particles=[0], direction=(0, 0), strength=1), "direction must not be zero"),
         (lambda: Muscle(particles=[0], direction=(np.nan, 0), strength=1), "direction must be finite"),
         (lambda: Muscle(particles=[0], direction=(1, 0), strength=np.inf), "strength must be finite"),
@@ -55,6 +65,10 @@ def scene(**changes) -> Scene:
         ),
         (lambda: Wall(normal=(0, 1), offset=np.nan), "wall offset must be finite"),
         (lambda: Wall(normal=(0, 0), offset=0), "wall normal must not be zero"),
+        (lambda: scene(driven=[0, 0]), "scene driven names a particle twice"),
+        (lambda: scene(driven=[[0]]), "scene driven needs a list of particle indices"),
+        (lambda: scene(driven=[0.5]), "scene driven particles must be whole numbers, got float64"),
+        (lambda: scene(driven=[True]), "np.flatnonzero"),
         (lambda: Wall(normal=(0, 1), offset=0, friction=-0.1), "friction must be ≥ 0"),
         (lambda: Wall(normal=(0, 1), offset=0, contact="slip", friction=0.1), "a slip wall has no friction"),
         (lambda: scene(bodies=[]), "at least one body"),
@@ -90,7 +104,9 @@ def test_refuses_values(make, message):
         ),
         (lambda: scene(grid=(8, 8)), "grid must be a Grid, got tuple"),
         (lambda: scene(bodies=scene().bodies[0]), "bodies must be a list of Body, got Body"),
-        (lambda: scene(muscles=[None]), r"muscles\[0\] must be a Muscle, got NoneType"),
+        (lambda: scene(muscles=[None]), r"muscles\[0\] must be a Muscle or Pressure, got NoneType"),
+        (lambda: scene(muscles=pressure()), "muscles must be a list of Muscle or Pressure, got Pressure"),
+        (lambda: Pressure(particles=[0], strength="p"), "pressure strength must be one number, got 'p'"),
         (lambda: scene(walls=3), "walls must be a list of Wall, got int"),
         (lambda: Particles(np.zeros((3, 2)), "a"), "volume must be real numbers, got <U1"),
         (lambda: Particles("abc", 1.0), "positions must be real numbers, got <U3"),
@@ -157,7 +173,25 @@ def test_arrays_cannot_be_written_to(again):
     direction = (0.2, 0.7, 0.4)
     particles = again(Particles(np.zeros((3, 2)), np.ones(3)))
     muscle = again(Muscle(particles=np.arange(3), direction=direction, strength=1))
-    for values in (particles.positions, particles.volume, muscle.particles):
+    chamber = again(pressure())
+    assert chamber.strength == 2.0 and repr(chamber) == "Pressure(1 particle, strength=2 Pa)"
+    made = again(scene(driven=[0]))
+    for values in (
+        particles.positions,
+        particles.volume,
+        muscle.particles,
+        chamber.particles,
+        made.driven,
+    ):
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 7
     assert muscle.direction == Muscle(particles=[0], direction=direction, strength=1).direction
+
+
+def test_driven_particles():
+    """Their indices are stored as int64 in the order given; none by default, and then the text of the scene does not name them."""
+    assert scene().driven.shape == (0,) and scene().driven.dtype == np.int64 and "driven" not in repr(scene())
+    for given in ([0], (0,), np.array([0], dtype=np.int32)):
+        made = scene(driven=given)
+        assert made.driven.tolist() == [0] and made.driven.dtype == np.int64
+    assert "driven: 1 particle" in repr(made)

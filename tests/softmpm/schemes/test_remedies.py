@@ -1,4 +1,4 @@
-"""What the error messages recommend helps: each remedy is applied to the case that it was given for."""
+"""Remedies of the error messages: each is applied to the case that it was given for, and helps."""
 
 import dataclasses
 import re

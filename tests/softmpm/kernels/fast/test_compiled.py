@@ -30,6 +30,8 @@ def scene_spec(dim: int, law: str, bare: bool) -> Spec:
         dtype="float32",
         laws=(law,),
         muscle_slots=0 if bare else 2,
+        actuators=() if bare else ("muscle",),
+        fibres=not bare,
         contacts=() if bare else ("separate",),
         friction=not bare,
         gravity=True,
@@ -38,10 +40,10 @@ def scene_spec(dim: int, law: str, bare: bool) -> Spec:
 
 
 def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
-    """What goes over the particles."""
+    """A kernel over particles."""
     spec = scene_spec(dim, law, bare)
     if which == "adjoint":
-        return fused_adj(spec, RequestedGrads(material=not bare, activation=not bare)).g2p2g_adj[few]
+        return fused_adj(spec, RequestedGrads(() if bare else ("material", "activation"))).g2p2g_adj[few]
     return fused(spec).g2p2g[few]
 
 
@@ -83,7 +85,7 @@ def test_walls_are_not_in_memory(dim):
     loads = []
     for kinds in (("separate",), ("separate", "slip", "stick", "slip", "separate", "separate")):
         spec = dataclasses.replace(scene_spec(dim, "neo_hookean", bare=False), contacts=kinds)
-        wanted = RequestedGrads(material=False, activation=False)
+        wanted = RequestedGrads()
         both = [compiled(k) for k in (fused(spec).grid_velocity, fused_adj(spec, wanted).grid_velocity_adj)]
         assert all(facts.frame == facts.stack == 0 for _, facts in both)
         loads.append([len(re.findall(r"\bld\.global", code)) for code, _ in both])

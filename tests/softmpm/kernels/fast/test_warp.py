@@ -64,7 +64,7 @@ def test_places_within_a_warp(warp, farthest, count):
         first, place = np.full(WARP, -1, np.int32), np.zeros(WARP, np.int32)
         first[:count] = random.integers(0, farthest, count, endpoint=True)
         first[: count // 2] %= 40
-        warp.places(*(a.ctypes.data_as(ctypes.c_void_p) for a in (place, first)))
+        warp.sorted_places(*(a.ctypes.data_as(ctypes.c_void_p) for a in (place, first)))
         assert sorted(place) == list(range(WARP))
         moved = np.empty_like(first)
         moved[place] = first

@@ -133,8 +133,8 @@ extern "C" int add3(float* n, const int* s, const int* f, const float* g, const 
     return add<3>(n, s, f, g, b, A, m);
 }
 
-// Where each lane's particle stands among those of its warp.
-extern "C" void places(int* place, const int* first)
+// Rank of each lane's particle among those of its warp.
+extern "C" void sorted_places(int* place, const int* first)
 {
     run(32, [=](int lane) { place[lane] = softmpm::sorted_place(first[lane]); });
 }

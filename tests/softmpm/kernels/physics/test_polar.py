@@ -88,7 +88,7 @@ def test_rotation_adj_is_the_finite_difference(dim, device):
 
 
 def test_rotation_adj_is_not_finite_where_the_rotation_is_not_unique():
-    """s₂ + s₃ = 0 has no derivative: the twin says so instead of returning a number."""
+    """s₂ + s₃ = 0 has no derivative: the adjoint is not finite there."""
     F = torch.diag(torch.tensor([1.0, 0.5, -0.5], dtype=torch.float64))
     mat, eye = types(3, "float64").mat, torch.eye(3, dtype=torch.float64)
     H = (F - eye)[None]

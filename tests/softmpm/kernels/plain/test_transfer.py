@@ -1,4 +1,4 @@
-"""Each kernel of the plain scheme and its twin against the reference, one at a time, for random cotangents."""
+"""Each kernel of the plain scheme and its adjoint against the reference, one at a time, for random cotangents."""
 
 import pytest
 import torch
@@ -7,13 +7,18 @@ from helpers import assert_relative, busy_inputs, busy_scene
 
 import softmpm
 from softmpm import reference
-from softmpm.kernels.physics.actuation_sum import COLLECTORS, collect_pull, collectors
+from softmpm.kernel_inputs import derive
+from softmpm.kernels.physics.slot_sum import COLLECTORS, collect_slots, collectors
 from softmpm.kernels.structs import RequestedGrads
-from softmpm.schemes.buffers import Motion, MotionAdj, Solid, SolidAdj, lame, masses
+from softmpm.planning.chunks import Horizon
+from softmpm.schemes.buffers import Motion, MotionAdj
+from softmpm.schemes.device import stream_of
+from softmpm.schemes.inputs import Accumulators, InputsAdj, grid_struct, particle_struct
+from softmpm.schemes.launch import KernelLauncher
 from softmpm.schemes.plain.substep import Substep
 
 LIMIT = 1e-13
-EVERYTHING = RequestedGrads(material=True, activation=True)
+EVERYTHING = RequestedGrads(("material", "activation"))
 
 
 class Bench:
@@ -26,10 +31,10 @@ class Bench:
         self.cpu = {k: t.detach().cpu().requires_grad_() for k, t in inputs.items()}
         state = softmpm.State(*(inputs[name].detach() for name in "xvCF"))
         params = softmpm.Params(*(inputs[name].detach() for name in softmpm.Params._fields))
-        mu, lam = lame(params)
-        pull = (inputs["activation"].detach()[0] * self.model.strength).contiguous()
-        solid = Solid(masses(self.model, params).contiguous(), mu.contiguous(), lam.contiguous(), pull)
-        self.step = Substep(self.model, solid.struct(self.model))
+        values = derive(self.model, inputs["activation"].detach(), params, {}, Horizon(1, 1))
+        self.step = Substep(self.model)
+        self.step.particle_inputs = particle_struct(self.model, self.model.fixed | values)
+        self.step.grid_inputs = grid_struct(self.model, values)
         self.motion, self.end = Motion.empty(self.model), Motion.empty(self.model)
         self.now, self.then = self.motion.struct(self.model), self.end.struct(self.model)
         self.step.enter(state, self.now)
@@ -118,7 +123,9 @@ def test_g2p_adj(bench):
     for name, weight, scale in zip(("fx", "v", "C", "H"), weights, (bench.dx, 1, 1, 1), strict=True):
         getattr(then, name).copy_(weight * scale)
     bench.step.adj_velocity.zero_()
-    bench.step.g2p_adj(EVERYTHING, bench.now, bench.then, then.struct(model), now.struct(model))
+    found = Accumulators(model, EVERYTHING, 1, model.node_count)
+    structs = then.struct(model), now.struct(model)
+    bench.step.g2p_adj(EVERYTHING, bench.now, bench.then, *structs, found.particle_struct())
     assert_relative(bench.step.adj_velocity.cpu(), want[0], LIMIT, "velocity")
     assert_relative(now.fx.cpu() / bench.dx, want[1], 1e-12, "x")
     assert_relative(now.H.cpu(), want[2], LIMIT, "F")
@@ -134,7 +141,8 @@ def test_grid_velocity_adj(walled):
     weight = bench.random(velocity, 3)
     adj_momentum, adj_mass = torch.autograd.grad((weight * velocity).sum(), (momentum, mass))
     bench.step.adj_velocity.copy_(weight)
-    bench.step.grid_adj()
+    found = Accumulators(bench.model, EVERYTHING, 1, bench.model.node_count)
+    bench.step.grid_adj(EVERYTHING, found.grid_struct())
     got = bench.step.adj_node.cpu()
     assert_relative(got[..., :-1], adj_momentum, 1e-12, "momentum")
     assert_relative(got[..., -1], adj_mass, 1e-12, "mass")
@@ -149,24 +157,26 @@ def test_p2g_adj(bench):
     loss = (weights[0] * mass).sum() + (weights[1] * momentum).sum()
     want = dict(zip(names, torch.autograd.grad(loss, [c[n] for n in names]), strict=True))
 
-    adj, adj_solid = MotionAdj.zeros(model), SolidAdj.zeros(model, EVERYTHING)
+    adj, found = MotionAdj.zeros(model), Accumulators(model, EVERYTHING, 1, model.node_count)
     step.adj_node.copy_(torch.cat([weights[1], weights[0][..., None]], -1))
-    step.p2g_adj(EVERYTHING, bench.now, adj.struct(model), adj_solid.struct(model), 0)
+    step.p2g_adj(EVERYTHING, bench.now, adj.struct(model), found.particle_struct(), 0)
+    found.collect(0, model.fixed, KernelLauncher(model, stream_of(model.device)))
+    adj_inputs = InputsAdj(model, EVERYTHING, 1)
+    adj_inputs.add(found, slice(0, 1))
+    adj_inputs.add_particles(found, slice(0, 1))
+    adj_mass, adj_mu, adj_lam = (adj_inputs.tensors[name].cpu() for name in ("mass", "mu", "lam"))
     assert_relative(adj.fx.cpu() / bench.dx, want["x"], LIMIT, "x")
     assert_relative(adj.v.cpu(), want["v"], LIMIT, "v")
     assert_relative(adj.C.cpu(), want["C"], LIMIT, "C")
     assert_relative(adj.H.cpu(), want["F"], LIMIT, "F")
-    assert_relative(adj_solid.mass.cpu() * model.specific_volume.cpu(), want["density"], LIMIT, "density")
+    assert_relative(adj_mass * model.specific_volume.cpu(), want["density"], LIMIT, "density")
     young, poisson = (c[n].detach().requires_grad_() for n in ("young", "poisson"))
-    by_lame = torch.autograd.grad(
-        reference.lame(young, poisson), (young, poisson), (adj_solid.mu.cpu(), adj_solid.lam.cpu())
-    )
+    by_lame = torch.autograd.grad(reference.lame(young, poisson), (young, poisson), (adj_mu, adj_lam))
     assert_relative(by_lame[0], want["young"], LIMIT, "young")
     assert_relative(by_lame[1], want["poisson"], LIMIT, "poisson")
-    pull = torch.zeros(2, 2, dtype=torch.float64, device=model.device)
-    step.collect_pull(adj_solid, pull)
-    assert_relative((pull * model.strength).cpu()[None], want["activation"], LIMIT, "activation")
-    assert (adj_solid.slot == 0).all(), "collecting must clear what it took"
+    adj_active = adj_inputs.tensors["active_stress"]
+    assert_relative((adj_active * model.strength).cpu(), want["activation"], LIMIT, "activation")
+    assert (found.tensors["active_stress"] == 0).all(), "collecting must clear what it took"
 
 
 def test_collecting_from_many_particles(device):
@@ -176,24 +186,26 @@ def test_collecting_from_many_particles(device):
     muscle = torch.randint(-1, 3, (2, 2 * COLLECTORS + 7, spec.muscle_slots), generator=random).int()
     found = torch.randn(muscle.shape, generator=random, dtype=torch.float64)
     want = torch.stack([((muscle == k) * found).sum((1, 2)) for k in range(3)], 1)
-    pull, slot = torch.ones(2, 3, dtype=torch.float64, device=device), found.to(device)
-    arrays = [wp.from_torch(tensor, requires_grad=False) for tensor in (muscle.to(device), slot, pull)]
-    wp.launch(collect_pull(spec), collectors(muscle.shape), arrays, device=wp.device_from_torch(pull.device))
-    assert_relative(pull.cpu() - 1, want, 1e-12)
+    summed, slot = torch.ones(2, 3, dtype=torch.float64, device=device), found.to(device)
+    arrays = [wp.from_torch(tensor, requires_grad=False) for tensor in (muscle.to(device), slot, summed)]
+    wp.launch(
+        collect_slots(spec), collectors(muscle.shape), arrays, device=wp.device_from_torch(summed.device)
+    )
+    assert_relative(summed.cpu() - 1, want, 1e-12)
     assert (slot.cpu() == torch.where(muscle < 0, found, 0.0)).all()
 
 
-def test_twins_add_into_their_outputs(bench):
-    """Running a twin twice doubles the adjoint of the state."""
+def test_adjoints_add_into_their_outputs(bench):
+    """Running an adjoint twice doubles the adjoint of the state."""
     model, step = bench.model, bench.step
     step.advance(bench.now, bench.then, 0)
-    then, now, solid = MotionAdj.zeros(model), MotionAdj.zeros(model), SolidAdj.zeros(model, EVERYTHING)
+    then, now = MotionAdj.zeros(model), MotionAdj.zeros(model)
+    found = Accumulators(model, EVERYTHING, 1, model.node_count)
+    inputs = found.particle_struct(), found.grid_struct()
     then.flat.copy_(bench.random(then.flat, 6))
     once = None
     for _ in range(2):
-        step.adjoint(
-            EVERYTHING, bench.now, bench.then, then.struct(model), now.struct(model), solid.struct(model), 0
-        )
+        step.adjoint(EVERYTHING, bench.now, bench.then, then.struct(model), now.struct(model), inputs, 0)
         once = now.flat.clone() if once is None else once
     torch.testing.assert_close(now.flat, 2 * once, rtol=1e-12, atol=1e-12)
 
@@ -222,7 +234,7 @@ def test_entering_and_leaving_is_exact(dim, dtype, device):
     model = softmpm.build(busy_scene(dim), device=device, dtype=dtype)
     inputs = busy_inputs(model)
     state = softmpm.State(*(inputs[name].detach() for name in "xvCF"))
-    motion, step = Motion.empty(model), Substep(model, None)
+    motion, step = Motion.empty(model), Substep(model)
     step.enter(state, motion.struct(model))
     back = step.leave(motion.struct(model))
     for name in "vCF":

@@ -58,11 +58,11 @@ def test_the_order_of_the_particles_leaves_no_trace(dim, monkeypatch):
         "reversed": lambda order: order.flip(1),
         "shuffled": lambda order: order[:, torch.randperm(order.shape[1])],
     }
-    renew = ParticleLayout.resort
+    resort = ParticleLayout.resort
 
-    def put(arrangement, x, change):
-        renew(arrangement, x)
-        arrangement.order.copy_(change(arrangement.order).clone())
+    def put(layout, x, change):
+        resort(layout, x)
+        layout.order.copy_(change(layout.order).clone())
 
     for deterministic in (True, False):
         found = {}
@@ -198,18 +198,6 @@ def test_the_model_says_how_it_adds():
     for settings in (dict(dtype=torch.float64, scheme="auto"), dict(scheme="plain")):
         model = build(2, **settings)
         assert model.deterministic and not model.spec.deterministic
-
-
-@pytest.mark.gpu
-def test_a_gpu_says_what_it_cannot_repeat():
-    """Double precision, the plain scheme and step() add in floating point, in any order."""
-    for settings in (dict(dtype=torch.float64), dict(scheme="plain")):
-        with pytest.raises(ValueError, match="needs torch.float32 and the fast scheme"):
-            build(2, device="cuda", **settings)
-    model = build(2, device="cuda")
-    states = [softmpm.warp_state(model) for _ in range(2)]
-    with pytest.raises(ValueError, match=r"use softmpm\.simulate"):
-        softmpm.step(model, *states, softmpm.warp_solid(model))
 
 
 @pytest.mark.gpu

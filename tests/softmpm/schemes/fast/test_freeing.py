@@ -32,18 +32,18 @@ HOLD_MEMORY = (
 
 @pytest.fixture
 def living(monkeypatch):
-    """What models and their calls made since and that is still in memory, their tensors included, of one class or of any."""
+    """Function that lists objects of models and calls created since and still alive, with their tensors; of one class or of any."""
     seen = []
 
-    def watch(kind):
+    def track(kind):
         make = kind.__init__
 
-        def watched(self, *args, **kwargs):
+        def tracked(self, *args, **kwargs):
             make(self, *args, **kwargs)
             tensors = (value for value in vars(self).values() if isinstance(value, torch.Tensor))
             seen.extend(weakref.ref(thing) for thing in (self, *tensors))
 
-        monkeypatch.setattr(kind, "__init__", watched)
+        monkeypatch.setattr(kind, "__init__", tracked)
 
     def alive(kind=object) -> list:
         things = (ref() for ref in seen)
@@ -52,7 +52,7 @@ def living(monkeypatch):
         )
 
     for kind in HOLD_MEMORY:
-        watch(kind)
+        track(kind)
     gc.disable()
     yield alive
     gc.enable()
@@ -62,9 +62,9 @@ def model(device="cpu", **settings) -> softmpm.Model:
     return softmpm.build(busy_scene(2), device=device, **settings)
 
 
-@pytest.fixture(params=["kept", "run again"])
+@pytest.fixture(params=["kept", "recomputed"])
 def budget(request, monkeypatch) -> dict:
-    """Settings with which a call keeps everything inside its chunks, and with which it runs them again."""
+    """Settings with which a call stores all intermediate states, and with which it recomputes them."""
     monkeypatch.setattr(memory, "LONGEST", 8)
     return {} if request.param == "kept" else little_memory(model())
 
@@ -80,26 +80,26 @@ def call(built, seed=1, substeps=7):
     return run(softmpm.simulate, built, inputs, substeps), inputs
 
 
-def pull(end, inputs) -> tuple[torch.Tensor, ...]:
+def backward(end, inputs) -> tuple[torch.Tensor, ...]:
     return torch.autograd.grad(dot(cotangent(end), end), list(inputs.values()))
 
 
 @pytest.mark.parametrize("work", ["forward", "forward and backward", "a call that waits"])
 def test_a_model_that_nobody_uses_is_freed(living, settings, work, device):
-    """And with it its programs: building one model after the other takes no more memory than one."""
+    """Its chunk graphs are freed as well: building models one after the other takes no more memory than one."""
     built = model(device=device, **settings)
     with torch.set_grad_enabled(work != "forward"):
         end, inputs = call(built)
     if work == "forward and backward":
-        pull(end, inputs)
-        pull(*call(built, seed=2))
+        backward(end, inputs)
+        backward(*call(built, seed=2))
     assert living(softmpm.Model) and living(torch.Tensor)
     del built, end, inputs
     assert not living()
 
 
 def test_a_model_that_failed_is_freed(living, settings, device):
-    """As soon as nobody has the error any more, be it of a forward or of a backward pass."""
+    """It is freed as soon as no reference to the error is left, in a forward and in a backward pass."""
     built, failed = model(device=device, **settings), 0
     inputs = busy_inputs(built)
     with torch.no_grad():
@@ -118,11 +118,11 @@ def test_a_model_that_failed_is_freed(living, settings, device):
     assert not living()
 
 
-def test_a_call_leaves_nothing_but_its_programs(living, settings, device):
-    """Whether its gradient was taken or not; a second one leaves no more."""
+def test_a_call_leaves_nothing_but_its_chunk_graphs(living, settings, device):
+    """This holds with and without its gradient; a second call leaves no more."""
     built, left = model(device=device, **settings), []
     for _ in range(3):
-        pull(*call(built))
+        backward(*call(built))
         call(built, seed=2)
         assert not living((fast_scheme.FastRun, plain_chunk.PlainRun))
         left.append(len(living()))
@@ -131,14 +131,14 @@ def test_a_call_leaves_nothing_but_its_programs(living, settings, device):
 
 @pytest.mark.parametrize("report", [0, 1, 9, 20, 21, 22, 30, 54])
 def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatch, report):
-    """Of its programs only the one in whose buffers the chunk starts, when those for the larger window are made.
+    """Only the old chunk graph that contains the initial state is alive when those for the larger window are built.
 
-    A particle is said to have left in the chunk with this number: the first 21 run forward, the others again in the backward pass.
+    A particle is reported to have left in the chunk of this number: the first 21 run forward, the others are recomputed.
     """
     built, seen, others = model(**little_memory(model())), [], []
     horizon = Horizon(3, 7)
     assert len(horizon.chunks(plan(horizon, built.sizes(), built.budget).longest)) == 21
-    pull(*call(built))
+    backward(*call(built))
     (smaller,) = living(particle_order.ParticleLayout)
     smaller.left = True
     del smaller
@@ -149,21 +149,21 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
         return outgrown(words) or len(seen) == report + 1
 
     def making(self, model, window, *args):
-        others.append(sum(one.arrangement is not window for one in living(chunk_graph.ChunkGraph)))
+        others.append(sum(one.layout is not window for one in living(chunk_graph.ChunkGraph)))
         make(self, model, window, *args)
 
     monkeypatch.setattr(fast_scheme, "outgrown", left_once)
     monkeypatch.setattr(chunk_graph.ChunkGraph, "__init__", making)
-    pull(*call(built))
+    backward(*call(built))
     assert len(seen) > report and others and max(others) <= 1
 
 
 def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, device):
-    """Those that were kept on the way forward go as others take their slots; a second backward pass has to find them again."""
+    """Checkpoints of the forward pass are freed as others take their slots; a second backward pass recomputes them."""
     monkeypatch.setattr(
         "softmpm.schemes.fast.footprint.price_of_chunk", lambda particles: 1
     )  # the same chunks on a GPU
-    built, kept, most, programs = model(device=device, **little_memory(model())), [], [], []
+    built, kept, most, graphs = model(device=device, **little_memory(model())), [], [], []
     horizon, copied, runs = Horizon(3, 7), SortedState.copy, chunk_graph.ChunkGraph.run
     chosen = plan(horizon, built.sizes(), built.budget)
     assert len(horizon.chunks(chosen.longest)) > 2 * chosen.slots > 4
@@ -175,7 +175,7 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
 
     def running(self, *args):
         most.append(sum(ref() is not None for ref in kept))
-        programs.append(len(living(chunk_graph.ChunkGraph)))
+        graphs.append(len(living(chunk_graph.ChunkGraph)))
         return runs(self, *args)
 
     monkeypatch.setattr(SortedState, "copy", copying)
@@ -186,7 +186,7 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
     again = torch.autograd.grad(weights, list(inputs.values()))
     # The start takes a slot, but it is the user's; and the state that was dropped last is in hand.
     assert len(kept) > 2 * chosen.slots and max(most) <= chosen.slots
-    assert max(programs) < chosen.slots  # what is kept holds none
+    assert max(graphs) < chosen.slots  # checkpoints refer to none
     for got, want in zip(again, first, strict=True):
         assert_relative(got, want, 0.0 if device == "cpu" else 2e-5)
 
@@ -231,7 +231,7 @@ def test_calls_of_a_closed_loop_share_the_budget(kind, monkeypatch):
 def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failing, monkeypatch, device):
     """Also what the calls before left to be used again: it may be what there is no room for."""
     built = model(device=device, **settings)
-    pull(*call(built))
+    backward(*call(built))
     waiting = call(built) if failing == "backward" else None
     owner, name = (
         (particle_order.ParticleLayout, "update_staleness")
@@ -246,7 +246,7 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
         owner, name = plain_chunk.PlainRun, "__init__" if failing == "forward" else "vjp"
     monkeypatch.setattr(owner, name, full)
     try:
-        pull(*(waiting or call(built)))
+        backward(*(waiting or call(built)))
     except torch.OutOfMemoryError as error:
         (note,) = error.__notes__
         assert note.startswith("softmpm: a call of 21 substeps with ") and "smaller memory_budget" in note
@@ -275,17 +275,17 @@ def test_a_call_without_gradient_that_does_not_fit_says_so(monkeypatch):
         assert note in caught.value.__notes__[0]
 
 
-def test_calls_of_many_lengths_leave_few_programs(living, device):
+def test_calls_of_many_lengths_leave_few_chunk_graphs(living, device):
     """Their memory is bounded by what two calls may keep; those of the last call are there for the next one like it."""
     sizes, lengths = model().sizes(), range(10, 40)
     budget = 3 * lengths[-1] * (sizes.inside + 2 * sizes.nodes)
     built = model(device=device, memory_budget=budget)
     for substeps in lengths:
         assert plan(Horizon(3, substeps), sizes, budget).keep_all
-        pull(*call(built, substeps=substeps))
+        backward(*call(built, substeps=substeps))
         last = living(chunk_graph.ChunkGraph)
         assert sum(one.bytes for one in last) <= 2 * budget
-        pull(*call(built, substeps=substeps))
+        backward(*call(built, substeps=substeps))
         assert living(chunk_graph.ChunkGraph) == last
         del last
 
@@ -295,23 +295,23 @@ def test_small_programs_all_stay(living, device):
     built, left = model(device=device), []
     for _ in range(2):
         for substeps in range(10, 20):
-            pull(*call(built, substeps=substeps))
+            backward(*call(built, substeps=substeps))
         left.append(living(chunk_graph.ChunkGraph))
     assert left[0] == left[1] and len(left[0]) >= 10
 
 
 def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
-    """What was made before its recording: model, order of the particles, programs. All of it goes with the graph's ledger."""
+    """Objects created before its capture, model, particle layout and chunk graphs, are freed with the graph's resources."""
     built = model(**budget)
-    pull(*call(built))  # makes what a recording must not
+    backward(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
     with_graphs = [
         weakref.ref(made) for made in living((chunk_graph.ChunkGraph, chunk_graph_adj.ChunkGraphAdj))
     ]
     for module in (autograd, chunk_graph, fast_scheme, rollout, runner):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
-    with capture.collected_resources() as ledger:
-        pull(*call(built))
+    with capture.collected_resources() as resources:
+        backward(*call(built))
         assert with_graphs and all(made() is not None for made in with_graphs), (
             "a graph that is destroyed ends the recording"
         )
@@ -321,13 +321,13 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     assert {id(held) for held in living(HOLD_MEMORY)} <= before, (
         "the recording owns the memory of what it made"
     )
-    del ledger
+    del resources
     assert not living()
 
 
 @pytest.mark.gpu
 def test_a_graph_runs_on_memory_of_its_own():
-    """What others allocate, once nothing but the graph uses the model any more, is not where the graph writes."""
+    """Once only the graph uses the model, new allocations do not overlap the memory that the graph writes to."""
     device = "cuda"
     built = {"model": model(device=device)}
     inputs = busy_inputs(built["model"])

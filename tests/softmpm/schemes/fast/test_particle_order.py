@@ -153,12 +153,12 @@ def test_a_grown_window_has_twice_the_margin(device):
     assert found.grown(x).grown(x).grown(x).shape == (80, 26)
 
 
-def test_an_arrangement_grows_stale_by_disorder_or_near_the_edge(device):
+def test_a_layout_grows_stale_by_disorder_or_near_the_edge(device):
     """Measured by the cells it met when it was new; on the CPU, where the order is fixed, only the edge counts."""
     model = robot(2, [(20, 20)], grid=(80, 80), worlds=2, device=device)
     x = model.rest().x
     found = ParticleLayout(model, x)
-    for apart in (1.0, 3.0):  # further apart in a renewed order: other cells, another measure
+    for apart in (1.0, 3.0):  # further apart, re-sorted: other cells, another measure
         x = x.mean(1, keepdim=True) + apart * (x - x.mean(1, keepdim=True))
         found.resort(x)
         followed = x if device == "cuda" else model.rest().x
@@ -251,7 +251,7 @@ def test_a_particle_that_flies_through_the_window(watched, device):
 
 
 def test_a_window_that_must_grow_in_the_second_chunk(watched, monkeypatch, device):
-    """What ran ahead of a void chunk is void too; what ran before it stays."""
+    """The chunk launched after a void one is void too; earlier chunks remain valid."""
     monkeypatch.setattr("softmpm.planning.memory.LONGEST", 16)
     v = torch.zeros(1, 32, 2, dtype=torch.float64)
     v[0, :16, 0] = 14.0  # 3.6 cells in each chunk of 16
@@ -262,7 +262,7 @@ def test_a_window_that_must_grow_in_the_second_chunk(watched, monkeypatch, devic
 
 
 def test_a_window_that_is_left_again_and_again_grows(watched, monkeypatch, device):
-    """A motion that leaves it in every call: chunks run twice at first, then never again."""
+    """A motion leaves it in every call: chunks are repeated at first, later none."""
     monkeypatch.setattr("softmpm.planning.memory.LONGEST", 16)
     model = robot(2, [(30, 30)], grid=(100, 64), device=device)
     v, runs, found = torch.tensor([14.0, 0.0], dtype=torch.float64), [], []  # 3.6 cells in each chunk of 16
@@ -365,7 +365,7 @@ def test_the_size_of_the_grid_costs_nothing(dtype, limit, watched, device):
     assert_same(*found, limit)
 
 
-# -- a window inside a recorded graph ------------------------------------------------------------------------------
+# -- a window inside a captured graph ------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -391,11 +391,11 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
 
 CUDA = torch.device("cuda")
 WANDERS = torch.tensor([4.0, 1.0], dtype=torch.float64)
-"""1.6 cells in a call of 25 substeps [m/s]; before a recording renews its window, it goes 9.6."""
+"""1.6 cells in a call of 25 substeps [m/s]; during a capture, before the window is re-centred, the robot moves 9.6."""
 
 
 def test_a_window_that_is_too_small_for_a_recording_grows_once(watched, recordings, device):
-    """Calls that look follow the robot without growing, a replay does not: it is done again, recorded again, and that stays."""
+    """Calls follow the robot without a larger window, a replay cannot: it is repeated and captured once more, then never."""
     build = {"corners": [(15, 28)], "grid": (80, 64), "device": device}
     _, fly = flight(robot(2, **build), WANDERS, 25, calls=14, twist=3.0)
     graph, found = softmpm.Graph(fly, CUDA), []

@@ -1,4 +1,4 @@
-"""The fast scheme: when it is chosen, that it does what the plain one does, and that its programs serve many calls."""
+"""The fast scheme: it is chosen where it applies, agrees with the plain scheme, and reuses its chunk graphs in many calls."""
 
 import itertools
 import queue
@@ -23,15 +23,14 @@ from helpers import (
 )
 
 import softmpm
-from softmpm import autograd
 from softmpm.building import choose_scheme
+from softmpm.kernel_inputs import material
 from softmpm.kernels.fast.native import WARP
 from softmpm.kernels.structs import BASE_BITS, packed_rows
 from softmpm.planning import memory
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import plan
 from softmpm.schemes import launch
-from softmpm.schemes.buffers import Solid
 from softmpm.schemes.fast import chunk_graph, chunk_graph_adj
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.particle_order import ParticleLayout
@@ -196,21 +195,21 @@ def test_each_gradient_can_be_wanted_alone(device):
         assert_relative(alone, every[name], 1e-6, name)
 
 
-# -- one program, many calls --------------------------------------------------------------------------------------
+# -- one graph, many calls ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def made(monkeypatch) -> list:
-    """Every program that is made."""
-    programs = []
+    """Every chunk graph that is built."""
+    graphs = []
 
     class Counted(chunk_graph.ChunkGraph):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            programs.append((self.chunk, self.keep))
+            graphs.append((self.chunk, self.keep))
 
     monkeypatch.setattr(fast_scheme, "ChunkGraph", Counted)
-    return programs
+    return graphs
 
 
 def calls(built, seeds, substeps=7):
@@ -248,14 +247,14 @@ def at_once(*threads: threading.Thread) -> None:
         sys.setswitchinterval(interval)
 
 
-@pytest.fixture(params=["kept", "run again"])
+@pytest.fixture(params=["kept", "recomputed"])
 def budget(request) -> dict:
-    """Settings with which a call keeps everything inside, and with which it keeps one state and runs chunks again."""
+    """Settings with which a call stores all intermediate states, and with which it stores one state and recomputes chunks."""
     return {} if request.param == "kept" else little_memory(model())
 
 
-def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device):
-    """After the first call, with and without gradient, every program is one that was made before."""
+def test_repeated_calls_build_no_new_chunk_graphs(made, short_chunks, budget, device):
+    """After the first call, with and without gradient, every chunk graph is reused."""
     built = model(device=device, **budget)
 
     def both():
@@ -273,8 +272,8 @@ def test_repeated_calls_make_no_new_programs(made, short_chunks, budget, device)
     assert len(made) == count, made[count:]
 
 
-def test_chunks_of_a_long_control_step_share_programs(made, short_chunks, device):
-    """Wherever in the control step they lie: forward three, one launched ahead and one that holds a start; going back one."""
+def test_chunks_of_a_long_control_step_share_chunk_graphs(made, short_chunks, device):
+    """Three graphs serve the forward pass, one launched ahead and one that contains an initial state; one serves the backward pass."""
     sizes = model().sizes()
     built = model(device=device, memory_budget=9 * (sizes.inside + sizes.nodes) + 20 * sizes.between)
     inputs = busy_inputs(built, control_steps=1, seed=1)
@@ -315,7 +314,7 @@ def test_starts_of_any_layout(dtype, device):
 
 
 def test_gradients_of_any_layout(device):
-    """Cotangents that are transposed or broadcast, as PyTorch hands them on, give the gradient of their copies."""
+    """Cotangents that are transposed or broadcast, as PyTorch may pass them, give the gradient of their copies."""
     built = model(device=device, worlds=2)
     weights = [w.transpose(0, 1).contiguous().transpose(0, 1) for w in cotangent(built.rest())[:4]]
     found = []
@@ -343,16 +342,16 @@ def test_material_is_not_mixed_up_when_the_order_is_renewed(device):
         with torch.no_grad():
             return softmpm.simulate(built, start, None, params, substeps=5).v
 
-    masses = [autograd._material(built, params) for params in (soft, stiff)]
+    masses = [material(built, params) for params in (soft, stiff)]
     runner, chunk = fast_scheme.Fast(built), Chunk(0, 5, 5)
 
     def chunk_of(k):
-        pull = torch.zeros(1, 1, built.muscle_count, device=device)
-        mu, lam, mass = masses[k]
-        return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end.state().v
+        values = dict(zip(("mu", "lam", "mass"), masses[k], strict=True))
+        values["active_stress"] = torch.zeros(1, 1, built.muscle_count, device=device)
+        return runner.run(chunk, start, values, False).end.state().v
 
     first, _ = chunk_of(0), chunk_of(0)  # the second takes note of a material that was already in order
-    runner._pool.arrangement.resort(start.x)
+    runner._pool.layout.resort(start.x)
     other, again = chunk_of(1), chunk_of(0)
     assert_relative(again, first, same_on(device))
     assert not torch.allclose(other, first)
@@ -378,9 +377,9 @@ def test_outstanding_gradients_keep_their_own_states(made, short_chunks, budget,
     assert counts[0] == counts[1]
 
 
-@pytest.fixture(params=itertools.product(KINDS, ["kept", "run again"]), ids=", ".join)
+@pytest.fixture(params=itertools.product(KINDS, ["kept", "recomputed"]), ids=", ".join)
 def kind(request) -> dict:
-    """Settings of a model, and with which its calls keep everything inside, or run chunks again."""
+    """Settings of a model with which its calls store all intermediate states, or recompute chunks."""
     name, memory = request.param
     return KINDS[name] | ({} if memory == "kept" else little_memory(model(**KINDS[name])))
 
@@ -400,7 +399,7 @@ def test_backward_twice(kind, short_chunks, device):
 
 @pytest.mark.gpu
 def test_backward_twice_inside_a_graph(budget, short_chunks):
-    """Recorded, and with little memory run again for the second gradient: both are those without a graph."""
+    """Captured, and with little memory recomputed for the second gradient: both are equal to those without a graph."""
     built = model(device="cuda", **budget)
     inputs, weights = busy_inputs(built, control_steps=3, seed=1), cotangent(built.rest())
 
@@ -417,7 +416,7 @@ def test_backward_twice_inside_a_graph(budget, short_chunks):
 
 @pytest.mark.parametrize("seeds", [(1, 1, 1), (1, 2, 3)], ids=["one call", "three calls"])
 def test_threads_go_back_through_calls_of_another(kind, seeds, short_chunks):
-    """At the same time, through one call or one each: they take turns, and each gets what one gets alone."""
+    """At the same time, through one call or one each: each thread gets the result that it gets alone."""
     built, together, found = model(**kind), threading.Barrier(len(seeds)), queue.Queue()
     waiting = {seed: next(calls(built, [seed])) for seed in set(seeds)}
     want = {seed: pull(*call, retain_graph=True) for seed, call in waiting.items()}
@@ -491,7 +490,7 @@ def test_threads_share_a_model(short_chunks, device):
 
 
 def test_a_backward_pass_in_another_thread(short_chunks, device, monkeypatch):
-    """One thread simulates, another pulls back what it gave, at once: both launch what leads from chunk to chunk."""
+    """One thread simulates while another runs a backward pass: both use the launches that permute states between chunks."""
     monkeypatch.setattr(memory, "LONGEST", 1)
     built, want, rounds = model(device=device), alone(1, device), 30
     waiting, errors = queue.Queue(4), []
@@ -507,14 +506,14 @@ def test_a_backward_pass_in_another_thread(short_chunks, device, monkeypatch):
         finally:
             waiting.put(None)
 
-    def pull_back():
+    def backward():
         while (call := waiting.get()) is not None:
             try:
                 assert_gradient(pull(*call), want, device)
             except Exception as error:
                 errors.append(error)
 
-    at_once(*(threading.Thread(target=work) for work in (simulate, pull_back)))
+    at_once(*(threading.Thread(target=work) for work in (simulate, backward)))
     assert not errors, errors
 
 
@@ -522,15 +521,16 @@ def test_a_backward_pass_in_another_thread(short_chunks, device, monkeypatch):
 
 
 def test_a_start_stays_until_nothing_needs_it(device):
-    """Chunks that run ahead write nowhere into what an earlier one started from: it may have to run again."""
+    """Chunks launched ahead do not overwrite the initial state of an earlier one, which may have to be repeated."""
     built = model(device=device)
-    mu, lam, mass = autograd._material(built, built.params())
+    mu, lam, mass = material(built, built.params())
     runner, chunk, state = fast_scheme.Fast(built), Chunk(0, 2, 2), built.rest()
     state.v.add_(0.3)
-    pull = torch.zeros(1, 1, built.muscle_count, device=device)
+    active = torch.zeros(1, 1, built.muscle_count, device=device)
+    values = dict(mu=mu, lam=lam, mass=mass, active_stress=active)
 
     def after(start):
-        return runner.run(chunk, start, pull, Solid(mass, mu, lam, None), False).end
+        return runner.run(chunk, start, values, False).end
 
     first = after(state)
     want, later = first.state(), first
@@ -543,14 +543,14 @@ def test_a_start_stays_until_nothing_needs_it(device):
 @pytest.fixture
 def shuffled(monkeypatch):
     """Before each chunk another order is drawn at random."""
-    renew = ParticleLayout.resort
+    resort = ParticleLayout.resort
 
-    def anew(self, x):
-        renew(self, x)
+    def shuffle(self, x):
+        resort(self, x)
         for order in self.order:
             order.copy_(order[torch.randperm(len(order)).to(order.device)])
 
-    monkeypatch.setattr(ParticleLayout, "resort", anew)
+    monkeypatch.setattr(ParticleLayout, "resort", shuffle)
     monkeypatch.setattr(ParticleLayout, "update_staleness", lambda self, *_: setattr(self, "stale", True))
 
 
@@ -583,7 +583,7 @@ def failure(built, seed=1, **changes) -> softmpm.UnstableError:
 
 
 def assert_same_failure(one, other, built) -> None:
-    """What, where and when; worlds that did not fail end alike, and so does the particle that did.
+    """Kind, place and time are equal; worlds that did not fail end alike, and so does the particle that did.
 
     The others of its world stop in that substep, before or after it: they run at the same time.
     """
@@ -640,7 +640,7 @@ def interrupted(monkeypatch):
     places = (torch, "empty"), (wp, "launch"), (wp.Launch, "launch"), (launch.RebindableLaunch, "__call__")
 
     def attempts(make, work, every: int):
-        """What was made for each attempt, once its work was stopped."""
+        """Objects made for each attempt, after its work was stopped."""
         for point in itertools.count(0, every):
             made, steps = make(), itertools.count()
 

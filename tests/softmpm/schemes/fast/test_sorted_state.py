@@ -1,4 +1,4 @@
-"""What is handed from chunk to chunk: particles may change their places, nothing else changes."""
+"""States and adjoints passed from chunk to chunk: the order of the particles may change, nothing else does."""
 
 import numpy as np
 import pytest
@@ -35,25 +35,25 @@ def state_of(model) -> softmpm.State:
         return softmpm.simulate(model, start, None, model.params(), substeps=2)
 
 
-def program_in(model, seed: int, x) -> ChunkGraph:
-    """A program whose particles stand in an order drawn at random, another one in each world."""
-    program = ChunkGraph(model, ParticleLayout(model, x), Chunk(0, 1, 1), keep=True)
+def graph_in(model, seed: int, x) -> ChunkGraph:
+    """A graph whose particles stand in an order drawn at random, another one in each world."""
+    graph = ChunkGraph(model, ParticleLayout(model, x), Chunk(0, 1, 1), keep=True)
     generator = torch.Generator().manual_seed(seed)
     for world in range(WORLDS):
-        program.order[world] = torch.randperm(model.particle_count, generator=generator)
-    program.origin.copy_(program.arrangement.origin)
-    program.reset_status()
-    return program
+        graph.order[world] = torch.randperm(model.particle_count, generator=generator)
+    graph.origin.copy_(graph.layout.origin)
+    graph.reset_status()
+    return graph
 
 
-def start_of(model, program) -> SortedState:
-    return SortedState(Unpacker(model), program.base[0], program.rows[0], program.order)
+def start_of(model, graph) -> SortedState:
+    return SortedState(Unpacker(model), graph.base[0], graph.rows[0], graph.order)
 
 
 def test_a_state_changes_hands_unchanged(model):
     """User → one order → another → user gives the same bits, low-order parts included; so does a copy of what was between."""
     state, stream = state_of(model), stream_of(model.device)
-    first, second = (program_in(model, seed, state.x) for seed in (1, 2))
+    first, second = (graph_in(model, seed, state.x) for seed in (1, 2))
     first._take(stream, state)
     between = start_of(model, first)
     kept = between.copy()
@@ -73,21 +73,21 @@ def test_a_state_changes_hands_unchanged(model):
 
 
 def test_an_adjoint_changes_hands_unchanged(model):
-    """The same for adjoints, from the scratch of one program to that of another."""
+    """The same for adjoints, from the scratch of one graph to that of another."""
     state, stream, wanted = (
         state_of(model),
         stream_of(model.device),
-        RequestedGrads(material=False, activation=False),
+        RequestedGrads(),
     )
     generator = torch.Generator().manual_seed(0)
     adj = softmpm.State(*(torch.randn(t.shape, generator=generator).to(t) for t in state[:4]))
-    programs = [program_in(model, seed, state.x) for seed in (1, 2)]
-    first, second = (ChunkGraphAdj(program, wanted, AdjointBuffers(program, wanted)) for program in programs)
+    graphs = [graph_in(model, seed, state.x) for seed in (1, 2)]
+    first, second = (ChunkGraphAdj(graph, wanted, AdjointBuffers(graph, wanted)) for graph in graphs)
     first._enter(stream, *adj[:4])
-    between = SortedAdj(Unpacker(model), first.scratch.adj, programs[0].order)
+    between = SortedAdj(Unpacker(model), first.scratch.adj, graphs[0].order)
     second._move(stream, between.inverse_permutation(), between.rows)
-    assert not torch.equal(programs[0].order, programs[1].order)
-    back = SortedAdj(Unpacker(model), second.scratch.adj, programs[1].order).state()
+    assert not torch.equal(graphs[0].order, graphs[1].order)
+    back = SortedAdj(Unpacker(model), second.scratch.adj, graphs[1].order).state()
     for name, got, want in zip("xvCF", back[:4], adj[:4], strict=True):
         torch.testing.assert_close(
             got, want, rtol=3e-7, atol=0, msg=name
@@ -97,7 +97,7 @@ def test_an_adjoint_changes_hands_unchanged(model):
 def test_a_window_that_does_not_hold_what_is_handed_over_is_reported(model):
     """With the particle's number, in its own world only, and what is written stays inside the window."""
     state, stream = state_of(model), stream_of(model.device)
-    first, second = (program_in(model, seed, state.x) for seed in (1, 2))
+    first, second = (graph_in(model, seed, state.x) for seed in (1, 2))
     first._take(stream, state)
     base = torch.floor(state.x[1, :, 0].double() / model.scene.grid.spacing - 0.5).int()
     second.origin[1, 0] = base.min() + 1
@@ -119,30 +119,30 @@ def test_what_a_chunk_reports_of_its_order(dim, device):
     scene = softmpm.Scene(grid=softmpm.Grid(shape=dim * (60,), spacing=1.0), bodies=[body], dt=1e-3)
     model = softmpm.build(scene, device=device, worlds=WORLDS, scheme="fast")
     state = model.rest()
-    program = program_in(model, 1, state.x)
-    program._take(stream_of(model.device), state)
+    graph = graph_in(model, 1, state.x)
+    graph._take(stream_of(model.device), state)
 
     def report() -> list[int]:
         found = torch.zeros(2, dtype=torch.int64, device=model.device)
-        window = program.arrangement.window(program.origin)
+        window = graph.layout.window(graph.origin)
         inputs = [
             model.constants,
             window,
             model.particle_count,
-            program.packed[0].base,
+            graph.packed[0].base,
             view(found, wp.int64),
         ]
         kernel = sorting(model.dim, model.spec.dtype).survey
-        wp.launch(kernel, program.total, inputs, device=model.wp_device, stream=stream_of(model.device))
+        wp.launch(kernel, graph.total, inputs, device=model.wp_device, stream=stream_of(model.device))
         return found.tolist()
 
     base = np.floor(state.x.double().cpu().numpy() - 0.5).astype(int)
-    along = np.take_along_axis(base, program.order.cpu().numpy()[..., None].astype(int), axis=1)
+    along = np.take_along_axis(base, graph.order.cpu().numpy()[..., None].astype(int), axis=1)
     cells = int((along[:, 1:] != along[:, :-1]).any(-1).sum()) + WORLDS
     assert report() == [cells, 0]
-    middle = program.origin[0, 0].item()
-    for first in (base[0, :, 0].min() - 1, base[0, :, 0].max() + 4 - program.arrangement.shape[0]):
-        program.origin[0, 0] = int(first)  # one node of room is left, below or above
+    middle = graph.origin[0, 0].item()
+    for first in (base[0, :, 0].min() - 1, base[0, :, 0].max() + 4 - graph.layout.shape[0]):
+        graph.origin[0, 0] = int(first)  # one node of room is left, below or above
         assert report() == [cells, 1]
-    program.origin[0, 0] = middle
+    graph.origin[0, 0] = middle
     assert report() == [cells, 0]

@@ -1,0 +1,248 @@
+"""Inputs of a call besides state, activation and material: every value and gradient against the float64 reference."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory
+
+import softmpm
+from softmpm import Inputs, reference
+
+GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
+WALLS = ("wall_offset", "wall_normal", "wall_velocity")
+TIMED = {"activation", "velocity", "force", *WALLS}
+"""Inputs with a first axis of control steps or poses."""
+STEPS = 3
+
+
+def scene(dim: int, *, driven=(1, 5), viscosity=0.02, **changes) -> softmpm.Scene:
+    """:func:`busy_scene` with every law, a chamber under pressure, viscosity, driven particles and a wall of each kind."""
+    full = busy_scene(dim, tuple(LAWS), per_law=8, **changes)
+    bodies = [
+        dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=viscosity))
+        for body in full.bodies
+    ]
+    chamber = softmpm.Pressure(particles=np.arange(2, 14), strength=6.0)
+    sticky = softmpm.Wall(normal=(1.0, 0.0, 0.1)[:dim], offset=0.33, contact="stick")
+    return dataclasses.replace(
+        full, bodies=bodies, driven=driven, walls=[*full.walls, sticky], muscles=[*full.muscles, chamber]
+    )
+
+
+def build(made: softmpm.Scene, **settings) -> softmpm.Model:
+    alarms = softmpm.Alarms(gap=None)
+    return softmpm.build(made, device=settings.pop("device", "cpu"), alarms=alarms, **settings)
+
+
+def given(model: softmpm.Model, names, steps=STEPS, seed=7) -> dict[str, torch.Tensor]:
+    """Random values of these inputs, near those of the scene, for each world, as leaves that require gradients."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(name, low, high):
+        shape = model.shape_of(name, steps)
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    walls = model.scene.walls
+    dtype = {"wall_offset": torch.float64, "wall_normal": torch.float64}
+    made = {
+        "gravity": lambda: random("gravity", -9.0, 3.0),
+        "damping": lambda: random("damping", 0.2, 3.0),
+        "friction": lambda: random("friction", 0.05, 0.4),
+        "direction": lambda: random("direction", 0.2, 1.5),
+        "strength": lambda: random("strength", 5.0, 12.0),
+        "viscosity": lambda: random("viscosity", 0.01, 0.05),
+        "velocity": lambda: random("velocity", -0.6, 0.6),
+        "force": lambda: random("force", -0.02, 0.02),
+        "wall_offset": lambda: torch.tensor([w.offset for w in walls]) + random("wall_offset", -2e-3, 2e-3),
+        "wall_normal": lambda: torch.tensor([w.normal for w in walls]) + random("wall_normal", -5e-3, 5e-3),
+        "wall_velocity": lambda: random("wall_velocity", -0.5, 0.5),
+    }
+    found = {name: made[name]().to(model.device, dtype.get(name, model.dtype)) for name in names}
+    return {name: tensor.detach().requires_grad_() for name, tensor in found.items()}
+
+
+def both(model: softmpm.Model, names, substeps=2, steps=STEPS):
+    """Ends and gradients of ⟨weights, end⟩ by the model and by the reference, with the leaves they belong to."""
+    base, extra = busy_inputs(model, control_steps=steps), given(model, names, steps)
+    leaves = base | extra
+    copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
+    weights = cotangent(softmpm.State(*(copies[name] for name in "xvCF")))
+    found = []
+    for simulate, on, tensors in (
+        (softmpm.simulate, model, leaves),
+        (reference.simulate, model.scene, copies),
+    ):
+        start = softmpm.State(*(tensors[name] for name in "xvCF"))
+        params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
+        inputs = Inputs(**{name: tensors[name] for name in names})
+        end = simulate(on, start, tensors["activation"], params, substeps=substeps, inputs=inputs)
+        loss = dot(softmpm.State(*(w.to(end.x) for w in weights[:4])), end)
+        gradients = torch.autograd.grad(loss, list(tensors.values()))
+        found.append((end, dict(zip(tensors, gradients, strict=True))))
+    return found
+
+
+def assert_equal(model: softmpm.Model, names, limit: float, **options) -> None:
+    (end, got), (wanted_end, want) = both(model, names, **options)
+    for name, a, b in zip("xvCF", end[:4], wanted_end[:4], strict=True):
+        assert_relative(a.detach().cpu().double(), b.detach(), limit, f"the end's {name}")
+    for name in want:
+        assert want[name].abs().max() > 0, f"the test does not exercise {name}"
+        assert_relative(got[name].cpu().double(), want[name], limit, name)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_every_input_is_the_references(dim, scheme, device):
+    """All inputs at once, other ones in each of two worlds, with muscles and every kind of wall at work: ≤ 1e-10."""
+    names = (*GIVEN, *WALLS)
+    model = build(scene(dim), device=device, dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
+    assert_equal(model, (*names, "strength", "velocity"), 1e-10)
+
+
+@pytest.mark.parametrize("name", [*GIVEN, "wall_velocity", "wall_offset", "strength", "velocity"])
+def test_each_input_alone_is_the_references(name, scheme):
+    """Kernels compiled for a single input: ≤ 1e-10."""
+    changes = {} if name == "velocity" else {"driven": ()}
+    model = build(scene(2, **changes), dtype=torch.float64, scheme=scheme, worlds=2, inputs=(name,))
+    assert_equal(model, (name,), 1e-10)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_inputs_in_single_precision(deterministic, device):
+    """The fast scheme in float32, in floating and in fixed point: ≤ 5e-4 of every gradient."""
+    names = (*GIVEN, *WALLS)
+    model = build(scene(2), device=device, worlds=2, inputs=names, deterministic=deterministic)
+    assert_equal(model, (*names, "strength", "velocity"), 5e-4)
+
+
+def test_inputs_over_chunks_that_begin_within_a_control_step(scheme):
+    """Few states are checkpointed, chunks begin in the middle of control steps: walls are where they are: ≤ 1e-9."""
+    names = (*GIVEN, *WALLS)
+    settings = dict(dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
+    model = build(scene(2), **settings)
+    model = build(scene(2), **settings, **little_memory(model))
+    assert_equal(model, (*names, "strength", "velocity"), 1e-9, substeps=7)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gradcheck_of_inputs(dim):
+    """PyTorch's own finite differences in float64."""
+    names = (
+        "gravity",
+        "damping",
+        "friction",
+        "direction",
+        "strength",
+        "velocity",
+        "wall_velocity",
+        "wall_offset",
+    )
+    model = build(scene(dim, driven=(1,)), dtype=torch.float64, inputs=names)
+    base, extra = busy_inputs(model, control_steps=2), given(model, names, steps=2)
+    start = softmpm.State(*(base[name].detach() for name in "xvCF"))
+    activation, params = base["activation"].detach(), model.params()
+
+    def end(*tensors):
+        inputs = Inputs(**dict(zip(names, tensors, strict=True)))
+        found = softmpm.simulate(model, start, activation, params, substeps=2, inputs=inputs)
+        return found.x, found.v
+
+    assert torch.autograd.gradcheck(
+        end, tuple(extra.values()), eps=1e-7, atol=1e-6, rtol=1e-4, fast_mode=True
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_worlds_equal_single_runs(dtype, scheme):
+    """Three worlds, each with inputs of its own, give what each gives alone."""
+    names = (*GIVEN, *WALLS)
+    many = build(scene(2), dtype=dtype, scheme=scheme, worlds=3, inputs=names)
+    one = build(scene(2), dtype=dtype, scheme=scheme, inputs=names)
+    base, extra = busy_inputs(many, STEPS), given(many, (*names, "strength", "velocity"))
+    limit = 2e-5 if dtype == torch.float32 else 1e-12
+
+    def run(model, pick):
+        start = softmpm.State(*(pick(name, base[name]) for name in "xvCF"))
+        params = softmpm.Params(*(pick(name, base[name]) for name in softmpm.Params._fields))
+        inputs = Inputs(**{name: pick(name, tensor) for name, tensor in extra.items()})
+        activation = pick("activation", base["activation"])
+        end = softmpm.simulate(model, start, activation, params, substeps=3, inputs=inputs)
+        loss = sum((t**2).sum() for t in end[:4])
+        return end, dict(zip(extra, torch.autograd.grad(loss, list(extra.values())), strict=True))
+
+    def world(w):
+        return lambda name, tensor: tensor[:, w : w + 1] if name in TIMED else tensor[w : w + 1]
+
+    end, gradients = run(many, lambda name, tensor: tensor)
+    for w in range(3):
+        alone, own = run(one, world(w))
+        for got, want in zip(end[:4], alone[:4], strict=True):
+            assert_relative(got[w : w + 1].detach(), want.detach(), limit)
+        for name in extra:
+            pick = world(w)
+            assert_relative(pick(name, gradients[name]), pick(name, own[name]), 50 * limit, name)
+
+
+def test_one_number_serves_every_world_and_control_step():
+    """Inputs broadcast; their gradients are the sums."""
+    model = build(scene(2), dtype=torch.float64, worlds=2, inputs=("gravity", "force"))
+    gravity = torch.tensor([0.5, -3.0], dtype=torch.float64, requires_grad=True)
+    force = torch.full((2,), 0.01, dtype=torch.float64, requires_grad=True)
+    base = busy_inputs(model, STEPS)
+    start = softmpm.State(*(base[name].detach() for name in "xvCF"))
+    few = Inputs(gravity=gravity, force=force)
+    full = Inputs(
+        gravity=gravity.expand(model.shape_of("gravity", STEPS)),
+        force=force.expand(model.shape_of("force", STEPS)),
+    )
+    found = []
+    for inputs in (few, full):
+        end = softmpm.simulate(model, start, base["activation"], model.params(), substeps=2, inputs=inputs)
+        found.append(torch.autograd.grad((end.x**2).sum(), (gravity, force)))
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-13, atol=0)
+
+
+def test_inputs_that_a_model_cannot_take():
+    """Each message says the rule, what was given and a remedy."""
+    model = build(scene(2, driven=()), worlds=2, inputs=("friction", "wall_offset"))
+    wall = model.wall_count
+
+    def call(**inputs):
+        softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, inputs=Inputs(**inputs))
+
+    call(friction=torch.full((wall,), 0.2))
+    for inputs, said in (
+        (
+            {"gravity": torch.zeros(2)},
+            r"inputs.gravity was given, .* build the model with inputs=\('gravity',\)",
+        ),
+        (
+            {"friction": torch.zeros(2, wall + 1)},
+            r"must broadcast to \(world, wall\) = \(2, 3\), got shape \(2, 4\)",
+        ),
+        (
+            {"friction": -torch.ones(wall)},
+            r"inputs.friction must be finite and ≥ 0, but inputs.friction\[0\] is -1",
+        ),
+        ({"friction": torch.zeros(wall).double()}, "inputs.friction must be torch.float32 like the model"),
+        (
+            {"wall_offset": torch.zeros(2, wall).double()},
+            r"got shape \(2, 3\); give the first two axes both or neither",
+        ),
+        ({"wall_offset": torch.zeros(wall)}, "inputs.wall_offset must be torch.float64 in every precision"),
+        ({"strength": torch.full((3,), torch.nan)}, "inputs.strength must be finite"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            call(**inputs)
+    offsets = torch.zeros(4, 1, wall, dtype=torch.float64)
+    activation = torch.zeros(2, 2, model.muscle_count)
+    inputs = Inputs(wall_offset=offsets)
+    with pytest.raises(ValueError, match="2 in activation, 3 in inputs.wall_offset"):
+        softmpm.simulate(model, model.rest(), activation, model.params(), substeps=1, inputs=inputs)
+    with pytest.raises(ValueError, match="inputs must be among gravity"):
+        build(scene(2), inputs=("wind",))
+    with pytest.raises(ValueError, match="inputs has 'friction', but the scene has no walls"):
+        build(busy_scene(2, walls=()), inputs=("friction",))
