@@ -1,10 +1,10 @@
-"""How long is an iteration of learning in closed loop, and how much of it is physics?
+"""Time of a closed-loop learning iteration, and the share of physics in it.
 
     python bench/episode.py [--device cuda] [--json bench/results/episode.json]
 
-The biped looks, decides and moves, and the loss is differentiated with respect to policy and materials. ``iteration`` is that,
-as training runs it; ``physics`` is its calls of `simulate` alone, forward and backward, recorded in the same way; ``eager`` is
-the iteration without the graph. Medians after a warm-up.
+The biped observes, acts and moves; the loss is differentiated with respect to policy and materials. ``iteration`` is the time of one
+such iteration as in training; ``physics`` that of its calls of `simulate`, forward and backward, captured as a CUDA graph as well;
+``eager`` that of the iteration without the graph. Medians after a warm-up.
 """
 
 import enum
@@ -36,12 +36,13 @@ def physics(run: Run):
     activation = torch.zeros(
         task.control_steps, 1, model.worlds, model.muscle_count, device=model.device
     ).requires_grad_()
-    params = softmpm.Params(*(p.detach().clone().requires_grad_() for p in run.params()))
+    params, inputs = run.design()
+    params = softmpm.Params(*(p.detach().clone().requires_grad_() for p in params))
 
     def work():
         state = model.rest()
         for row in activation:
-            state = softmpm.simulate(model, state, row, params, substeps=task.substeps)
+            state = softmpm.simulate(model, state, row, params, substeps=task.substeps, inputs=inputs)
         return torch.autograd.grad(state.x.sum(), [activation, *params])
 
     return softmpm.Graph(work, model.device)

@@ -36,7 +36,7 @@ from softmpm_learn.tasks import TASKS
 from softmpm_learn.train import TrainingError
 
 CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "device")
-"""What may differ when a run is resumed: how far it goes, what it records and where it runs."""
+"""Settings that may differ when a run is resumed: its length, the recorded episodes and the device."""
 EXPECTED = (
     ValueError,
     RuntimeError,
@@ -189,7 +189,7 @@ def _end(code: int, said: str) -> NoReturn:
 
 
 def sentence(error: BaseException) -> str:
-    """What went wrong and, where it is known, what to do, in one line."""
+    """Error message in one line, with the remedy where it is known."""
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return sentence(error.__cause__)
     cause = error.__cause__ or error.__context__

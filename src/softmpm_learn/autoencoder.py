@@ -141,14 +141,14 @@ class Autoencoder(nn.Module):
 
 @dataclass(frozen=True)
 class Learned:
-    """What a learning phase reports."""
+    """Result of a learning phase."""
 
     epochs: int
     """Epochs that were run."""
     training: float
     """Mean loss of the last epoch."""
     validation: float
-    """Loss of the weights that were kept on simulations held out; nan if there are none yet."""
+    """Loss of the final weights on held-out simulations; nan if there are none yet."""
 
 
 def train_autoencoder(
@@ -159,22 +159,22 @@ def train_autoencoder(
     conf: LearningConf,
     generator: torch.Generator,
 ) -> Learned:
-    """Train on minibatches from ``sample``, watch ``validation``, and with early stopping keep the best weights, also the first.
+    """Train on minibatches from ``sample``; with early stopping restore the weights of lowest validation loss, even the initial ones.
 
     Args:
         sample: Gives a minibatch of velocities [m/s], shape (batch, dim, *nodes).
-        validation: Pictures of other simulations, or None; without them nothing stops early.
+        validation: Velocity images of other simulations, or None; without them there is no early stopping.
         generator: Source of the variational noise.
     """
     kl = conf.kl if conf.variational else None
     best_loss, best, training, waited, epochs = float("inf"), None, float("nan"), 0, 0
 
-    def judge(pictures: Tensor) -> float:
+    def validation_loss(pictures: Tensor) -> float:
         with torch.no_grad():
             return autoencoder.loss(pictures, kl).item()
 
     if validation is not None:
-        best_loss, best = judge(validation), copy.deepcopy(autoencoder.state_dict())
+        best_loss, best = validation_loss(validation), copy.deepcopy(autoencoder.state_dict())
     while epochs < conf.epochs and waited < conf.patience:
         losses = []
         for _ in range(conf.batches):
@@ -186,7 +186,7 @@ def train_autoencoder(
         training, epochs = torch.stack(losses).mean().item(), epochs + 1
         if validation is None:
             continue
-        now = judge(validation)
+        now = validation_loss(validation)
         if now < best_loss or not conf.early_stopping:
             best_loss, best, waited = now, copy.deepcopy(autoencoder.state_dict()), 0
         else:

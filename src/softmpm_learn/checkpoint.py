@@ -56,7 +56,7 @@ def save(folder: Path, content: dict) -> Path:
 
 
 def exists(folder: Path) -> bool:
-    """Whether there is something to resume from."""
+    """True if the folder has a checkpoint to resume from."""
     return (folder / NAME).exists() or (folder / PREVIOUS).exists()
 
 

@@ -28,7 +28,7 @@ DTYPES = ("float32", "float64")
 
 @dataclass(kw_only=True)
 class DeviceConf:
-    """Where a run happens and how precisely."""
+    """Device and precision of a run."""
 
     name: str = "auto"
     """auto takes a CUDA GPU if there is one; cpu; cuda."""
@@ -66,7 +66,7 @@ class RunConf:
 
     @property
     def settings(self) -> Settings:
-        """What the learning loop needs."""
+        """Settings of the learning loop."""
         return Settings(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Settings)})
 
 

@@ -12,12 +12,12 @@ logger = logging.getLogger("softmpm_learn")
 
 
 class Seal(TypedDict):
-    """What a checkpoint remembers of a file that grows."""
+    """Length and hash of a growing file, as stored in a checkpoint."""
 
     bytes: int
     """Length [B] when the checkpoint was written."""
     sha256: str
-    """Hash of so many bytes."""
+    """Hash of these bytes."""
 
 
 class Table:

@@ -44,11 +44,11 @@ class Group:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that writes files."""
+        """True in the process that writes files."""
         return self.rank == 0
 
     def split(self, worlds: int) -> range:
-        """Which of so many worlds are this process's own."""
+        """Worlds of this process, out of ``worlds`` in all processes."""
         if worlds % self.size:
             more = worlds + self.size - worlds % self.size
             raise ValueError(
@@ -59,7 +59,7 @@ class Group:
         return range(self.rank * share, (self.rank + 1) * share)
 
     def device(self, name: str) -> str | None:
-        """Where this process simulates, from auto, cpu or cuda: with others, on the GPU of its number. None: where it can."""
+        """Device of this process for auto, cpu or cuda; with several processes, the GPU of its local rank. None: any."""
         if self.size == 1 or name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
             return None if name == "auto" else name
         count = torch.cuda.device_count()
@@ -71,7 +71,7 @@ class Group:
         return f"cuda:{self.local_rank}"
 
     def any(self, wish: bool) -> bool:
-        """Whether a process wishes so."""
+        """True if ``wish`` is True in any process."""
         return self._largest(int(wish)) > 0
 
     def average(self, tensors: Iterable[Tensor]) -> list[Tensor]:
@@ -94,12 +94,12 @@ class Group:
         return torch.cat(parts, dim) if parts else None
 
     def broadcast_(self, tensors: Iterable[Tensor]) -> None:
-        """Each tensor takes, in place, the values that it has in the first process."""
+        """Copy the tensors of the first process into those of the others, in place."""
         for tensor in tensors if self.size > 1 else ():
             dist.broadcast(tensor, src=0)
 
     def broadcast(self, value: T, source: int = 0) -> T:
-        """What ``source`` passes, in every process: plain values and tensors on the CPU."""
+        """The value of process ``source``, in every process: plain values and tensors on the CPU."""
         values = [value]
         if self.size > 1:
             dist.broadcast_object_list(values, src=source)

@@ -1,4 +1,4 @@
-"""Observe → act → simulate, again and again, differentiable end to end: one closed-loop simulation."""
+"""Closed-loop simulation: observe → act → simulate in each control step, differentiable end to end."""
 
 import weakref
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import softmpm
-from softmpm import Model, Params, State
+from softmpm import Inputs, Model, Params, State
 from softmpm_learn.observe import Observer
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class Frame:
     """Time since the episode began [s]."""
     state: State
     features: Tensor
-    """What the observer made of it, shape (world, size)."""
+    """Features that the observer computed, shape (world, size)."""
     activation: Tensor | None
     """Activation during the step [-], shape (world, muscle)."""
 
@@ -50,19 +50,19 @@ class Episode:
         return self.final + self.running
 
     def detach(self) -> "Episode":
-        """Without anything that a gradient needs, the decisions included."""
+        """The episode without its autograd graph and without the decisions."""
         final, running = self.final.detach(), self.running.detach()
         return replace(self, final=final, running=running, end=self.end.detach(), decisions=Decisions())
 
 
 @dataclass(frozen=True)
 class Decisions:
-    """What the policy decided on and how, one tensor for each control step."""
+    """Inputs and outputs of the policy, one tensor for each control step."""
 
     features: list[Tensor] = field(default_factory=list)
-    """Features that it saw, shape (world, size) each."""
+    """Features that it received, each of shape (world, size)."""
     activations: list[Tensor] = field(default_factory=list)
-    """Its answer [-], shape (world, muscle) each. Differentiable."""
+    """Activations that it returned [-], each of shape (world, muscle). Differentiable."""
 
 
 def run_episode(
@@ -72,6 +72,7 @@ def run_episode(
     policy: nn.Module,
     params: Params,
     *,
+    inputs: Inputs | None = None,
     goal: Tensor | None = None,
     keep_every: int = 0,
     on_frame: Callable[[Frame], None] | None = None,
@@ -79,7 +80,7 @@ def run_episode(
     """Simulate a task from rest under a policy. Under ``torch.no_grad`` it keeps nothing for a gradient.
 
     Args:
-        params: Materials; see :class:`softmpm_learn.design.Design`.
+        params, inputs: Material of the robot and what else is not the scene's, see :class:`softmpm_learn.design.Design`.
         goal: Goal of each world [m], shape (world, dim), where it is not the task's own.
         keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
@@ -99,7 +100,9 @@ def run_episode(
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
         try:
-            state = softmpm.simulate(model, state, activation[None], params, substeps=task.substeps)
+            state = softmpm.simulate(
+                model, state, activation[None], params, substeps=task.substeps, inputs=inputs
+            )
         except softmpm.UnstableError as error:
             when = f"which began at {step * period:.4g} s"
             error.add_note(f"In control step {step} of {task.control_steps}, {when}.")
@@ -122,7 +125,7 @@ def run_episode(
 
 
 def _times(task: "Task", model: Model) -> Tensor:
-    """When each control step begins [s], shape (step,)."""
+    """Time at which each control step begins [s], shape (step,)."""
     return task.control_period * torch.arange(task.control_steps, dtype=model.dtype, device=model.device)
 
 
@@ -130,8 +133,8 @@ class ClosedLoop:
     """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one captured graph.
 
     Args:
-        params: Gives the materials, see :class:`softmpm_learn.design.Design`.
-        free: What the materials are made of.
+        design: Gives the material and the inputs, see :class:`softmpm_learn.design.Design`.
+        free: Parameters of the design.
         keep_every: As in :func:`run_episode`.
     """
 
@@ -141,12 +144,12 @@ class ClosedLoop:
         model: Model,
         observer: Observer,
         policy: nn.Module,
-        params: Callable[[], Params],
+        design: Callable[[], tuple[Params, Inputs]],
         free: list[nn.Parameter],
         keep_every: int = 0,
     ):
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
-        self.params, self.free, self.keep_every = params, free, keep_every
+        self.design, self.free, self.keep_every = design, free, keep_every
         self._goal: Tensor | None = None
         loop = weakref.proxy(self)  # or the graph would hold what holds it
         self._graph = softmpm.Graph(lambda: loop._work(), model.device)
@@ -165,12 +168,14 @@ class ClosedLoop:
         return self._work(on_frame) if on_frame else self._graph()
 
     def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
+        params, inputs = self.design()
         episode = run_episode(
             self.task,
             self.model,
             self.observer,
             self.policy,
-            self.params(),
+            params,
+            inputs=inputs,
             goal=self._goal,
             keep_every=self.keep_every,
             on_frame=on_frame,

@@ -15,6 +15,7 @@ import warp as wp
 
 import softmpm
 from softmpm_learn.config import RunConf
+from softmpm_learn.design import DESIGNABLE, declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
 from softmpm_learn.objective import Progress, Reach
@@ -31,7 +32,10 @@ DESIGN = {
     "young": ("Young's modulus", "Pa"),
     "poisson": ("Poisson's ratio", ""),
     "density": ("density", "kg/m³"),
+    "strength": ("strength of the muscles", "Pa"),
+    "viscosity": ("viscosity", "Pa s"),
 }
+"""Title and unit of each quantity in robot.png."""
 CURVES = {
     "loss": "loss",
     "validation_loss": "validation loss of the autoencoder",
@@ -101,6 +105,7 @@ def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
         dtype=getattr(torch, conf.device.dtype),
         worlds=len(group.split(conf.train.worlds)),
         memory_budget=None if memory is None else round(1e6 * memory),
+        inputs=declared_inputs(conf.design),
         calls=task.control_steps,
     )
 
@@ -128,7 +133,7 @@ def draw(result: Result, task: Task, out: Path) -> None:
 
 
 def curves(path: Path) -> dict[str, tuple[list[float], list[float]]]:
-    """What loss.png shows of metrics.csv: iterations and values of each curve."""
+    """Curves of loss.png from metrics.csv: iterations and values of each."""
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     found = {}
@@ -152,13 +157,29 @@ def decoded(run: Run) -> np.ndarray:
 
 @torch.no_grad()
 def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
-    """Materials of the best robot: value of each particle and unit."""
+    """Material of the best robot and the inputs that were designed: value on each particle and unit."""
     now = run.policy_snapshot()
     if run.best["iteration"] >= 0:
         run.load_policy(run.best)
-    params = run.params()
+    params, inputs = run.design()
     run.load_policy(now)
-    return {title: (getattr(params, name).cpu().numpy(), unit) for name, (title, unit) in DESIGN.items()}
+    found = params._asdict() | {name: value for name, value in inputs._asdict().items() if value is not None}
+    shown = {}
+    for name, value in found.items():
+        title, unit = DESIGN.get(name, (name, ""))
+        shown[title] = (_on_particles(run.model, name, value.cpu().numpy()), unit)
+    return shown
+
+
+def _on_particles(model: softmpm.Model, name: str, value: np.ndarray) -> np.ndarray:
+    """Value on each particle: of a quantity of the muscles the sum over those of the particle, NaN where there is none."""
+    if DESIGNABLE[name] == "particle":
+        return value
+    total, muscular = np.zeros(model.particle_count), np.zeros(model.particle_count, dtype=bool)
+    for muscle, one in zip(model.scene.muscles, value, strict=True):
+        total[muscle.particles] += one
+        muscular[muscle.particles] = True
+    return np.where(muscular, total, np.nan)
 
 
 def last_episode(path: Path) -> tuple[int, dict[str, np.ndarray]] | None:
@@ -175,7 +196,7 @@ def last_episode(path: Path) -> tuple[int, dict[str, np.ndarray]] | None:
 
 
 def farewell(result: Result, task: Task, out: Path) -> str:
-    """What came out, and as the last line how to look at it or how to go on."""
+    """Summary of the result; its last line is the command to view the recording or to resume the run."""
     lines = []
     if math.isfinite(result.best_loss):
         lines.append(
@@ -194,7 +215,7 @@ def farewell(result: Result, task: Task, out: Path) -> str:
 
 
 def outcome(task: Task, out: Path) -> str:
-    """How far the robot of the last recorded simulation got, in words."""
+    """Distance that the robot of the last recorded simulation travelled, in words."""
     episode = last_episode(out / "run.h5")
     if episode is None:
         return ""

@@ -14,7 +14,7 @@ from softmpm import Scene
 from softmpm_learn.files import replace
 
 VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
-"""What each latent feature is set to in ``latent_figure``, the others being 0."""
+"""Values of each latent feature in ``latent_figure``, the others being 0."""
 STILL = 0.1
 """Nodes that never move at this share of the highest speed are cut off around a latent picture."""
 SIGNED = "RdBu"

@@ -20,15 +20,21 @@ MAY_CHANGE = ("iterations", "record_every", "frame_every")
 
 def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object]:
     """Settings, task and scene by name; arrays by a short digest."""
-    flat: dict[str, object] = {}
-    for group, values in dataclasses.asdict(settings).items():
-        names = [n for n in values if not (group == "train" and n in MAY_CHANGE)]
-        flat |= {f"{group}.{name}": values[name] for name in names}
+    flat = identity_of_settings(settings)
     for field in dataclasses.fields(task):
         if field.name != "scene":
             flat |= dict(_described(f"task.{field.name}", getattr(task, field.name)))
     flat["dtype"] = str(model.dtype)
     flat["scene"] = _digest(model)
+    return flat
+
+
+def identity_of_settings(settings: Settings) -> dict[str, object]:
+    """The part of :func:`identity` that the settings alone decide."""
+    flat: dict[str, object] = {}
+    for group, values in dataclasses.asdict(settings).items():
+        names = [n for n in values if not (group == "train" and n in MAY_CHANGE)]
+        flat |= {f"{group}.{name}": values[name] for name in names}
     return flat
 
 
@@ -63,7 +69,9 @@ def _digest(model: Model) -> str:
     for tensor in (model.positions, model.volume, *model.params()):
         digest.update(tensor.cpu().numpy().tobytes())
     for muscle in scene.muscles:
-        digest.update(muscle.particles.tobytes() + repr((muscle.direction, muscle.strength)).encode())
+        fibre = getattr(muscle, "direction", type(muscle).__name__)
+        digest.update(muscle.particles.tobytes() + repr((fibre, muscle.strength)).encode())
     digest.update(repr([(len(body.particles), body.material) for body in scene.bodies]).encode())
+    digest.update(np.asarray(scene.driven).tobytes())
     digest.update(repr((scene.grid, scene.walls, scene.gravity, scene.damping, scene.dt)).encode())
     return digest.hexdigest()[:16]

@@ -12,11 +12,11 @@ from softmpm_learn.settings import LearningConf
 from softmpm_learn.target import TargetNetwork
 
 MANY = 512
-"""So many pictures, evenly chosen, are enough to validate with and to take means of."""
+"""Number of evenly chosen velocity images that suffices for validation and for means."""
 
 
 class Learner:
-    """Learns pictures of grid velocity; the policy uses :attr:`encoder`."""
+    """Learns to encode images of grid velocity; the policy uses :attr:`encoder`."""
 
     def __init__(self, conf: LearningConf, autoencoder: Autoencoder, replay: Replay):
         self.conf, self.autoencoder, self.replay = conf, autoencoder, replay
@@ -30,12 +30,13 @@ class Learner:
 
     @property
     def networks(self) -> list[nn.Module]:
-        """What a learning phase changes."""
+        """Networks that a learning phase modifies."""
         return [self.autoencoder] if self.target is None else [self.autoencoder, self.target]
 
-    def watch(self, first: int, observations: Tensor) -> None:
-        """Remember the simulations of all worlds, (frame, world, dim, *nodes), under numbers from ``first`` on; where there are more
-        than the buffer holds, only the last are written.
+    def add_observations(self, first: int, observations: Tensor) -> None:
+        """Add the simulations of all worlds, shape (frame, world, dim, *nodes), to the replay buffer, numbered from ``first`` on.
+
+        If they exceed the capacity of the buffer, only the last ones are written.
         """
         for world in range(observations.shape[1])[-self.replay.simulations :]:
             self.replay.add(first + world, observations[:, world])

@@ -1,4 +1,4 @@
-"""What the robot should do: a loss of how a simulation ends, and running terms along the way. Smaller is better."""
+"""Objectives: a loss of the final state of a simulation, and running costs of its control steps. Smaller is better."""
 
 import functools
 from abc import ABC, abstractmethod
@@ -53,7 +53,7 @@ class Height(Running):
     weight: float
     lowest: float
     axis: int = 1
-    """Which axis is up."""
+    """Vertical axis."""
 
     def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
         return self.weight * (self.lowest - x[..., self.axis].mean(dim=-1)).clamp(min=0.0).square()
@@ -72,7 +72,7 @@ class Upright(Running):
 
     @functools.cached_property
     def lever(self) -> np.ndarray:
-        """What each particle's height counts for in the slope [1/m], shape (particle,)."""
+        """Weight of each particle's height in the slope [1/m], shape (particle,)."""
         share = np.zeros(len(self.rest))
         share[self.front] += 1 / len(self.front)
         share[self.back] -= 1 / len(self.back)
@@ -119,7 +119,7 @@ class Reach(Objective):
     particles: np.ndarray
     """Indices of the particles that should get there."""
     target: np.ndarray
-    """Where to [m], shape (dim,); an episode with a goal of its own goes there instead."""
+    """Target position [m], shape (dim,); the goal of an episode, if it has one, takes its place."""
     terms: tuple[Running, ...] = ()
 
     def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:

@@ -24,7 +24,7 @@ POSTURE = 0.1
 
 
 class Observer(nn.Module, ABC):
-    """What the policy sees of the robot."""
+    """Observation of the robot by the policy."""
 
     size: int
     """Number of features."""

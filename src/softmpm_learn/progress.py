@@ -1,4 +1,4 @@
-"""How a run tells where it is: a bar with loss and time left on a terminal, a few lines anywhere else."""
+"""Progress report of a run: a bar with loss and remaining time on a terminal, a few log lines elsewhere."""
 
 import logging
 import sys

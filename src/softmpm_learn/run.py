@@ -1,4 +1,4 @@
-"""What a run is made of: observer, policy, design, optimiser and learner, made from settings, saved and restored as one."""
+"""Components of a run: observer, policy, design, optimiser and learner, built from settings, saved and restored together."""
 
 import json
 import math
@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from softmpm import Model, Params
+from softmpm import Model
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import ClosedLoop
-from softmpm_learn.identity import identity
+from softmpm_learn.identity import identity, identity_of_settings
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Centroids, Latent, Observer, VelocityImage, clusters
 from softmpm_learn.policy import Goal, make_policy
@@ -117,7 +117,7 @@ class Run:
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """What the gradient changes: policy, then design."""
+        """Parameters that the gradient updates: policy, then design."""
         return [*self.policy.parameters(), *self.design.parameters()]
 
     def snapshot(self) -> None:
@@ -128,10 +128,6 @@ class Run:
         """Halve the step since :meth:`snapshot`."""
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
-
-    def params(self) -> Params:
-        """Materials of the design as it is."""
-        return self.design()
 
     def draw_goals(self) -> Tensor | None:
         """A goal for each world [m], shape (world, dim), or None for the task's own.
@@ -172,13 +168,14 @@ class Run:
         }
 
     def load_state_dict(self, content: dict) -> None:
-        """Go on from a checkpoint of the same task and settings.
+        """Go on from a checkpoint of the same task and settings; one that is older than a setting was made with its default.
 
         Raises:
             SettingsError: Task or settings are others; names each difference.
             ValueError, LookupError, TypeError, AttributeError, RuntimeError: It holds something else than a run.
         """
-        theirs, ours = json.loads(content["about"]), json.loads(self.about())
+        theirs = identity_of_settings(Settings()) | json.loads(content["about"])
+        ours = json.loads(self.about())
         changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
         if changed:
             both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
@@ -216,11 +213,11 @@ class Run:
             self.load_policy(now)
 
     def about(self) -> str:
-        """What a resumed run must share, as JSON."""
+        """Identity of the run, which a resumed run must share, as JSON."""
         return json.dumps(identity(self.task, self.model, self.settings), sort_keys=True)
 
 
 def _moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> list[Tensor]:
-    """What an optimiser remembers for each number of a parameter."""
+    """State of an optimiser that has one number for each number of a parameter, such as its moments."""
     found = optimizer.state.get(parameter, {})
     return [value for name, value in found.items() if isinstance(value, Tensor) and name != "step"]

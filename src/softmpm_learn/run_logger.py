@@ -1,4 +1,4 @@
-"""What a run leaves on the disk while it goes on: metrics.csv and timing.csv, recording, checkpoint and replay buffer."""
+"""Files that a run writes while it trains: metrics.csv and timing.csv, recording, checkpoint and replay buffer."""
 
 import contextlib
 import logging
@@ -17,17 +17,20 @@ from softmpm_learn.run import Run
 
 logger = logging.getLogger("softmpm_learn")
 
-METRICS = [
-    *("loss", "final", "running", "best", "effort"),
-    *("gradient_policy", "gradient_design", "clipped", "retries"),
-    *("young_change", "poisson_change", "density_change"),
-    *("epochs", "training_loss", "validation_loss", "replay"),
-]
-"""Columns of metrics.csv; nothing in it depends on the clock."""
 TIMING = ["episode", "learn", "save"]
 """Columns of timing.csv [s]: ``episode`` is simulation, gradient and its mean over the processes, ``learn`` keeps pictures as well,
 ``save`` is that of the iteration before.
 """
+
+
+def metrics(run: Run) -> list[str]:
+    """Columns of metrics.csv; nothing in it depends on the clock."""
+    return [
+        *("loss", "final", "running", "best", "effort"),
+        *("gradient_policy", "gradient_design", "clipped", "retries"),
+        *(f"{name}_change" for name in run.design.change()),
+        *("epochs", "training_loss", "validation_loss", "replay"),
+    ]
 
 
 class RunLogger:
@@ -47,7 +50,7 @@ class RunLogger:
     def __init__(self, run: Run, out: Path, seals: dict, begin: Callable[[], None] = lambda: None):
         self.run, self.out = run, out
         self._named = run.learner.replay.ids if run.learner else []
-        self._metrics = Table(out / "metrics.csv", METRICS, seals.get("metrics.csv"))
+        self._metrics = Table(out / "metrics.csv", metrics(run), seals.get("metrics.csv"))
         self._timing = Table(out / "timing.csv", TIMING, seals.get("timing.csv"))
         self._recorded = seals.get("run.h5")
         self._recorder = self._open_recorder() if run.settings.train.record_every else None
@@ -80,7 +83,7 @@ class RunLogger:
 
     @property
     def seals(self) -> dict:
-        """What a checkpoint must know of the files beside it."""
+        """Seals of the other files of the run, for the checkpoint."""
         if self._recorder:
             self._recorded = {"before": self.run.iteration, "sha256": self._recorder.digest}
         return {
@@ -106,7 +109,7 @@ class RunLogger:
             self._named = ids
 
     def due(self, iteration: int) -> bool:
-        """Whether the episode of this iteration is to be recorded."""
+        """True if the episode of this iteration is recorded."""
         conf = self.run.settings.train
         return bool(conf.record_every) and (
             iteration % conf.record_every == 0 or iteration == conf.iterations - 1

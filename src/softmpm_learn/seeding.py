@@ -1,4 +1,4 @@
-"""Randomness that touches nobody else's: PyTorch's own seed stays as it was."""
+"""Seeded initialisation that leaves PyTorch's global random state unchanged."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -7,6 +7,8 @@ elsewhere name their source. A wrong value fails where the settings are made, in
 import math
 from dataclasses import dataclass, field
 
+from softmpm import QUANTITIES
+
 OBSERVERS = ("latent", "centroids", "kmeans")
 POLICIES = ("linear", "mlp", "sinusoids", "knots")
 OPTIMIZERS = ("adam", "sgd")
@@ -34,7 +36,7 @@ def _share(group: str, settings, *names: str) -> None:
 
 @dataclass(kw_only=True)
 class ObserverConf:
-    """What the policy sees of the robot."""
+    """Observation of the robot by the policy."""
 
     name: str = "latent"
     """latent (learned from grid velocity), centroids (hand-picked regions of the task) or kmeans (clusters found at rest)."""
@@ -47,7 +49,7 @@ class ObserverConf:
     nodes: int | None = None
     """latent: most nodes of the picture along its longest axis, coarser than the grid by averaging; null: 64 in 2D, 32 in 3D."""
     follow: bool = True
-    """latent: the picture is centred on the robot, so that a step looks alike anywhere; False shows the grid as it stands."""
+    """latent: the velocity image is centred on the robot and does not depend on its position; False shows the grid unchanged."""
 
     def __post_init__(self):
         _one_of("observer.name", self.name, OBSERVERS)
@@ -62,7 +64,7 @@ class ObserverConf:
 
 @dataclass(kw_only=True)
 class PolicyConf:
-    """What turns an observation into the activation of each muscle, in (-1, 1)."""
+    """Policy, which maps an observation to the activation of each muscle, in (-1, 1)."""
 
     name: str = "mlp"
     """linear, tanh(Wz + b); mlp; sinusoids or knots, which are open loop and see nothing but the time."""
@@ -92,41 +94,56 @@ class PolicyConf:
 
 @dataclass(kw_only=True)
 class DesignConf:
-    """Which materials are optimised together with the policy, and between which bounds (as Spielberg et al. 2021)."""
+    """Quantities of the robot that are optimised together with the policy, and their bounds (as Spielberg et al. 2021).
+
+    Each has a switch with its name in ``softmpm.QUANTITIES`` and bounds: ``_factor`` in units of the scene's value, or ``_range``.
+    """
 
     enabled: bool = True
-    """False keeps the scene's materials: control only."""
+    """False keeps the scene's values: control only."""
     per: str = "particle"
-    """What has a value of its own: particle, region (of the task) or uniform (one for the robot)."""
+    """Unit with a separate material: particle, region (of the task) or uniform (one for the robot)."""
     young: bool = True
     """Optimise Young's modulus."""
     poisson: bool = True
     """Optimise Poisson's ratio."""
     density: bool = True
     """Optimise the density."""
+    strength: bool = False
+    """Optimise the strength of each muscle, whatever ``per`` is."""
+    viscosity: bool = False
+    """Optimise the viscosity; the scene's must be > 0."""
     young_factor: list[float] = field(default_factory=lambda: [0.7, 2.0])
     """Lowest and highest Young's modulus, in units of the scene's."""
     poisson_range: list[float] = field(default_factory=lambda: [0.2, 0.4])
     """Lowest and highest Poisson's ratio [-]; the scene's must lie between."""
     density_factor: list[float] = field(default_factory=lambda: [0.7, 2.0])
     """Lowest and highest density, in units of the scene's."""
+    strength_factor: list[float] = field(default_factory=lambda: [0.5, 1.5])
+    """Lowest and highest strength, in units of the scene's. Our choice: stronger muscles invert particles, see docs/results.md."""
+    viscosity_factor: list[float] = field(default_factory=lambda: [0.5, 2.0])
+    """Lowest and highest viscosity, in units of the scene's. Our choice: a higher one takes a smaller step."""
 
     def __post_init__(self):
         _one_of("design.per", self.per, DESIGNS)
-        for name in ("young_factor", "density_factor"):
-            bounds = list(getattr(self, name))
-            if len(bounds) != 2 or not 0.0 < bounds[0] < 1.0 < bounds[1] < math.inf:
-                raise ValueError(f"design.{name} must be [low, high] with 0 < low < 1 < high, got {bounds}.")
-        bounds = list(self.poisson_range)
-        if len(bounds) != 2 or not -1.0 < bounds[0] < bounds[1] < 0.5:
-            raise ValueError(
-                f"design.poisson_range must be [low, high] with -1 < low < high < 0.5, got {bounds}."
-            )
+        for name, quantity in QUANTITIES.items():
+            if hasattr(self, f"{name}_factor"):
+                bounds = list(getattr(self, f"{name}_factor"))
+                if len(bounds) != 2 or not 0.0 < bounds[0] < 1.0 < bounds[1] < math.inf:
+                    raise ValueError(
+                        f"design.{name}_factor must be [low, high] with 0 < low < 1 < high, got {bounds}."
+                    )
+            if hasattr(self, f"{name}_range"):
+                bounds, low, high = list(getattr(self, f"{name}_range")), quantity.low, quantity.high
+                if len(bounds) != 2 or not low < bounds[0] < bounds[1] < high:
+                    raise ValueError(
+                        f"design.{name}_range must be [low, high] with {low:g} < low < high < {high:g}, got {bounds}."
+                    )
 
 
 @dataclass(kw_only=True)
 class OptimizerConf:
-    """How the gradient of a simulation changes policy and design."""
+    """Optimiser that updates policy and design by the gradient of a simulation."""
 
     name: str = "adam"
     """adam or sgd (plain gradient descent)."""
@@ -137,7 +154,7 @@ class OptimizerConf:
     max_norm: float | None = 1.0
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
     retries: int = 4
-    """Where a simulation fails, go halfway back to the last that did not, at most so often; 0 ends the run at once."""
+    """Maximum number of times that a failed step is halved towards the last successful simulation; 0 ends the run at once."""
 
     def __post_init__(self):
         _one_of("optimizer.name", self.name, OPTIMIZERS)
@@ -181,9 +198,9 @@ class LearningConf:
     frame_every: int = 2
     """Control steps between two recorded pictures."""
     target_network: bool = True
-    """Refinement 3: the policy sees through a copy that follows slowly; False, through the network in training."""
+    """Refinement 3: the policy uses a copy of the encoder that follows slowly; False, the encoder in training."""
     target_rate: float = 0.3
-    """How much of the way to the trained network the copy goes after a learning phase, all of it after the first; 1 copies."""
+    """Fraction by which the copy moves to the trained network after a learning phase; 1 copies it, as does the first phase."""
 
     def __post_init__(self):
         _positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")

@@ -13,7 +13,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Signals:
-    """How signals end this process, for a program's main thread.
+    """Handling of the signals that end this process, for the main thread of a program.
 
     Attributes:
         advice: What was saved and how to go on, said when a signal ends the process.

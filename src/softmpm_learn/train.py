@@ -48,7 +48,7 @@ class TrainingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Result:
-    """How a run stands when it ends."""
+    """State of a run at its end."""
 
     run: Run
     """Observer, policy, design and learner as they are now."""
@@ -97,8 +97,8 @@ def train(
         with group.fail_together():
             run = Run(task, model, settings, out, group)
         seals = _resume(run, out)
-        journal = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin)))
-        return _loop(run, journal, progress, stop)
+        run_logger = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin)))
+        return _loop(run, run_logger, progress, stop)
 
 
 @contextlib.contextmanager
@@ -144,35 +144,35 @@ def _restore(run: Run, content: dict, out: Path) -> dict:
         ) from error
 
 
-def _loop(run: Run, journal: RunLogger | None, progress, stop) -> Result:
+def _loop(run: Run, run_logger: RunLogger | None, progress, stop) -> Result:
     group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
     while run.iteration < last and not group.any(stop()):
         k = run.iteration
-        row, observations = optimise(run, journal, seconds)
+        row, observations = optimise(run, run_logger, seconds)
         with _clock(seconds, "learn"):
             row |= learn(run, observations)
         with group.fail_together():
-            if journal:
-                journal.add(k, row, seconds)
+            if run_logger:
+                run_logger.add(k, row, seconds)
         run.iteration += 1
         with _clock(seconds, "save"), group.fail_together():
-            if journal:
-                journal.save()
+            if run_logger:
+                run_logger.save()
         if progress and group.first:
             progress(k, row)
-    if run.iteration >= last and journal and run.best["iteration"] >= 0:
-        play_best(run, journal)
+    if run.iteration >= last and run_logger and run.best["iteration"] >= 0:
+        play_best(run, run_logger)
     return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"])
 
 
 def optimise(
-    run: Run, journal: RunLogger | None, seconds: dict[str, float]
+    run: Run, run_logger: RunLogger | None, seconds: dict[str, float]
 ) -> tuple[dict[str, float], Tensor | None]:
-    """One optimisation step: simulate, differentiate, move policy and design. Gives figures for metrics.csv and what was seen."""
+    """One optimisation step: simulate, differentiate, update policy and design. Returns a row of metrics.csv and the observations."""
     goal, retries = run.draw_goals(), 0
     while True:
         try:
-            episode, row = attempt(run, goal, journal, seconds)
+            episode, row = attempt(run, goal, run_logger, seconds)
             break
         except (softmpm.UnstableError, OtherProcessError) as error:
             if not run.safe or retries == run.settings.optimizer.retries:
@@ -188,10 +188,12 @@ def optimise(
     return row | {"retries": retries, "best": run.best["loss"]}, episode.observations
 
 
-def attempt(run: Run, goal, journal: RunLogger | None, seconds) -> tuple[Episode, dict[str, float]]:
+def attempt(run: Run, goal, run_logger: RunLogger | None, seconds) -> tuple[Episode, dict[str, float]]:
     """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
     recorded = (
-        journal.record(run.iteration) if journal and journal.due(run.iteration) else contextlib.nullcontext()
+        run_logger.record(run.iteration)
+        if run_logger and run_logger.due(run.iteration)
+        else contextlib.nullcontext()
     )
     with _clock(seconds, "episode"):
         with _all_worlds(run), recorded as on_frame:
@@ -262,7 +264,7 @@ def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
     pictures = run.group.gather(observations, dim=1)
     with run.group.fail_together():
         if pictures is not None:
-            run.learner.watch(run.iteration * run.settings.train.worlds, pictures)
+            run.learner.add_observations(run.iteration * run.settings.train.worlds, pictures)
     row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
         row |= run.group.once(run.learner.learn, run.generator) or {}
@@ -272,17 +274,19 @@ def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
 
 
 @torch.no_grad()
-def play_best(run: Run, journal: RunLogger) -> None:
+def play_best(run: Run, run_logger: RunLogger) -> None:
     """Record the best policy and design once more, as the episode after the last."""
     now = run.policy_snapshot()
     run.load_policy(run.best)
-    with journal.record(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
+    params, inputs = run.design()
+    with run_logger.record(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
         run_episode(
             run.task,
             run.model,
             run.observer,
             run.policy,
-            run.params(),
+            params,
+            inputs=inputs,
             goal=run.middle_goals(),
             on_frame=on_frame,
         )

@@ -50,7 +50,7 @@ def composed(*overrides):
 
 
 def refusal(monkeypatch, capsys, *overrides) -> str:
-    """What ``python -m softmpm_learn`` says on stderr when it ends with exit code 1."""
+    """Message of ``python -m softmpm_learn`` on stderr when it ends with exit code 1."""
     with pytest.raises(SystemExit) as stop:
         main(monkeypatch, *overrides)
     assert stop.value.code == 1
@@ -212,7 +212,7 @@ def test_a_fault_of_the_program_is_called_so():
 
 
 def test_too_little_memory_names_the_settings_that_help(tmp_path):
-    """Whether the device has no more, or the simulator is allowed no more."""
+    """This holds if the device is full, and if the simulator's budget is."""
     full = app.sentence(torch.OutOfMemoryError("CUDA out of memory."))
     assert full.startswith("CUDA out of memory. Settings for that: train.worlds") and "device.memory" in full
     with pytest.raises(ValueError, match="memory_budget is 1,000 bytes") as refused:
@@ -264,7 +264,7 @@ def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finis
 
 
 def test_a_refused_resume_changes_nothing(monkeypatch, capsys, tmp_path, finished):
-    """Refused for another precision, or because another run is writing, the run goes on as if nobody had asked."""
+    """Refused for another precision, or because another run is writing, the run continues unaffected."""
     shutil.copytree(finished[0], tmp_path / "run")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
     asked = (f"resume={tmp_path}/run", "train.iterations=9", "device.dtype=float64")
@@ -295,7 +295,7 @@ def test_the_log_follows_the_run(monkeypatch, tmp_path, finished):
 
 
 def test_memory_is_for_a_whole_simulation():
-    """What it may keep for its gradient is shared by all control steps."""
+    """The memory budget for its gradient is shared by all control steps."""
     conf = to_run(composed(*TINY, "device.memory=1"))
     model = experiment.make_model(make_task(conf.task), conf, Group())
     assert (model.budget, model.calls) == (1_000_000, 2)
@@ -372,7 +372,7 @@ def test_an_interruption_elsewhere_says_how_to_go_on(monkeypatch, capsys, tmp_pa
 
 
 def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_path):
-    """Where rerun is not installed a run still ends well, and says which command converts its recording elsewhere."""
+    """Without rerun installed a run still ends well, and reports which command converts its recording elsewhere."""
 
     def missing(*_):
         raise ImportError("no rerun here")

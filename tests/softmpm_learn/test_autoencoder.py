@@ -75,7 +75,7 @@ def test_it_learns(variational):
 
 
 def test_early_stopping_keeps_the_best_weights():
-    """Trained on noise of other statistics, the validation loss rises: it stops after the patience and gives back the best."""
+    """Trained on noise of other statistics, the validation loss rises: training stops after the patience at the best weights."""
     autoencoder, generator = make(), torch.Generator().manual_seed(0)
     held_out = torch.zeros(4, 2, 11, 6)
     conf = LearningConf(epochs=50, batches=2, rate=1e-2, patience=3, variational=False)

@@ -16,7 +16,7 @@ def test_numbers_read_back_to_the_last_bit(tmp_path):
 
 
 def test_resuming_cuts_back_whole_and_broken_rows(tmp_path):
-    """Rows of iterations that are done again go, a row cut short goes; what follows equals a file never cut."""
+    """Rows of repeated iterations are removed, as is an incomplete row; what follows equals a file never cut."""
     path, other = tmp_path / "t.csv", tmp_path / "other.csv"
     table, unbroken = Table(path, ["a"]), Table(other, ["a"])
     for k in range(4):

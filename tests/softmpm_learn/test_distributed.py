@@ -60,7 +60,7 @@ KIND = type("Kind", (), {"name": "INVERTED"})
 
 
 def one_of_two(out: Path, group: Group) -> None:
-    """What each process does; leaves in ``said.RANK.json`` how each run ended there."""
+    """Work of each process; writes to ``said.RANK.json`` how each run ended there."""
     import conftest
 
     torch.set_num_threads(1)
@@ -129,7 +129,7 @@ def figures(folder: Path) -> list[dict[str, float]]:
 
 
 def assert_same(folder: Path, other: Path) -> None:
-    """Every metric, and the weights, what the policy looks through and the generator of the checkpoint."""
+    """Every metric is equal, and so are the weights, the policy's encoder and the random generator of the checkpoint."""
     for row, want in zip(figures(folder), figures(other), strict=True):
         assert row == pytest.approx(want, rel=SAME, nan_ok=True)
     now, want = checkpoint.load(folder), checkpoint.load(other)
@@ -230,8 +230,8 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
     assert done.stdout.count("after 3 of 3 iterations: loss") == 1
     (out,) = (tmp_path / "outputs" / "arm").iterdir()
     left = {path.name for path in out.iterdir()}
-    films = {"run.h5", "run.rrd"} if importlib.util.find_spec("rerun") else {"run.h5"}
-    assert left >= films | {"loss.png", "latent.png", "robot.png"} and "error.txt" not in left
+    recordings = {"run.h5", "run.rrd"} if importlib.util.find_spec("rerun") else {"run.h5"}
+    assert left >= recordings | {"loss.png", "latent.png", "robot.png"} and "error.txt" not in left
     conf = load(out)
     task, one = make_task(conf.task), tmp_path / "one"
     train.train(task, make_model(task, conf, Group()), conf.settings, one)

@@ -41,23 +41,34 @@ def test_equals_one_call_of_simulate(task, model):
     assert episode.effort.item() == pytest.approx((0.25 + 0.09) / 2) and episode.observations is None
 
 
+def viscous(task):
+    """The task with a material that can have its viscosity designed."""
+    (body,) = task.scene.bodies
+    body = dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=0.1))
+    return dataclasses.replace(task, scene=dataclasses.replace(task.scene, bodies=[body]))
+
+
 def test_gradient_of_policy_and_design(task):
-    """Autograd through policy, observer, simulator and design agrees with a central difference along a random direction."""
+    """Autograd through policy, observer, simulator and design agrees with a central difference along a random direction: for the
+    policy, and for each quantity of the design."""
+    task = viscous(task)
     model = softmpm.build(task.scene, device="cpu", dtype=torch.float64, worlds=2)
     with seeded(0):
         net = nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3), nn.Tanh()).double()
     observer = Latent(VelocityImage(model), net, size=3)
     policy = make_policy(PolicyConf(name="linear"), 3, 2, 0.1, seed=0).double()
-    design = Design(DesignConf(), model, task.regions)
+    design = Design(DesignConf(strength=True, viscosity=True), model, task.regions)
     variables = [*policy.parameters(), *design.parameters()]
 
     def loss():
-        return run_episode(task, model, observer, policy, design()).loss.mean()
+        params, inputs = design()
+        return run_episode(task, model, observer, policy, params, inputs=inputs).loss.mean()
 
     gradient = torch.autograd.grad(loss(), variables)
     generator = torch.Generator().manual_seed(0)
     direction = [torch.randn(v.shape, generator=generator, dtype=v.dtype) for v in variables]
-    for part in (slice(0, 2), slice(2, None)):  # policy, design
+    assert len(variables) == 2 + len(design.free) == 7
+    for part in (slice(0, 2), *(slice(k, k + 1) for k in range(2, 7))):  # policy, each of the design
 
         def shifted(h, part=part):
             with torch.no_grad():
@@ -75,15 +86,18 @@ def test_gradient_of_policy_and_design(task):
 
 
 @pytest.mark.parametrize("name", ["mlp", "knots"])
-def test_the_loop_gives_the_gradient_of_all_parameters(task, model, name):
+def test_the_loop_gives_the_gradient_of_all_parameters(task, name):
     """The policy's, taken of all decisions at once, and the design's are those of autograd through the episode."""
+    task = viscous(task)
+    model = softmpm.build(task.scene, device="cpu")
     observer = Centroids(model, list(task.regions.values()), task.body_length)
     policy = make_policy(PolicyConf(name=name), observer.size, 2, 0.1, seed=0)
-    design = Design(DesignConf(), model, task.regions)
+    design = Design(DesignConf(strength=True, viscosity=True), model, task.regions)
     free = list(design.parameters())
     episode, got = ClosedLoop(task, model, observer, policy, design, free)(None)
     assert not episode.loss.requires_grad and not episode.decisions.activations
-    loss = run_episode(task, model, observer, policy, design()).loss.mean()
+    params, inputs = design()
+    loss = run_episode(task, model, observer, policy, params, inputs=inputs).loss.mean()
     want = torch.autograd.grad(loss, [*policy.parameters(), *free])
     for a, b in zip(got, want, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())

@@ -39,7 +39,7 @@ def lock(path) -> None:
 
 
 def test_a_lock_is_not_emptied(tmp_path):
-    """What stands in the file stays; a missing one is made."""
+    """The contents of the file remain; a missing file is created."""
     (tmp_path / "full").write_bytes(b"text")
     lock(tmp_path / "full")
     lock(tmp_path / "new")

@@ -25,12 +25,12 @@ def seen(number: int) -> torch.Tensor:
 def taught(folder, simulations=4, **changes) -> tuple[Learner, dict]:
     subject, generator = learner(folder, **changes), torch.Generator().manual_seed(0)
     for number in range(simulations):
-        subject.watch(number, seen(number))
+        subject.add_observations(number, seen(number))
     return subject, subject.learn(generator)
 
 
-def test_the_policy_looks_through_the_target(tmp_path):
-    """The target copies after the first phase and then follows at its rate; without it the network itself is looked through."""
+def test_the_policy_uses_the_target(tmp_path):
+    """The target copies after the first phase and then follows at its rate; without it the policy uses the network itself."""
     subject, _ = taught(tmp_path / "with")
     online, x = subject.autoencoder.encoder, seen(9)[:, 0]
     assert torch.equal(subject.encoder(x), online(x))
@@ -66,7 +66,7 @@ def test_without_replay_the_past_is_forgotten(tmp_path):
 def test_what_cannot_be_kept_is_not_written(tmp_path):
     """Of more worlds than the buffer holds simulations, the last are kept, and no file is made of the others."""
     subject, pictures = learner(tmp_path), torch.cat([seen(number) for number in range(10)], dim=1)
-    subject.watch(20, pictures)
+    subject.add_observations(20, pictures)
     assert subject.replay.ids == list(range(22, 30)) and len(list(tmp_path.iterdir())) == 8
     torch.testing.assert_close(torch.cat(subject.replay.split("training")[:1]), pictures[:, 2])
 

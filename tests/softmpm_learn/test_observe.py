@@ -54,7 +54,7 @@ def test_picture_averages_blocks_of_the_grid_velocity(exact):
 
 
 def test_picture_follows_the_robot(exact):
-    """With follow, a robot elsewhere looks the same; without, it does not. At the rim it is still seen, not an error."""
+    """With follow, the image does not depend on the robot's position; without, it does. At the rim it is no error."""
     state = moving(exact)
     away = state._replace(x=state.x + torch.tensor([0.13, 0.07], dtype=torch.float64))
     follow, fixed = VelocityImage(exact), VelocityImage(exact, follow=False)

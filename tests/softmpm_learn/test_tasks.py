@@ -124,11 +124,19 @@ def test_a_leg_swings_when_its_halves_work_against_each_other():
 def test_settings_reach_the_scene():
     """Materials, strength, gravity, friction and resolution of the settings are those of the scene."""
     conf = ElephantConf(
-        young=4e4, poisson=0.25, density=900.0, strength=1e4, gravity=3.0, friction=0.3, damping=0.5
+        young=4e4,
+        poisson=0.25,
+        density=900.0,
+        viscosity=20.0,
+        strength=1e4,
+        gravity=3.0,
+        friction=0.3,
+        damping=0.5,
     )
     scene = elephant(conf).scene
     material = scene.bodies[0].material
     assert (material.young, material.poisson, material.density) == (4e4, 0.25, 900.0)
+    assert material.viscosity == 20.0
     assert {muscle.strength for muscle in scene.muscles} == {1e4}
     assert scene.gravity == (0.0, -3.0) and scene.walls[0].friction == 0.3 and scene.damping == 0.5
     assert scene.grid.spacing == pytest.approx(1 / 80)
@@ -139,6 +147,7 @@ def test_settings_reach_the_scene():
     [
         (ElephantConf, {"seconds": 0.0}, "task.seconds must be > 0"),
         (ElephantConf, {"young": float("nan")}, "task.young must be > 0"),
+        (ElephantConf, {"viscosity": -1.0}, "task.viscosity must be ≥ 0"),
         (ElephantConf, {"gravity": -1.0}, "task.gravity must be ≥ 0"),
         (ElephantConf, {"friction": -0.1}, "task.friction must be ≥ 0"),
         (BipedConf, {"upright": -1.0}, "task.upright must be ≥ 0"),

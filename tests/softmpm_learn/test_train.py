@@ -1,6 +1,7 @@
 import dataclasses
 import gc
 import itertools
+import json
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import torch
 import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
+from softmpm_learn.experiment import design
 from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 
@@ -202,7 +204,7 @@ def test_what_was_moved_away_is_begun_anew(task, model, settings, unbroken, tmp_
 
 
 def test_a_recording_outlives_a_part_that_records_nothing(task, model, settings, tmp_path):
-    """What was recorded before is the run's own afterwards too."""
+    """Earlier recordings still belong to the run afterwards."""
     for iterations, every in ((2, 1), (3, 0), (4, 1)):
         conf = copy_of(settings, train=dict(iterations=iterations, record_every=every))
         train.train(task, model, conf, tmp_path)
@@ -284,6 +286,35 @@ def test_other_settings_do_not_resume(task, model, settings, unbroken):
         train.train(task, model, copy_of(settings, policy=dict(gain=0.5)), unbroken)
     assert train.train(task, model, copy_of(settings, train=dict(iterations=6)), unbroken).finished
     assert len(rows(unbroken)) == 6
+
+
+def test_a_checkpoint_that_is_older_than_a_setting_resumes(task, model, settings, unbroken):
+    """It was made with the default of that setting: with the default it goes on, with another value it is refused."""
+    old = checkpoint.load(unbroken)
+    about = json.loads(old["about"])
+    del about["design.strength"], about["design.strength_factor"]
+    checkpoint.save(unbroken, old | {"about": json.dumps(about)})
+    with pytest.raises(ValueError, match=r"design\.strength: False then, True now"):
+        train.train(task, model, copy_of(settings, design=dict(strength=True)), unbroken)
+    assert train.train(task, model, copy_of(settings, train=dict(iterations=6)), unbroken).finished
+
+
+def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
+    """A run that designs the strength lowers the loss by it alone, reports its change, and resumes."""
+    alone = dict(young=False, poisson=False, density=False, strength=True)
+    conf = copy_of(settings, design=alone, optimizer=dict(policy_rate=1e-12), policy=dict(gain=1.0))
+    conf = copy_of(conf, observer=dict(name="centroids"), train=dict(iterations=4))
+    train.train(task, model, conf, tmp_path)
+    result = train.train(task, model, copy_of(conf, train=dict(iterations=6)), tmp_path)
+    found = rows(tmp_path)
+    assert result.finished and list(found[0])[10:15] == [
+        f"{n}_change" for n in ("young", "poisson", "density", "strength")
+    ] + ["epochs"]
+    assert float(found[0]["strength_change"]) == 0 < float(found[-1]["strength_change"])
+    losses = [float(row["loss"]) for row in found]
+    assert all(after < before for before, after in itertools.pairwise(losses)), losses
+    drawn = design(result.run)
+    assert list(drawn)[-1] == "strength of the muscles" and drawn["strength of the muscles"][0].shape == (32,)
 
 
 @pytest.mark.parametrize("observer", ["latent", "centroids", "kmeans"])
@@ -369,7 +400,7 @@ def test_a_failed_simulation_is_tried_again_from_halfway_back(
 def test_a_run_that_cannot_go_on_names_the_iteration(
     task, model, settings, tmp_path, monkeypatch, at, iteration
 ):
-    """A failure without a way back ends with the iteration, the particle and advice; the run resumes from before it."""
+    """A failure that cannot backtrack ends with the iteration, the particle and advice; the run resumes from before it."""
     conf = copy_of(settings, optimizer=dict(retries=1))
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at))
     with pytest.raises(

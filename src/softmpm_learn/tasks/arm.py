@@ -33,7 +33,7 @@ class ArmConf(TaskConf):
     strength: float = 4e3
     """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
-    """Where the tip should be when the episode ends: x and y [m]; at rest it is at (0.45, 0.41)."""
+    """Goal of the tip at the end of the episode: x and y [m]; at rest it is at (0.45, 0.41)."""
 
     def __post_init__(self):
         super().__post_init__()

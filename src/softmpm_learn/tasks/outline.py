@@ -58,7 +58,7 @@ class Limb:
         return np.concatenate([self.line + half * normal, tip, (self.line - half * normal)[::-1]])
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points lie: along the limb, 0 at the root and 1 at the tip, and left of its line [m]."""
+        """Coordinates of points: position along the limb, 0 at the root and 1 at the tip, and offset to the left of its line [m]."""
         start, step = self.line[:-1], np.diff(self.line, axis=0)
         length = np.linalg.norm(step, axis=1)
         share = ((points[:, None] - start) * step).sum(-1) / length**2
@@ -86,7 +86,7 @@ class Limb:
 
 
 def inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """Whether each point lies in a closed polygon (even-odd rule), shape (point,)."""
+    """True for each point that lies in a closed polygon (even-odd rule), shape (point,)."""
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = points[:, 0, None], points[:, 1, None]
     crosses = (a[:, 1] > y) != (b[:, 1] > y)

@@ -1,4 +1,4 @@
-"""What every task has: settings, the robot's scene, the regions worth watching, what to do."""
+"""Parts of every task: its settings, the robot's scene, the observed regions and the objective."""
 
 import dataclasses
 import math
@@ -36,6 +36,8 @@ class TaskConf:
     """Poisson's ratio ν [-]; where co-design starts."""
     density: float = 1000.0
     """Rest density ρ₀ [kg/m³]; where co-design starts."""
+    viscosity: float = 0.0
+    """Viscosity η of the material [Pa s]; co-design starts there if it is > 0."""
     strength: float = 1.2e4
     """Stress of a muscle at full activation [Pa]."""
     gravity: float = 9.81
@@ -53,7 +55,7 @@ class TaskConf:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"task.{name} must be > 0, got {value}.")
-        self.need_not_negative("gravity", "damping", "effort")
+        self.need_not_negative("viscosity", "gravity", "damping", "effort")
         if self.control_period > self.seconds:
             raise ValueError(
                 f"task.control_period must be at most task.seconds = {self.seconds}, got {self.control_period}."
@@ -106,7 +108,7 @@ class Task:
     body_length: float
     """Extent of the robot at rest along x, or its reach [m]."""
     goal: np.ndarray | None = None
-    """Where to go [m], shape (dim,), if the task has a place to go to."""
+    """Goal position [m], shape (dim,), if the task has one."""
 
     @property
     def seconds(self) -> float:
@@ -128,7 +130,9 @@ def clock(conf: TaskConf, scene: softmpm.Scene) -> tuple[softmpm.Scene, int, int
 
 def neo_hookean(conf: TaskConf) -> softmpm.NeoHookean:
     """The material that the settings describe."""
-    return softmpm.NeoHookean(density=conf.density, young=conf.young, poisson=conf.poisson)
+    return softmpm.NeoHookean(
+        density=conf.density, young=conf.young, poisson=conf.poisson, viscosity=conf.viscosity
+    )
 
 
 def level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
