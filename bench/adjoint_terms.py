@@ -1,8 +1,8 @@
 """The additive terms of the explicit adjoints, found in their source, and that source with a factor on each of them.
 
 An adjoint is a function whose name, or that of a function around it, ends in ``_adj`` or ``_slope``, or one of the few in ``ALSO``.
-Its terms are what it assigns, adds, stores, passes to another adjoint or returns, sum by sum, down to the sums inside parentheses and
-the components of vectors. Indices, conditions, zeros and whole structs are no terms.
+Its terms are the addends of every value that it assigns, adds, stores, passes to another adjoint or returns, including sums inside
+parentheses and components of vectors. Indices, conditions, zeros and whole structs are not terms.
 """
 
 import ast
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ALSO = ("slopes", "vjp", "collect", "parts", "total")
-"""Used by adjoints alone, though their names do not say so."""
+"""Functions without these suffixes that only adjoints use."""
 BUILDERS = ("vec", "mat", "triple", "node_vec", "aligned", "pack", "matrix_from_cols", "skew")
 """Calls whose arguments are the components of a value."""
 STORES = {
@@ -25,7 +25,7 @@ STORES = {
     "copy_": 0,
     "mul_": 0,
 }
-"""Calls that write, and which of their arguments."""
+"""Calls that store a value, and the index of that argument."""
 ON_HOST = "from mutant import on_host as factor\n"
 IN_KERNELS = "from mutant import in_kernel as factor\nfrom softmpm.kernels.structs import types\n"
 """First lines of a source with factors."""
@@ -41,9 +41,9 @@ INTEGERS = (
         "node_coordinates",
         "place_of",
     ),
-    *("coordinates", "offset", "range", "len", "law_of"),
+    *("coordinates", "offset", "range", "len", "law_of", "actuator_of"),
 )
-"""Calls that give integers."""
+"""Calls that return integers."""
 STRUCTS = (
     *(
         "moved_adj",
@@ -51,13 +51,15 @@ STRUCTS = (
         "gather_adj",
         "slope_adj",
         "node_velocity_adj",
-        "muscle_stress_adj",
+        "viscous_stress_adj",
+        "respond_adj",
+        "slide_adj",
         "placed",
     ),
-    "stress_adj_of",
+    *("stress_adj_of", "active_stress_adj_of"),
 )
-"""Calls that give structs, which no number multiplies; their fields are terms where they are used."""
-FIELDS = ("shape", "count", "muscle", "base", "origin", "order", "places", "law")
+"""Calls that return structs, which cannot be multiplied by a factor; their fields are terms where they are used."""
+FIELDS = ("shape", "count", "muscle", "base", "origin", "order", "places", "law", "driven", "actuator")
 """Attributes and arrays of integers."""
 
 
@@ -179,7 +181,7 @@ def _terms(function: ast.FunctionDef) -> Iterator[ast.expr]:
 
 
 def _stored_on_the_host(function: ast.FunctionDef) -> Iterator[ast.expr]:
-    """Of a function that runs on tensors: what is copied, scaled in place or put into a state."""
+    """Terms of a function on tensors: values that are copied, scaled in place or put into a state."""
     for call in (n for n in ast.walk(function) if isinstance(n, ast.Call)):
         if _called(call) in ("copy_", "mul_"):
             yield call.args[0]
@@ -210,7 +212,7 @@ def _sum(node: ast.expr, whole: set[str]) -> Iterator[ast.expr]:
 
 
 def _inside(node: ast.AST, whole: set[str]) -> Iterator[ast.expr]:
-    """Sums in parentheses, components of vectors, and what other adjoints are given."""
+    """Terms inside an expression: sums in parentheses, components of vectors, arguments of other adjoints."""
     if isinstance(node, ast.Call):
         name = _called(node)
         for value in node.args:
@@ -241,7 +243,7 @@ def _addends(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def _is_zero(node: ast.expr) -> bool:
-    """A new vector, struct or number that holds nothing yet."""
+    """True for a new vector, struct or number that is zero."""
     if not isinstance(node, ast.Call) or node.keywords or _called(node) == "identity":
         return False
     return not node.args or all(isinstance(a, ast.Constant) and a.value == 0.0 for a in node.args)
@@ -266,7 +268,7 @@ def _is_whole(node: ast.AST, whole: set[str]) -> bool:
 
 
 def _only_tested(function: ast.FunctionDef) -> set[str]:
-    """Names that are read in conditions alone."""
+    """Names that are read in conditions only."""
     tests = {id(n) for c in ast.walk(function) if isinstance(c, ast.If) for n in ast.walk(c.test)}
     read = [n for n in ast.walk(function) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)]
     return {n.id for n in read} - {n.id for n in read if id(n) not in tests}

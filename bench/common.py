@@ -53,7 +53,7 @@ def cube(
 
 
 def turning(model: softmpm.Model, rate: float = 2.0) -> softmpm.State:
-    """The scene at rest but turning [rad/s], so that particles change their cells and the order they are kept in grows stale."""
+    """The scene at rest but turning [rad/s], so that particles change cells and their order becomes stale."""
     start = model.rest()
     arm = start.x - start.x.mean(dim=1, keepdim=True)
     start.v[..., 0], start.v[..., 1] = -rate * arm[..., 1], rate * arm[..., 0]
@@ -85,7 +85,7 @@ def arguments(description: str, schemes: bool = False) -> argparse.Namespace:
     parser.add_argument("--largest", type=int, default=None, help="skip cases with more particles")
     if schemes:
         parser.add_argument("--scheme", default="auto", choices=["auto", "fast", "plain"])
-    parser.add_argument("--json", type=Path, default=None, help="write the table there as well")
+    parser.add_argument("--json", type=Path, default=None, help="also write the table to this file")
     return parser.parse_args()
 
 
@@ -96,7 +96,7 @@ def machine(device: torch.device) -> str:
 
 
 class Table:
-    """What a benchmark measured. A row is printed, and in the JSON file if one is asked for, as soon as it is there."""
+    """Results of a benchmark. Each row is printed, and written to the JSON file if one was given, as soon as it is measured."""
 
     def __init__(self, title: str, device: torch.device, path: Path | None):
         self.title, self.machine, self.path, self.rows = title, machine(device), path, []

@@ -1,6 +1,6 @@
-"""What does the same result from run to run cost? `python bench/deterministic.py [--device cuda] [--json FILE]`
+"""Time of a deterministic substep: `python bench/deterministic.py [--device cuda] [--json FILE]`
 
-Microseconds of a substep, forward and backward with everything kept, of an ordinary and of a deterministic model, and the ratios.
+Microseconds of a substep, forward and backward with all states retained, of an ordinary and of a deterministic model, and the ratios.
 """
 
 import torch

@@ -1,8 +1,8 @@
-"""What does each feature of a scene cost when it is there? `python bench/features.py [--device cuda] [--json FILE]`
+"""Time of each feature of a scene: `python bench/features.py [--device cuda] [--json FILE]`
 
-Microseconds of a substep, forward and backward with everything kept, and their ratio to the scene with nothing but a neo-Hookean
-cube. What a scene lacks is not compiled (tests/softmpm/test_model.py), so the first row is also what each absence costs. The last
-rows hold the same cube in grids that are mostly empty.
+Microseconds of a substep, forward and backward with all states retained, and their ratio to a scene that consists of a neo-Hookean cube
+only. Features that a scene lacks are not compiled (tests/softmpm/test_model.py), so an absent feature costs nothing. The last rows
+place the same cube in grids that are mostly empty.
 """
 
 import torch

@@ -1,9 +1,9 @@
-"""What do random scenes and calls come to? `python bench/fuzz.py --count 5000 --seed 0`, and `--legal --count 1000`
+"""Outcomes of random scenes and calls: `python bench/fuzz.py --count 5000 --seed 0`, and `--legal --count 1000`
 
-Scenes of extreme numbers, starts of every kind, wrong arguments, Warp arrays that do not belong together: tests/fuzzing. Each case has
-a number, from ``--seed`` on, and runs in a process that may die or hang without ending the others. A table counts what came of them.
-Those that went wrong are printed, and written with all their numbers into the JSON file if one is asked for; ``--case`` runs a single
-one in this process. With `--legal` the scenes are those that a sensible user could write, close to the stable step.
+Cases are drawn from tests/fuzzing: scenes with extreme numbers, initial states of every kind, wrong arguments, mismatched Warp arrays.
+Each case has a number, starting with ``--seed``, and runs in a separate process, so that a crash or a hang does not end the others. A
+table counts the outcomes. Cases with a bad outcome are printed and, with all their numbers, written to the JSON file if one was given;
+``--case`` runs a single case in this process. With `--legal` the scenes are plausible ones close to the stable step.
 """
 
 import argparse
@@ -28,17 +28,19 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--way", choices=["all", "simulate", "step"], default="all", help="which calls to draw"
     )
-    parser.add_argument("--legal", action="store_true", help="scenes that a sensible user could write")
+    parser.add_argument(
+        "--legal", action="store_true", help="plausible scenes, as a careful user would write them"
+    )
     parser.add_argument("--share", type=float, default=0.95, help="of the stable step, in legal scenes")
     parser.add_argument("--case", type=int, default=None, help="only this number, in this process")
     parser.add_argument(
-        "--json", type=Path, default=None, help="write the table and what went wrong there as well"
+        "--json", type=Path, default=None, help="also write the table and the bad cases to this file"
     )
     return parser.parse_args()
 
 
 def planner(args: argparse.Namespace) -> Callable[[int], dict]:
-    """The case of a number, as data: hypothesis makes its choices from random bytes."""
+    """Function from the number of a case to its data; hypothesis draws it from random bytes."""
     if args.legal:
         return lambda seed: {"way": "legal", "seed": seed, "share": args.share}
     import hypothesis
@@ -61,7 +63,7 @@ def planner(args: argparse.Namespace) -> Callable[[int], dict]:
 
 
 def table(counts: collections.Counter) -> list[dict]:
-    """A row for each way in."""
+    """One row for each kind of call."""
     kinds = [*GOOD, *sorted({kind for _, kind in counts} - set(GOOD))]
     rows = []
     for way in sorted({way for way, _ in counts}):

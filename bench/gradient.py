@@ -1,9 +1,9 @@
-"""How long is a substep backward? `python bench/gradient.py [--device cuda] [--json bench/results/gradient.json]`
+"""Time of a substep and of its adjoint: `python bench/gradient.py [--device cuda] [--json bench/results/gradient.json]`
 
-Forward with gradient and backward of one call, each divided by its substeps; medians after a warm-up. ``kept``: memory for
-everything inside, nothing runs twice. ``again``: a call of more substeps, as many as a long gradient has, with memory for a fifth of
-what it would keep, so that the backward pass runs the substeps again; its time includes that. The cube falls; activation gets a
-gradient where the scene has muscles, the materials only in the rows that say so.
+Forward pass with gradient and backward pass of one call, each divided by the number of substeps; medians after a warm-up. ``kept``:
+the budget suffices for all states, so nothing is recomputed. ``again``: a call with more substeps, as in a long gradient, and a budget
+of a fifth of all states, so that the backward pass recomputes the substeps; its time includes the recomputation. The cube falls.
+Gradients: of the activation where the scene has muscles, of the materials only in the rows named accordingly.
 """
 
 import time
@@ -20,7 +20,7 @@ GRADIENTS = VARIANTS | {"neo-Hookean, materials": {}, "neo-Hookean, turning": {}
 
 
 def substeps_of(particles: int, device: torch.device) -> dict[str, int]:
-    """By what is measured: what is kept must fit into the memory of the device."""
+    """Substeps of each measurement; all retained states must fit into the memory of the device."""
     if device.type == "cpu":
         return {"kept": 50, "again": 50}
     kept = 512 if particles < 500_000 else 64 if particles < 5_000_000 else 32

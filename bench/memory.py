@@ -1,7 +1,7 @@
-"""What does a gradient through a thousand substeps cost with little memory? `python bench/memory.py [--device cuda] [--json FILE]`
+"""Memory and time of a gradient through a thousand substeps: `python bench/memory.py [--device cuda] [--json FILE]`
 
-Peak memory of one call and its backward pass, or of a closed loop of many, what the formula of docs/memory.md says of it, and the
-median time of both, against memory for everything where that fits.
+Peak memory of one call, or of a closed loop of calls, with its backward pass; the prediction of the formula in docs/memory.md; and the
+median time, compared with a budget for all states where these fit.
 """
 
 import statistics
@@ -16,7 +16,7 @@ from softmpm.planning.memory import memory, plan
 
 GIB = 2**30
 WARM = 2
-"""Calls that do not count: one compiles, the next records graphs."""
+"""Warm-up calls: the first compiles kernels, the second captures graphs."""
 
 
 def main():

@@ -1,10 +1,10 @@
-"""Which test notices an adjoint that is one per cent wrong? `python bench/mutants.py [--file polar] [--most 50 --seed 1]`
+"""Mutation test of the adjoints, each term one per cent wrong: `python bench/mutants.py [--file polar] [--most 50 --seed 1]`
 
-Every additive term of every explicit adjoint (adjoint_terms.py) gets a factor in a copy of the source. All of them are 1 but one, which
-is 1.01: a mutant. The factors are read from memory, so that the kernels are compiled once for all mutants; each of these then runs the
-tests in a process of its own, up to the first that fails. Results are appended to a JSON file, a line each; mutants that are there
-already are left out, so that several runs complete the list. The CPU suffices: terms that only a GPU runs are in headers without
-adjoints of their own.
+In a copy of the source, every additive term of every explicit adjoint (adjoint_terms.py) is multiplied by a factor. In a mutant one of
+these factors is 1.01 and all others are 1. Kernels read the factors from memory, so that they are compiled once for all mutants. Each
+mutant runs the tests in a separate process up to the first failure. Results are appended to a JSON Lines file; mutants that are listed
+there are skipped, so that several runs complete the list. The CPU suffices: code that only a GPU runs is in headers without separate
+adjoints.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from adjoint_terms import Term, terms_of, with_factors
 ROOT = Path(__file__).parents[1]
 TESTS = (
     "tests/softmpm/test_adjoint_terms.py",
+    "tests/softmpm/test_inputs.py",
     "tests/softmpm/test_rollout.py",
     "tests/softmpm/test_autograd.py",
     "tests/softmpm/test_warp_api.py",
@@ -36,11 +37,11 @@ TESTS = (
     "tests/softmpm/schemes/fast/test_sorted_state.py",
     "tests/softmpm/kernels",
 )
-"""In the order in which they run."""
+"""Tests, in the order in which they run."""
 IGNORED = "tests/softmpm/kernels/fast/test_compiled.py"
-"""Counts registers, of which the factors take some."""
+"""Not run: it counts registers, and the factors change their number."""
 CELL = 0x7E0000000000
-"""Address of the number of the mutant: kernels are compiled with it, so that it is the same in every run."""
+"""Address of the number of the active mutant: compiled into the kernels, hence the same in every run."""
 FACTOR = f"""
 import ctypes
 import warp as wp
@@ -56,23 +57,23 @@ HOMOGENEOUS = (
 )
 UNCHANGED = {
     ("back", "v"): HOMOGENEOUS,
-    ("back", "respond(walls, v)"): HOMOGENEOUS,
+    ("back", "meet(inputs, world, here, constants.exact_spacing, v)"): HOMOGENEOUS,
     (
         "grid_velocity_adj",
         "load_node(node_before, i)",
     ): "momentum and mass alike, of which only the quotient is used",
 }
-"""Mutants that give the same numbers, and the reason."""
+"""Equivalent mutants, which do not change any result, and the reason."""
 PATIENCE = 300.0
-"""Seconds for the tests of one mutant."""
+"""Time limit for the tests of one mutant [s]."""
 
 
 class Trials:
-    """pytest plugin: runs the collected tests once as they are, then again for each mutant, up to the first that fails.
+    """pytest plugin that runs the collected tests without a mutant, then for each mutant up to the first failure.
 
     Args:
-        numbers: Of the mutants.
-        report: Takes the number of a mutant, the test that noticed it, and what that said; "" if none did.
+        numbers: Numbers of the mutants.
+        report: Called with the number of a mutant, the test that detected it, and its message; "" if no test did.
     """
 
     def __init__(self, numbers: list[int], report: Callable[[int, str, str], None]):
@@ -102,14 +103,14 @@ class Trials:
                 return
 
     def _caught(self, session, number: int) -> tuple[str, str]:
-        """In a process of its own, which a mutant may spoil."""
+        """Test that detects a mutant, run in a separate process, which the mutant may corrupt."""
         context = multiprocessing.get_context("fork")
         ours, theirs = context.Pipe()
         process = context.Process(target=self._trial, args=(session, number, theirs))
         process.start()
         theirs.close()
         try:
-            return ours.recv() if ours.poll(PATIENCE) else ("no end", f"after {PATIENCE:.0f} s")
+            return ours.recv() if ours.poll(PATIENCE) else ("timeout", f"after {PATIENCE:.0f} s")
         except EOFError:
             return "a crash", "the process died"
         finally:
@@ -123,7 +124,7 @@ class Trials:
 
 
 def instrument(root: Path) -> list[Term]:
-    """Copy what the tests need to ``root``, a factor on each term of the adjoints; the terms in the order of their numbers."""
+    """Copy sources and tests to ``root``, with a factor on each term of the adjoints; returns the terms in that order."""
     for name in ("src", "tests", "conf", "pyproject.toml"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, root / name)
@@ -139,8 +140,8 @@ def instrument(root: Path) -> list[Term]:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--file", default="", help="only files with this in their name")
-    parser.add_argument("--most", type=int, default=None, help="at most so many mutants, drawn at random")
+    parser.add_argument("--file", default="", help="only files whose name contains this")
+    parser.add_argument("--most", type=int, default=None, help="largest number of mutants, drawn at random")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=Path("mutants.jsonl"))
     parser.add_argument("--list", action="store_true", help="print the terms, run nothing")
@@ -148,7 +149,7 @@ def arguments() -> argparse.Namespace:
 
 
 def keys(terms: list[Term]) -> list[list]:
-    """Names of terms that outlast changes elsewhere: file, function, text, and which of those alike it is."""
+    """Names of terms that do not depend on line numbers: file, function, text, and a counter for equal ones."""
     alike, found = collections.Counter(), []
     for term in terms:
         same = term.file, term.function, term.text
@@ -171,7 +172,7 @@ def chosen(terms: list[Term], args: argparse.Namespace) -> list[int]:
 
 
 def prepare(root: Path) -> None:
-    """Let kernels read the number of the mutant, and imports find the copy."""
+    """Map the page with the number of the mutant, and put the copy first on the import path."""
     memory = ctypes.CDLL(None).mmap
     memory.restype, memory.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_size_t, *4 * [ctypes.c_int]]
     protection, fixed = mmap.PROT_READ | mmap.PROT_WRITE, 0x100000  # MAP_FIXED_NOREPLACE
@@ -203,7 +204,7 @@ def main() -> None:
                 file.write(json.dumps(result) + "\n")
             if not (test or reason):
                 survivors.append(term)
-            print(f"{term}: {test or (f'cannot be noticed, {reason}' if reason else 'SURVIVED')}", flush=True)
+            print(f"{term}: {test or (f'equivalent, {reason}' if reason else 'SURVIVED')}", flush=True)
 
         prepare(Path(folder).resolve())
         numbers = chosen(terms, args)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 LIGHT = wp.constant(1e-18)
-"""Nodes up to this mass [kg] count as empty: the generated adjoint divides by its square, and what they hold is less than rounding."""
+"""Nodes up to this mass [kg] count as empty: the generated adjoint divides by its square, and their content is below rounding."""
 
 
 @functools.lru_cache(maxsize=None)
@@ -169,7 +169,7 @@ class NaiveWarp:
 
     Attributes:
         states: x, v, C, F of every substep.
-        adj: Adjoints of two states, used in turn; the adjoint of the start is ``adj[0]``.
+        adj: Adjoints of two states, used alternately; the adjoint of the start is ``adj[0]``.
     """
 
     def __init__(self, case: dict[str, np.ndarray], substeps: int, device: str):

@@ -1,21 +1,21 @@
-"""How fast are others? `python bench/peers.py [--device cuda] [--largest 64000] [--json bench/results/peers.json]`
+"""Speed beside other simulators: `python bench/peers.py [--device cuda] [--largest 64000] [--json bench/results/peers.json]`
 
-One elastic cube, one run, float32, every contender in turn, medians after a warm-up, microseconds per substep:
+One elastic cube, one run, float32, all contenders one after the other, medians after a warm-up, microseconds per substep:
 
-    softmpm           `simulate` as it comes: checks on, everything kept if that takes a sixteenth of the GPU's memory at most
-    softmpm, all      the same with a memory budget for all states, which is what the others keep
+    softmpm           `simulate` with default settings: checks on, the default memory budget of a sixteenth of the GPU's memory
+    softmpm, all      the same with a memory budget for all states, which the peers store as well
     Warp, generated   bench/naive_warp.py: three kernels, Warp's generated adjoint, one CUDA graph forward, one backward
     Taichi            bench/taichi_mpm.py: the DiffTaichi scheme, in a process of its own
 
-`forward` is a run without gradient, `kept` one that keeps what the backward pass needs, `backward` that pass with whatever it
-recomputes. `forward x`, `backward x` and `gradient x` say how often softmpm fits into the time of the contender, the last one for
-kept and backward together. softmpm's times hold its checks and all of Python; a CUDA graph has none of that.
+`forward` is a run without gradient, `kept` one that stores the states for the backward pass, `backward` the backward pass with its
+recomputation. `forward x`, `backward x` and `gradient x` are the ratios of the contender's time to that of softmpm, the last one for
+`kept` and `backward` together. The times of softmpm include its checks and all Python overhead; a CUDA graph has neither.
 
-All must compute the same: after 30 substeps, `apart` is the largest difference of a coordinate from softmpm's in dx, `gradient
-apart` the relative difference of the gradient of a random projection of x with respect to the first v. Beyond the tolerances
-below the run ends with an error.
+All contenders must compute the same motion: after 30 substeps, `apart` is the largest difference of a coordinate from that of softmpm
+in dx, and `gradient apart` the relative difference of the gradient of a random projection of x with respect to the initial v. If a
+tolerance below is exceeded, the run ends with an error.
 
-Taichi is looked for in this Python, or in the one that the variable TAICHI_PYTHON names; without it the row says so.
+Taichi is imported in this Python, or in the one that the environment variable TAICHI_PYTHON names; without it the row is empty.
 """
 
 import dataclasses
@@ -40,15 +40,15 @@ ORDERS = ("random", "lattice")
 CHECKED = 30
 """Substeps after which results are compared."""
 TAICHI_SECONDS = 400
-"""Time for Taichi, of which it compiles for about a minute."""
+"""Time limit for Taichi, of which compilation takes about a minute."""
 WARM = 4
-"""Runs before those that count."""
+"""Warm-up runs."""
 APART, GRADIENT_APART = 1e-4, 1e-3
-"""Tolerances. The peers round x to float32 in every substep, 3e-8 m or 4e-6 dx on the finest grid; softmpm keeps the rest."""
+"""Tolerances. The peers round x to float32 in every substep, 3e-8 m or 4e-6 dx on the finest grid; softmpm stores the remainder."""
 
 
 class Ours:
-    """softmpm through its public names, in the manner of :class:`NaiveWarp`."""
+    """softmpm through its public API, with the interface of :class:`NaiveWarp`."""
 
     def __init__(self, scene: softmpm.Scene, case: dict, substeps: int, device: torch.device, budget=None):
         self.model = softmpm.build(scene, device=device, memory_budget=budget)
@@ -76,7 +76,7 @@ class Ours:
 
 
 def ordered(scene: softmpm.Scene, order: str) -> softmpm.Scene:
-    """The scene with its particles row by row, or as it is."""
+    """The scene with its particles sorted row by row, or in the given random order."""
     if order == "random":
         return scene
     body = scene.bodies[0]
@@ -105,12 +105,12 @@ def case_of(scene: softmpm.Scene) -> dict[str, np.ndarray]:
 
 
 def keep(contender):
-    """A run that keeps what the backward pass needs; the peers always do."""
+    """Run and store the states for the backward pass; the peers always do."""
     getattr(contender, "keep", contender.forward)()
 
 
 def times(contender, device: torch.device, repeats: int) -> dict[str, float]:
-    """Seconds of a run without gradient, of one that keeps, and of its backward pass, once windows and programs are settled."""
+    """Seconds of a run without gradient, of one that stores states, and of its backward pass, after windows and graphs are in place."""
     kept, backward = [], []
     for _ in range(repeats + WARM):
         sync(device)
@@ -130,7 +130,7 @@ def times(contender, device: torch.device, repeats: int) -> dict[str, float]:
 
 
 def result(make, substeps: int, device: torch.device, repeats: int) -> dict:
-    """What ``make(substeps)`` computes in the run that is compared, and its times."""
+    """Final positions and gradient of the contender in the compared run, and its times."""
     checked = make(CHECKED)
     keep(checked)
     checked.backward()
@@ -151,14 +151,14 @@ class Cube(NamedTuple):
 
 def cube_in_orders(dim: int, particles: int, nodes: int, device: torch.device) -> Cube:
     most = 20 if device.type == "cpu" else 1000
-    # The peers keep all states, some gigabytes of them; and in 3D the swirl takes a particle off the grid after 745 substeps.
+    # The peers store all states, some gigabytes of them; and in 3D the swirl takes a particle off the grid after 745 substeps.
     substeps = 1000 if dim == 2 else 256 if particles < 10_000 else 200 if particles < 100_000 else 32
     scenes = [ordered(cube(dim, particles, nodes), order) for order in ORDERS]
     return Cube(dim, nodes, min(most, substeps), scenes, [case_of(scene) for scene in scenes])
 
 
 def taichi(cubes: list[Cube], device: torch.device, repeats: int) -> list[list[dict] | None]:
-    """Results of Taichi for each cube and order; None, and a printed reason, where there are none."""
+    """Results of Taichi for each cube and order; None, with a printed reason, if there is no result."""
     python = os.environ.get("TAICHI_PYTHON", sys.executable)
     program = Path(__file__).with_name("taichi_mpm.py")
     with tempfile.TemporaryDirectory() as folder:
@@ -173,7 +173,7 @@ def taichi(cubes: list[Cube], device: torch.device, repeats: int) -> list[list[d
 
 
 def run(command: list[str]) -> str | None:
-    """Why the command failed, if it did."""
+    """Run a command; the reason if it fails, else None."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TAICHI_SECONDS)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -217,7 +217,7 @@ def row(name: str, found: dict | None, ours: dict, substeps: int, dx: float) -> 
 
 
 def contest(one: Cube, others: list[dict] | None, device: torch.device, repeats: int, table: Table) -> None:
-    """All contenders on one cube, its particles in either order; Taichi's results are given."""
+    """All contenders on one cube, with its particles in both orders; the results of Taichi are an argument."""
     others = others or [None] * len(ORDERS)
     for order, scene, case, other in zip(ORDERS, one.scenes, one.cases, others, strict=True):
 

@@ -1,10 +1,10 @@
-"""How far from the memory's speed is a substep? `python bench/roofline.py [--device cuda] [--json bench/results/roofline.json]`
+"""Forward substep relative to memory bandwidth: `python bench/roofline.py [--device cuda] [--json bench/results/roofline.json]`
 
-The copy bandwidth of the device, measured here, against the bytes that a forward substep of the cases of bench/step.py must move
-at least: every state read and written once, the material of a particle read once (16 B: volume, mass, μ, λ), momentum and velocity of
-the nodes in memory once (a little less is enough: velocities of empty nodes are not written).
-The reads of the grid by 3^dim nodes a particle, and all atomic additions, are taken to cost nothing. `floor us` is the time of these
-bytes at copy speed, `times floor` how often it fits into the measured substep. A scene that fits into the caches may beat its floor.
+Compares a forward substep of the cases of bench/step.py with the time to move the least number of bytes, at the measured copy bandwidth
+of the device: every state is read and written once, the material of a particle is read once (16 B: volume, mass, μ, λ), and momentum
+and velocity of the allocated nodes are moved once (slightly too much, since velocities of empty nodes are not written). Reads of 3^dim
+nodes per particle and all atomic additions are neglected. `floor us` is the time of these bytes at copy speed, `times floor` the ratio
+of the measured time to it. A scene that fits into the caches may be faster than its floor.
 """
 
 import torch
@@ -26,13 +26,13 @@ def copy_bandwidth(device: torch.device, repeats: int) -> float:
 
 
 def least_bytes(model: softmpm.Model) -> int:
-    """What a forward substep has to move [B]."""
+    """Least number of bytes that a forward substep moves."""
     particles, sizes = model.worlds * model.particle_count, model.sizes()
     return 2 * sizes.inside + MATERIAL_BYTES * particles + 2 * sizes.nodes
 
 
 def seconds(model: softmpm.Model, repeats: int) -> float:
-    """Of one forward substep more, everything in it that a user gets."""
+    """Marginal time of a forward substep, including checks and re-sorting [s]."""
     given, substeps = (model, model.rest(), model.params()), substeps_of(model.particle_count, model.device)
     one, all_of_them = (
         median_seconds(lambda n=n: run(*given, n), model.device, repeats) for n in (1, substeps)

@@ -1,14 +1,15 @@
-"""How far is the reported step limit from the largest stable one? `python bench/running_limit.py [--device cuda] [--json FILE]`
+"""Measured over reported step limit: `python bench/running_limit.py [--device cuda] [--json FILE]`
 
 ``softmpm.stable_dt(scene, stretch=F)`` against a measurement by bisection to 3 %, for 20 lone particles and for a strip whose ends
 are in stick walls, four particles a cell and axis, all in one homogeneous deformation: diag(s, 1, ..) for the
-particles, with the contraction of free sides for the strip. Shown is measured over reported, and reported over that at rest.
+particles, with the contraction of free sides for the strip. Reported are the ratio of the measured to the reported limit, and of the
+reported limit to that at rest.
 
 A body in that deformation moves, except at s = 1, so "stable" needs a definition. Velocities are chosen so that the substep brings them
-to rest, as at the turning point of a vibration: the substep then leaves x and F as they are, and its Jacobian J in (x, v, C, F) is
-that of a vibration about them. Too large a step turns an eigenvalue of J to below -1: the mode overshoots by more each time.
-Eigenvalues above 1 belong to a material that is unstable itself, as a compressed one is, whatever the step, and do not count.
-J - 1 has an eigenvalue below -2 then, and the power iteration finds it: J times a vector is a central difference in float64.
+to rest, as at the turning point of a vibration: the substep then leaves x and F unchanged, and its Jacobian J in (x, v, C, F) is
+that of a vibration about them. If the step is too large, J has an eigenvalue below -1: the amplitude of that mode grows each time.
+Eigenvalues above 1 belong to a material that is unstable at any step, such as a compressed one, and do not count. Then J - 1 has an
+eigenvalue below -2, which the power iteration finds; J times a vector is a central difference in float64.
 """
 
 import dataclasses
@@ -29,7 +30,7 @@ import softmpm
 
 STRETCHES = (0.3, 0.6, 1.0, 2.0, 3.0, 4.0)
 ITERATIONS, AVERAGED = 80, 60
-"""Of the power iteration, and those at its end that count: the size of a vector swings while an eigenvalue nears -1."""
+"""Iterations of the power method, and number of the last ones that are averaged: the norm oscillates as an eigenvalue nears -1."""
 EPS = 1e-6
 PRECISION = 0.03
 LAME = YOUNG / 2.6, 0.3 * YOUNG / (1.3 * 0.4)
@@ -110,7 +111,7 @@ def measured(scene: softmpm.Scene, F: np.ndarray, how: How, guess: float) -> flo
 
 
 def is_stable(scene: softmpm.Scene, F: np.ndarray, how: How) -> bool:
-    """Whether no eigenvalue of the substep's Jacobian is below -1."""
+    """True if no eigenvalue of the Jacobian of the substep is below -1."""
     model = make(scene, how, worlds=2)
     base = bodies.deformed(model.rest(), F) if len(scene.walls) > 1 else model.rest()
     base = base._replace(F=torch.as_tensor(F).to(base.F).expand_as(base.F).clone())
@@ -144,7 +145,7 @@ def is_stable(scene: softmpm.Scene, F: np.ndarray, how: How) -> bool:
 
 
 def resting(scene: softmpm.Scene, base: softmpm.State, how: How) -> softmpm.State:
-    """What the forces add to v and C in a second, from a substep so short that it moves nothing far."""
+    """Rates of change of v and C by the forces, from a substep so short that displacements are negligible."""
     dt = 1e-3 * scene.dt
     model = make(dataclasses.replace(scene, dt=dt), how, worlds=2)
     end = softmpm.simulate(model, base, None, model.params(), substeps=1)

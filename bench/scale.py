@@ -1,16 +1,16 @@
-"""How much faster is a run on several GPUs? `python bench/scale.py [--device cuda] [--json bench/results/scale.json]`
+"""Speed-up of a training run on several GPUs: `python bench/scale.py [--device cuda] [--json bench/results/scale.json]`
 
-An arm reaches for a goal of its own in each world. The same run is started by torchrun with 1, 2, 4 and 8 processes that share its
+In each world an arm reaches for a different goal. The same run is started by torchrun with 1, 2, 4 and 8 processes that share its
 worlds, as far as there are GPUs (1 and 2 on a CPU). Seconds of an iteration, from timing.csv without its first rows:
 
-    episode     simulation, gradient and its mean over the processes, which is the work they share; the median
-    alone       `learn` and `save`, for which all wait for the first process: pictures, autoencoder, checkpoint; the mean, since one
-                iteration in five has a learning phase. With `centroids` there are neither pictures nor autoencoder
+    episode     simulation, gradient and its mean over the processes, which is the shared work; the median
+    alone       `learn` and `save`, during which all processes wait for the first: velocity images, autoencoder, checkpoint; the mean,
+                since one iteration in five has a learning phase. With `centroids` there are no images and no autoencoder
 
-``shared`` is the speed-up of the episode over one process, ``speed-up`` and ``efficiency`` those of both columns together. Nothing is
-recorded. ``loss apart`` is the largest relative difference of an iteration's loss from that of one process. In float64 it must be
-rounding, or the benchmark fails. In float32 a GPU's sums differ from run to run, and an autoencoder that is learned meanwhile makes
-much of it: two runs of one process are as far apart then.
+``shared`` is the speed-up of the episode over one process, ``speed-up`` and ``efficiency`` are those of both columns together. No
+recording is written. ``loss apart`` is the largest relative difference of an iteration's loss from that of one process. In float64 it
+must not exceed rounding, or the benchmark fails. In float32 the sums of a GPU differ from run to run, and autoencoder training
+amplifies the difference: two runs of a single process differ as much.
 """
 
 import csv
@@ -35,9 +35,9 @@ CASES = [
 """Observer, precision, worlds, and seconds of an episode."""
 ON_A_CPU = [("centroids", "float64", 16, 0.025), ("latent", "float64", 16, 0.025)]
 WARM, ITERATIONS = 3, 13
-"""Iterations left out, which compile and record, and all of them; the ten that count have two learning phases."""
+"""Warm-up iterations, which compile and capture, and all iterations; the ten that count contain two learning phases."""
 SAME = 1e-5
-"""In float64: far above rounding that a few iterations have multiplied, far below what another result would be."""
+"""Tolerance in float64: far above rounding after a few iterations, far below the difference of a wrong result."""
 
 
 def main():
@@ -70,11 +70,11 @@ def main():
                 row | times | {"speed-up": faster, "efficiency": faster / processes, "loss apart": apart}
             )
             if precision == "float64" and not apart <= SAME:
-                sys.exit(f"{processes} processes learn something else than one: {apart:.2g} > {SAME:g}.")
+                sys.exit(f"{processes} processes differ from one: {apart:.2g} > {SAME:g}.")
 
 
 def run(words: list[str], processes: int) -> tuple[list[float], float, float]:
-    """Train in so many processes; gives the loss of each iteration, and seconds of its episode and of the first process alone."""
+    """Train with ``processes`` processes; returns the loss of each iteration, and the seconds of ``episode`` and ``alone``."""
     torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
     with tempfile.TemporaryDirectory() as folder:
         program = ["-m", "softmpm_learn", *words, f"hydra.run.dir={folder}"]

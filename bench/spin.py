@@ -1,9 +1,9 @@
-"""Does a spinning body keep its angular momentum and its energy in float32? `python bench/spin.py [--device cuda] [--json FILE]`
+"""Angular momentum and energy of a spinning body in float32: `python bench/spin.py [--device cuda] [--json FILE]`
 
-A disc (2D) and a cube (3D) turn freely at π/2 rad/s for 10,000 substeps at half the largest stable step, in every law and both
-schemes. ``momentum`` is the relative change of the angular momentum since the start, ``energy`` the relative difference of the total
-energy from a run in float64 (which loses a little to the transfers, as it should); ``float64`` is that run's change of the momentum.
-The last line is the worst of all rows.
+A disc (2D) and a cube (3D) turn freely at π/2 rad/s for 10,000 substeps at half the largest stable step, in each law of
+bench/extremes/laws.py and in both schemes. ``momentum`` is the relative change of the angular momentum since the start, ``energy`` the
+relative difference of the total energy from a run in float64 (which loses a little to the dissipation of the transfers, as expected);
+``float64`` is the change of the momentum in that run. The last line is the maximum over all rows.
 """
 
 import dataclasses

@@ -1,12 +1,12 @@
-"""Where are the limits, and does every failure have a name? `python bench/stability.py [--device cuda] [--short] [--row NAME]`
+"""Maps of the limits and of the named failures: `python bench/stability.py [--device cuda] [--short] [--row NAME]`
 
-Each row takes one quantity to its extremes, in every law, in 2D and 3D, and gives each cell one of four outcomes: *right* by criteria
-that do not use the library's alarms, *refused* by name (ValueError), *stopped* by name (UnstableError; the kind is shown), or *silent*:
-a state came back that is not right. Prints a table and writes it to ``--json FILE``; ``--draw FILE`` draws such a file, and that of
-bench/running_limit.py beside it, as docs/images/limits_*.png and measures nothing.
+Each row varies one quantity up to its extremes, for the laws of bench/extremes/laws.py, in 2D and 3D. Each cell has one of four
+outcomes: *right* by criteria that do not use the library's alarms, *refused* by name (ValueError), *stopped* by name (UnstableError;
+the kind is shown), or *silent*: a returned state is wrong. Prints a table and writes it to ``--json FILE``; ``--draw FILE`` draws such
+a file, and the results of bench/running_limit.py beside it, as docs/images/limits_*.png without measuring.
 
-``--longest`` bounds the rows whose subject is the length of a run. ``--needless`` runs what was refused or stopped once more without
-alarms and counts what is right then.
+``--longest`` bounds the rows that vary the length of a run. ``--needless`` repeats refused and stopped cells without alarms and counts
+those that are right then.
 """
 
 import argparse
@@ -63,10 +63,10 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--short", action="store_true", help="a few cells of each row")
     names = [row.name for rows in PAGES.values() for row in rows]
     parser.add_argument("--row", choices=names, help="one row only")
-    parser.add_argument("--longest", type=float, default=1e4, help="most substeps of a run")
+    parser.add_argument("--longest", type=float, default=1e4, help="largest number of substeps of a run")
     parser.add_argument("--needless", action="store_true", help="repeat what was stopped without alarms")
     parser.add_argument("--strict", action="store_true", help="exit with 1 if a cell is silent")
-    parser.add_argument("--json", type=Path, help="write the cells there")
+    parser.add_argument("--json", type=Path, help="write the cells to this file")
     parser.add_argument("--draw", type=Path, help="draw the cells of this file")
     return parser.parse_args()
 

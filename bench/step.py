@@ -1,9 +1,9 @@
-"""How long is a substep forward? `python bench/step.py [--device cuda] [--json bench/results/step.json]`
+"""Time of a forward substep: `python bench/step.py [--device cuda] [--json bench/results/step.json]`
 
-What one more substep adds to a call of `simulate` without gradient, everything in it that a user gets: checks, sorting again,
-what lies between chunks. The particles come in random order. In the first column the cube falls, in the second it also turns at
-2 rad/s, so that all of its particles change cells all the time. ``call`` is a call of a single substep, which is the price of
-calling. Medians of repeats after a warm-up.
+The marginal time of one substep in a call of `simulate` without gradient. It includes all checks, re-sorting and the work between
+chunks. Particles are given in random order. In the first column the cube falls; in the second it also turns at 2 rad/s, so that its
+particles change cells continually. ``call`` is the time of a call with a single substep, that is the overhead of a call. Medians of
+repeats after a warm-up.
 """
 
 import torch

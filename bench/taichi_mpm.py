@@ -87,7 +87,7 @@ class TaichiMpm:
 
     @staticmethod
     def _placed(field, size: int):
-        """A tree each for the field and its adjoint: one tree of them all would pass 2 GiB."""
+        """A separate tree for each field and its adjoint: a single tree would exceed 2 GiB."""
         for part in (field, field.grad):
             builder = ti.FieldsBuilder()
             builder.dense(ti.i, size).place(part)
@@ -95,7 +95,7 @@ class TaichiMpm:
         return field
 
     def start(self, case: dict[str, np.ndarray], order: int):
-        """Take the sizes of a case and its particles in one order."""
+        """Load the sizes of a case and its particles in one order."""
         numbers = {name: float(case[name]) for name in ("dx", "dt", "mass", "volume", "mu", "lam")}
         dx, dt, mass, volume = (numbers[name] for name in ("dx", "dt", "mass", "volume"))
         self.count, self.nodes = case["x"].shape[1], int(case["nodes"])
@@ -238,7 +238,7 @@ def median_seconds(work, repeats: int) -> float:
 
 
 def measure(mpm: TaichiMpm, case: dict[str, np.ndarray]) -> dict:
-    """What is compared and the seconds of forward and backward, for each order of the particles."""
+    """Compared results, and seconds of the forward and backward pass, for each order of the particles."""
     substeps, check, repeats = (int(case[name]) for name in ("substeps", "check", "repeats"))
     result = {}
     for order in range(len(case["x"])):
@@ -258,14 +258,16 @@ def measure(mpm: TaichiMpm, case: dict[str, np.ndarray]) -> dict:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "folder", type=Path, help="cases that bench/peers.py wrote; x, v, seed lead with the order"
+        "folder",
+        type=Path,
+        help="cases that bench/peers.py wrote; the first axis of x, v and seed is the order",
     )
     parser.add_argument("--device", default="cuda")
     args = parser.parse_args()
     paths = sorted(args.folder.glob("*.case.npz"))
     cases = [dict(np.load(path)) for path in paths]
     for dim in sorted({int(case["dim"]) for case in cases}):
-        # One thread on the CPU, as Warp has there. No cache: a run leaves nothing behind.
+        # One thread on the CPU, as in Warp. No cache, so that a run leaves no files.
         arch = {"arch": ti.cuda} if args.device == "cuda" else {"arch": ti.cpu, "cpu_max_num_threads": 1}
         ti.init(**arch, default_fp=ti.f32, offline_cache=False, log_level=ti.WARN)
         same = [(path, case) for path, case in zip(paths, cases, strict=True) if case["dim"] == dim]

@@ -1,7 +1,7 @@
-"""Do many small robots in one launch run as fast as one large one? `python bench/worlds.py [--device cuda] [--json FILE]`
+"""Throughput of many small robots in one launch: `python bench/worlds.py [--device cuda] [--json FILE]`
 
-Millions of particles and substeps per second, forward and backward, everything kept; ``share`` is the throughput over that of the
-first row, one scene with as many particles as 64 worlds.
+Millions of particles and substeps per second, forward and backward, with all states retained; ``share`` is the throughput relative to
+that of the first row, one scene with as many particles as 64 worlds.
 """
 
 import torch

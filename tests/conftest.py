@@ -1,4 +1,4 @@
-"""What every test shares: quiet Warp, one thread, a ``device`` that is the CPU and, where there is one, a GPU, both schemes."""
+"""Shared setup of all tests: quiet Warp, one thread, and fixtures for both schemes and every device, the CPU and a GPU if present."""
 
 import os
 

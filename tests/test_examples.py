@@ -1,4 +1,4 @@
-"""What the README shows runs as it stands there."""
+"""The examples of the README run as printed."""
 
 import re
 from pathlib import Path

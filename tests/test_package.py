@@ -1,4 +1,4 @@
-"""What is installed: types, a version, and no dependency that nothing imports."""
+"""The installed package has types, a version, and no dependency that nothing imports."""
 
 import ast
 import re
@@ -33,7 +33,7 @@ def wheel(tmp_path_factory) -> zipfile.ZipFile:
 
 
 def test_types_are_shipped(wheel):
-    """Both packages say that they are typed, so that mypy looks into them."""
+    """Both packages are marked as typed, so that mypy checks their types."""
     assert {"softmpm/py.typed", "softmpm_learn/py.typed"} <= set(wheel.namelist())
 
 

@@ -1,1 +1,1 @@
-"""Maps of the physical extremes: cells, the judges of what comes back, and the pictures."""
+"""Maps of the physical extremes: cells, judges of the returned states, and pictures."""

@@ -1,7 +1,7 @@
 """Scenes of the maps: blocks, bars and clouds above a frictionless floor, in units where only ratios matter.
 
-Cells of 1 cm, 1,000 kg/m³ and 1e5 Pa give a wave speed √(E/ρ) of 10 m/s. Gravity is 1e-4 E/(ρ dx), so weak that a body bends
-under it by less than 1 %, and there so that every centre of mass has a law to obey.
+Cells of 1 cm, 1,000 kg/m³ and 1e5 Pa give a wave speed √(E/ρ) of 10 m/s. Gravity is 1e-4 E/(ρ dx): a body bends under it by
+less than 1 %, and the free fall of its centre of mass can be checked.
 """
 
 import dataclasses
@@ -68,7 +68,7 @@ def halves(law: type, dim: int, height: float, lower: dict, upper: dict) -> list
 
 
 def cloud(law: type, dim: int, count: int = 20, poisson: float = 0.3) -> softmpm.Body:
-    """Particles that share no node, each somewhere else between its nodes."""
+    """Particles that share no node, at random positions within their cells."""
     random = np.random.default_rng(0)
     lattice = np.stack(np.meshgrid(*[np.arange(FLOOR + 6, NODES[dim] - 6, 6)] * dim), -1).reshape(-1, dim)
     places = random.permutation(lattice)[:count] + random.uniform(0, 1, (min(count, len(lattice)), dim))

@@ -1,9 +1,9 @@
-"""One cell of a map: a scene is built and run, judged after every call, and comes to one of four outcomes.
+"""One cell of a map: a scene is built, run and judged after every call. Its outcome is one of four.
 
-*right*: every call returned, and every state that came back passed the criteria of its row.
+*right*: every call returned, and every returned state passed the criteria of its row.
 *refused*: ``build`` or a call raised ValueError, which names the rule.
 *stopped*: a call raised UnstableError; its kind is the note.
-*silent*: a state came back that fails a criterion; no error told of it.
+*silent*: a returned state fails a criterion and no error was raised.
 """
 
 import warnings
@@ -19,13 +19,13 @@ import softmpm
 from .judges import Exact, Matter, exact, least_det
 
 LEAST_DET = 0.05
-"""A body crushed to a twentieth of its volume is no longer what its law was made for."""
+"""Least det F: a body compressed to a twentieth of its volume is outside the range of its law."""
 APART = 1.4
-"""Cells between rest neighbours beyond which they share too few nodes to hold each other."""
+"""Largest distance of rest neighbours [cells]; beyond it numerical fracture occurs, since they share too few nodes."""
 ENERGY = 1.05
-"""Most mechanical energy over that of the start and the work of the muscles: nothing else does any."""
+"""Largest ratio of the mechanical energy to that of the initial state plus the work of the muscles, the only source of work."""
 FLIGHT = 1e-3
-"""Most that a free centre of mass may be off the discrete law of free fall [cells]."""
+"""Largest deviation of a free centre of mass from the discrete law of free fall [cells]."""
 
 
 class Outcome(StrEnum):
@@ -39,7 +39,7 @@ class Outcome(StrEnum):
 class Verdict:
     outcome: Outcome
     note: str
-    """A word or number for the picture: least det F, kind of the error, or what is wrong."""
+    """Text for the picture: least det F, kind of the error, or the failed criterion."""
     detail: str = ""
     """The whole message of an error."""
 
@@ -54,13 +54,13 @@ class CriterionError(Exception):
 
 @dataclass(frozen=True)
 class How:
-    """Where a map runs."""
+    """Settings of a map: device, precision, alarms."""
 
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
     alarms: bool = True
     longest: int = 10_000
-    """Most substeps of the rows whose subject is the length of a run."""
+    """Largest number of substeps, for the rows that vary the length of a run."""
 
 
 NO_ALARMS = softmpm.Alarms(collapse=None, gap=None, step=None)
@@ -84,7 +84,7 @@ def call(model: softmpm.Model, state: softmpm.State, activation, params, substep
 
 
 def verdict(cell: Callable[[], str]) -> Verdict:
-    """Outcome of a cell: a function that returns the note of a right one."""
+    """Outcome of a cell, a function that returns the note of a right outcome."""
     try:
         return Verdict(Outcome.RIGHT, cell())
     except softmpm.UnstableError as error:
@@ -97,17 +97,17 @@ def verdict(cell: Callable[[], str]) -> Verdict:
 
 @dataclass
 class Run:
-    """What a criterion judges."""
+    """Data that a criterion judges."""
 
     matter: Matter
     states: list[Exact] = field(default_factory=list)
-    """The start and the last one."""
+    """The initial and the latest state."""
     substeps: int = 0
-    """Substeps from the one to the other."""
+    """Substeps between them."""
     least: float = np.inf
     """Least det F so far."""
     work: float = 0.0
-    """Most work that the muscles have done so far [J]."""
+    """Largest work that the muscles have done so far [J]."""
 
     @property
     def start(self) -> Exact:
@@ -148,7 +148,7 @@ def passive(run: Run) -> None:
 def falls_freely(run: Run) -> None:
     """Centre of mass on the discrete law of free fall, within 1e-3 cells for 10,000 substeps.
 
-    Beyond, rounding lets the momentum wander by √n of n substeps, and so the place by n √n.
+    For more substeps n, rounding makes the momentum drift as √n, hence the position as n √n.
     """
     scene, n = run.matter.scene, run.substeps
     velocity = run.matter.momentum(run.start) / run.matter.mass.sum()
@@ -172,7 +172,7 @@ FREE = (*BODY, falls_freely)
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """What is run, from which start, and judged by what."""
+    """A run: scene, initial state, loads and criteria."""
 
     scene: softmpm.Scene
     substeps: int
@@ -181,17 +181,17 @@ class Case:
     young_factor: float = 1.0
     """Young's modulus of the call over that of the scene."""
     criteria: tuple[Criterion, ...] = BODY
-    looks: int = 20
-    """Calls that the run is cut into; each end is judged."""
+    calls: int = 20
+    """Number of calls of the run; the state after each is judged."""
 
     @property
     def length(self) -> int:
         """Substeps of a call."""
-        return max(1, self.substeps // self.looks)
+        return max(1, self.substeps // self.calls)
 
 
 def states(case: Case, how: How) -> Iterator[softmpm.State]:
-    """The start, and the end of each call."""
+    """The initial state and the state after each call."""
     model = make(case.scene, how)
     params = model.params()
     params = params._replace(young=params.young * case.young_factor)
@@ -200,13 +200,13 @@ def states(case: Case, how: How) -> Iterator[softmpm.State]:
         activation = torch.full((1, 1, model.muscle_count), case.activation).to(params.young)
     state = case.start(model.rest())
     yield state
-    for _ in range(case.looks):
+    for _ in range(case.calls):
         state = call(model, state, activation, params, case.length)
         yield state
 
 
 def judged(case: Case, how: How) -> Run:
-    """Run a case and judge the end of each call."""
+    """Run a case and judge the state after each call."""
     run, length = Run(Matter(case.scene, case.activation, case.young_factor)), case.length
     for k, state in enumerate(states(case, how)):
         run.states = [*run.states[:1], exact(state)]
@@ -219,7 +219,7 @@ def judged(case: Case, how: How) -> Run:
 
 
 def play(case: Case, how: How) -> str:
-    """The least det F of a run that is right."""
+    """Least det F of a run whose outcome is right."""
     return short(judged(case, how).least)
 
 

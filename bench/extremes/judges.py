@@ -1,11 +1,11 @@
-"""Judges of a returned state that share nothing with the library: NumPy in float64, written from the definitions.
+"""Judges of a returned state, independent of the library: NumPy in float64, written from the definitions.
 
 Energies follow from the laws' densities, with J = det F, the principal stretches s of F and the Lamé parameters μ and λ:
 
     neo-Hookean            μ/2 (Σ s² − dim) − μ log J + λ/2 log²J
     fixed corotated        μ Σ (s − 1)² + λ/2 (J − 1)²
     barrier corotated      μ Σ (s − 1)² + λ/8 (J − 1/J)²
-    muscle of pull p       p/2 |F d|²
+    muscle, active stress p  p/2 |F d|²
 
 A particle carries the affine velocity C as well, so its kinetic energy is m/2 (|v|² + D |C|²) with D = dx²/4, and its angular
 momentum has the part m D (C − Cᵀ). Velocities of a state are half a substep older than its positions; the energies are taken
@@ -63,7 +63,7 @@ DENSITIES = {
     "FixedCorotated": fixed_corotated,
     "BarrierCorotated": barrier_corotated,
 }
-"""Energy of a unit of rest volume [J/m³] by the name of the law."""
+"""Energy per unit of rest volume [J/m³], by the name of the law."""
 
 
 def stretches(F: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def stretches(F: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of a body [J]; ``mechanical`` leaves out the muscles, whose loss is their work."""
+    """Energies of a body [J]; ``mechanical`` excludes the energy of the muscles, whose decrease is their work."""
 
     kinetic: float
     elastic: float
@@ -109,12 +109,14 @@ class Matter:
         self.mu = young / (2 * (1 + poisson))
         self.lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
         self.laws = np.repeat([type(body.material).__name__ for body in bodies], sizes)
-        self.pulls = [(m.particles, np.array(m.direction), activation * m.strength) for m in scene.muscles]
+        self.active_stresses = [
+            (m.particles, np.array(m.direction), activation * m.strength) for m in scene.muscles
+        ]
         self.floor = min((wall.offset for wall in scene.walls), default=0.0)
         self.pairs = self._neighbours(np.cumsum([0, *sizes]))
 
     def _neighbours(self, first: np.ndarray) -> np.ndarray:
-        """Pairs of neighbours at rest; bodies have none in others, since those may part."""
+        """Pairs of neighbours at rest within each body; different bodies may separate."""
         reach = NEIGHBOUR * self.volume ** (1 / self.dim)
         found = [
             a + cKDTree(self.rest[a:b]).query_pairs(reach[a], output_type="ndarray")
@@ -123,7 +125,7 @@ class Matter:
         return np.concatenate(found)
 
     def energy(self, state: Exact) -> Energy:
-        """Energies, positions and F taken half a substep back, where v and C are."""
+        """Energies, with positions and F evaluated half a substep earlier, at the time of v and C."""
         half = 0.5 * self.scene.dt
         x = state.x - half * state.v
         F = state.F - half * state.C @ state.F
@@ -135,7 +137,8 @@ class Matter:
         squares = (state.v**2).sum(-1) + self.dx**2 / 4 * (state.C**2).sum((-1, -2))
         height = (x - self.floor * np.eye(self.dim)[1]) @ np.array(self.scene.gravity)
         muscle = sum(
-            float((p / 2 * self.volume[i] * ((F[i] @ d) ** 2).sum(-1)).sum()) for i, d, p in self.pulls
+            float((p / 2 * self.volume[i] * ((F[i] @ d) ** 2).sum(-1)).sum())
+            for i, d, p in self.active_stresses
         )
         return Energy(
             kinetic=float((self.mass * squares).sum() / 2),

@@ -1,4 +1,4 @@
-"""The laws that the maps are drawn for."""
+"""Laws of the maps."""
 
 import softmpm
 

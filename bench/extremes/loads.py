@@ -1,4 +1,4 @@
-"""Extremes of the load: impact, muscles, throws, spins, and a call unlike the scene that it was built for."""
+"""Extremes of the load: impact, muscles, throws, spins, and calls whose inputs differ from those of the scene."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ PRESSURE_WAVE = 1.16
 
 
 def impact(law: type, dim: int, value: float, how: How) -> str:
-    """Long enough for the bounce, too short for a flight off the grid."""
+    """The run is long enough for the bounce and ends before the block leaves the grid."""
     case = Case(
         scene=bodies.scene(bodies.block(law, dim, height=0.5)),
         substeps=int(np.clip(60 / value, 60, 200)),
@@ -37,21 +37,21 @@ def sudden(sign: float):
     return cell
 
 
-def balance(law: type, dim: int, pull: float) -> np.ndarray:
-    """F of a free body in which the law balances a pull along x: the least energy over the stretches."""
+def balance(law: type, dim: int, active_stress: float) -> np.ndarray:
+    """F of a free body in which the law balances an active stress along x: the minimum of the energy over the stretches."""
     mu, lam = YOUNG / 2.6, 0.3 * YOUNG / (1.3 * 0.4)
 
     def energy(log: np.ndarray) -> float:
         s = np.exp(np.array([[log[0]] + (dim - 1) * [log[1]]]))
         own = DENSITIES[law.__name__](s, s.prod(-1), np.array([mu]), np.array([lam]))[0]
-        return (own + pull / 2 * s[0, 0] ** 2) / YOUNG
+        return (own + active_stress / 2 * s[0, 0] ** 2) / YOUNG
 
     log = minimize(energy, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-14}).x
     return np.diag(np.exp([log[0]] + (dim - 1) * [log[1]]))
 
 
 def stays(F: np.ndarray) -> Callable[[Run], None]:
-    """Within 1 % of the homogeneous deformation that is the exact answer."""
+    """Criterion: F is within 1 % of the exact homogeneous deformation."""
 
     def criterion(run: Run) -> None:
         off = np.abs(run.now.F @ np.linalg.inv(F) - np.eye(len(F))).max()

@@ -12,7 +12,7 @@ from .cells import BODY, Case, CriterionError, How, exact, judged, play, short, 
 from .rows import Row
 
 SAME = 0.01
-"""Most that a scaled motion may be off [cells]; rounding to float32 alone gives less than a tenth of it."""
+"""Largest deviation of a scaled motion [cells]; rounding to float32 causes less than a tenth of it."""
 
 
 def dropped(law: type, dim: int, mach: float, young: float = YOUNG, poisson: float = 0.3) -> Case:
@@ -28,7 +28,7 @@ def dropped(law: type, dim: int, mach: float, young: float = YOUNG, poisson: flo
 
 @functools.cache
 def bounce(law: type, dim: int, device: str) -> np.ndarray:
-    """Where the bounce of a block of 1e5 Pa ends in float64 [m]."""
+    """Final positions of the bounce of a block of 1e5 Pa in float64 [m]."""
     *_, end = states(dropped(law, dim, 0.1), How(device, torch.float64))
     return exact(end).x
 
@@ -51,7 +51,7 @@ def ratio(quantity: str, loaded: float):
 
     Args:
         quantity: ``young`` or ``density``.
-        loaded: Speed of the impact over the slower of the halves' wave speeds, which both can bear; if negative, over the faster.
+        loaded: Impact speed over the smaller wave speed of the two halves, which both withstand; if negative, over the larger one.
     """
 
     def cell(law: type, dim: int, value: float, how: How) -> str:

@@ -25,9 +25,9 @@ def step_of_block(law: type, dim: int, value: float, how: How) -> str:
 
 
 def rings(fraction: float) -> Callable[[Run], None]:
-    """Each particle vibrates within the bound of symplectic Euler, 1/√(1 − (dt/limit)²) of its first strain.
+    """Each particle vibrates within the bound of symplectic Euler, 1/√(1 − (dt/limit)²) of its initial strain.
 
-    There is no finite bound at the limit and above it; ten times the first strain stands in for it.
+    At the limit and above there is no finite bound; ten times the initial strain is used instead.
     """
     most = 1.05 / np.sqrt(max(1 - fraction**2, 0.01))
 
@@ -53,7 +53,7 @@ def step_of_cloud(law: type, dim: int, value: float, how: How) -> str:
         substeps=200,
         start=start,
         criteria=(FREE[-1], rings(value)),
-        looks=40,
+        calls=40,
     )
     return play(case, how)
 
@@ -70,7 +70,7 @@ def density_of_particles(law: type, dim: int, value: float, how: How) -> str:
 
 
 def tumbling(dim: int, rate: float = 0.02) -> Callable[[softmpm.State], softmpm.State]:
-    """A start that is stretched by 5 % and turns."""
+    """An initial state that is stretched by 5 % and spins."""
     F = np.diag([1.05] + [1.0] * (dim - 1))
     turn = bodies.spinning(dim, rate * WAVE / DX)
     return lambda state: bodies.affine(bodies.deformed(state, F), turn)
@@ -82,7 +82,7 @@ def long_flight(law: type, dim: int, value: float, how: How) -> str:
 
 
 def stands(run: Run) -> None:
-    """A body that rests on the floor does not creep: 0.01 cells sideways, one cell down."""
+    """A body that rests on the floor creeps by at most 0.01 cells sideways and one cell down."""
     moved = (run.matter.center(run.now) - run.matter.center(run.start)) / run.matter.dx
     down, aside = moved[1], np.linalg.norm(np.delete(moved, 1))
     if not (aside <= 0.01 and -1.0 <= down <= 0.01):
@@ -95,11 +95,11 @@ def long_rest(law: type, dim: int, value: float, how: How) -> str:
 
 
 ROUNDING = 0.01
-"""Most that a gradient in float32 may be off; it follows its own trajectory, which drifts by about 1e-9 of a turn per substep."""
+"""Largest relative deviation of a float32 gradient; its trajectory drifts by about 1e-9 of a turn per substep."""
 
 
 def gradient(law: type, dim: int, value: float, how: How) -> str:
-    """Derivative of a random weighting of the end with respect to a factor of E and one of the start's velocity."""
+    """Derivative of a random weighting of the final state with respect to factors on E and on the initial velocity."""
     body = bodies.box([7] * dim, [5 - dim] * dim, law)
     scene = bodies.scene(body, gravity=False, nodes=16)
     precise = replace(how, dtype=torch.float64)
@@ -121,7 +121,7 @@ def gradient(law: type, dim: int, value: float, how: How) -> str:
 def loss(
     scene: softmpm.Scene, dim: int, substeps: int, how: How, factors: torch.Tensor, backward: bool
 ) -> tuple[float, np.ndarray]:
-    """Weighted mean of the end's positions [cells], and its gradient with respect to the factors."""
+    """Weighted mean of the final positions [cells], and its gradient with respect to the factors."""
     model = make(scene, how)
     factors = factors.to(model.device, model.dtype).requires_grad_(backward)
     start, params = tumbling(dim, 0.002)(model.rest()), model.params()

@@ -1,6 +1,6 @@
 """The maps as pictures, one a page: a line for each law and dimension, a column for each value, a colour for each outcome.
 
-Colours are those of Okabe and Ito (2008), which readers with any colour vision tell apart; symbols repeat what they say.
+Colours are those of Okabe and Ito (2008), which are distinguishable with any colour vision; the text repeats the information.
 """
 
 from pathlib import Path
@@ -118,7 +118,7 @@ def draw_row(axes: Axes, row: Row, cells: list[dict]) -> None:
 
 
 def draw_limit(rows: list[dict], folder: Path) -> None:
-    """Measured over reported step limit against the stretch, and what is reported."""
+    """Ratio of the measured to the reported step limit, and the reported limit, against the stretch."""
     figure, three = plt.subplots(1, 3, figsize=(WIDTH, 3.5), layout="constrained", facecolor="white")
     panels = {
         "lone": "20 lone particles: measured / reported",

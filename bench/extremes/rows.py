@@ -1,4 +1,4 @@
-"""A row of a map: one quantity taken to its extremes, and every row there is."""
+"""A row of a map: one quantity varied up to its extremes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ class Row:
 
     name: str
     title: str
-    """What varies, and by which measure."""
+    """The varied quantity and its unit."""
     right: str
-    """What a right cell has to show."""
+    """Criteria of a right outcome."""
     values: tuple
     few: tuple
     """Values of the short map."""
     cell: Callable[[type, int, float, How], str]
-    """Law, dimension, value and setting to the note of a right cell."""
+    """Function of law, dimension, value and settings; returns the note of a right outcome."""
     dims: Callable[[float], tuple[int, ...]] = lambda value: (2, 3)
-    """Dimensions in which a value has a cell."""
+    """Dimensions in which a value is run."""
 
     counts_substeps: bool = False
-    """Whether the values are substeps, of which a run may have a limit."""
+    """True if the values are numbers of substeps, which ``How.longest`` bounds."""
 
     def label(self, value) -> str:
         if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""Extremes of the start: stretched, compressed, mirrored and turned bodies that are let go at rest."""
+"""Extremes of the start: stretched, compressed, mirrored and turned bodies, released at rest."""
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from .cells import FREE, Case, How, play
 from .rows import Row
 
 SIDE = {2: 6, 3: 3}
-"""Cells along an edge; ten times that still fits the grid."""
+"""Cells along an edge; ten times this length fits into the grid."""
 
 
 def released(law: type, dim: int, F: np.ndarray, how: How) -> str:

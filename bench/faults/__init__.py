@@ -1,1 +1,1 @@
-"""Fault scripts: what a run and its files survive. ``python -m bench.faults`` runs the full round of all of them."""
+"""Fault injection: robustness of a run and its files. ``python -m bench.faults`` runs all scripts in full."""

@@ -1,4 +1,4 @@
-"""All fault scripts: ``python -m bench.faults [--share 0.1]``."""
+"""All fault-injection scripts: ``python -m bench.faults [--share 0.1]``."""
 
 from bench.faults import common, corruption, flips, hostile, kills
 

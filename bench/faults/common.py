@@ -1,4 +1,4 @@
-"""What the fault scripts share: the smallest run that has every phase, forked children to run it in, tables of outcomes."""
+"""Common parts of the fault scripts: the smallest run that has every phase, forked child processes, tables of outcomes."""
 
 import argparse
 import collections
@@ -35,37 +35,37 @@ TINY = [
     *("learning.epochs=1", "learning.batches=1", "learning.simulations=2", "train.iterations=4"),
 ]
 LIMIT = 60.0
-"""A child that lives longer [s] counts as hung; an undisturbed one takes about a second."""
+"""Time limit of a child [s], beyond which it counts as hung; an undisturbed one takes about a second."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child ended."""
+    """End of a child process."""
 
     code: int
     """Exit code; minus the signal that killed it."""
-    said: str
+    output: str
     """Its stdout and stderr."""
     hung: bool
     megabytes: float = 0.0
-    """Memory that it took beyond that of this process."""
+    """Memory [MB] beyond that of this process."""
 
 
 def forked(work: Callable[[], None], during: Callable[[int], None] = lambda pid: None, limit=LIMIT) -> Ended:
-    """Run ``work`` in a child, and ``during`` with its process id meanwhile in this process."""
-    ears, mouth = os.pipe()  # holds 64 kB; a file would be subject to a limit on the size of files
+    """Run ``work`` in a child process, and meanwhile ``during`` with its process id in this process."""
+    reader, writer = os.pipe()  # holds 64 kB; a file would be subject to a limit on the size of files
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the child answers them
     pid = os.fork()
     if pid == 0:
         code = 70
         try:
-            os.dup2(mouth, 1)
-            os.dup2(mouth, 2)
+            os.dup2(writer, 1)
+            os.dup2(writer, 2)
             code = _code_of(work)
         finally:
             os._exit(code)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    os.close(mouth)
+    os.close(writer)
     during(pid)
     end = time.monotonic() + limit
     while (found := os.wait4(pid, os.WNOHANG))[0] == 0 and time.monotonic() < end:
@@ -74,8 +74,8 @@ def forked(work: Callable[[], None], during: Callable[[int], None] = lambda pid:
     if hung:
         os.kill(pid, signal.SIGKILL)
         found = os.wait4(pid, 0)
-    with os.fdopen(ears, "rb") as said:
-        text = said.read().decode(errors="replace")
+    with os.fdopen(reader, "rb") as pipe:
+        text = pipe.read().decode(errors="replace")
     here = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     megabytes = (found[2].ru_maxrss - here) * 1024 / 1e6
     return Ended(os.waitstatus_to_exitcode(found[1]), text, hung, megabytes)
@@ -97,7 +97,7 @@ def _code_of(work: Callable[[], None]) -> int:
 
 
 def program(*arguments: str) -> Callable[[], None]:
-    """``python -m softmpm_learn`` with these arguments, for a child; with pictures and everything."""
+    """``python -m softmpm_learn`` with these arguments, as work of a child; pictures included."""
 
     def work() -> None:
         GlobalHydra.instance().clear()
@@ -111,13 +111,13 @@ def program(*arguments: str) -> Callable[[], None]:
 
 
 def fresh(folder: Path, *more: str) -> Callable[[], None]:
-    """The smallest run, into this folder."""
+    """The smallest run, as work of a child, written to this folder."""
     conf = _composed(*TINY, *more)
     return _training(lambda: conf, folder)
 
 
 def resume(folder: Path, iterations: int = 4) -> Callable[[], None]:
-    """Go on with the run in this folder."""
+    """Resume the run in this folder, as work of a child."""
     asked = dataclasses.replace(_composed(*TINY, f"train.iterations={iterations}"), resume=str(folder))
     overrides = [f"resume={folder}", f"train.iterations={iterations}"]
     return _training(lambda: app.resumed(asked, overrides), folder)
@@ -125,7 +125,7 @@ def resume(folder: Path, iterations: int = 4) -> Callable[[], None]:
 
 @functools.cache
 def _composed(*overrides: str) -> RunConf:
-    """What Hydra makes of them; most of the time of a child would go into that."""
+    """Configuration that Hydra composes, cached: composition would take most of the time of a child."""
     app.register()
     GlobalHydra.instance().clear()
     with initialize_config_dir(conf_dir(), version_base="1.3"):
@@ -150,7 +150,7 @@ def _training(conf: Callable[[], RunConf], folder: Path) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def workshop() -> Iterator[Path]:
-    """An empty folder, removed at the end; one thread, so that equal runs have equal bits."""
+    """An empty folder, removed at the end; a single thread, so that equal runs are bitwise identical."""
     torch.set_num_threads(1)
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     here = os.getcwd()
@@ -163,9 +163,9 @@ def workshop() -> Iterator[Path]:
 
 
 def fingerprint(folder: Path) -> dict[str, object]:
-    """What two equal runs have equal, to the bit: metrics, checkpoint, replay buffer and recorded numbers."""
+    """Data in which two equal runs agree to the bit: metrics, checkpoint, replay buffer and recorded numbers."""
     saved = checkpoint.load(folder)
-    del saved["seals"]["timing.csv"]  # of the clock
+    del saved["seals"]["timing.csv"]  # depends on the clock
     found: dict[str, object] = {"metrics.csv": (folder / "metrics.csv").read_bytes()}
     found |= {f"checkpoint {k}": v for k, v in _flat(saved)}
     for path in sorted((folder / "replay").iterdir()):
@@ -191,7 +191,7 @@ def _flat(value: object, path: str = "") -> Iterable[tuple[str, object]]:
 
 
 def killed_run(folder: Path, rows: int = 3) -> None:
-    """A run killed by SIGKILL once metrics.csv has so many rows."""
+    """A run killed by SIGKILL once metrics.csv has ``rows`` rows."""
 
     def kill(pid: int) -> None:
         metrics = folder / "metrics.csv"
@@ -200,11 +200,11 @@ def killed_run(folder: Path, rows: int = 3) -> None:
         os.kill(pid, signal.SIGKILL)
 
     ended = forked(fresh(folder), kill)
-    assert ended.code == -signal.SIGKILL, ended.said
+    assert ended.code == -signal.SIGKILL, ended.output
 
 
 def same(folder: Path, whole: dict[str, object]) -> str:
-    """``same``, or the first thing that differs."""
+    """``same``, or the first item that differs."""
     found = fingerprint(folder)
     for name in whole.keys() | found.keys():
         if whole.get(name) != found.get(name):
@@ -212,10 +212,10 @@ def same(folder: Path, whole: dict[str, object]) -> str:
     return "same"
 
 
-def unclear(said: str) -> bool:
-    """Whether an error says too little: a traceback, a fault of the program, a bare number of an error."""
+def unclear(output: str) -> bool:
+    """True for an uninformative error: a traceback, an internal error, a bare error number."""
     words = ("Traceback", "fault of the program", "[Errno", "ModuleNotFoundError")
-    return any(word in said for word in words)
+    return any(word in output for word in words)
 
 
 class Table:
@@ -257,7 +257,7 @@ T = TypeVar("T")
 
 
 def some(trials: list[T], share: float) -> list[T]:
-    """So many of them, always the same; all for a share of 1."""
+    """A share of the trials, always the same ones; all of them for a share of 1."""
     return trials if share == 1.0 else random.Random(0).sample(trials, math.ceil(len(trials) * share))
 
 
@@ -269,7 +269,7 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
 
 
 def report(*rounds: Callable[[float], Table]) -> None:
-    """Print the tables of some scripts, and end with exit code 1 if a trial had a bad outcome."""
+    """Print the tables of the given scripts; exit with code 1 if a trial had a bad outcome."""
     parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__)
     parser.add_argument("--share", type=float, default=1.0, help="share of the trials, 1 for all")
     share = parser.parse_args().share

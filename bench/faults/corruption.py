@@ -1,6 +1,6 @@
-"""One file of a finished run is damaged, emptied, deleted or that of another run; then the run goes on.
+"""Damaged run folders: one file of a finished run is corrupted, emptied, deleted or replaced, and the run resumed.
 
-It must be refused with the file's name, or say what is lost, or end with the numbers of an undisturbed run.
+The run must be refused with the name of the file, or report the loss, or end with the numbers of an undisturbed run.
 
     python -m bench.faults.corruption [--share 0.1]
 """
@@ -16,11 +16,11 @@ FILES = (
     *("run.h5", "replay/00000002.h5", "replay/00000003.h5", ".lock", "softmpm_learn.log"),
 )
 FLIPS, CUTS = 15, 4
-"""Of each file, beside an empty one, a deleted one and that of another run: 22 harms for each of ten files."""
+"""Corruptions of each file, besides emptying, deleting and replacing it: 22 in all for each of ten files."""
 
 
 def main(share: float = 1.0) -> common.Table:
-    """The whole round, or a share of it."""
+    """All trials, or a share of them."""
     table = common.Table("corrupted run folders", ["silently different", "unclear", "hang"])
     with common.workshop() as folder:
         whole = prepare(folder)
@@ -31,15 +31,15 @@ def main(share: float = 1.0) -> common.Table:
 
 
 def prepare(folder: Path) -> dict[str, object]:
-    """A run of four iterations, another one of another seed, and the first one's end after five."""
+    """Run four iterations, the same with another seed, and five iterations without interruption."""
     for name, more in (("run", ()), ("other", ("train.seed=1",)), ("whole", ("train.iterations=5",))):
         ended = common.forked(common.fresh(folder / name, *more))
-        assert ended.code == 0, ended.said
+        assert ended.code == 0, ended.output
     return common.fingerprint(folder / "whole")
 
 
 def harms(folder: Path, name: str) -> list[tuple[str, bytes | None]]:
-    """What the file is replaced by; None deletes it."""
+    """Contents that replace the file; None deletes it."""
     data, chance = (folder / "run" / name).read_bytes(), random.Random(name)
     found: list[tuple[str, bytes | None]] = [("empty", b""), ("deleted", None)]
     found.append(("of another run", (folder / "other" / name).read_bytes()))
@@ -63,16 +63,16 @@ def outcome(
 def judged(run: Path, name: str, ended: common.Ended, whole: dict[str, object], kind: str) -> tuple[str, str]:
     if ended.hung:
         return "hang", kind
-    if common.unclear(ended.said):
-        return "unclear", f"{kind}: {ended.said}"
-    named = str(run) in ended.said and Path(name).name.partition(".")[0] in ended.said
+    if common.unclear(ended.output):
+        return "unclear", f"{kind}: {ended.output}"
+    named = str(run) in ended.output and Path(name).name.partition(".")[0] in ended.output
     if ended.code:
-        return ("refused" if named else "unclear"), f"{kind}: {ended.said}"
+        return ("refused" if named else "unclear"), f"{kind}: {ended.output}"
     found = common.same(run, whole)
     if found == "same":
         return "same numbers", ""
-    said = named and "is missing" in ended.said
-    return ("said what is lost" if said else "silently different"), f"{kind}: {found}: {ended.said}"
+    reported = named and "is missing" in ended.output
+    return ("reported the loss" if reported else "silently different"), f"{kind}: {found}: {ended.output}"
 
 
 if __name__ == "__main__":

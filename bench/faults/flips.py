@@ -1,4 +1,4 @@
-"""One bit flipped in the recording of a killed run, or the recording cut short: it is read at once or refused at once.
+"""Damaged recordings of a killed run, with one bit flipped or truncated: each is read or refused without delay.
 
 python -m bench.faults.flips [--share 0.1]
 """
@@ -13,11 +13,11 @@ import softmpm
 
 FLIPS, CUTS = 60, 30
 SECONDS = 5.0
-"""Reading takes longer than this: it hangs."""
+"""Time limit of reading [s], beyond which it counts as hung."""
 
 
 def read_all(path: Path) -> None:
-    """Read every number of a recording; one sentence if it is refused."""
+    """Read every number of a recording; print one sentence if it is refused."""
     try:
         with softmpm.Recording(path) as recording:
             for iteration in recording.episodes:
@@ -28,7 +28,7 @@ def read_all(path: Path) -> None:
 
 
 def main(share: float = 1.0) -> common.Table:
-    """The whole round, or a share of it."""
+    """All trials, or a share of them."""
     chance, table = random.Random(0), common.Table("damaged recordings of a killed run", ["hang", "unclear"])
     with common.workshop() as folder:
         common.killed_run(folder / "run")
@@ -50,10 +50,10 @@ def outcome(path: Path) -> tuple[str, str]:
     began = time.monotonic()
     ended = common.forked(lambda: read_all(path), limit=SECONDS)
     if ended.hung or time.monotonic() - began > SECONDS:
-        return "hang", ended.said
-    if ended.code or common.unclear(ended.said) or (ended.said and path.name not in ended.said):
-        return "unclear", ended.said
-    return ("refused" if "refused" in ended.said else "read"), ""
+        return "hang", ended.output
+    if ended.code or common.unclear(ended.output) or (ended.output and path.name not in ended.output):
+        return "unclear", ended.output
+    return ("refused" if "refused" in ended.output else "read"), ""
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Run folders that somebody else made to do harm: links and pipes, interpolations, bombs, with hashes that are right.
+"""Hostile run folders: links and pipes, interpolations, decompression bombs, with valid hashes.
 
-Nothing may be written or deleted outside the folder, no variable of the environment may leak into it, nothing may hang or fill the
-memory, and each refusal names the file.
+No file outside the folder may be written or deleted, no environment variable may leak into it, no run may hang or exhaust the memory,
+and each refusal names the file.
 
     python -m bench.faults.hostile [--share 0.1]
 """
@@ -22,7 +22,7 @@ from softmpm_learn import checkpoint
 
 SECRET = "a-secret-of-the-environment"
 MEMORY = 600.0
-"""A child may take so much more than this process [MB]."""
+"""Largest memory of a child beyond that of this process [MB]."""
 LINKED = (
     *(".lock", "config.yaml", "metrics.csv", "timing.csv", "run.h5", "checkpoint.pt", "checkpoint.previous.pt"),
     *("softmpm_learn.log", "error.txt", "replay/00000003.h5", "run.h5.new", "metrics.csv.new", "timing.csv.new"),
@@ -52,13 +52,13 @@ TEXTS = {
 
 
 def main(share: float = 1.0) -> common.Table:
-    """The whole round, or a share of it."""
+    """All trials, or a share of them."""
     bad = ["wrote elsewhere", "leak", "memory", "hang", "unclear"]
     table = common.Table("hostile run folders", bad)
     os.environ["SECRET"] = SECRET
     with common.workshop() as folder:
         ended = common.forked(common.fresh(folder / "run"))
-        assert ended.code == 0, ended.said
+        assert ended.code == 0, ended.output
         for kind, name, harm in common.some(trials(), share):
             table.add(kind, *outcome(folder, name, harm))
     return table
@@ -92,7 +92,7 @@ def outcome(folder: Path, name: str, harm: Callable[[Path, Path], None]) -> tupl
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Everything that is not in the harmed run."""
+    """Contents of all files outside the harmed run."""
     found = (path for path in folder.rglob("*") if path.is_file() and "harmed" not in path.parts)
     return {str(path): path.read_bytes() for path in found}
 
@@ -100,23 +100,23 @@ def contents(folder: Path) -> dict[str, bytes]:
 def judged(
     folder: Path, run: Path, ended: common.Ended, before: dict[str, bytes], name: str
 ) -> tuple[str, str]:
-    said = f"{name}: {ended.said}"
+    message = f"{name}: {ended.output}"
     if contents(folder) != before:
-        return "wrote elsewhere", said
+        return "wrote elsewhere", message
     if ended.hung:
-        return "hang", said
+        return "hang", message
     files = [path.read_bytes() for path in run.rglob("*") if path.is_file() and not path.is_symlink()]
-    if SECRET in ended.said or any(SECRET.encode() in data for data in files):
-        return "leak", said
+    if SECRET in ended.output or any(SECRET.encode() in data for data in files):
+        return "leak", message
     if ended.megabytes > MEMORY:
-        return "memory", f"{ended.megabytes:.0f} MB: {said}"
-    if ended.code and (common.unclear(ended.said) or str(run) not in ended.said):
-        return "unclear", said
+        return "memory", f"{ended.megabytes:.0f} MB: {message}"
+    if ended.code and (common.unclear(ended.output) or str(run) not in ended.output):
+        return "unclear", message
     return ("refused" if ended.code else "went on"), ""
 
 
 def symbolic(name: str) -> Callable[[Path, Path], None]:
-    """The file is elsewhere, and a link leads there."""
+    """The file is moved out of the folder and replaced by a symbolic link to it."""
 
     def harm(run: Path, elsewhere: Path) -> None:
         if (run / name).exists():
@@ -170,13 +170,13 @@ def edited(old: str, new: str) -> Callable[[Path, Path], None]:
 
 
 def resealed(run: Path, **changes: object) -> None:
-    """Write the checkpoint again with other content and the right hash."""
+    """Rewrite the checkpoint with changed content and a valid hash."""
     checkpoint.save(run, checkpoint.load(run) | changes)
     (run / checkpoint.PREVIOUS).unlink()
 
 
 def replay_bomb(run: Path, elsewhere: Path) -> None:
-    """2 kB that declare 950 MB, with the right hash."""
+    """2 kB that declare 950 MB, with a valid hash."""
     path = run / "replay" / "00000003.h5"
     with h5py.File(path, "w") as file:
         file.create_dataset("velocity", (2400, 2, 222, 222), np.float32, chunks=True, compression=1)
@@ -197,7 +197,7 @@ def stride_bomb(run: Path, elsewhere: Path) -> None:
 
 
 def packed_bomb(run: Path, elsewhere: Path) -> None:
-    """A checkpoint of 0.5 MB that unpacks to 500 MB."""
+    """A checkpoint of 0.5 MB that decompresses to 500 MB."""
     import zipfile
 
     buffer = io.BytesIO()
@@ -229,7 +229,7 @@ def not_finite(run: Path, elsewhere: Path) -> None:
 
 
 def recording_bomb(run: Path, elsewhere: Path) -> None:
-    """Tables that declare a million rows that were never written."""
+    """Tables that declare a million rows which were never written."""
     with h5py.File(run / "run.h5", "r+") as file:
         for name in ("x", "v", "strain"):
             table = file[f"frame/{name}"]

@@ -1,7 +1,7 @@
-"""A run is killed, interrupted or meets a full disk, and goes on: it must end with the bits of an undisturbed one.
+"""Interrupted runs: killed, stopped by a signal or out of disk space, then resumed. They must end bitwise equal to an undisturbed run.
 
-Kills come just before a file operation or at a random time, in forked children and in real processes; signals at a random time,
-pictures included, must be answered by a sentence.
+Kills occur just before a file operation or at a random time, in forked children and in separate processes. A signal at a random time,
+also while pictures are drawn, must lead to an explanatory message.
 
     python -m bench.faults.kills [--share 0.1]
 """
@@ -26,7 +26,7 @@ _COUNTED = {"open", "os.rename", "os.remove", "os.truncate", "os.mkdir"}
 
 
 def main(share: float = 1.0) -> common.Table:
-    """The whole round, or a share of it."""
+    """All trials, or a share of them."""
     table, chance = common.Table("kills, signals and full disks", BAD), random.Random(0)
 
     def times(count: int) -> range:
@@ -35,7 +35,7 @@ def main(share: float = 1.0) -> common.Table:
     with common.workshop() as folder:
         began = time.monotonic()
         ended = common.forked(common.fresh(folder / "whole"))
-        assert ended.code == 0, ended.said
+        assert ended.code == 0, ended.output
         seconds, whole = time.monotonic() - began, common.fingerprint(folder / "whole")
         run = folder / "run"
         for _ in times(RANDOM):
@@ -65,7 +65,7 @@ def main(share: float = 1.0) -> common.Table:
 
 
 def after(seconds: float, number: int) -> Callable[[int], None]:
-    """Send a signal to a child after so long."""
+    """Function that sends a signal to a child after ``seconds``."""
 
     def during(pid: int) -> None:
         time.sleep(seconds)
@@ -75,13 +75,13 @@ def after(seconds: float, number: int) -> Callable[[int], None]:
 
 
 def goes_on(run: Path, first: common.Ended, whole: dict[str, object]) -> tuple[str, str]:
-    """Resume, and compare with the undisturbed run; the folder is removed."""
+    """Resume, compare with the undisturbed run, and remove the folder."""
     resumed = common.forked(common.resume(run) if (run / "config.yaml").exists() else common.fresh(run))
     try:
         if first.hung or resumed.hung:
-            return "hang", first.said + resumed.said
+            return "hang", first.output + resumed.output
         if resumed.code:
-            return "differs", resumed.said
+            return "differs", resumed.output
         found = common.same(run, whole)
         return ("same" if found == "same" else "differs"), found
     finally:
@@ -115,11 +115,11 @@ def counted(run: Path) -> int:
 
     ended = common.forked(work)
     shutil.rmtree(run)
-    return int(ended.said.rpartition("operations: ")[2])
+    return int(ended.output.rpartition("operations: ")[2])
 
 
 def dying(work: Callable[[], None], run: Path, place: int) -> Callable[[], None]:
-    """The work, killed before the file operation of this number."""
+    """The work, killed just before the file operation with this number."""
     left = [place]
 
     def touch() -> None:
@@ -135,7 +135,7 @@ def dying(work: Callable[[], None], run: Path, place: int) -> Callable[[], None]
 
 
 def real(run: Path, seconds: float) -> common.Ended:
-    """``python -m softmpm_learn`` in a process of its own, killed after so long."""
+    """``python -m softmpm_learn`` in a separate process, killed after ``seconds``."""
     words = [sys.executable, "-m", "softmpm_learn", *common.TINY, f"hydra.run.dir={run}"]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         time.sleep(seconds)
@@ -144,17 +144,17 @@ def real(run: Path, seconds: float) -> common.Ended:
 
 
 def answered(ended: common.Ended) -> tuple[str, str]:
-    """Whether a signal was answered by a sentence: on the iterations it stopped after, on what is saved, or by a finished run."""
+    """Outcome of a signal: answered by a message (iterations done, state saved, or run finished), or not."""
     if ended.hung:
-        return "hang", ended.said
-    if common.unclear(ended.said) or "Exception ignored" in ended.said:
-        return "unclear", ended.said
+        return "hang", ended.output
+    if common.unclear(ended.output) or "Exception ignored" in ended.output:
+        return "unclear", ended.output
     words = ("To go on:", "interrupted. ", "Everything is in")
-    return ("answered" if any(word in ended.said for word in words) else "silent"), ended.said
+    return ("answered" if any(word in ended.output for word in words) else "silent"), ended.output
 
 
 def limited(work: Callable[[], None], size: int) -> Callable[[], None]:
-    """The work, where no file can be larger than ``size`` bytes: as on a full disk, the write fails."""
+    """The work with files limited to ``size`` bytes: the write fails as on a full disk."""
 
     def runs() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -165,11 +165,11 @@ def limited(work: Callable[[], None], size: int) -> Callable[[], None]:
 
 
 def refused(ended: common.Ended, run: Path) -> tuple[str, str]:
-    """Whether a run without room ended with a sentence that names the file, or did not need the room."""
+    """Outcome of a run without disk space: a message that names the file, or no need of the space."""
     if ended.hung:
-        return "hang", ended.said
-    if ended.code and (common.unclear(ended.said) or str(run) not in ended.said):
-        return "unclear", ended.said
+        return "hang", ended.output
+    if ended.code and (common.unclear(ended.output) or str(run) not in ended.output):
+        return "unclear", ended.output
     return "refused", ""
 
 

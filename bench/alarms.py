@@ -1,8 +1,9 @@
-"""What do alarms cost? `python bench/watch.py [--device cuda] [--json bench/results/watch.json]`
+"""Cost of the alarms: `python bench/alarms.py [--device cuda] [--json bench/results/alarms.json]`
 
-The same substeps with all alarms, without those between chunks (neighbours at rest, running step limit), and with kernels that are
-compiled without the checks of kernels/physics/status.py as well, one after the other in one run: medians and their ratios. The last
-kind of kernel exists only here. The cube falls or, in every second row, also turns, so that its order is renewed.
+Time of a substep with all alarms, without the alarms between chunks (distance of rest neighbours, running step limit), and with kernels
+compiled without the checks of kernels/physics/status.py; the three are timed in turn within one run. Reported are medians and their
+ratios. Kernels without checks exist in this benchmark only. The cube falls; in every second row it also turns, so that its particles
+are re-sorted.
 """
 
 import dataclasses
@@ -24,29 +25,29 @@ from softmpm.kernels.structs import types
 
 
 def unchecked(model: softmpm.Model):
-    """Replace the checks by functions that say yes, for a specification that differs in its name only."""
+    """Compile the kernels of a model with checks that always succeed, under a specification that differs only in its name."""
     spec = model.spec
     t = types(spec.dim, spec.dtype)
-    ivec, vec, mat, Scale = t.ivec, t.vec, t.mat, t.Scale
+    ivec, vec, mat, Constants = t.ivec, t.vec, t.mat, t.Constants
 
     @wp.func
-    def running(watch: wp.array(dtype=wp.int64), world: int) -> bool:
+    def running(words: wp.array(dtype=wp.int64), world: int) -> bool:
         return True
 
     @wp.func
-    def valid(scale: Scale, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
+    def valid(constants: Constants, corner: ivec, shape: ivec, fx: vec, base: ivec, H: mat) -> bool:
         return True
 
     report_of, check_of = status.report, status.check
     status.report = lambda *_: SimpleNamespace(running=running, report=report_of(spec.dim, spec.dtype).report)
-    # Nobody complains of a state that is valid:
+    # Every state is valid, so this function is never called:
     status.check = lambda *_: SimpleNamespace(valid=valid, report_invalid=check_of(spec).report_invalid)
     transfer(spec) if model.scheme == "plain" else fused(spec)
     status.report, status.check = report_of, check_of
 
 
 def variants(scene: softmpm.Scene, device: torch.device, scheme: str) -> dict[str, softmpm.Model]:
-    """The same model with all alarms, with those of each substep only, and with none."""
+    """One model with all alarms, one with the alarms of each substep only, and one without any."""
     few = softmpm.Alarms(gap=None, step=None)
     settings = {"all": None, "substep": few, "none": few}
     models = {
