@@ -101,7 +101,7 @@ def _simulate(
     if not is_capturing(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
         check_inputs_bounds(given)
-    values = derive(model, activation, params, given, horizon)
+    values = derive(model, start, activation, params, given, horizon)
     tensors = (*values.values(), *start[:4])
     needed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     call = _Call(model, horizon, tuple(values), needed, failures)

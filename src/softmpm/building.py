@@ -115,7 +115,9 @@ def check_given(scene: Scene, inputs: Iterable[str]) -> tuple[str, ...]:
             if len(owners[axis]) == 0:
                 raise ValueError(f"inputs has {name!r}, but the scene has no {OWNED[axis]}; leave it out.")
     # What kernels take in any case is not compiled in another way:
-    return tuple(name for name in Inputs._fields if name in names and name not in ("strength", "velocity"))
+    return tuple(
+        name for name in Inputs._fields if name in names and name not in ("strength", "velocity", "position")
+    )
 
 
 OWNED = {"wall": "walls", "muscle": "muscles", "driven": "driven particles"}

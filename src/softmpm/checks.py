@@ -98,7 +98,8 @@ def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
     given = {name: value for name, value in _fields("inputs", inputs, Inputs._fields) if value is not None}
     for name, value in given.items():
         need(
-            name in model.spec.given or name == "strength" or name in model.defaults,
+            name in (*model.spec.given, *model.defaults, "strength")
+            or (name == "position" and "velocity" in model.defaults),
             f"inputs.{name} was given, but the model's kernels do not take it; build the model with inputs=({name!r},).",
         )
         dtype = torch.float64 if QUANTITIES[name].double else model.dtype
@@ -123,6 +124,10 @@ def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
                     else "."
                 )
             )
+    need(
+        not {"position", "velocity"} <= given.keys(),
+        "inputs.position and inputs.velocity were both given; give the driven particles one of them.",
+    )
     return given
 
 

@@ -42,6 +42,9 @@ class Inputs(NamedTuple):
     """Viscosity η of the material [Pa s], shape (world, particle)."""
     velocity: Tensor | None = None
     """Velocity of the driven particles [m/s], shape (control_step, world, driven, dim)."""
+    position: Tensor | None = None
+    """Position of the driven particles at the end of each control step [m], shape (control_step, world, driven, dim); they move there
+    at a constant velocity. In place of ``velocity``."""
     force: Tensor | None = None
     """External force on each particle [N], shape (control_step, world, particle, dim)."""
 
@@ -112,6 +115,7 @@ QUANTITIES = {
         default=lambda scene: [0.0] * scene.grid.dim,
         needed=lambda spec: spec.driven,
     ),
+    "position": Quantity(axes=("control_step", "world", "driven", "dim")),
     "force": Quantity(
         axes=("control_step", "world", "particle", "dim"), default=lambda scene: [0.0] * scene.grid.dim
     ),

@@ -8,7 +8,7 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
-from softmpm.state import Params
+from softmpm.state import Params, State
 
 
 def lame(params: Params) -> tuple[Tensor, Tensor]:
@@ -24,12 +24,17 @@ def masses(model: Model, params: Params) -> Tensor:
 
 
 def derive(
-    model: Model, activation: Tensor | None, params: Params, given: Values, horizon: Horizon
+    model: Model,
+    start: State,
+    activation: Tensor | None,
+    params: Params,
+    given: Values,
+    horizon: Horizon,
 ) -> Values:
     """Inputs of the kernels that a call sets, in the order of :data:`softmpm.inputs.INPUTS`; the others are in ``model.fixed``.
 
     Args:
-        activation, params: As in :func:`softmpm.simulate`.
+        start, activation, params: As in :func:`softmpm.simulate`.
         given: Fields of :class:`softmpm.Inputs` that are not None, already checked (checks.py).
         horizon: Length of the call; inputs that vary in time have a row for each of its control steps.
     """
@@ -44,6 +49,9 @@ def derive(
             found["decay"] = torch.exp(-value * model.scene.dt)
         elif name == "force":
             found["force"] = value / model.mass_unit
+        elif name == "position":
+            before = torch.cat([start.x[None, :, model.driven], value[:-1]])
+            found["velocity"] = (value - before) / (horizon.substeps * model.scene.dt)
         elif name == "wall_velocity":
             found["surface_velocity"] = value
         elif name not in ("strength", "wall_offset", "wall_normal"):

@@ -40,6 +40,7 @@ class Model:
         mass: Mass [kg] as the scene gives it, shape (particle,).
         mass_unit: Mass of the heaviest particle [kg], in which the kernels count, shape ().
         specific_volume: Rest volume per unit of mass [m³/kg], shape (particle,).
+        driven: Indices of the driven particles, shape (driven,).
         body: Index of each particle's body, shape (particle,).
         wall_constants: Numbers of the walls that lie in the parameters of a launch, by the names of the inputs.
         fixed: What the scene alone decides of the kernels' inputs, by name.
@@ -76,6 +77,7 @@ class Model:
         self.particle_count = sum(sizes)
         self.muscle_count, self.wall_count = len(scene.muscles), len(scene.walls)
         self.driven_count = len(scene.driven)
+        self.driven = torch.tensor(np.array(scene.driven, dtype=np.int64), device=device)
         self.node_count = math.prod(scene.grid.shape)
         self.body = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes)).to(device)
         self.exact_positions = np.concatenate([body.particles.positions for body in scene.bodies])

@@ -251,6 +251,9 @@ def simulate(
     steps = _control_steps(activation, inputs)
     for c in range(steps):
         row, now = None if activation is None else activation[c], _of_control_step(inputs, c, steps)
+        if now.position is not None:
+            way = now.position - state.x[:, torch.tensor(list(scene.driven))]
+            now = now._replace(velocity=way / (substeps * scene.dt), position=None)
         for s in range(substeps):
             time, duration = s * scene.dt, substeps * scene.dt
             state = step(scene, state, row, mu, lam, mass, now, time, duration)

@@ -273,10 +273,14 @@ def warp_solid(
         raise ValueError(
             f"a step takes inputs of one control step, got {steps}; take one row of each, two poses."
         )
+    if "position" in given:
+        raise ValueError(
+            "a step takes inputs.velocity of the driven particles, since it does not know their start."
+        )
     if not is_capturing(model):
         check_finite(None, activation)
         check_inputs_bounds(given)
-    return _warp_solid(model, derive(model, row, params, given, Horizon(1, 1)), requires_grad)
+    return _warp_solid(model, derive(model, model.rest(), row, params, given, Horizon(1, 1)), requires_grad)
 
 
 @on_its_gpu

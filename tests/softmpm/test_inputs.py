@@ -12,7 +12,7 @@ from softmpm import Inputs, reference
 
 GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
-TIMED = {"activation", "velocity", "force", *WALLS}
+TIMED = {"activation", "velocity", "position", "force", *WALLS}
 """Inputs with a first axis of control steps or poses."""
 STEPS = 3
 
@@ -54,6 +54,10 @@ def given(model: softmpm.Model, names, steps=STEPS, seed=7) -> dict[str, torch.T
         "strength": lambda: random("strength", 5.0, 12.0),
         "viscosity": lambda: random("viscosity", 0.01, 0.05),
         "velocity": lambda: random("velocity", -0.6, 0.6),
+        "position": lambda: (
+            torch.from_numpy(model.exact_positions[list(model.scene.driven)])
+            + random("position", -5e-3, 5e-3)
+        ),
         "force": lambda: random("force", -0.02, 0.02),
         "wall_offset": lambda: torch.tensor([w.offset for w in walls]) + random("wall_offset", -2e-3, 2e-3),
         "wall_normal": lambda: torch.tensor([w.normal for w in walls]) + random("wall_normal", -5e-3, 5e-3),
@@ -101,10 +105,10 @@ def test_every_input_is_the_references(dim, scheme, device):
     assert_equal(model, (*names, "strength", "velocity"), 1e-10)
 
 
-@pytest.mark.parametrize("name", [*GIVEN, "wall_velocity", "wall_offset", "strength", "velocity"])
+@pytest.mark.parametrize("name", [*GIVEN, "wall_velocity", "wall_offset", "strength", "velocity", "position"])
 def test_each_input_alone_is_the_references(name, scheme):
     """Kernels compiled for a single input: ≤ 1e-10."""
-    changes = {} if name == "velocity" else {"driven": ()}
+    changes = {} if name in ("velocity", "position") else {"driven": ()}
     model = build(scene(2, **changes), dtype=torch.float64, scheme=scheme, worlds=2, inputs=(name,))
     assert_equal(model, (name,), 1e-10)
 

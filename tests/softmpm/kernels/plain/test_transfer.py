@@ -31,7 +31,7 @@ class Bench:
         self.cpu = {k: t.detach().cpu().requires_grad_() for k, t in inputs.items()}
         state = softmpm.State(*(inputs[name].detach() for name in "xvCF"))
         params = softmpm.Params(*(inputs[name].detach() for name in softmpm.Params._fields))
-        values = derive(self.model, inputs["activation"].detach(), params, {}, Horizon(1, 1))
+        values = derive(self.model, state, inputs["activation"].detach(), params, {}, Horizon(1, 1))
         self.step = Substep(self.model)
         self.step.particle_inputs = particle_struct(self.model, self.model.fixed | values)
         self.step.grid_inputs = grid_struct(self.model, values)
