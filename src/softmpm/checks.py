@@ -166,9 +166,9 @@ def check_inputs_bounds(given: dict[str, Tensor]) -> None:
         least = math.nextafter(known.low, -math.inf) if known.closed else known.low
         if not (least < low and high < known.high):
             _demand(f"inputs.{name}", value, (value > least) & (value < known.high), known.rule)
-    normal = given.get("wall_normal")
-    if normal is not None:
-        _demand("inputs.wall_normal", normal.norm(dim=-1), normal.norm(dim=-1) > 0, "longer than 0")
+    for name in {"wall_normal", "direction"} & given.keys():
+        length = given[name].norm(dim=-1)
+        _demand(f"the length of inputs.{name}", length, length > 0, "> 0")
 
 
 def check_horizon(steps: int, substeps: int) -> Horizon:

@@ -241,6 +241,12 @@ def test_inputs_that_a_model_cannot_take():
     ):
         with pytest.raises(ValueError, match=said):
             call(**inputs)
+    for name in ("wall_normal", "direction"):
+        steered = build(scene(2, driven=()), inputs=(name,))
+        zero = torch.zeros(steered.shape_of(name, 1), dtype=torch.float64 if name == "wall_normal" else None)
+        inputs = Inputs(**{name: zero})
+        with pytest.raises(ValueError, match=rf"the length of inputs.{name} must be > 0, but .* is 0"):
+            softmpm.simulate(steered, steered.rest(), None, steered.params(), substeps=1, inputs=inputs)
     offsets = torch.zeros(4, 1, wall, dtype=torch.float64)
     activation = torch.zeros(2, 2, model.muscle_count)
     inputs = Inputs(wall_offset=offsets)

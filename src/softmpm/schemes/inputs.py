@@ -78,10 +78,10 @@ class InputsAdj:
     def __init__(self, model: Model, wanted: RequestedGrads, control_steps: int):
         self.model, self.wanted = model, wanted
         self.inputs = tuple(one for one in differentiable(model.spec) if one.group in wanted)
-        self.names = [one.name for one in self.inputs if is_particle_scalar(one)]
+        names = [one.name for one in self.inputs if is_particle_scalar(one)]
         lead = (model.worlds, model.particle_count)
-        self.scalars = torch.zeros(len(self.names), *lead, dtype=model.dtype, device=model.device)
-        self.tensors: Values = dict(zip(self.names, self.scalars, strict=True))
+        self.scalars = torch.zeros(len(names), *lead, dtype=model.dtype, device=model.device)
+        self.tensors: Values = dict(zip(names, self.scalars, strict=True))
         for one in self.inputs:
             if one.name not in self.tensors:
                 shape = shape_of(model, one, control_steps)

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.structs import types
 
 NEWTON_STEPS = {"float32": 2, "float64": 3}  # each doubles the digits of a start that has a few
@@ -66,6 +67,7 @@ def _polar2(dtype: str) -> SimpleNamespace:
 def _polar3(dtype: str) -> SimpleNamespace:
     t = types(3, dtype)
     real, vec, mat, divide = t.real, t.vec, t.mat, t.divide
+    cofactor = kinematics(3, dtype).cofactor
     quat = wp.types.vector(4, real)  # (w, x, y, z), unit
     steps = NEWTON_STEPS[dtype]
     close = 1e-4 if dtype == "float32" else 1e-6  # the eigenvalue need not be better: (R3) finishes
@@ -79,16 +81,6 @@ def _polar3(dtype: str) -> SimpleNamespace:
     @wp.func
     def normalized(q: quat) -> quat:
         return divide(real(1.0), wp.length(q)) * q
-
-    @wp.func
-    def cofactor(F: mat) -> mat:
-        a = vec(F[0, 0], F[0, 1], F[0, 2])
-        b = vec(F[1, 0], F[1, 1], F[1, 2])
-        c = vec(F[2, 0], F[2, 1], F[2, 2])
-        bc = wp.cross(b, c)
-        ca = wp.cross(c, a)
-        ab = wp.cross(a, b)
-        return mat(bc[0], bc[1], bc[2], ca[0], ca[1], ca[2], ab[0], ab[1], ab[2])
 
     @wp.func
     def largest_eigenvalue(F: mat) -> real:

@@ -1,5 +1,7 @@
 """Stress of each law against NumPy; its adjoint against finite differences, for a random cotangent."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -127,61 +129,35 @@ def test_stress_adj_is_the_finite_difference(law, dim, device):
         assert np.abs(got[n].numpy() - want).max() / np.abs(want).max() < 1e-7, name
 
 
+def pull_along(fibre, F, p):
+    """τ = p (Fd)(Fd)ᵀ."""
+    f = (F @ fibre[:, :, None])[..., 0]
+    return p[:, None, None] * f[:, :, None] * f[:, None, :]
+
+
+def push_from_inside(fibre, F, p):
+    """τ = −p J I."""
+    return -(p * torch.linalg.det(F))[:, None, None] * torch.eye(F.shape[-1], dtype=F.dtype)
+
+
+ACTUATORS = {"muscle": pull_along, "pressure": push_from_inside}
+
+
+@pytest.mark.parametrize("kind", ACTUATORS)
 @pytest.mark.parametrize("dim", [2, 3])
-def test_muscle_stress_and_its_adjoint(dim, device):
-    """τ = p (Fd)(Fd)ᵀ, and the derivatives of ⟨W, τ⟩ for random W, as PyTorch finds them."""
-    t, blocks, eye = (
-        types(dim, "float64"),
-        actuator("muscle", dim, "float64"),
-        torch.eye(dim, dtype=torch.float64),
-    )
-    generator = torch.Generator().manual_seed(2)
-    H, W = torch.randn(2, 6, dim, dim, generator=generator, dtype=torch.float64)
-    d = torch.nn.functional.normalize(torch.randn(6, dim, generator=generator, dtype=torch.float64), dim=1)
-    active_stress = torch.tensor([1.5, -0.7, 0.0, 2.0, 1.0, -3.0], dtype=torch.float64)
-    given = ((H.to(device), t.mat), (d.to(device), t.vec), (active_stress.to(device), t.real))
-
-    def stress(F, active_stress):
-        f = (F @ d[:, :, None])[..., 0]
-        return active_stress[:, None, None] * f[:, :, None] * f[:, None, :]
-
-    got = apply(blocks.stress, t.mat, (dim, dim), *given).cpu()
-    torch.testing.assert_close(got, stress(eye + H, active_stress), rtol=1e-13, atol=1e-13)
-
-    stress_adj, flat = blocks.stress_adj, wp.types.vector(dim * dim + 1, wp.float64)
-
-    @wp.func
-    def flattened(H: t.mat, fibre: t.vec, active_stress: t.real, adj_tau: t.mat) -> flat:
-        adj = stress_adj(H, fibre, active_stress, adj_tau)
-        out = flat()
-        for i in range(dim):
-            for j in range(dim):
-                out[i * dim + j] = adj.F[i, j]
-        out[dim * dim] = adj.active_stress
-        return out
-
-    adj = apply(flattened, flat, (dim * dim + 1,), *given, (W.to(device), t.mat)).cpu()
-    F, p = (eye + H).requires_grad_(), active_stress.clone().requires_grad_()
-    want = torch.autograd.grad((W * stress(F, p)).sum(), (F, p))
-    torch.testing.assert_close(
-        adj, torch.cat([want[0].flatten(1), want[1][:, None]], 1), rtol=1e-12, atol=1e-12
-    )
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_pressure_and_its_adjoint(dim, device):
-    """τ = −p J I, and the derivatives of ⟨W, τ⟩ for random W, as PyTorch finds them."""
-    t, blocks = types(dim, "float64"), actuator("pressure", dim, "float64")
+def test_active_stress_and_its_adjoint(kind, dim, device):
+    """The stress of each actuator, and the derivatives of ⟨W, τ⟩ for random W, as PyTorch finds them."""
+    t, blocks = types(dim, "float64"), actuator(kind, dim, "float64")
     generator, eye = torch.Generator().manual_seed(2), torch.eye(dim, dtype=torch.float64)
     H, W = torch.randn(2, 6, dim, dim, generator=generator, dtype=torch.float64)
+    d = torch.nn.functional.normalize(torch.randn(6, dim, generator=generator, dtype=torch.float64), dim=1)
     p = torch.tensor([1.5, -0.7, 0.0, 2.0, 1.0, -3.0], dtype=torch.float64)
-    given = ((H.to(device), t.mat), (torch.zeros(6, dim).double().to(device), t.vec), (p.to(device), t.real))
-
-    def stress(F, p):
-        return -(p * torch.linalg.det(F))[:, None, None] * eye
+    given = ((H.to(device), t.mat), (d.to(device), t.vec), (p.to(device), t.real))
+    stress = functools.partial(ACTUATORS[kind], d)
 
     got = apply(blocks.stress, t.mat, (dim, dim), *given).cpu()
     torch.testing.assert_close(got, stress(eye + H, p), rtol=1e-12, atol=1e-12)
+
     stress_adj, flat = blocks.stress_adj, wp.types.vector(dim * dim + 1, wp.float64)
 
     @wp.func
@@ -197,9 +173,8 @@ def test_pressure_and_its_adjoint(dim, device):
     adj = apply(flattened, flat, (dim * dim + 1,), *given, (W.to(device), t.mat)).cpu()
     F, p = (eye + H).requires_grad_(), p.clone().requires_grad_()
     want = torch.autograd.grad((W * stress(F, p)).sum(), (F, p))
-    torch.testing.assert_close(
-        adj, torch.cat([want[0].flatten(1), want[1][:, None]], 1), rtol=1e-12, atol=1e-12
-    )
+    wanted = torch.cat([want[0].flatten(1), want[1][:, None]], 1)
+    torch.testing.assert_close(adj, wanted, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("law", LAWS)
