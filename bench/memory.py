@@ -55,7 +55,7 @@ def main():
                     "substeps": substeps,
                     "budget GiB": budget,
                     "chunk": chosen.longest,
-                    "states kept": chosen.slots or "all",
+                    "states kept": chosen.checkpoints or "all",
                     "peak GiB": peak,
                     "formula GiB": memory(model, horizon).backward / GIB,
                     "forward and backward s": statistics.median(seconds[WARM:]),

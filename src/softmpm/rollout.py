@@ -49,7 +49,11 @@ class Trail:
     @property
     def checkpointed(self) -> tuple[int, ...]:
         """Chunks whose initial state is checkpointed."""
-        return checkpointing.initial_checkpoints(len(self.chunks), self.plan.slots) if self.plan.slots else ()
+        return (
+            checkpointing.initial_checkpoints(len(self.chunks), self.plan.checkpoints)
+            if self.plan.checkpoints
+            else ()
+        )
 
 
 @on_its_gpu
@@ -214,7 +218,7 @@ def _inside_out(trail: Trail, runner: Runner) -> Iterator[Run]:
     states = _taken(trail, runner)
     nothing = torch.empty(0)
     current: Any = State(nothing, nothing, nothing, nothing)
-    for action, k in checkpointing.backward_schedule(len(trail.chunks), trail.plan.slots):
+    for action, k in checkpointing.backward_schedule(len(trail.chunks), trail.plan.checkpoints):
         if action == "restore":
             current = states[k]
         elif action == "advance":

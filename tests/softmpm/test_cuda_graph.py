@@ -12,7 +12,7 @@ import softmpm
 from softmpm import autograd, rollout, runner
 from softmpm.errors import NEVER
 from softmpm.schemes import capture
-from softmpm.schemes.fast import chunk_graph
+from softmpm.schemes.fast import chunk_buffers
 from softmpm.schemes.fast import scheme as fast_scheme
 
 
@@ -42,7 +42,7 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
     built = softmpm.build(busy_scene(2), device="cpu", **settings)
     inputs = busy_inputs(built)
     run(softmpm.simulate, built, inputs, 5).x.sum().backward()
-    for module in (autograd, fast_scheme, chunk_graph, rollout, runner):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         end = run(softmpm.simulate, built, inputs, 5)

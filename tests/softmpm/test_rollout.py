@@ -210,7 +210,9 @@ def test_recomputing_gives_the_gradient_of_keeping_everything(scheme):
         plans.append(plan(Horizon(4, 14), model.sizes(), model.budget))
         found.append(gradients(softmpm.simulate, model, busy_inputs(model, control_steps=4), substeps=14))
     assert plans[0].keep_all and plans[1].longest > plans[2].longest
-    assert 1 < plans[2].slots < len(Horizon(4, 14).chunks(plans[2].longest)) / 2  # chunks run more than twice
+    assert (
+        1 < plans[2].checkpoints < len(Horizon(4, 14).chunks(plans[2].longest)) / 2
+    )  # chunks run more than twice
     for name, others in itertools.product(INPUTS, found[1:]):
         assert_relative(found[0][name], others[name], 1e-12, name)
 

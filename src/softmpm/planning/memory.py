@@ -96,13 +96,21 @@ def default_budget(device: torch.device, sizes: Sizes) -> int:
     return max(min(sizes.calls, most) * one, one + (sizes.calls - 1) * sizes.start)
 
 
+def sizes_of(model, *, inside: int, nodes: int, between: int) -> Sizes:
+    """Sizes of a scheme whose states take this number of bytes; the rest does not depend on the scheme."""
+    particles = model.worlds * model.particle_count
+    start = state_bytes(particles, model.dim, model.dtype.itemsize)
+    price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
+    return Sizes(inside, nodes, between, start, longest_chunk(particles), price, model.calls)
+
+
 class Plan(NamedTuple):
     """Memory plan of a call."""
 
     longest: int
     """Maximum number of substeps of a chunk."""
-    slots: int
-    """Number of states between chunks that are checkpointed; 0 if all intermediate states are stored."""
+    checkpoints: int
+    """Number of states between chunks that are stored; 0 if all intermediate states are stored."""
     kept: int
     """Bytes that the forward pass of one call stores."""
     recomputed: int
@@ -111,7 +119,7 @@ class Plan(NamedTuple):
     @property
     def keep_all(self) -> bool:
         """True if all intermediate states are stored and nothing is recomputed."""
-        return self.slots == 0
+        return self.checkpoints == 0
 
 
 @functools.lru_cache(maxsize=256)
@@ -134,14 +142,14 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
         inside = sum((n + 1) * sizes.inside + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
-        slots = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
-        if slots < 1:
+        stored = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
+        if stored < 1:
             continue
-        runs = recomputed(len(chunks), slots)
+        runs = recomputed(len(chunks), stored)
         length = max(chunk.length for chunk in chunks)
         # Each chunk runs forward and backward; some are recomputed in between.
         if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
-            best, least = Plan(longest, slots, slots * sizes.between, inside + sizes.between), cost
+            best, least = Plan(longest, stored, stored * sizes.between, inside + sizes.between), cost
     if best is None:
         smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes + others * sizes.start
         raise ValueError(
@@ -223,7 +231,7 @@ def memory(model, horizon) -> Memory:
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
     chunks = len(horizon.chunks(chosen.longest))
-    runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.slots) / chunks
+    runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.checkpoints) / chunks
     return Memory(
         buffers.forward + material + sizes.start, kept, kept + chosen.recomputed + state + adjoints, runs
     )

@@ -10,7 +10,7 @@ from softmpm.kernels.compile import launch
 from softmpm.kernels.plain.alarms import state_alarms
 from softmpm.kernels.structs import element_type, types
 from softmpm.model import Model
-from softmpm.schemes.buffers import slot, slots_in, view
+from softmpm.schemes.buffers import placeholder, placeholders_in, view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Values, particle_struct, shape_of, strongest
 from softmpm.schemes.launch import RebindableLaunch
@@ -32,19 +32,22 @@ class StartCheck:
     def __init__(self, model: Model):
         self.model, t = model, types(model.spec.dim, model.spec.dtype)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
-        inputs, places = particle_struct(model, model.fixed), [slot(model, t.vec), slot(model, t.mat)]
+        inputs, places = (
+            particle_struct(model, model.fixed),
+            [placeholder(model, t.vec), placeholder(model, t.mat)],
+        )
         self._open = [
             one for one in stored(model.spec) if one.stage != "grid" and one.name not in model.fixed
         ]
-        slots = []
+        given = []
         for one in self._open:
             shape = shape_of(model, one, 1)[1 if one.rows else 0 :]
             size = shape[:-1] if one.kind == "vector" else shape
-            slots += slots_in(inputs, (one.name,), model, element_type(model.spec, one), *size)
+            given += placeholders_in(inputs, (one.name,), model, element_type(model.spec, one), *size)
         neighbours, words = view(model.neighbours, wp.int32), view(self.words, wp.int64)
         arguments = (model.constants, inputs, neighbours, -1, *places, words)
         lead = (model.worlds, model.particle_count)
-        self._check = RebindableLaunch(model, state_alarms(model.spec), lead, arguments, [*slots, *places])
+        self._check = RebindableLaunch(model, state_alarms(model.spec), lead, arguments, [*given, *places])
 
     def __call__(self, start: State, values: Values) -> Tensor:
         """Launch the check and return its status words. It uses the largest active stress of each actuator."""

@@ -35,7 +35,7 @@ def passing(tensor: Tensor, dtype):
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
-def slot(model: Model, dtype, *size: int):
+def placeholder(model: Model, dtype, *size: int):
     """Placeholder for contiguous tensors that are bound later, see :class:`softmpm.schemes.launch.RebindableLaunch`.
 
     Args:
@@ -46,11 +46,11 @@ def slot(model: Model, dtype, *size: int):
     return passing(torch.empty(shape, dtype=kind, device="meta"), dtype)
 
 
-def slots_in(struct, names: Sequence[str], model: Model, dtype, *size: int) -> list:
-    """Set fields of a struct to placeholders, as made by :func:`slot`, and return these."""
+def placeholders_in(struct, names: Sequence[str], model: Model, dtype, *size: int) -> list:
+    """Set fields of a struct to placeholders, as made by :func:`placeholder`, and return these."""
     held = struct.__ctype__()
     for name in names:
-        setattr(held, name, slot(model, dtype, *size))
+        setattr(held, name, placeholder(model, dtype, *size))
     return [getattr(held, name) for name in names]  # they lie in the struct's own memory
 
 

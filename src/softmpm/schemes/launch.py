@@ -31,11 +31,12 @@ class RebindableLaunch:
 
     Args:
         inputs: Inputs of the kernel, some of which are placeholders, or structs that hold placeholders.
-        slots: The placeholders, from :func:`softmpm.schemes.buffers.slot`. They are written in place, so no other launch may use them.
+        placeholders: Those of the inputs, from :func:`softmpm.schemes.buffers.placeholder`. They are written in place, so no other
+            launch may use them.
     """
 
-    def __init__(self, model: Model, kernel, dim, inputs: Sequence, slots: Sequence):
-        self._slots = slots
+    def __init__(self, model: Model, kernel, dim, inputs: Sequence, placeholders: Sequence):
+        self._placeholders = placeholders
         made = launch(kernel, dim, inputs, device=model.wp_device, record_cmd=True)
         assert made is not None
         self._launch, self._filling = made, threading.Lock()
@@ -47,8 +48,8 @@ class RebindableLaunch:
         """
         assert all(tensor.is_contiguous() for tensor in tensors)
         with self._filling:
-            for slot, tensor in zip(self._slots, tensors, strict=True):
-                slot.data = tensor.data_ptr()
+            for placeholder, tensor in zip(self._placeholders, tensors, strict=True):
+                placeholder.data = tensor.data_ptr()
             self._launch.launch(stream)
 
 

@@ -18,7 +18,7 @@ SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4,
 def recomputations(chosen: Plan, horizon: Horizon) -> tuple[int, int]:
     """Number of substeps that are recomputed, and of chunks that run in all, counted along the schedule."""
     chunks = horizon.chunks(chosen.longest)
-    moves = list(backward_schedule(len(chunks), chosen.slots))
+    moves = list(backward_schedule(len(chunks), chosen.checkpoints))
     substeps = sum(chunks[move.stage].length for move in moves if move.kind == "advance")
     return substeps, len(chunks) + sum(move.kind in ("advance", "vjp") for move in moves)
 
@@ -40,7 +40,9 @@ def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
             break
         shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
         inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
-        assert chosen.kept == chosen.slots * SIZES.between and chosen.recomputed == inside + SIZES.between
+        assert (
+            chosen.kept == chosen.checkpoints * SIZES.between and chosen.recomputed == inside + SIZES.between
+        )
         starts = (calls - 1) * (SIZES.start - SIZES.between)  # the first state that is kept is the user's
         assert calls * chosen.kept + starts + chosen.recomputed <= budget
         times.append(seconds(chosen, horizon, SIZES))
@@ -54,7 +56,7 @@ def test_calls_share_a_budget():
     assert plan(horizon, sizes, everything).keep_all and not plan(horizon, sizes, everything - 1).keep_all
     with pytest.raises(ValueError, match="a gradient through 5 calls needs at least 938 bytes"):
         plan(horizon, sizes, 937)
-    assert plan(horizon, sizes, 938) == Plan(longest=1, slots=1, kept=104, recomputed=314)
+    assert plan(horizon, sizes, 938) == Plan(longest=1, checkpoints=1, kept=104, recomputed=314)
 
 
 @pytest.mark.parametrize("device, one, most", [("cpu", 2**26, 64), ("cuda", 10**9, 6)])

@@ -55,9 +55,9 @@ class FixedPointAccumulator:
         """Struct of sum ``k`` for the kernels that read it."""
         return self._sums[k % len(self._sums)]
 
-    def accumulate(self, graph, k: int, states, mass: wp.array | None, launch: KernelLauncher) -> None:
+    def accumulate(self, buffers, k: int, states, mass: wp.array | None, launch: KernelLauncher) -> None:
         """Accumulate the contributions of the particles of ``states`` in sum ``k``."""
         mass = self._none if mass is None else mass
-        arguments = (graph.window, graph.total, states, self.shares(k), mass, self.sums(k))
-        kernel = fixed(self.model.dim).push
-        launch(kernel, graph.threads(graph.particles_per_warp), *arguments, block_dim=graph.block)
+        size = buffers.size
+        arguments = (buffers.window, size.particles, states, self.shares(k), mass, self.sums(k))
+        launch(fixed(self.model.dim).push, size.threads, *arguments, block_dim=size.block)

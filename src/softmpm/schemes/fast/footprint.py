@@ -14,9 +14,7 @@ from softmpm.planning.memory import (
     Plan,
     Sizes,
     input_bytes,
-    longest_chunk,
-    price_of_chunk,
-    state_bytes,
+    sizes_of,
     window_shape,
 )
 
@@ -45,9 +43,7 @@ class FastFootprint:
         inside = particles * (4 + real * packed_rows(d).rows)
         between = inside + 4 * particles  # and the order
         nodes = model.worlds * model.held_nodes * 4 * real
-        price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
-        start = state_bytes(particles, d, real)
-        return Sizes(inside, nodes, between, start, longest_chunk(particles), price, model.calls)
+        return sizes_of(model, inside=inside, nodes=nodes, between=between)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         sizes = model.sizes()

@@ -20,7 +20,7 @@ from softmpm.kernels.fast.sorting import sorting
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.memory import MARGIN, window_shape
-from softmpm.schemes.buffers import slot, view
+from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import Report
@@ -84,7 +84,7 @@ class ParticleLayout:
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         gravity = model.scene.gravity
         up = max(range(t.dim), key=lambda axis: abs(gravity[axis])) if gravity else 0
-        places, found = [slot(model, t.vec) for _ in range(2)], (self._key, *self._ends)
+        places, found = [placeholder(model, t.vec) for _ in range(2)], (self._key, *self._ends)
         inputs = (model.constants, up, *places, *(view(tensor, wp.int32) for tensor in found))
         return RebindableLaunch(
             model, sorting(t.dim, model.spec.dtype).locate, self.order.shape, inputs, places

@@ -14,9 +14,10 @@ from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import LONGEST, Footprint
 from softmpm.schemes.alarm_check import StartCheck
 from softmpm.schemes.capture import is_capturing, keep_alive
+from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import outgrown
-from softmpm.schemes.fast.chunk_graph import ChunkGraph
-from softmpm.schemes.fast.chunk_graph_adj import AdjointBuffers, ChunkGraphAdj
+from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
+from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
 from softmpm.schemes.fast.footprint import FastFootprint
 from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacker
@@ -57,8 +58,8 @@ class GraphCache:
         self.model, self.layout, self.unpacker = model, layout, unpacker
         # By whether they store their intermediate states, then by shape, the most recent last:
         self._free: dict[bool, dict[tuple, _FreeList]] = {False: {}, True: {}}
-        self._adjoint_buffers: dict[RequestedGrads, AdjointBuffers] = {}
-        # Guards the adjoint buffers: the backward pass of this thread's calls may run in other threads.
+        self._shared_adjoints: dict[RequestedGrads, SharedAdjoint] = {}
+        # Guards the shared adjoints: the backward pass of this thread's calls may run in other threads.
         self.lock = threading.Lock()
 
     def take(self, chunk: Chunk, keep: bool) -> tuple[CachedGraph, _FreeList]:
@@ -79,7 +80,7 @@ class GraphCache:
         """Evict old shapes to make room for another graph."""
         shapes, part = self._free[keep], self.model.budget // self.model.calls
         for shape in list(shapes)[: -RETAINED_SHAPES[keep]]:
-            if sum(cached.graph.bytes for free in shapes.values() for cached in free) <= part:
+            if sum(cached.graph.buffers.bytes for free in shapes.values() for cached in free) <= part:
                 break
             del shapes[shape]
 
@@ -87,11 +88,11 @@ class GraphCache:
         """The adjoint of a graph for the requested gradients, built on first use."""
         graph, adjoints = cached
         if is_capturing(self.model):
-            return ChunkGraphAdj(graph, wanted, AdjointBuffers(graph, wanted))
-        if wanted not in self._adjoint_buffers:
-            self._adjoint_buffers[wanted] = AdjointBuffers(graph, wanted)
+            return ChunkGraphAdj(graph, SharedAdjoint(graph.buffers, wanted))
+        if wanted not in self._shared_adjoints:
+            self._shared_adjoints[wanted] = SharedAdjoint(graph.buffers, wanted)
         if wanted not in adjoints:
-            adjoints[wanted] = ChunkGraphAdj(graph, wanted, self._adjoint_buffers[wanted])
+            adjoints[wanted] = ChunkGraphAdj(graph, self._shared_adjoints[wanted])
         return adjoints[wanted]
 
 
@@ -126,18 +127,23 @@ class FastRun:
     ):
         self.pool, self.updated, self.chunk, self.start = pool, updated, chunk, start
         self._lease = _Lease(pool, chunk, keep)
-        graph = self._lease.cached.graph
-        graph.run(chunk, start, values, frozen)
-        self.end = SortedState(pool.unpacker, graph.base[-1], graph.rows[-1], graph.order, self._lease)
-        self.words = graph.words
+        graph, stream = self._lease.cached.graph, stream_of(pool.model.device)
+        buffers = graph.buffers
+        buffers.load(stream, chunk, start, values, frozen)
+        graph.run(stream)
+        self.end = SortedState(pool.unpacker, buffers.base[-1], buffers.rows[-1], buffers.order, self._lease)
+        self.words = buffers.words
         self.outgrow: Callable[[], None] | None = pool.layout.outgrow
 
     def vjp(self, adj_end: State | SortedAdj, adj_inputs: InputsAdj, wanted: RequestedGrads) -> SortedAdj:
         """Adjoint of the initial state; the adjoints of the inputs are added into ``adj_inputs``."""
         with self.pool.lock:
             adjoint = self.pool.adjoint(self._lease.cached, wanted)
-            adjoint.run(self.chunk, adj_end, adj_inputs)
-            adj, order = adjoint.scratch.adj, adjoint.graph.order  # both are reused by other runs
+            buffers, stream = adjoint.buffers, stream_of(self.pool.model.device)
+            buffers.load(stream, adj_end)
+            adjoint.run(stream)
+            buffers.unload(stream, self.chunk, adj_inputs)
+            adj, order = buffers.shared.adj, buffers.forward.order  # both are reused by other runs
             return SortedAdj(self.pool.unpacker, adj.clone(), order.clone())
 
 

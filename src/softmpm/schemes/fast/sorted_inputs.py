@@ -8,7 +8,7 @@ from softmpm.inputs import stored
 from softmpm.kernels.fast.permute import permute
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
-from softmpm.schemes.buffers import slot, view
+from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.inputs import (
     Accumulators,
     InputsAdj,
@@ -34,7 +34,7 @@ class Permutation:
     def __init__(self, model: Model, order: Tensor, placed: Tensor, *, back: bool = False):
         kind = str(placed.dtype).removeprefix("torch.")
         dtype = {"float32": wp.float32, "float64": wp.float64, "int32": wp.int32}[kind]
-        given, arrays = slot(model, dtype, *placed.shape), (view(order, wp.int32), view(placed, dtype))
+        given, arrays = placeholder(model, dtype, *placed.shape), (view(order, wp.int32), view(placed, dtype))
         kernels = permute(kind)
         inputs = (*arrays, given) if back else (arrays[0], given, arrays[1])
         kernel = kernels.sort_adj if back else kernels.sort

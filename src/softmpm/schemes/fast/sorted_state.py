@@ -15,7 +15,7 @@ from softmpm.kernels.fast.packing import packing
 from softmpm.kernels.fast.sorting import sorting
 from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.schemes.buffers import slot
+from softmpm.schemes.buffers import placeholder
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.launch import RebindableLaunch
 from softmpm.state import Low, State
@@ -34,8 +34,8 @@ class Unpacker:
         nothing = (2 - len(low)) * (None,)
 
         def rebindable(kernel, parameters, *fields, none=()) -> RebindableLaunch:
-            slots = [slot(model, *field) for field in fields]
-            return RebindableLaunch(model, kernel, lead, (*parameters, *slots, *none), slots)
+            given = [placeholder(model, *field) for field in fields]
+            return RebindableLaunch(model, kernel, lead, (*parameters, *given, *none), given)
 
         self.invert = rebindable(sorting(spec.dim, spec.dtype).invert, (), order, (wp.int32,))
         self.leave = rebindable(pack.leave, constants, order, base, rows, *end, *low, none=nothing)

@@ -42,15 +42,15 @@ class PlainRun:
             self._values["elapsed"] = elapsed(model, chunk.first, chunk.length, chunk.substeps)
         self.step = Substep(model)
         self.states = Motion.empty(model, chunk.length + 1 if keep else 2)
-        self.slots = [self.states[i].struct(model) for i in range(len(self.states.base))]
+        self.structs = [self.states[i].struct(model) for i in range(len(self.states.base))]
         if frozen:
             self.step.words[list(frozen)] = FROZEN
-        self.step.enter(start, self.slots[0])
+        self.step.enter(start, self.structs[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
             self._use_inputs(s, s - 1)
-            self.step.advance(self.slots[now], self.slots[then], s)
-        self.end = self.step.leave(self.slots[chunk.length if keep else chunk.length % 2])
+            self.step.advance(self.structs[now], self.structs[then], s)
+        self.end = self.step.leave(self.structs[chunk.length if keep else chunk.length % 2])
         if armed(model):
             check_end(model, self.step.particle_inputs, self.end, self.step.words_array, chunk.length - 1)
         self.words = self.step.words
@@ -82,7 +82,7 @@ class PlainRun:
             row = chunk.row(s)
             self._use_inputs(s, s + 1)
             clear(adjoints[s % 2].flat)
-            states = self.slots[s], self.slots[s + 1], structs[(s + 1) % 2], structs[s % 2]
+            states = self.structs[s], self.structs[s + 1], structs[(s + 1) % 2], structs[s % 2]
             inputs = found.particle_struct(row, row), found.grid_struct(row)
             step.adjoint(wanted, *states, inputs, chunk.length - 1 - s)
             if s == 0 or row != chunk.row(s - 1):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import ClassVar
 
-from softmpm.planning.memory import Buffers, Plan, Sizes, longest_chunk, price_of_chunk, state_bytes
+from softmpm.planning.memory import Buffers, Plan, Sizes, sizes_of, state_bytes
 
 
 class PlainFootprint:
@@ -20,9 +20,7 @@ class PlainFootprint:
     def sizes(self, model) -> Sizes:
         real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
         inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-        start = state_bytes(particles, d, real)
-        price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
-        return Sizes(inside, 0, start, start, longest_chunk(particles), price, model.calls)
+        return sizes_of(model, inside=inside, nodes=0, between=state_bytes(particles, d, real))
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         inside, terms = model.sizes().inside, term_bytes(model)

@@ -14,7 +14,7 @@ from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
 from softmpm.schemes import capture
-from softmpm.schemes.fast import chunk_graph, chunk_graph_adj, particle_order
+from softmpm.schemes.fast import adjoint_buffers, chunk_buffers, chunk_graph, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.sorted_state import SortedState
 from softmpm.schemes.plain import chunk as plain_chunk
@@ -23,8 +23,8 @@ HOLD_MEMORY = (
     softmpm.Model,
     particle_order.ParticleLayout,
     chunk_graph.ChunkGraph,
-    chunk_graph_adj.ChunkGraphAdj,
-    chunk_graph_adj.AdjointBuffers,
+    chunk_graph.ChunkGraphAdj,
+    adjoint_buffers.SharedAdjoint,
     fast_scheme.FastRun,
     plain_chunk.PlainRun,
 )
@@ -149,7 +149,7 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
         return outgrown(words) or len(seen) == report + 1
 
     def making(self, model, window, *args):
-        others.append(sum(one.layout is not window for one in living(chunk_graph.ChunkGraph)))
+        others.append(sum(one.buffers.layout is not window for one in living(chunk_graph.ChunkGraph)))
         make(self, model, window, *args)
 
     monkeypatch.setattr(fast_scheme, "outgrown", left_once)
@@ -161,12 +161,12 @@ def test_a_window_that_grows_leaves_little_of_the_smaller_one(living, monkeypatc
 def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, device):
     """Checkpoints of the forward pass are freed as others take their slots; a second backward pass recomputes them."""
     monkeypatch.setattr(
-        "softmpm.schemes.fast.footprint.price_of_chunk", lambda particles: 1
+        "softmpm.planning.memory.price_of_chunk", lambda particles: 1
     )  # the same chunks on a GPU
     built, kept, most, graphs = model(device=device, **little_memory(model())), [], [], []
     horizon, copied, runs = Horizon(3, 7), SortedState.copy, chunk_graph.ChunkGraph.run
     chosen = plan(horizon, built.sizes(), built.budget)
-    assert len(horizon.chunks(chosen.longest)) > 2 * chosen.slots > 4
+    assert len(horizon.chunks(chosen.longest)) > 2 * chosen.checkpoints > 4
 
     def copying(self):
         copy = copied(self)
@@ -185,8 +185,8 @@ def test_a_backward_pass_keeps_no_more_states_than_planned(living, monkeypatch, 
     first = torch.autograd.grad(weights, list(inputs.values()), retain_graph=True)
     again = torch.autograd.grad(weights, list(inputs.values()))
     # The start takes a slot, but it is the user's; and the state that was dropped last is in hand.
-    assert len(kept) > 2 * chosen.slots and max(most) <= chosen.slots
-    assert max(graphs) < chosen.slots  # checkpoints refer to none
+    assert len(kept) > 2 * chosen.checkpoints and max(most) <= chosen.checkpoints
+    assert max(graphs) < chosen.checkpoints  # checkpoints refer to none
     for got, want in zip(again, first, strict=True):
         assert_relative(got, want, 0.0 if device == "cpu" else 2e-5)
 
@@ -254,7 +254,7 @@ def test_a_call_that_does_not_fit_gives_everything_back(living, settings, failin
         raise AssertionError("it did fit")
     del waiting
     for _ in range(100):  # PyTorch's own thread may hold the call for a moment longer
-        left = living((chunk_graph.ChunkGraph, chunk_graph_adj.ChunkGraphAdj, plain_chunk.PlainRun))
+        left = living((chunk_graph.ChunkGraph, chunk_graph.ChunkGraphAdj, plain_chunk.PlainRun))
         if not left:
             return
         del left
@@ -284,7 +284,7 @@ def test_calls_of_many_lengths_leave_few_chunk_graphs(living, device):
         assert plan(Horizon(3, substeps), sizes, budget).keep_all
         backward(*call(built, substeps=substeps))
         last = living(chunk_graph.ChunkGraph)
-        assert sum(one.bytes for one in last) <= 2 * budget
+        assert sum(one.buffers.bytes for one in last) <= 2 * budget
         backward(*call(built, substeps=substeps))
         assert living(chunk_graph.ChunkGraph) == last
         del last
@@ -305,10 +305,8 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     built = model(**budget)
     backward(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
-    with_graphs = [
-        weakref.ref(made) for made in living((chunk_graph.ChunkGraph, chunk_graph_adj.ChunkGraphAdj))
-    ]
-    for module in (autograd, chunk_graph, fast_scheme, rollout, runner):
+    with_graphs = [weakref.ref(made) for made in living((chunk_graph.ChunkGraph, chunk_graph.ChunkGraphAdj))]
+    for module in (autograd, chunk_buffers, fast_scheme, rollout, runner):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         backward(*call(built))
@@ -352,7 +350,7 @@ def test_a_graph_runs_on_memory_of_its_own():
 @pytest.mark.gpu
 def test_garbage_does_not_end_a_recording(monkeypatch):
     """A graph that nothing but itself refers to waits for the collector, which is made to come at once."""
-    built, launches, threshold = model(device="cuda"), chunk_graph.ChunkGraph._launch_all, gc.get_threshold()
+    built, launches, threshold = model(device="cuda"), chunk_graph.ChunkGraph._launch, gc.get_threshold()
     inputs, weights = busy_inputs(built, control_steps=3), cotangent(built.rest())
 
     def work():
@@ -369,7 +367,7 @@ def test_garbage_does_not_end_a_recording(monkeypatch):
         knot = None
         launches(self, launch)
 
-    monkeypatch.setattr(chunk_graph.ChunkGraph, "_launch_all", launching)
+    monkeypatch.setattr(chunk_graph.ChunkGraph, "_launch", launching)
     gc.set_threshold(1)
     try:
         other = model(device="cuda")  # which records its own

@@ -31,7 +31,7 @@ from softmpm.planning import memory
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import plan
 from softmpm.schemes import launch
-from softmpm.schemes.fast import chunk_graph, chunk_graph_adj
+from softmpm.schemes.fast import adjoint_buffers, chunk_buffers, chunk_graph
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.particle_order import ParticleLayout
 
@@ -149,8 +149,8 @@ def test_what_new_memory_holds_leaves_no_trace(dim, deterministic, device, monke
 
     found = []
     for number in (0.0, torch.nan):
-        monkeypatch.setattr(fast_scheme, "ChunkGraph", full_of(number, chunk_graph.ChunkGraph))
-        monkeypatch.setattr(fast_scheme, "AdjointBuffers", full_of(number, chunk_graph_adj.AdjointBuffers))
+        monkeypatch.setattr(chunk_graph, "ChunkBuffers", full_of(number, chunk_buffers.ChunkBuffers))
+        monkeypatch.setattr(fast_scheme, "SharedAdjoint", full_of(number, adjoint_buffers.SharedAdjoint))
         built = softmpm.build(tiny((16,) * dim), device=device, scheme="fast", deterministic=deterministic)
         start = built.rest()
         start.v.add_(torch.tensor([0.3, 0.2, 0.1][:dim], device=device))
@@ -206,7 +206,7 @@ def made(monkeypatch) -> list:
     class Counted(chunk_graph.ChunkGraph):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            graphs.append((self.chunk, self.keep))
+            graphs.append((self.buffers.chunk, self.buffers.keep))
 
     monkeypatch.setattr(fast_scheme, "ChunkGraph", Counted)
     return graphs

@@ -1,0 +1,163 @@
+"""Buffers of a chunk of the fast scheme: everything that its launches read and write, at addresses that do not change.
+
+A captured graph refers to addresses, so whatever changes between calls is copied into these buffers first: the order of the particles,
+the inputs (sorted_inputs.py) and the initial state.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+
+from softmpm.errors import FROZEN, NEVER
+from softmpm.kernels.fast.native import padded
+from softmpm.kernels.fast.packing import packing
+from softmpm.kernels.fast.sorting import sorting
+from softmpm.kernels.structs import types
+from softmpm.model import Model
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.buffers import passing, placeholder, view
+from softmpm.schemes.capture import is_capturing
+from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
+from softmpm.schemes.fast.launch_size import LaunchSize
+from softmpm.schemes.fast.particle_order import ParticleLayout
+from softmpm.schemes.fast.sorted_inputs import SortedInputs
+from softmpm.schemes.fast.sorted_state import SortedState
+from softmpm.schemes.inputs import Values
+from softmpm.schemes.launch import RebindableLaunch
+from softmpm.state import State
+
+
+class ChunkBuffers:
+    """Buffers of the chunks of one shape on one particle layout.
+
+    Args:
+        keep: Whether to store the intermediate states, which the backward pass needs.
+
+    Attributes:
+        order, origin: Particle at each place, and first node of the window, of the initial state that was loaded last.
+        words: Status words, as in :class:`softmpm.schemes.fast.scheme.FastRun`.
+        inputs: Inputs in this order.
+        base, rows: Packed states, one or, if ``keep``, one more than substeps; the last one is the final state.
+        nodes: Mass and momentum of the window's nodes, two or, if ``keep``, one for each substep.
+        velocity: Nodal velocities of the present substep.
+        exact: Fixed-point sums of a deterministic model.
+    """
+
+    def __init__(self, model: Model, layout: ParticleLayout, chunk: Chunk, keep: bool):
+        self.model, self.layout, self.chunk, self.keep = model, layout, chunk, keep
+        self.types = t = types(model.spec.dim, model.spec.dtype)
+        self.lead = (model.worlds, model.particle_count)
+        self.size = LaunchSize(model)
+        places = padded(self.size.particles)
+        stored, grids = (chunk.length + 1, chunk.length) if keep else (1, 2)
+
+        def tensor(*size, dtype=model.dtype):
+            return torch.empty(*size, dtype=dtype, device=model.device)
+
+        self.order = tensor(*self.lead, dtype=torch.int32)
+        self.origin = tensor(model.worlds, model.dim, dtype=torch.int32)
+        self.words = tensor(model.worlds + 2, dtype=torch.int64)
+        self._no_status = torch.full_like(self.words, NEVER)
+        self._no_status[-2:].zero_()
+        self._version = -1  # of the layout that order and origin were copied from
+        self.inputs = SortedInputs(model, chunk, self.order)
+        self.base = tensor(stored, places, dtype=torch.int32)
+        self.rows = tensor(stored, places * t.rows)
+        self.nodes = tensor(grids, model.worlds * layout.node_count, 4)
+        self.velocity = tensor(model.worlds * layout.node_count, 4)
+        self.nothing = view(tensor(0, 4), t.aligned)
+        self._view()
+        self.exact = None
+        if model.spec.deterministic:
+            sums = view(tensor(places * t.rows), t.real)
+            self.exact = FixedPointAccumulator(model, sums, self.node_arrays)
+        self._prepare_loading(places)
+
+    def _view(self) -> None:
+        """Warp arrays and structs on the buffers."""
+        t = self.types
+        self.window = self.layout.window(self.origin)
+        self.packed = []
+        for base, rows in zip(self.base, self.rows, strict=True):
+            packed = t.Packed()
+            packed.base, packed.rows = view(base, wp.int32), view(rows, t.real)
+            self.packed.append(packed)
+        self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
+        self.velocity_array = view(self.velocity, t.aligned)
+        self.order_array = view(self.order, wp.int32)
+        self.order_flat = view(self.order.view(-1), wp.int32)
+        self.words_array = view(self.words, wp.int64)
+        self.survey_array = view(self.words[-2:], wp.int64)
+        self.mass = view(self.inputs.values["mass"], t.real)
+
+    def _prepare_loading(self, places: int) -> None:
+        """Launches that load a user's state, with or without low-order parts, or the final state of another chunk."""
+        model, t = self.model, self.types
+        pack, sort = packing(t.dim, model.spec.dtype), sorting(t.dim, model.spec.dtype)
+        at, low = (model.constants, self.window, self.order_array), (t.vec, t.mat)
+        state = (t.vec, t.vec, t.mat, t.mat)
+        zero = torch.zeros(t.dim, t.dim, dtype=model.dtype, device=model.device)
+        none = passing(zero[0].expand(*self.lead, -1), t.vec), passing(zero.expand(*self.lead, -1, -1), t.mat)
+
+        def enter(*dtypes, low=()) -> RebindableLaunch:
+            given = [placeholder(model, dtype) for dtype in dtypes]
+            arguments = (*at, *given, *low, self.words_array, self.packed[0])
+            return RebindableLaunch(model, pack.enter, self.lead, arguments, given)
+
+        self._enter = {False: enter(*state, low=none), True: enter(*state, *low)}
+        given = [
+            placeholder(model, wp.int32),
+            placeholder(model, wp.int32, places),
+            placeholder(model, t.real, places * t.rows),
+        ]
+        arguments = (self.window, self.order_array, *given, self.words_array, self.packed[0])
+        self._move = RebindableLaunch(model, sort.move, self.lead, arguments, given)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the buffers."""
+        sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
+        return sum(tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums))
+
+    def reset_status(self) -> None:
+        """Reset all status words."""
+        self.words.copy_(self._no_status)
+
+    def load(
+        self,
+        stream: wp.Stream | None,
+        chunk: Chunk,
+        start: State | SortedState,
+        values: Values,
+        frozen: Sequence[int] = (),
+    ) -> None:
+        """Copy everything that a chunk depends on into the buffers, in the present order of the particles.
+
+        Args:
+            chunk: Of these buffers' shape.
+            values: Inputs that the call sets; those with rows have one for each control step of the chunk.
+            frozen: Worlds whose particles do not move.
+        """
+        moved = is_capturing(self.model) or self._version != self.layout.version
+        if moved:
+            self._version = -1  # until the inputs are in this order too
+            self.order.copy_(self.layout.order)
+            self.origin.copy_(self.layout.origin)
+            self.layout.place_neighbours()
+        self.reset_status()
+        if frozen:
+            self.words[list(frozen)] = FROZEN
+        self.inputs.take(stream, chunk, values, moved)
+        self._version = self.layout.version
+        self.load_state(stream, start)
+        if self.exact is not None:
+            self.exact.begin(values["mass"])
+
+    def load_state(self, stream: wp.Stream | None, start: State | SortedState) -> None:
+        """Copy the initial state into the buffers, permuted into the present order."""
+        if isinstance(start, SortedState):
+            self._move(stream, start.inverse_permutation(), start.base, start.rows)
+        else:
+            given = [tensor.contiguous() for tensor in (*start[:4], *(start.low or ()))]
+            self._enter[start.low is not None](stream, *given)

@@ -1,0 +1,40 @@
+"""Number of threads of the launches over particles, and the variant of the kernels for it."""
+
+import functools
+
+from softmpm.kernels.fast.native import BLOCK, FEW, VERY_FEW, WARP
+from softmpm.model import Model
+
+
+class LaunchSize:
+    """Threads of the launches over the particles of a model.
+
+    On a GPU the lanes of a warp cooperate, so that whole blocks are launched. With few particles each warp has a block of its own and
+    the kernels may use more registers; with very few, half of the lanes stay empty, so that twice as many warps share the work, at
+    the price of more reductions (decisions/0009-deletions.md).
+    """
+
+    def __init__(self, model: Model):
+        self.particles, self.on_gpu = model.worlds * model.particle_count, model.device.type == "cuda"
+        self.few = self.on_gpu and self.particles <= FEW
+        self.block = WARP if self.few else BLOCK
+        may_halve = self.on_gpu and not model.spec.deterministic and self.particles <= VERY_FEW
+        self.per_warp_adj = WARP // 2 if may_halve else WARP
+        self.per_warp = self.per_warp_adj if model.dim == 2 else WARP
+        """Particles of each warp in the forward kernels."""
+
+    @functools.cached_property
+    def threads(self) -> int:
+        """Threads of a forward launch."""
+        return self._threads(self.per_warp)
+
+    @functools.cached_property
+    def threads_adj(self) -> int:
+        """Threads of an adjoint launch."""
+        return self._threads(self.per_warp_adj)
+
+    def _threads(self, per_warp: int) -> int:
+        if not self.on_gpu:
+            return self.particles
+        warps = -(-self.particles // per_warp)
+        return -(-warps * WARP // self.block) * self.block

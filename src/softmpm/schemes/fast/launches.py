@@ -1,0 +1,88 @@
+"""Launches of a chunk of the fast scheme, in their order: P2G, then for each substep the grid and G2P with the next P2G."""
+
+from softmpm.kernels.fast.alarms import packed_alarms
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.fast.native import BLOCK
+from softmpm.kernels.fast.sorting import sorting
+from softmpm.schemes.alarm_check import armed
+from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
+from softmpm.schemes.launch import KernelLauncher
+
+
+def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
+    """Advance the first packed state by all substeps of the chunk, then check the last one."""
+    kernels, held = fused(buffers.model.spec), len(buffers.velocity)
+    launch(kernels.clear, held, buffers.velocity_array, block_dim=BLOCK)
+    if buffers.exact is None:
+        launch(kernels.clear, held, buffers.node_arrays[0], block_dim=BLOCK)
+    _p2g_first(buffers, launch)
+    for s in range(buffers.chunk.length):
+        _grid(buffers, s, launch)
+        _g2p2g(buffers, s, launch)
+    _survey(buffers, launch)
+    if armed(buffers.model):
+        _check(buffers, launch)
+
+
+def _p2g_first(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
+    """P2G of the first substep."""
+    model, size, exact = buffers.model, buffers.size, buffers.exact
+    sink = buffers.node_arrays[0] if exact is None else exact.shares(0)
+    sizes = (size.per_warp, model.particle_count, size.particles, buffers.order_flat)
+    state = (buffers.packed[0], buffers.words_array)
+    inputs = buffers.inputs.particle_struct(0, 0)
+    kernel = fused(model.spec).p2g_first[size.few]
+    arguments = (model.constants, inputs, buffers.window, *sizes, *state, sink)
+    launch(kernel, size.threads, *arguments, block_dim=size.block)
+    if exact is not None:
+        exact.accumulate(buffers, 0, buffers.packed[0], buffers.mass, launch)
+
+
+def _grid(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
+    """Nodal velocities of substep ``s``; clears the nodes that the next P2G adds to."""
+    model, nodes, last = buffers.model, buffers.node_arrays, s + 1 == buffers.chunk.length
+    now, then = nodes[s % len(nodes)], buffers.nothing if last else nodes[(s + 1) % len(nodes)]
+    if buffers.exact is not None:
+        now, then = buffers.exact.sums(s), buffers.nothing
+    inputs = buffers.inputs.grid_struct(s)
+    arguments = (model.constants, inputs, buffers.window, now, buffers.velocity_array, then)
+    launch(fused(model.spec).grid_velocity, len(buffers.velocity), *arguments, block_dim=BLOCK)
+
+
+def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
+    """G2P of substep ``s`` and P2G of the next."""
+    model, size, exact = buffers.model, buffers.size, buffers.exact
+    nodes, last = buffers.node_arrays, s + 1 == buffers.chunk.length
+    now, then = (buffers.packed[s], buffers.packed[s + 1]) if buffers.keep else 2 * (buffers.packed[0],)
+    sink = nodes[(s + 1) % len(nodes)] if exact is None else exact.shares(s + 1)
+    parameters = (
+        model.constants,
+        buffers.inputs.particle_struct(s + 1, s),
+        buffers.window,
+        s,
+        last,
+        size.per_warp,
+    )
+    sizes = (model.particle_count, size.particles, buffers.order_flat)
+    arguments = (*parameters, *sizes, buffers.velocity_array, now, buffers.words_array, then, sink)
+    launch(fused(model.spec).g2p2g[size.few], size.threads, *arguments, block_dim=size.block)
+    if exact is not None and not last:
+        exact.accumulate(buffers, s + 1, then, buffers.mass, launch)
+
+
+def _survey(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
+    """Count the changes of cell along the order, and find particles near the window's edge."""
+    model, total = buffers.model, buffers.size.particles
+    kernel = sorting(model.dim, model.spec.dtype).survey
+    arguments = (model.constants, buffers.window, model.particle_count, buffers.packed[-1].base)
+    launch(kernel, total, *arguments, buffers.survey_array)
+
+
+def _check(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
+    """Check the alarms on the final state."""
+    model, total, last = buffers.model, buffers.size.particles, buffers.chunk.length - 1
+    sizes = (last, model.particle_count, total, buffers.order_flat)
+    inputs = buffers.inputs.particle_struct(last, last)
+    arguments = (model.constants, inputs, buffers.layout.neighbours, *sizes)
+    kernel = packed_alarms(model.spec).check
+    launch(kernel, total, *arguments, buffers.packed[-1], buffers.words_array)
