@@ -141,6 +141,8 @@ def _steps(name: str, value: Tensor) -> int | None:
 
 def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
     """Of a call: those of the activation or, without one, of the inputs, which must agree."""
+    if activation is not None and not given:
+        return activation.shape[0]
     told = {} if activation is None else {"activation": len(activation)}
     for name, value in given.items():
         if (steps := _steps(name, value)) is not None:
@@ -154,11 +156,11 @@ def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
     return next(iter(told.values()), 1)
 
 
-@torch.no_grad()
 def check_inputs_bounds(given: dict[str, Tensor]) -> None:
     """All inputs are finite and within their bounds. Reads back once: a GPU has to wait."""
     if not given:
         return
+    given = {name: value.detach() for name, value in given.items()}
     ends = [end.double() for value in given.values() for end in torch.aminmax(value)]
     ends = torch.stack(ends).tolist()
     for (name, value), low, high in zip(given.items(), ends[::2], ends[1::2], strict=True):

@@ -53,16 +53,16 @@ _ROWS = {one.name for one in INPUTS if one.rows}
 def in_rows(values: Values, rows: slice) -> Values:
     """The inputs of these control steps."""
     found = values.copy()
-    for name in _ROWS & values.keys():
-        if len(values[name]) != rows.stop - rows.start:
-            found[name] = values[name][rows]
+    for name, value in values.items():
+        if name in _ROWS and value.shape[0] != rows.stop - rows.start:
+            found[name] = value[rows]
     return found
 
 
 def strongest(values: Values) -> Values:
     """The inputs of the first control step, with the largest active stress of each actuator in all control steps."""
     found, active = in_rows(values, slice(0, 1)), values.get("active_stress")
-    if active is not None and len(active) > 1:
+    if active is not None and active.shape[0] > 1:
         found["active_stress"] = active.amax(0, keepdim=True)
     return found
 
