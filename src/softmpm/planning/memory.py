@@ -255,7 +255,7 @@ def adjoint_bytes(model, control_steps: int) -> int:
             numbers = model.dim if one.kind == "vector" else 1
         places = {"particle": particles, "muscle": particles * model.spec.muscle_slots, "world": nodes}
         size += numbers * places.get(one.per, nodes * model.wall_count if one.per == "wall" else 0)
-    return model.worlds * (size + particles) * model.dtype.itemsize
+    return model.worlds * size * model.dtype.itemsize
 
 
 def check_room(model) -> None:
