@@ -20,7 +20,9 @@ def cube(
     *,
     law=softmpm.NeoHookean,
     muscles=False,
+    pressure=False,
     floor=False,
+    clamp=False,
     seed=0,
     domain=None,
     **scene_settings,
@@ -29,6 +31,9 @@ def cube(
 
     Args:
         nodes: Nodes along an axis of a grid one metre wide; they decide the spacing.
+        muscles, pressure: Add an actuator of this kind that acts on all particles.
+        floor: Add a wall with friction at the lowest particles.
+        clamp: Drive the lowest particles, which stand still unless a call gives their velocity.
         domain: Nodes along an axis of a larger grid, most of it empty.
     """
     dx = 1.0 / nodes
@@ -40,12 +45,15 @@ def cube(
         softmpm.Particles(positions, (dx / 2) ** dim), law(density=1.0, young=100.0, poisson=0.3)
     )
     up = (0.0, 1.0) + (0.0,) * (dim - 2)
-    index = np.arange(len(positions))
+    index, lowest = np.arange(len(positions)), float(positions[:, 1].min())
+    actuators = [softmpm.Muscle(particles=index, direction=up, strength=1.0)] if muscles else []
+    actuators += [softmpm.Pressure(particles=index, strength=1.0)] if pressure else []
     scene = dict(
         grid=softmpm.Grid(shape=(domain or nodes,) * dim, spacing=dx),
         bodies=[body],
-        muscles=[softmpm.Muscle(particles=index, direction=up, strength=1.0)] if muscles else [],
-        walls=[softmpm.Wall(normal=up, offset=float(positions[:, 1].min()), friction=0.5)] if floor else [],
+        muscles=actuators,
+        walls=[softmpm.Wall(normal=up, offset=lowest, friction=0.5)] if floor else [],
+        driven=np.flatnonzero(positions[:, 1] == lowest) if clamp else (),
         gravity=tuple(-0.5 * u for u in up),  # so weak that a thousand substeps stay on the grid
     )
     scene |= scene_settings
