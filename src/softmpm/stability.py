@@ -123,6 +123,13 @@ def running_limit(
     return scene.grid.spacing * math.sqrt(density / K) if K > 0 else math.inf
 
 
+def stiffening_signs(scene: Scene) -> list[float]:
+    """For each actuator of the scene, the sign of the active stress that stiffens: 1 for a muscle, -1 for a pressure (suction)."""
+    with torch.inference_mode(False), torch.device("cpu"):
+        at_rest = torch.eye(scene.grid.dim, dtype=torch.float64)
+        return [_stiffening_sign(actuator_tangent(actuator, at_rest)).item() for actuator in scene.muscles]
+
+
 def need_stable(scene: Scene, most: float) -> None:
     """Raise ValueError if the scene's dt is more than ``most`` times :func:`stable_dt`."""
     limit = stable_dt(scene)
@@ -209,10 +216,8 @@ def _limit(
     A_active = torch.zeros_like(A_mu)
     for m in group.muscles:
         A_unit = actuator_tangent(scene.muscles[m], F)
-        stiffening = (
-            A_unit.diagonal(dim1=-2, dim2=-1).sum(-1).sign()[..., None, None]
-        )  # the sign of the activation that is stiffer
-        A_active = A_active + abs(activation * scene.muscles[m].strength) * stiffening * A_unit
+        sign = _stiffening_sign(A_unit)[..., None, None]
+        A_active = A_active + abs(activation * scene.muscles[m].strength) * sign * A_unit
     if given is None:
         rows = Params(
             *(torch.tensor([[getattr(material, name)]], dtype=torch.float64) for name in Params._fields)
@@ -233,6 +238,11 @@ def _limit(
     world, particle = divmod(int(squared.argmin()), squared.shape[1])
     dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
     return dt, K[world, particle].item(), int(group.particles[particle])
+
+
+def _stiffening_sign(A_unit: Tensor) -> Tensor:
+    """Sign of the active stress that stiffens, by the tangent of unit active stress; shape (..., k, k) to (...)."""
+    return A_unit.diagonal(dim1=-2, dim2=-1).sum(-1).sign()
 
 
 def _stiffness(A: Tensor, V: Tensor, inertia: Tensor) -> Tensor:

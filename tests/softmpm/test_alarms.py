@@ -92,6 +92,23 @@ def test_the_step_limit_knows_what_a_call_is_given(what, scheme, device):
     assert "running stable step" in str(caught.value) and caught.value.substep == 0
 
 
+@pytest.mark.parametrize("kind", [softmpm.Muscle, softmpm.Pressure])
+def test_the_step_limit_knows_every_control_step(kind, scheme, device):
+    """An active stress of one control step that stiffens beyond the limit is found at the start; of the other sign it is none."""
+    fibres = {"direction": (1.0, 0.0)} if kind is softmpm.Muscle else {}
+    count = len(bar().bodies[0].particles)
+    actuator = kind(particles=range(count), strength=30.0, **fibres)
+    model = softmpm.build(bar(muscles=[actuator]), device=device, scheme=scheme)
+    stiffer = 1.0 if kind is softmpm.Muscle else -1.0
+    activation = torch.zeros(3, 1, 1, device=model.device)
+    activation[1] = 40.0 * stiffer
+    with pytest.raises(softmpm.UnstableError) as caught:
+        run(model, None, activation, substeps=1)
+    assert caught.value.kind == "step" and "in the start state" in str(caught.value)
+    activation[1] = -0.1 * stiffer
+    run(model, None, activation, substeps=1)
+
+
 def test_the_step_limit_follows_the_run(scheme, device):
     """A clamped bar stretches under a heavy load until dt is above its running limit; the substep is the first at which it is."""
     wall = softmpm.Wall(normal=(1.0, 0.0), offset=0.3, contact="stick")
