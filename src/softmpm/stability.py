@@ -96,6 +96,7 @@ def running_limit(
     F: Tensor,
     active_stress: list[float],
     viscosity: float = 0.0,
+    directions: Tensor | None = None,
 ) -> float:
     """Stable step [s] of one particle alone on the grid, as it is at a moment of a run (W2), (W4).
 
@@ -103,18 +104,20 @@ def running_limit(
         F: Its deformation gradient, shape (dim, dim).
         active_stress: Activation times strength of each muscle and pressure of the scene [Pa].
         viscosity: Its viscosity η [Pa s].
+        directions: Unit fibre direction of each muscle and pressure, shape (muscle, dim); None takes the scene's.
     """
     with torch.inference_mode(False), torch.device("cpu"):
         F = F.detach().cpu().double()
+        fibres = [None] * len(scene.muscles) if directions is None else directions.detach().cpu().double()
         bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
         A = tangent(
             scene.bodies[bodies[particle]].material,
             F,
             *(torch.tensor(v, dtype=torch.float64) for v in (mu, lam)),
         )
-        for muscle, stress in zip(scene.muscles, active_stress, strict=True):
+        for muscle, stress, fibre in zip(scene.muscles, active_stress, fibres, strict=True):
             if particle in muscle.particles:
-                A = A + stress * actuator_tangent(muscle, F)
+                A = A + stress * actuator_tangent(muscle, F, fibre)
         V = viscosity * viscous_tangent(F)
         if not bool(torch.isfinite(A).all() and torch.isfinite(V).all()):
             return math.nan
