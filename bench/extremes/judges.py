@@ -5,6 +5,8 @@ Energies follow from the laws' densities, with J = det F, the principal stretche
     neo-Hookean            μ/2 (Σ s² − dim) − μ log J + λ/2 log²J
     fixed corotated        μ Σ (s − 1)² + λ/2 (J − 1)²
     barrier corotated      μ Σ (s − 1)² + λ/8 (J − 1/J)²
+    stable neo-Hookean     2/3 μ (I − 3 − log((I + 1)/4)) + ℓ/2 ((J − α)² − (1 − α)²),  I = Σ s² over three stretches,
+                           ℓ = λ + 5/6 μ,  α = 1 + μ/ℓ
     muscle, active stress p  p/2 |F d|²
 
 A particle carries the affine velocity C as well, so its kinetic energy is m/2 (|v|² + D |C|²) with D = dx²/4, and its angular
@@ -58,10 +60,18 @@ def barrier_corotated(s: np.ndarray, J: np.ndarray, mu: np.ndarray, lam: np.ndar
     return mu * ((s - 1) ** 2).sum(-1) + lam / 8 * (J - 1 / np.where(J != 0, J, np.nan)) ** 2
 
 
+def stable_neo_hookean(s: np.ndarray, J: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+    square = (s**2 - 1).sum(-1)  # I - 3: in plane strain the third stretch is 1
+    volumetric = lam + 5 / 6 * mu
+    volume = volumetric / 2 * (J - 1) ** 2 - mu * (J - 1)
+    return 2 / 3 * mu * (square - np.log1p(square / 4)) + volume
+
+
 DENSITIES = {
     "NeoHookean": neo_hookean,
     "FixedCorotated": fixed_corotated,
     "BarrierCorotated": barrier_corotated,
+    "StableNeoHookean": stable_neo_hookean,
 }
 """Energy per unit of rest volume [J/m³], by the name of the law."""
 

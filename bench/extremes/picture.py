@@ -32,6 +32,7 @@ SHORT = {
     "NeoHookean": "neo-Hookean",
     "FixedCorotated": "fixed corotated",
     "BarrierCorotated": "barrier corot.",
+    "StableNeoHookean": "stable neo-H.",
 }
 LINE, HEAD = 0.235, 0.62
 """Heights of a line of cells and of a row's title [inch]."""
@@ -126,7 +127,9 @@ def draw_limit(rows: list[dict], folder: Path) -> None:
         "strip reported / rest": "held strip: reported / that at rest",
     }
     for axes, (column, title) in zip(three, panels.items(), strict=True):
-        for law, colour, marker in zip(LAWS, ("#0072B2", "#D55E00", "#009E73"), "osD", strict=True):
+        for law, colour, marker in zip(
+            LAWS, ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), "osD^", strict=True
+        ):
             for dim, style in ((2, "-"), (3, "--")):
                 own = [row for row in rows if row["law"] == law.__name__ and row["dim"] == dim]
                 axes.plot(
