@@ -75,7 +75,10 @@ def draw_page(page: str, rows: list[Row], cells: list[dict], path: Path) -> None
 
 TITLES = {
     "material": "Extremes of the material",
+    "viscosity": "Extremes of the viscosity",
     "loads": "Extremes of the load",
+    "actuators": "Extremes of the actuators",
+    "walls": "Extremes of moving walls",
     "starts": "Extremes of the start",
     "numerics": "Extremes of the method",
 }
