@@ -19,7 +19,7 @@ MU, LAM = YOUNG / 2.6, 0.3 * YOUNG / (1.3 * 0.4)
 
 
 def bounce(law: type, dim: int, value: float, how: How) -> str:
-    """The run is long enough for the bounce, up to a viscosity of 10 units, whose step is a hundredth of that of none."""
+    """The run is long enough for the bounce, up to a viscosity of 10 units, whose step is a thirtieth of that of none."""
     scene = bodies.scene(bodies.block(law, dim, height=0.5, viscosity=value * UNIT))
     case = Case(
         scene=scene,

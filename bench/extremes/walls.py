@@ -169,7 +169,7 @@ SPEEDS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 5, 20)
 ROWS = [
     Row(
         name="rising",
-        title="Floor that rises to a block, speed over that of the pressure wave (2 is a cell per substep)",
+        title="Floor that rises to a block, speed over that of the pressure wave (2 is 0.8 cells per substep)",
         right=f"{JUDGED}, energy ≤ 1.05 of the start in the frame of the wall",
         values=SPEEDS,
         few=(0.1, 1, 5),
