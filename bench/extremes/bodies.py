@@ -32,12 +32,13 @@ def box(
     young: float = YOUNG,
     density: float = DENSITY,
     poisson: float = 0.3,
+    viscosity: float = 0.0,
     per_axis: int = 2,
 ) -> softmpm.Body:
     """A box from the corner ``low``, both it and the edges in cells."""
     corner = DX * np.asarray(low, dtype=float)
     particles = softmpm.box(corner, corner + DX * np.asarray(cells, dtype=float), DX / per_axis)
-    return softmpm.Body(particles, law(density=density, young=young, poisson=poisson))
+    return softmpm.Body(particles, law(density=density, young=young, poisson=poisson, viscosity=viscosity))
 
 
 def block(
@@ -67,12 +68,12 @@ def halves(law: type, dim: int, height: float, lower: dict, upper: dict) -> list
     return [box(low, cells, law, **lower), box(high, cells, law, **upper)]
 
 
-def cloud(law: type, dim: int, count: int = 20, poisson: float = 0.3) -> softmpm.Body:
+def cloud(law: type, dim: int, count: int = 20, viscosity: float = 0.0) -> softmpm.Body:
     """Particles that share no node, at random positions within their cells."""
     random = np.random.default_rng(0)
     lattice = np.stack(np.meshgrid(*[np.arange(FLOOR + 6, NODES[dim] - 6, 6)] * dim), -1).reshape(-1, dim)
     places = random.permutation(lattice)[:count] + random.uniform(0, 1, (min(count, len(lattice)), dim))
-    material = law(density=DENSITY, young=YOUNG, poisson=poisson)
+    material = law(density=DENSITY, young=YOUNG, poisson=0.3, viscosity=viscosity)
     return softmpm.Body(softmpm.Particles(DX * places, (DX / 2) ** dim), material)
 
 
@@ -81,6 +82,8 @@ def scene(
     fraction: float = 0.5,
     gravity: bool = True,
     muscle: float = 0.0,
+    pressure: float = 0.0,
+    friction: float = 0.0,
     young: float = YOUNG,
     nodes: int | None = None,
 ) -> softmpm.Scene:
@@ -88,18 +91,24 @@ def scene(
 
     Args:
         muscle: Strength [Pa] of a muscle along x through all particles.
+        pressure: Strength [Pa] of a pressure in all particles.
+        friction: Coulomb coefficient of the floor.
         young: Young's modulus that gravity is measured by.
         nodes: Nodes along an axis of the grid.
     """
     dim = bodies[0].particles.positions.shape[1]
     count = sum(len(body.particles) for body in bodies)
     along = np.eye(dim)
-    muscles = [softmpm.Muscle(particles=np.arange(count), direction=along[0], strength=muscle)]
+    everywhere, muscles = np.arange(count), []
+    if muscle:
+        muscles.append(softmpm.Muscle(particles=everywhere, direction=along[0], strength=muscle))
+    if pressure:
+        muscles.append(softmpm.Pressure(particles=everywhere, strength=pressure))
     whole = softmpm.Scene(
         grid=softmpm.Grid(shape=(nodes or NODES[dim],) * dim, spacing=DX),
         bodies=bodies,
-        muscles=muscles if muscle else (),
-        walls=[softmpm.Wall(normal=along[1], offset=FLOOR * DX)],
+        muscles=muscles,
+        walls=[softmpm.Wall(normal=along[1], offset=FLOOR * DX, friction=friction)],
         gravity=-1e-4 * young / (DENSITY * DX) * along[1] if gravity else None,
         dt=1.0,
     )

@@ -23,7 +23,7 @@ LEAST_DET = 0.05
 APART = 1.4
 """Largest distance of rest neighbours [cells]; beyond it numerical fracture occurs, since they share too few nodes."""
 ENERGY = 1.05
-"""Largest ratio of the mechanical energy to that of the initial state plus the work of the muscles, the only source of work."""
+"""Largest ratio of the mechanical energy to that of the initial state plus the work of the actuators, the only source of work."""
 FLIGHT = 1e-3
 """Largest deviation of a free centre of mass from the discrete law of free fall [cells]."""
 
@@ -66,19 +66,22 @@ class How:
 NO_ALARMS = softmpm.Alarms(collapse=None, gap=None, step=None)
 
 
-def make(scene: softmpm.Scene, how: How, worlds: int = 1) -> softmpm.Model:
+def make(scene: softmpm.Scene, how: How, worlds: int = 1, inputs: tuple[str, ...] = ()) -> softmpm.Model:
     alarms = None if how.alarms else NO_ALARMS
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", softmpm.StabilityWarning)  # a warning is no outcome
         try:
-            return softmpm.build(scene, device=how.device, dtype=how.dtype, worlds=worlds, alarms=alarms)
+            settings = dict(device=how.device, dtype=how.dtype, worlds=worlds, alarms=alarms)
+            return softmpm.build(scene, inputs=inputs, **settings)
         except ValueError as error:
             raise RefusedError(str(error)) from error
 
 
-def call(model: softmpm.Model, state: softmpm.State, activation, params, substeps: int) -> softmpm.State:
+def call(
+    model: softmpm.Model, state: softmpm.State, activation, params, substeps: int, inputs=None
+) -> softmpm.State:
     try:
-        return softmpm.simulate(model, state, activation, params, substeps=substeps)
+        return softmpm.simulate(model, state, activation, params, substeps=substeps, inputs=inputs)
     except ValueError as error:
         raise RefusedError(str(error)) from error
 
@@ -107,7 +110,7 @@ class Run:
     least: float = np.inf
     """Least det F so far."""
     work: float = 0.0
-    """Largest work that the muscles have done so far [J]."""
+    """Largest work that the actuators have done so far [J]."""
 
     @property
     def start(self) -> Exact:
@@ -137,9 +140,9 @@ def not_crushed(run: Run) -> None:
 
 
 def passive(run: Run) -> None:
-    """Mechanical energy at most 1.05 (start + work of the muscles)."""
+    """Mechanical energy at most 1.05 (start + work of the actuators)."""
     start, now = run.matter.energy(run.start), run.matter.energy(run.now)
-    run.work = max(run.work, start.muscle - now.muscle)
+    run.work = max(run.work, start.actuators - now.actuators)
     most = start.mechanical + run.work
     if not now.mechanical <= ENERGY * most:
         raise CriterionError(f"E ×{short(now.mechanical / most)}" if most > 0 else "E > 0")
@@ -180,6 +183,8 @@ class Case:
     activation: float = 0.0
     young_factor: float = 1.0
     """Young's modulus of the call over that of the scene."""
+    inputs: Callable[[int, int], dict[str, np.ndarray]] | None = None
+    """Inputs of the call between two substeps, such as the poses of a wall at both; None if the scene has all."""
     criteria: tuple[Criterion, ...] = BODY
     calls: int = 20
     """Number of calls of the run; the state after each is judged."""
@@ -192,7 +197,7 @@ class Case:
 
 def states(case: Case, how: How) -> Iterator[softmpm.State]:
     """The initial state and the state after each call."""
-    model = make(case.scene, how)
+    model = make(case.scene, how, inputs=() if case.inputs is None else tuple(case.inputs(0, 1)))
     params = model.params()
     params = params._replace(young=params.young * case.young_factor)
     activation = None
@@ -200,9 +205,18 @@ def states(case: Case, how: How) -> Iterator[softmpm.State]:
         activation = torch.full((1, 1, model.muscle_count), case.activation).to(params.young)
     state = case.start(model.rest())
     yield state
-    for _ in range(case.calls):
-        state = call(model, state, activation, params, case.length)
+    for k in range(case.calls):
+        given = None
+        if case.inputs is not None:
+            arrays = case.inputs(k * case.length, (k + 1) * case.length)
+            given = softmpm.Inputs(**{name: _tensor(model, name, array) for name, array in arrays.items()})
+        state = call(model, state, activation, params, case.length, given)
         yield state
+
+
+def _tensor(model: softmpm.Model, name: str, array: np.ndarray) -> torch.Tensor:
+    dtype = torch.float64 if name in ("wall_offset", "wall_normal") else model.dtype
+    return torch.as_tensor(array, dtype=dtype, device=model.device)
 
 
 def judged(case: Case, how: How) -> Run:

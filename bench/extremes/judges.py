@@ -5,7 +5,10 @@ Energies follow from the laws' densities, with J = det F, the principal stretche
     neo-Hookean            μ/2 (Σ s² − dim) − μ log J + λ/2 log²J
     fixed corotated        μ Σ (s − 1)² + λ/2 (J − 1)²
     barrier corotated      μ Σ (s − 1)² + λ/8 (J − 1/J)²
+    stable neo-Hookean     2/3 μ (I − 3 − log((I + 1)/4)) + ℓ/2 ((J − α)² − (1 − α)²),  I = Σ s² over three stretches,
+                           ℓ = λ + 5/6 μ,  α = 1 + μ/ℓ
     muscle, active stress p  p/2 |F d|²
+    pressure p             −p (J − 1)
 
 A particle carries the affine velocity C as well, so its kinetic energy is m/2 (|v|² + D |C|²) with D = dx²/4, and its angular
 momentum has the part m D (C − Cᵀ). Velocities of a state are half a substep older than its positions; the energies are taken
@@ -58,10 +61,18 @@ def barrier_corotated(s: np.ndarray, J: np.ndarray, mu: np.ndarray, lam: np.ndar
     return mu * ((s - 1) ** 2).sum(-1) + lam / 8 * (J - 1 / np.where(J != 0, J, np.nan)) ** 2
 
 
+def stable_neo_hookean(s: np.ndarray, J: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+    square = (s**2 - 1).sum(-1)  # I - 3: in plane strain the third stretch is 1
+    volumetric = lam + 5 / 6 * mu
+    volume = volumetric / 2 * (J - 1) ** 2 - mu * (J - 1)
+    return 2 / 3 * mu * (square - np.log1p(square / 4)) + volume
+
+
 DENSITIES = {
     "NeoHookean": neo_hookean,
     "FixedCorotated": fixed_corotated,
     "BarrierCorotated": barrier_corotated,
+    "StableNeoHookean": stable_neo_hookean,
 }
 """Energy per unit of rest volume [J/m³], by the name of the law."""
 
@@ -75,12 +86,12 @@ def stretches(F: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of a body [J]; ``mechanical`` excludes the energy of the muscles, whose decrease is their work."""
+    """Energies of a body [J]; ``mechanical`` excludes the energy of the actuators, whose decrease is their work."""
 
     kinetic: float
     elastic: float
     gravity: float
-    muscle: float
+    actuators: float
 
     @property
     def mechanical(self) -> float:
@@ -88,7 +99,7 @@ class Energy:
 
     @property
     def total(self) -> float:
-        return self.mechanical + self.muscle
+        return self.mechanical + self.actuators
 
 
 class Matter:
@@ -109,9 +120,7 @@ class Matter:
         self.mu = young / (2 * (1 + poisson))
         self.lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
         self.laws = np.repeat([type(body.material).__name__ for body in bodies], sizes)
-        self.active_stresses = [
-            (m.particles, np.array(m.direction), activation * m.strength) for m in scene.muscles
-        ]
+        self.active_stresses = [(actuator, activation * actuator.strength) for actuator in scene.muscles]
         self.floor = min((wall.offset for wall in scene.walls), default=0.0)
         self.pairs = self._neighbours(np.cumsum([0, *sizes]))
 
@@ -136,16 +145,23 @@ class Matter:
             density[own] = DENSITIES[law](s[own], J[own], self.mu[own], self.lam[own])
         squares = (state.v**2).sum(-1) + self.dx**2 / 4 * (state.C**2).sum((-1, -2))
         height = (x - self.floor * np.eye(self.dim)[1]) @ np.array(self.scene.gravity)
-        muscle = sum(
-            float((p / 2 * self.volume[i] * ((F[i] @ d) ** 2).sum(-1)).sum())
-            for i, d, p in self.active_stresses
-        )
         return Energy(
             kinetic=float((self.mass * squares).sum() / 2),
             elastic=float((self.volume * density).sum()),
             gravity=float(-(self.mass * height).sum()),
-            muscle=float(muscle),
+            actuators=self._energy_of_actuators(F, J),
         )
+
+    def _energy_of_actuators(self, F: np.ndarray, J: np.ndarray) -> float:
+        energy = 0.0
+        for actuator, p in self.active_stresses:
+            i = actuator.particles
+            if isinstance(actuator, softmpm.Muscle):
+                density = p / 2 * ((F[i] @ np.array(actuator.direction)) ** 2).sum(-1)
+            else:
+                density = -p * (J[i] - 1)
+            energy += float((self.volume[i] * density).sum())
+        return energy
 
     def center(self, state: Exact) -> np.ndarray:
         return self.mass @ state.x / self.mass.sum()

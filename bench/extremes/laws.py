@@ -2,4 +2,4 @@
 
 import softmpm
 
-LAWS = [softmpm.NeoHookean, softmpm.FixedCorotated, softmpm.BarrierCorotated]
+LAWS = [softmpm.NeoHookean, softmpm.FixedCorotated, softmpm.BarrierCorotated, softmpm.StableNeoHookean]

@@ -32,6 +32,7 @@ SHORT = {
     "NeoHookean": "neo-Hookean",
     "FixedCorotated": "fixed corotated",
     "BarrierCorotated": "barrier corot.",
+    "StableNeoHookean": "stable neo-H.",
 }
 LINE, HEAD = 0.235, 0.62
 """Heights of a line of cells and of a row's title [inch]."""
@@ -74,7 +75,10 @@ def draw_page(page: str, rows: list[Row], cells: list[dict], path: Path) -> None
 
 TITLES = {
     "material": "Extremes of the material",
+    "viscosity": "Extremes of the viscosity",
     "loads": "Extremes of the load",
+    "actuators": "Extremes of the actuators",
+    "walls": "Extremes of moving walls",
     "starts": "Extremes of the start",
     "numerics": "Extremes of the method",
 }
@@ -126,7 +130,9 @@ def draw_limit(rows: list[dict], folder: Path) -> None:
         "strip reported / rest": "held strip: reported / that at rest",
     }
     for axes, (column, title) in zip(three, panels.items(), strict=True):
-        for law, colour, marker in zip(LAWS, ("#0072B2", "#D55E00", "#009E73"), "osD", strict=True):
+        for law, colour, marker in zip(
+            LAWS, ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), "osD^", strict=True
+        ):
             for dim, style in ((2, "-"), (3, "--")):
                 own = [row for row in rows if row["law"] == law.__name__ and row["dim"] == dim]
                 axes.plot(

@@ -20,6 +20,7 @@ from softmpm.kernels.structs import Spec, types
 from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
 from softmpm.scene.neighbours import rest_neighbours
 from softmpm.scene.scene import Scene
+from softmpm.stability import stiffening_signs
 from softmpm.state import Low, Params, State
 from softmpm.summary import counted
 from softmpm.workspace import Workspace
@@ -40,6 +41,7 @@ class Model:
         mass: Mass [kg] as the scene gives it, shape (particle,).
         mass_unit: Mass of the heaviest particle [kg], in which the kernels count, shape ().
         specific_volume: Rest volume per unit of mass [m³/kg], shape (particle,).
+        stiffening: Sign of the active stress that stiffens, of each actuator, shape (muscle,).
         driven: Indices of the driven particles, shape (driven,).
         body: Index of each particle's body, shape (particle,).
         wall_constants: Numbers of the walls that lie in the parameters of a launch, by the names of the inputs.
@@ -88,6 +90,7 @@ class Model:
         self.deterministic, self.workspace = deterministic, Workspace()
         self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point)
         self.strength = self._tensor([m.strength for m in scene.muscles])
+        self.stiffening = self._tensor(stiffening_signs(scene))
         # Computed now, not on first use: that may be during a capture, which runs nothing.
         self._params, self._low = self._given(), self._rounded() if dtype == torch.float32 else None
         self.mass = (self._params.density * self.volume).contiguous()

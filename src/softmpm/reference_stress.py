@@ -190,9 +190,11 @@ def actuator_stress(actuator: Actuator, F: Tensor, direction: Tensor, p: Tensor)
     return _kind(actuator)[0](F, direction, p)
 
 
-def actuator_tangent(actuator: Actuator, F: Tensor) -> Tensor:
-    """As :func:`tangent` for an actuator of unit activation times strength."""
-    return _kind(actuator)[1](F, torch.tensor(getattr(actuator, "direction", ()), dtype=torch.float64))
+def actuator_tangent(actuator: Actuator, F: Tensor, direction: Tensor | None = None) -> Tensor:
+    """As :func:`tangent` for an actuator of unit activation times strength; a unit ``direction`` replaces that of the actuator."""
+    if direction is None:
+        direction = torch.tensor(getattr(actuator, "direction", ()), dtype=torch.float64)
+    return _kind(actuator)[1](F, direction)
 
 
 def _kind(actuator: Actuator) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:

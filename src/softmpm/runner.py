@@ -10,7 +10,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
 from softmpm.schemes.capture import defer_status_check, is_capturing
 from softmpm.schemes.failure_report import Report, failed_worlds, failure
-from softmpm.schemes.inputs import Values, in_rows, strongest
+from softmpm.schemes.inputs import Values, in_rows, stiffest
 from softmpm.schemes.registry import SCHEMES
 from softmpm.schemes.scheme import Run, Scheme
 from softmpm.state import State
@@ -52,7 +52,9 @@ class Runner:
         words = [] if report is None else report.read()
         for world in failed_worlds(words):
             self._take(
-                failure(self.model, words, world, start, values=strongest(self.values), before=True),
+                failure(
+                    self.model, words, world, start, values=stiffest(self.model, self.values), before=True
+                ),
                 0,
             )
         return not failed_worlds(words)
@@ -102,7 +104,7 @@ class Runner:
             state = single.end
         # Sums in another order may have avoided the failure; the report remains true.
         world = min(self._failed(words), key=lambda w: words[w])
-        return found(words, world, at_end, first=run.chunk.first, values=strongest(self.values))
+        return found(words, world, at_end, first=run.chunk.first, values=stiffest(self.model, self.values))
 
     def _single(self, chunk: Chunk, state: Any) -> tuple[Run, list[int]]:
         """A run of one substep, repeated until the scheme accepts it, and its status words."""

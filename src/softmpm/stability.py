@@ -96,6 +96,7 @@ def running_limit(
     F: Tensor,
     active_stress: list[float],
     viscosity: float = 0.0,
+    directions: Tensor | None = None,
 ) -> float:
     """Stable step [s] of one particle alone on the grid, as it is at a moment of a run (W2), (W4).
 
@@ -103,24 +104,33 @@ def running_limit(
         F: Its deformation gradient, shape (dim, dim).
         active_stress: Activation times strength of each muscle and pressure of the scene [Pa].
         viscosity: Its viscosity η [Pa s].
+        directions: Unit fibre direction of each muscle and pressure, shape (muscle, dim); None takes the scene's.
     """
     with torch.inference_mode(False), torch.device("cpu"):
         F = F.detach().cpu().double()
+        fibres = [None] * len(scene.muscles) if directions is None else directions.detach().cpu().double()
         bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
         A = tangent(
             scene.bodies[bodies[particle]].material,
             F,
             *(torch.tensor(v, dtype=torch.float64) for v in (mu, lam)),
         )
-        for muscle, stress in zip(scene.muscles, active_stress, strict=True):
+        for muscle, stress, fibre in zip(scene.muscles, active_stress, fibres, strict=True):
             if particle in muscle.particles:
-                A = A + stress * actuator_tangent(muscle, F)
+                A = A + stress * actuator_tangent(muscle, F, fibre)
         V = viscosity * viscous_tangent(F)
         if not bool(torch.isfinite(A).all() and torch.isfinite(V).all()):
             return math.nan
         inertia = torch.tensor(density * scene.grid.spacing**2, dtype=torch.float64)
         K = _stiffness(A, V, inertia).item()
     return scene.grid.spacing * math.sqrt(density / K) if K > 0 else math.inf
+
+
+def stiffening_signs(scene: Scene) -> list[float]:
+    """For each actuator of the scene, the sign of the active stress that stiffens: 1 for a muscle, -1 for a pressure (suction)."""
+    with torch.inference_mode(False), torch.device("cpu"):
+        at_rest = torch.eye(scene.grid.dim, dtype=torch.float64)
+        return [_stiffening_sign(actuator_tangent(actuator, at_rest)).item() for actuator in scene.muscles]
 
 
 def need_stable(scene: Scene, most: float) -> None:
@@ -209,10 +219,8 @@ def _limit(
     A_active = torch.zeros_like(A_mu)
     for m in group.muscles:
         A_unit = actuator_tangent(scene.muscles[m], F)
-        stiffening = (
-            A_unit.diagonal(dim1=-2, dim2=-1).sum(-1).sign()[..., None, None]
-        )  # the sign of the activation that is stiffer
-        A_active = A_active + abs(activation * scene.muscles[m].strength) * stiffening * A_unit
+        sign = _stiffening_sign(A_unit)[..., None, None]
+        A_active = A_active + abs(activation * scene.muscles[m].strength) * sign * A_unit
     if given is None:
         rows = Params(
             *(torch.tensor([[getattr(material, name)]], dtype=torch.float64) for name in Params._fields)
@@ -233,6 +241,11 @@ def _limit(
     world, particle = divmod(int(squared.argmin()), squared.shape[1])
     dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
     return dt, K[world, particle].item(), int(group.particles[particle])
+
+
+def _stiffening_sign(A_unit: Tensor) -> Tensor:
+    """Sign of the active stress that stiffens, by the tangent of unit active stress; shape (..., k, k) to (...)."""
+    return A_unit.diagonal(dim1=-2, dim2=-1).sum(-1).sign()
 
 
 def _stiffness(A: Tensor, V: Tensor, inertia: Tensor) -> Tensor:

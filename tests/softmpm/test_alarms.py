@@ -92,6 +92,57 @@ def test_the_step_limit_knows_what_a_call_is_given(what, scheme, device):
     assert "running stable step" in str(caught.value) and caught.value.substep == 0
 
 
+def test_the_step_limit_knows_the_viscosity_of_a_call(scheme, device):
+    """K dt² + 4η dt ≤ ρ dx²: 0.98 of the largest viscosity runs, and 1.02 of it is named at the start, with its value."""
+    scene = bar(muscles=())
+    model = softmpm.build(scene, device=device, scheme=scheme, inputs=("viscosity",))
+    inertia, K = scene.grid.spacing**2, 100.0 / 1.3 + 2 * 30.0 / (1.3 * 0.4)
+    largest = (inertia - K * scene.dt**2) / (4 * scene.dt)
+    for factor in (0.98, 1.02):
+        inputs = softmpm.Inputs(viscosity=torch.full((1, 1), factor * largest, device=model.device))
+        if factor < 1:
+            run(model, substeps=3, inputs=inputs)
+        else:
+            with pytest.raises(
+                softmpm.UnstableError, match=f"viscosity {factor * largest:.4g} Pa s"
+            ) as caught:
+                run(model, substeps=3, inputs=inputs)
+            assert caught.value.kind == "step" and "in the start state" in str(caught.value)
+
+
+def test_the_step_limit_is_stated_with_the_direction_of_a_call(scheme, device):
+    """A fibre direction of the call gives the message of a scene that has this direction."""
+    particles = range(len(bar().bodies[0].particles))
+    messages = []
+    for own, given in (((1.0, 0.0), None), ((0.0, 1.0), (2.0, 0.0))):
+        scene = bar(muscles=[softmpm.Muscle(particles=particles, direction=own, strength=30.0)])
+        model = softmpm.build(scene, device=device, scheme=scheme, inputs=("direction",))
+        start = model.rest()
+        start.F[..., 0, 0] = 2.0
+        inputs = None if given is None else softmpm.Inputs(direction=torch.tensor([[given]]).to(start.F))
+        with pytest.raises(softmpm.UnstableError, match="running stable step") as caught:
+            run(model, start, torch.full((1, 1, 1), 10.0, device=model.device), 1, inputs=inputs)
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1]
+
+
+@pytest.mark.parametrize("kind", [softmpm.Muscle, softmpm.Pressure])
+def test_the_step_limit_knows_every_control_step(kind, scheme, device):
+    """An active stress of one control step that stiffens beyond the limit is found at the start; of the other sign it is none."""
+    fibres = {"direction": (1.0, 0.0)} if kind is softmpm.Muscle else {}
+    count = len(bar().bodies[0].particles)
+    actuator = kind(particles=range(count), strength=30.0, **fibres)
+    model = softmpm.build(bar(muscles=[actuator]), device=device, scheme=scheme)
+    stiffer = 1.0 if kind is softmpm.Muscle else -1.0
+    activation = torch.zeros(3, 1, 1, device=model.device)
+    activation[1] = 40.0 * stiffer
+    with pytest.raises(softmpm.UnstableError) as caught:
+        run(model, None, activation, substeps=1)
+    assert caught.value.kind == "step" and "in the start state" in str(caught.value)
+    activation[1] = -0.1 * stiffer
+    run(model, None, activation, substeps=1)
+
+
 def test_the_step_limit_follows_the_run(scheme, device):
     """A clamped bar stretches under a heavy load until dt is above its running limit; the substep is the first at which it is."""
     wall = softmpm.Wall(normal=(1.0, 0.0), offset=0.3, contact="stick")

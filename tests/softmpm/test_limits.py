@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from bench.extremes import bodies
 from bench.extremes.cells import How, Outcome, verdict
-from bench.extremes.judges import DENSITIES, stretches
+from bench.extremes.judges import DENSITIES, Exact, Matter, stretches
 from bench.extremes.laws import LAWS
 from bench.extremes.pages import PAGES
 
@@ -39,3 +40,24 @@ def test_the_judges_energies_belong_to_the_stresses(law, dim):
     stress = reference.LAWS[law](*(torch.from_numpy(array) for array in (F, mu, lam))).numpy()
     slope = (energy(eps) - energy(-eps)) / (2 * eps)
     assert slope == pytest.approx((stress * G).sum((1, 2)), rel=1e-7, abs=1e-7)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["muscle", "pressure"])
+def test_the_judges_energies_belong_to_the_actuators(kind, dim):
+    """The same for the energy of actuators, Σ V⁰ τ : G, at an activation of 0.7."""
+    scene = bodies.scene(bodies.block(softmpm.NeoHookean, dim, side=1), **{kind: 20.0})
+    matter, random, eps = Matter(scene, activation=0.7), np.random.default_rng(0), 1e-6
+    shape = (len(matter.rest), dim, dim)
+    F, G = np.eye(dim) + 0.2 * random.standard_normal(shape), random.standard_normal(shape)
+
+    def energy(step: float) -> float:
+        still = np.zeros_like(F)
+        return matter.energy(Exact(matter.rest, still[:, 0], still, F + step * G @ F)).actuators
+
+    actuator = scene.muscles[0]
+    direction = torch.tensor(getattr(actuator, "direction", ()), dtype=torch.float64).expand(len(F), -1)
+    p = torch.full((len(F),), 0.7 * 20.0, dtype=torch.float64)
+    stress = reference.actuator_stress(actuator, torch.from_numpy(F), direction, p).numpy()
+    slope = (energy(eps) - energy(-eps)) / (2 * eps)
+    assert slope == pytest.approx(matter.volume @ (stress * G).sum((1, 2)), rel=1e-7)

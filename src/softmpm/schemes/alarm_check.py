@@ -12,7 +12,7 @@ from softmpm.kernels.structs import element_type, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import placeholder, placeholders_in, view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.inputs import Values, particle_struct, shape_of, strongest
+from softmpm.schemes.inputs import Values, particle_struct, shape_of, stiffest
 from softmpm.schemes.launch import RebindableLaunch
 from softmpm.state import State
 
@@ -50,9 +50,9 @@ class StartCheck:
         self._check = RebindableLaunch(model, state_alarms(model.spec), lead, arguments, [*given, *places])
 
     def __call__(self, start: State, values: Values) -> Tensor:
-        """Launch the check and return its status words. It uses the largest active stress of each actuator."""
+        """Launch the check and return its status words. It uses the stiffest active stress of each actuator."""
         self.words.fill_(NEVER)
-        values = strongest(values)
+        values = stiffest(self.model, values)
         given = [(values[one.name][0] if one.rows else values[one.name]).contiguous() for one in self._open]
         self._check(stream_of(self.model.device), *given, start.x.contiguous(), start.F.contiguous())
         return self.words

@@ -1,6 +1,6 @@
 """Failures in words: what a particle did, the rule that it broke, and a remedy.
 
-Each remedy is tried in tests/softmpm/test_remedies.py.
+Each remedy is tried in tests/softmpm/schemes/test_remedies.py.
 """
 
 from dataclasses import dataclass
@@ -108,13 +108,15 @@ class Case:
 
     def _step(self) -> tuple[str, str, str, str]:
         scene, most = self.model.scene, self.model.alarms.step or 1.0
-        largest = self._running_limit()
+        largest, viscosity = self._running_limit(), self._viscosity()
         F = self.end.F[self.world, self.particle].detach().double()
         stretches = ", ".join(f"{s:.3g}" for s in torch.linalg.svdvals(F.cpu()).tolist())
         value = f"makes dt = {scene.dt:.4g} s {scene.dt / largest:.4g} times its running stable step of {largest:.4g} s"
-        value += f" (principal stretches {stretches})"
+        viscous = f", viscosity {viscosity:.4g} Pa s" if viscosity > 0 else ""
+        value += f" (principal stretches {stretches}{viscous})"
         limit = f"that ratio must stay within {most:.4g}"
-        advice = f"Use a dt of at most {0.8 * most * largest:.2g} s, a softer or denser material, or a weaker activation"
+        other = "a softer, denser or less viscous" if viscosity > 0 else "a softer or denser"
+        advice = f"Use a dt of at most {0.8 * most * largest:.2g} s, {other} material, or a weaker activation"
         return "step", value, limit, advice + "; alarms=softmpm.Alarms(step=None) runs it all the same."
 
     def _not_finite(self) -> tuple[str, str, str, str]:
@@ -164,11 +166,18 @@ class Case:
         if values is None:
             return float("nan")
         mu, lam, mass = (values[name][self.world, p].item() for name in ("mu", "lam", "mass"))
-        active_stress, viscosity = [0.0] * model.muscle_count, 0.0
+        active_stress = [0.0] * model.muscle_count
         if "active_stress" in values:
             active_stress = values["active_stress"][0, self.world].tolist()
-        if "viscosity" in values:
-            viscosity = values["viscosity"][self.world, p].item()
+        directions = values["fibre"][self.world] if "fibre" in values else None
         density = mass / model.specific_volume[p].item()
         F = self.end.F[self.world, p]
-        return running_limit(model.scene, p, mu, lam, density, F, active_stress, viscosity)
+        viscosity = self._viscosity()
+        return running_limit(
+            model.scene, p, mu, lam, density, F, active_stress, viscosity, directions=directions
+        )
+
+    def _viscosity(self) -> float:
+        """Viscosity of the particle in the call [Pa s]."""
+        values = self.values or {}
+        return values["viscosity"][self.world, self.particle].item() if "viscosity" in values else 0.0

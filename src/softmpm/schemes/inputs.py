@@ -59,11 +59,11 @@ def in_rows(values: Values, rows: slice) -> Values:
     return found
 
 
-def strongest(values: Values) -> Values:
-    """The inputs of the first control step, with the largest active stress of each actuator in all control steps."""
+def stiffest(model: Model, values: Values) -> Values:
+    """The inputs of the first control step, with the active stress of each actuator that is stiffest among all control steps."""
     found, active = in_rows(values, slice(0, 1)), values.get("active_stress")
     if active is not None and active.shape[0] > 1:
-        found["active_stress"] = active.amax(0, keepdim=True)
+        found["active_stress"] = (active * model.stiffening).amax(0, keepdim=True) * model.stiffening
     return found
 
 

@@ -84,6 +84,22 @@ def test_a_step_that_is_too_large():
     softmpm.simulate(loose, loose.rest(), None, params, substeps=1)
 
 
+def test_a_step_that_is_too_large_for_the_viscosity():
+    """The dt that the message names and a less viscous material each pass."""
+
+    def run(viscosity: float, dt: float | None = None) -> None:
+        scene = bar(muscles=())
+        scene = dataclasses.replace(scene, dt=dt or scene.dt)
+        model = softmpm.build(scene, device="cpu", inputs=("viscosity",))
+        inputs = softmpm.Inputs(viscosity=torch.full((1, 1), viscosity))
+        softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, inputs=inputs)
+
+    with pytest.raises(softmpm.UnstableError, match="a softer, denser or less viscous material") as caught:
+        run(1.0)
+    run(1.0, dt=float(re.search(r"dt of at most (\S+) s", str(caught.value))[1]))
+    run(0.1)
+
+
 def test_a_particle_that_leaves_the_grid():
     """A larger grid, a wall and a start further inside each hold a bar that flies to the right."""
     scene = bar(muscles=())
