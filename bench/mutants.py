@@ -57,7 +57,7 @@ HOMOGENEOUS = (
 )
 UNCHANGED = {
     ("back", "v"): HOMOGENEOUS,
-    ("back", "meet(inputs, world, here, constants.exact_spacing, v)"): HOMOGENEOUS,
+    ("back", "meet(inputs, world, x, v)"): HOMOGENEOUS,
     (
         "grid_velocity_adj",
         "load_node(node_before, i)",

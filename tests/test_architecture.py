@@ -19,11 +19,11 @@ LAYERS = """
     reference_stress reference_walls
     reference kernels.physics
     stability kernels.convert
-    kernels.rasterize kernels.plain kernels.fast
+    kernels.rasterize kernels.plain kernels.fast kernels.lagrangian rest_grid
     describe
     model
-    schemes
-    schemes.plain schemes.fast recording
+    nodal schemes
+    schemes.plain schemes.fast schemes.lagrangian recording
     schemes.registry
     kernel_inputs
     building runner rasterization cuda_graph

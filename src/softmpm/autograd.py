@@ -16,6 +16,7 @@ from softmpm.checks import (
     check_horizon,
     check_inputs,
     check_inputs_bounds,
+    check_shown,
     check_state,
     control_steps,
 )
@@ -24,12 +25,13 @@ from softmpm.inputs import Inputs, differentiable
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model, check_model
+from softmpm.nodal import nodes_of, particles_of
 from softmpm.planning.chunks import Horizon
 from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
-from softmpm.state import GridField, Low, Params, State
+from softmpm.state import GridField, Low, Nodal, Params, State
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
@@ -102,13 +104,23 @@ def _simulate(
         check_finite(start, activation)
         check_inputs_bounds(given)
     values = derive(model, start, activation, params, given, horizon)
+    if model.formulation == "moving":
+        return _run(model, horizon, start, values, failures)
+    if start.nodes is not None and not is_capturing(model):
+        check_shown(start, particles_of(model, start.nodes.detach()))
+    nodes = nodes_of(model, start, values["mass"]) if start.nodes is None else start.nodes
+    return particles_of(model, _run(model, horizon, nodes, values, failures))
+
+
+def _run(model: Model, horizon: Horizon, start: Any, values: Values, failures: Failures | None) -> Any:
+    """The final state, of the type of the initial one."""
     tensors = (*values.values(), *start[:4])
     needed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     call = _Call(model, horizon, tuple(values), needed, failures)
     if not needed and not _has_transform_or_tangent(tensors):
         return call.run(start, values)
-    simulated: Any = _Simulate.apply(call, *tensors, *(start.low or (None, None)))
-    return State(*simulated[:4], low=Low(*simulated[4:6]) if model.dtype == torch.float32 else None)
+    simulated: Any = _Simulate.apply(call, *tensors, *call.rounding(start))
+    return call.state(simulated)
 
 
 def _has_transform_or_tangent(tensors: Iterable[Tensor | None]) -> bool:
@@ -171,7 +183,18 @@ class _Call:
     failures: Failures | None
     trail: Trail | None = None
 
-    def run(self, start: State, values: Values) -> State:
+    def state(self, tensors: Sequence) -> Any:
+        """A state of the model's formulation from its tensors and those of its low-order parts."""
+        if self.model.formulation == "reference":
+            return Nodal(*tensors)
+        x, v, C, F, low_x, low_F = tensors
+        return State(x, v, C, F, None if low_x is None else Low(low_x, low_F))
+
+    def rounding(self, state: Any) -> tuple:
+        """The low-order parts of a state of the moving formulation, or None in their place."""
+        return () if isinstance(state, Nodal) else tuple(state.low or (None, None))
+
+    def run(self, start: Any, values: Values) -> Any:
         """The end, after the trail is kept."""
         with explain_out_of_memory(self.model, self.horizon, self.differentiable):
             given = self.model, self.horizon, start, values, self.differentiable, self.failures
@@ -203,9 +226,9 @@ class _Simulate(_Function):
     def forward(*given):
         # PyTorch binds arguments to the signature at each call, which takes longer the more of them have names.
         call, *tensors = given
-        values, (x, v, C, F, low_x, low_F) = call.split(tensors)
-        end = call.run(State(x, v, C, F, None if low_x is None else Low(low_x, low_F)), values)
-        return (*end[:4], *(end.low or (None, None)))
+        values, state = call.split(tensors)
+        end = call.run(call.state(state), values)
+        return (*end[:4], *call.rounding(end))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -219,10 +242,12 @@ class _Simulate(_Function):
         refuse_batches(adj_end)
         needed = dict(zip(ctx.call.names, ctx.needs_input_grad[1:], strict=False))
         found = [one.group for one in differentiable(ctx.call.model.spec) if needed.get(one.name)]
+        rounding = len(adj_end) - len(adj_end[:4])
         given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:4]
         # It may be differentiated once more:
         again = torch.is_grad_enabled() or _has_transform_or_tangent(given[2:])
-        return None, *(_SimulateBackward.apply if again else _SimulateBackward.forward)(*given), None, None
+        backward = _SimulateBackward.apply if again else _SimulateBackward.forward
+        return None, *backward(*given), *rounding * (None,)
 
 
 class _SimulateBackward(_Function):
@@ -232,10 +257,11 @@ class _SimulateBackward(_Function):
     def forward(*given):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
         call, wanted, *tensors = given
-        values, (x, v, C, F, _, _, *adj_end) = call.split(tensors)
-        pairs = zip(adj_end, (x, v, C, F), strict=True)
-        adj_x, adj_v, adj_C, adj_F = (torch.zeros_like(like) if adj is None else adj for adj, like in pairs)
-        adj_end = State(adj_x, adj_v, adj_C, adj_F)
+        values, state = call.split(tensors)
+        kind: Any = Nodal if call.model.formulation == "reference" else State
+        count = len(state) // 2 if kind is Nodal else 4
+        pairs = zip(state[-count:], state[:count], strict=True)
+        adj_end = kind(*(torch.zeros_like(like) if adj is None else adj for adj, like in pairs))
         with explain_out_of_memory(call.model, call.horizon, gradient=True):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
         found = (adj_inputs.tensors.get(name) for name in call.names)

@@ -1,5 +1,6 @@
 """``build``: a scene checked, a scheme chosen, and the model of both."""
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -23,6 +24,7 @@ def build(
     worlds: int = 1,
     memory_budget: int | None = None,
     scheme: str = "auto",
+    formulation: str = "moving",
     inputs: Iterable[str] = (),
     deterministic: bool = False,
     calls: int = 1,
@@ -39,6 +41,8 @@ def build(
             None takes a share of the device's memory; ``describe`` estimates the whole of a call. See docs/memory.md.
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
+        formulation: "moving": material point method, whose grid is reset in each substep. "reference": total Lagrangian, with weights
+            taken once at rest; see docs/formulations.md.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower, and in the plain scheme
@@ -64,8 +68,10 @@ def build(
             memory_budget = int(memory_budget)
         check_whole("memory_budget, in bytes,", memory_budget)
         memory_budget = int(memory_budget)
-    if scheme not in ("auto", *SCHEMES):
+    if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
+    if formulation not in ("moving", "reference"):
+        raise ValueError(f"formulation must be 'moving' or 'reference', got {formulation!r}.")
     given = check_given(scene, inputs)
     if not isinstance(deterministic, (bool, np.bool_)):
         raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
@@ -76,7 +82,12 @@ def build(
     if alarms.step is not None:
         need_stable(scene, alarms.step)
     warn_sparse(scene)
-    scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
+    if formulation == "reference":
+        check_reference(scene, given, scheme)
+        scheme, reason = "lagrangian", "formulation='reference'"
+        alarms = dataclasses.replace(alarms, gap=None, step=None)
+    else:
+        scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
     place = device_of(device)
     return Model(
         scene,
@@ -86,6 +97,7 @@ def build(
         reason,
         SCHEMES[scheme].footprint,
         alarms,
+        formulation=formulation,
         given=given,
         deterministic=bool(deterministic),
         fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme),
@@ -93,6 +105,21 @@ def build(
         memory_budget=memory_budget,
         calls=int(calls),
     )
+
+
+def check_reference(scene: Scene, given: tuple[str, ...], scheme: str) -> None:
+    """Raise ValueError for what the reference formulation cannot do."""
+    if scheme != "auto":
+        raise ValueError(f"formulation='reference' has one scheme, got scheme={scheme!r}; leave scheme out.")
+    moving = [name for name in given if name.startswith("wall_")]
+    if moving:
+        raise ValueError(
+            f"formulation='reference' has walls at rest only, but inputs has {moving[0]!r}; take formulation='moving'."
+        )
+    if len(scene.driven):
+        raise ValueError(
+            "formulation='reference' has no driven particles, but the scene does; take formulation='moving'."
+        )
 
 
 def check_given(scene: Scene, inputs: Iterable[str]) -> tuple[str, ...]:
@@ -146,12 +173,12 @@ def choose_scheme(scene: Scene, dtype: torch.dtype, worlds: int, wanted: str) ->
 
 
 def in_fixed_point(device: torch.device, dtype: torch.dtype, scheme: str) -> bool:
-    """True if a deterministic model sums in fixed point, as the fast scheme does; the plain scheme sums in the order of the particles.
+    """True if a deterministic model sums in fixed point, as the fast scheme does; the others sum in a fixed order.
 
     Raises:
         ValueError: It would have to, and cannot.
     """
-    if scheme == "plain":
+    if scheme != "fast":
         return False
     if dtype == torch.float32:
         return True

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.planning.chunks import Horizon
-from softmpm.state import Low, Params, State
+from softmpm.state import Low, Nodal, Params, State
 from softmpm.validate import need
 
 
@@ -36,6 +36,10 @@ class Sizes(Protocol):
     def spec(self) -> Any: ...
     @property
     def defaults(self) -> dict[str, Tensor]: ...
+    @property
+    def formulation(self) -> str: ...
+    @property
+    def rest_grid(self) -> Any: ...
     def shape_of(self, name: str, control_steps: int) -> tuple[int, ...]: ...
 
 
@@ -51,12 +55,39 @@ def check_state(model: Sizes, state: State) -> None:
     shapes = {"x": (*lead, d), "v": (*lead, d), "C": (*lead, d, d), "F": (*lead, d, d)}
     for name in shapes:
         _check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
+    if state.nodes is not None:
+        _check_nodes(model, state.nodes)
     if state.low is None:
         return
     if not isinstance(state.low, Low):
         raise TypeError(f"state.low must be a softmpm.Low or None, got {type(state.low).__name__}.")
     for name in ("x", "F"):
         _check_tensor(model, f"state.low.{name}", getattr(state.low, name), shapes[name])
+
+
+def _check_nodes(model: Sizes, nodes: Nodal) -> None:
+    """Shape, dtype and device of the nodal state, which only the reference formulation has."""
+    if model.formulation != "reference":
+        raise ValueError(
+            "state.nodes must be None with formulation='moving'; take state._replace(nodes=None), or build the model with "
+            "formulation='reference'."
+        )
+    shape = (model.worlds, model.rest_grid.count, model.dim)
+    for name in Nodal._fields:
+        _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), shape)
+
+
+def check_shown(state: State, shown: State) -> None:
+    """The four tensors of a state with nodes are what its particles show of these. Reads back once: a GPU has to wait."""
+    apart = torch.stack(
+        [(ours - theirs).abs().max() for ours, theirs in zip(state[:4], shown[:4], strict=True)]
+    )
+    for name, distance in zip(State._fields, apart.tolist(), strict=False):
+        need(
+            distance == 0.0,
+            f"state.{name} was changed, but state.nodes was not, from which a call continues: they differ by {distance:g}; take "
+            "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
+        )
 
 
 def check_activation(model: Sizes, activation: Tensor | None) -> None:

@@ -18,6 +18,7 @@ from softmpm.inputs import QUANTITIES, direction_of, stored
 from softmpm.kernels import physics
 from softmpm.kernels.structs import Spec, types
 from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
+from softmpm.rest_grid import RestGrid
 from softmpm.scene.neighbours import rest_neighbours
 from softmpm.scene.scene import Scene
 from softmpm.stability import stiffening_signs
@@ -50,6 +51,7 @@ class Model:
         derived: Names of the kernels' inputs that a call decides, in their order.
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
+        formulation: "moving" or "reference".
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
         footprint: Memory of that scheme.
         workspace: What calls leave for later calls; no part of the model's value.
@@ -65,6 +67,7 @@ class Model:
         footprint: Footprint,
         alarms: Alarms,
         *,
+        formulation: str,
         given: tuple[str, ...],
         deterministic: bool,
         fixed_point: bool,
@@ -88,6 +91,8 @@ class Model:
         slots = muscle_slots(scene, self.particle_count)
         self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
         self.deterministic, self.workspace = deterministic, Workspace()
+        self.formulation = formulation
+        self._rest_grid = RestGrid(scene, device) if formulation == "reference" else None
         self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point)
         self.strength = self._tensor([m.strength for m in scene.muscles])
         self.stiffening = self._tensor(stiffening_signs(scene))
@@ -222,6 +227,17 @@ class Model:
     def held_nodes(self) -> int:
         """Nodes of one world in memory: all of them or, in the fast scheme, those around the particles, counted at rest."""
         return self.footprint.node_count(self)
+
+    @property
+    def rest_grid(self) -> RestGrid:
+        """Nodes and weights of the reference formulation."""
+        assert self._rest_grid is not None, "the moving formulation has no grid at rest"
+        return self._rest_grid
+
+    @property
+    def rest_low(self) -> Tensor:
+        """Remainders of rounding the rest positions [m], shape (particle, dim); zeros in float64."""
+        return torch.zeros_like(self.positions) if self._low is None else self._low
 
     def sizes(self) -> Sizes:
         """Bytes of what a call may keep, see planning/memory.py."""

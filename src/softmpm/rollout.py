@@ -21,7 +21,7 @@ from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.failure_report import Report, raise_gradient_failure
 from softmpm.schemes.inputs import InputsAdj, Values
 from softmpm.schemes.scheme import Run
-from softmpm.state import State
+from softmpm.state import Nodal, State
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Trail:
 
     plan: Plan
     chunks: tuple[Chunk, ...]
-    start: State
+    start: State | Nodal
     """The user's initial state, which is never written to."""
     runs: list[Run] = field(default_factory=list)
     """All chunks, if every state is retained."""
@@ -60,11 +60,11 @@ class Trail:
 def rollout(
     model: Model,
     horizon: Horizon,
-    start: State,
+    start: State | Nodal,
     values: Values,
     keep: bool,
     failures: Failures | None = None,
-) -> tuple[State, Trail | None]:
+) -> tuple[Any, Trail | None]:
     """Integrate from ``start``. Each chunk is launched before the status of the previous one is read.
 
     Args:
@@ -73,7 +73,7 @@ def rollout(
         failures: Collects the failures of single worlds; None raises the first one.
 
     Returns:
-        The final state as a :class:`State`, and the :class:`Trail` if ``keep``, else None.
+        The final state, of the type of the initial one, and the :class:`Trail` if ``keep``, else None.
 
     Raises:
         UnstableError: A world failed.
@@ -114,22 +114,23 @@ def rollout(
     return _returned(model, runner.scheme.to_user(state), start, runner), trail if keep else None
 
 
-def _returned(model: Model, end: State, start: State, runner: Runner) -> State:
+def _returned(model: Model, end: Any, start: Any, runner: Runner) -> Any:
     """The final state, in which the failure policy has frozen or reset the worlds that failed."""
     if runner.failures is None or not runner.frozen:
         return end
     reset = runner.failures.policy == "reset"
     # Worlds that never ran are returned as they were given: the fast scheme cannot represent particles off the grid.
     worlds = sorted(world for world, substep in runner.frozen.items() if reset or substep == 0)
-    there, end = model.rest() if reset else start.detach(), end.clone()
+    there, end = runner.scheme.rest() if reset else start.detach(), end.clone()
     for tensor, wanted in zip(end[:4], there[:4], strict=True):
         tensor[worlds] = wanted[worlds]
-    for name in () if end.low is None else ("x", "F"):
-        getattr(end.low, name)[worlds] = 0.0 if there.low is None else getattr(there.low, name)[worlds]
+    low, there_low = getattr(end, "low", None), getattr(there, "low", None)
+    for name in () if low is None else ("x", "F"):
+        getattr(low, name)[worlds] = 0.0 if there_low is None else getattr(there_low, name)[worlds]
     return end
 
 
-def _captured(runner: Runner, trail: Trail, inside: bool) -> State:
+def _captured(runner: Runner, trail: Trail, inside: bool) -> Any:
     """:func:`rollout` while PyTorch captures a graph, without reading anything back."""
     keep_alive(runner.model)
     state: Any = trail.start
@@ -146,8 +147,8 @@ def _captured(runner: Runner, trail: Trail, inside: bool) -> State:
 
 @on_its_gpu
 def rollout_adj(
-    model: Model, horizon: Horizon, trail: Trail, values: Values, adj_end: State, wanted: RequestedGrads
-) -> tuple[State, InputsAdj]:
+    model: Model, horizon: Horizon, trail: Trail, values: Values, adj_end: Any, wanted: RequestedGrads
+) -> tuple[Any, InputsAdj]:
     """Adjoint of :func:`rollout`.
 
     Returns:
@@ -183,12 +184,12 @@ def rollout_adj(
     return adj, adj_inputs
 
 
-def _without(frozen: dict[int, int], adj_end: State) -> State:
+def _without(frozen: dict[int, int], adj_end: Any) -> Any:
     """The adjoint of the final state, contiguous, and zero for worlds that failed."""
-    x, v, C, F = (a.clone() if frozen else a.contiguous() for a in adj_end[:4])
-    for tensor in (x, v, C, F) if frozen else ():
+    tensors = [a.clone() if frozen else a.contiguous() for a in adj_end[:4]]
+    for tensor in tensors if frozen else ():
         tensor[sorted(frozen)] = 0
-    return State(x, v, C, F)
+    return type(adj_end)(*tensors)
 
 
 def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:

@@ -13,7 +13,6 @@ from softmpm.schemes.failure_report import Report, failed_worlds, failure
 from softmpm.schemes.inputs import Values, in_rows, stiffest
 from softmpm.schemes.registry import SCHEMES
 from softmpm.schemes.scheme import Run, Scheme
-from softmpm.state import State
 
 
 class Runner:
@@ -37,7 +36,7 @@ class Runner:
         frozen = [world for world, substep in self.frozen.items() if chunk.first >= substep]
         return self.scheme.run(chunk, start, in_rows(self.values, chunk.rows), keep, frozen)
 
-    def check(self, start: State) -> Report | None:
+    def check(self, start: Any) -> Report | None:
         """Launch the check of the call's initial state; :meth:`passed` evaluates the report. None if there is nothing to check."""
         if not armed(self.model) and self.model.alarms.collapse is None:
             return None
@@ -47,13 +46,18 @@ class Runner:
             return None
         return Report(words)
 
-    def passed(self, start: State, report: Report | None) -> bool:
+    def passed(self, start: Any, report: Report | None) -> bool:
         """True if all worlds passed the check of the initial state, False if some were frozen instead."""
         words = [] if report is None else report.read()
         for world in failed_worlds(words):
             self._take(
                 failure(
-                    self.model, words, world, start, values=stiffest(self.model, self.values), before=True
+                    self.model,
+                    words,
+                    world,
+                    self.scheme.particles(start),
+                    values=stiffest(self.model, self.values),
+                    before=True,
                 ),
                 0,
             )
@@ -92,7 +96,8 @@ class Runner:
     def _located(self, run: Run, words: list[int]) -> UnstableError:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
         state: Any = run.start
-        at_end, start = self.scheme.to_user(run.end), run.start if run.chunk.first == 0 else None
+        shown = self.scheme.particles
+        at_end, start = shown(run.end), shown(run.start) if run.chunk.first == 0 else None
         found = functools.partial(failure, self.model, start=start, state=at_end)
         for s in range(run.chunk.length):
             one = Chunk(run.chunk.first + s, 1, run.chunk.substeps)
@@ -100,7 +105,7 @@ class Runner:
             if self._failed(reported):
                 world = min(self._failed(reported), key=lambda w: reported[w])
                 values = in_rows(self.values, one.rows)
-                return found(reported, world, self.scheme.to_user(single.end), first=one.first, values=values)
+                return found(reported, world, shown(single.end), first=one.first, values=values)
             state = single.end
         # Sums in another order may have avoided the failure; the report remains true.
         world = min(self._failed(words), key=lambda w: words[w])

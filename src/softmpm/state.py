@@ -46,6 +46,30 @@ class Low(NamedTuple):
         return Low(*(tensor.to(*args, **kwargs) for tensor in self))
 
 
+class Nodal(NamedTuple):
+    """State of the nodes in the reference formulation (docs/formulations.md). Differentiable."""
+
+    u: Tensor
+    """Displacements [m], shape (world, node, dim)."""
+    v: Tensor
+    """Velocities [m/s], shape (world, node, dim)."""
+
+    def __repr__(self) -> str:
+        return _text(self)
+
+    def detach(self) -> "Nodal":
+        """The same state without its history."""
+        return Nodal(self.u.detach(), self.v.detach())
+
+    def clone(self) -> "Nodal":
+        """The same state in memory of its own. Differentiable."""
+        return Nodal(self.u.clone(), self.v.clone())
+
+    def to(self, *args: Any, **kwargs: Any) -> "Nodal":
+        """Both tensors on another device or in another precision; arguments as for ``torch.Tensor.to``."""
+        return Nodal(self.u.to(*args, **kwargs), self.v.to(*args, **kwargs))
+
+
 class State(NamedTuple):
     """State of every particle of every world; ``state[:4]`` is what is differentiable of it."""
 
@@ -61,6 +85,9 @@ class State(NamedTuple):
     """Remainders of rounding ``x`` and ``F`` to float32, or None. :func:`softmpm.simulate` returns and takes them, so that a motion
     of 1e-5 of a cell survives a division into many calls; they carry no gradient. A state without them stands for exactly its
     four tensors."""
+    nodes: Nodal | None = None
+    """What the particles show, in the reference formulation; None in the moving one. A state with nodes continues without loss; for
+    one without, the nodes are computed from the four tensors."""
 
     def __repr__(self) -> str:
         return _text(self)
@@ -82,7 +109,8 @@ class State(NamedTuple):
 
     def _each(self, change: Callable[[Any], Any]) -> "State":
         x, v, C, F = (change(tensor) for tensor in self[:4])
-        return State(x, v, C, F, None if self.low is None else change(self.low))
+        low = None if self.low is None else change(self.low)
+        return State(x, v, C, F, low, None if self.nodes is None else change(self.nodes))
 
 
 class Params(NamedTuple):

@@ -1,7 +1,8 @@
 """Registry of the schemes by name."""
 
 from softmpm.schemes.fast.scheme import Fast
+from softmpm.schemes.lagrangian.chunk import Lagrangian
 from softmpm.schemes.plain.chunk import Plain
 from softmpm.schemes.scheme import Scheme
 
-SCHEMES: dict[str, type[Scheme]] = {"fast": Fast, "plain": Plain}
+SCHEMES: dict[str, type[Scheme]] = {"fast": Fast, "plain": Plain, "lagrangian": Lagrangian}

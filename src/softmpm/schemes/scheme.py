@@ -43,7 +43,7 @@ class Scheme(Protocol):
         """The scheme of this model for the current thread and stream; it may cache buffers in the model's workspace."""
         ...
 
-    def check_start(self, start: State, values: Values) -> Tensor:
+    def check_start(self, start: Any, values: Values) -> Tensor:
         """Launch the alarms on a call's initial state. Returns their status words, which the next check overwrites."""
         ...
 
@@ -73,6 +73,16 @@ class Scheme(Protocol):
         """A copy of an initial or final state in separate memory, so that it does not keep the buffers of a run in use."""
         ...
 
-    def to_user(self, state: Any) -> State:
-        """An initial state, a final state or an adjoint as a :class:`State` in the user's order."""
+    def rest(self) -> Any:
+        """The state at rest, as calls take it."""
+        ...
+
+    def to_user(self, state: Any) -> Any:
+        """An initial state, a final state or an adjoint as calls take and return it: a :class:`State` in the user's order, or a
+        :class:`softmpm.state.Nodal` in the reference formulation.
+        """
+        ...
+
+    def particles(self, state: Any) -> State:
+        """What the particles show of such a state."""
         ...

@@ -43,7 +43,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, moved = one.rotation, one.moved
     linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum
-    node_velocity = grid(spec).node_velocity
+    node_velocity, position = grid(spec).node_velocity, grid(spec).position
     running, report_invalid = status.report(spec.dim, spec.dtype).running, status.check(spec).report_invalid
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     exact, give, not_finite = spec.deterministic, fixed(dim).give, int(Kind.NOT_FINITE)
@@ -61,9 +61,9 @@ def fused(spec: Spec) -> SimpleNamespace:
         return g
 
     @wp.func
-    def place_of(window: Window, world: int, i: int) -> t.ivec:
-        """Grid coordinates of node ``i`` of all allocated nodes."""
-        return coordinates(i - world * window.count, window.shape) + window.origin[world]
+    def place_of(constants: Constants, window: Window, world: int, i: int) -> types(dim, "float64").vec:
+        """Position of node ``i`` of all allocated nodes [m]."""
+        return position(constants, coordinates(i - world * window.count, window.shape) + window.origin[world])
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def clear(node: wp.array(dtype=node_vec)):
@@ -84,7 +84,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     ):
         i = wp.tid()
         world = world_of(i, window.count, velocity.shape[0])
-        place = place_of(window, world, i)  # computed while the node is being loaded
+        place = place_of(constants, window, world, i)  # computed while the node is being loaded
         here = take(node, i)
         if here[dim] > real(0.0):
             v = node_velocity(constants, inputs, world, place, head(here), here[dim])

@@ -73,7 +73,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         i = wp.tid()
         world = world_of(i, window.count, velocity.shape[0])
-        place = place_of(window, world, i)
+        place = place_of(constants, window, world, i)
         if i < node.shape[0]:
             here = load_node(node, i)
             adj_v = take(adj, i)

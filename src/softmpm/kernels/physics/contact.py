@@ -25,16 +25,9 @@ from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input
 def wall(spec: Spec, k: int) -> SimpleNamespace:
     """Wall number ``k``."""
     t = types(spec.dim, spec.dtype)
-    vec, ivec = t.vec, t.ivec
+    vec = t.vec
     exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
     respond, moving = response(spec, k), spec.moving
-
-    @wp.func
-    def place(node: ivec, spacing: wp.float64) -> exact_vec:
-        x = exact_vec()
-        for axis in range(spec.dim):
-            x[axis] = wp.float64(node[axis]) * spacing
-        return x
 
     @wp.func
     def plane(inputs: GridInputs, world: int) -> exact_vec:
@@ -42,17 +35,17 @@ def wall(spec: Spec, k: int) -> SimpleNamespace:
         return inputs.normal[world, k] + inputs.elapsed[0] * inputs.normal_rate[world, k]
 
     @wp.func
-    def inside(inputs: GridInputs, world: int, node: ivec, spacing: wp.float64) -> bool:
-        """Decided in float64, so that both precisions put a node on the surface to the same side."""
+    def inside(inputs: GridInputs, world: int, x: exact_vec) -> bool:
+        """Decided in float64, so that both precisions put a point on the surface to the same side."""
         reach = wp.float64(0.0)
         if wp.static(moving):
             a = plane(inputs, world)
             for axis in range(spec.dim):
-                reach += a[axis] * (wp.float64(node[axis]) * spacing)
+                reach += a[axis] * x[axis]
             return reach <= inputs.offset[world, k] + inputs.elapsed[0] * inputs.offset_rate[world, k]
         else:
             for axis in range(spec.dim):
-                reach += inputs.normal[k, axis] * (wp.float64(node[axis]) * spacing)
+                reach += inputs.normal[k, axis] * x[axis]
             return reach <= inputs.offset[k]
 
     @wp.func
@@ -63,41 +56,39 @@ def wall(spec: Spec, k: int) -> SimpleNamespace:
             return vec(inputs.normal[k])
 
     @wp.func
-    def velocity(inputs: GridInputs, world: int, node: ivec, spacing: wp.float64) -> vec:
+    def velocity(inputs: GridInputs, world: int, x: exact_vec) -> vec:
         """u of (C5)."""
         a = plane(inputs, world)
-        speed = inputs.offset_rate[world, k] - wp.dot(inputs.normal_rate[world, k], place(node, spacing))
+        speed = inputs.offset_rate[world, k] - wp.dot(inputs.normal_rate[world, k], x)
         return vec(speed / wp.dot(a, a) * a) + inputs.surface_velocity[world, k]
 
     @wp.func
-    def meet(inputs: GridInputs, world: int, node: ivec, spacing: wp.float64, v: vec) -> vec:
+    def meet(inputs: GridInputs, world: int, x: exact_vec, v: vec) -> vec:
         """Velocity after the wall of a node inside it."""
         if wp.static(moving):
-            u = velocity(inputs, world, node, spacing)
+            u = velocity(inputs, world, x)
             return u + respond(inputs, world, normal(inputs, world), v - u)  # (C5)
         else:
             return respond(inputs, world, normal(inputs, world), v)
 
-    return SimpleNamespace(
-        inside=inside, meet=meet, normal=normal, velocity=velocity, plane=plane, place=place
-    )
+    return SimpleNamespace(inside=inside, meet=meet, normal=normal, velocity=velocity, plane=plane)
 
 
 @kernel_factory
 def wall_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
     """Adjoint of ``meet`` of wall number ``k``: that of v; adds those of the wall's inputs at node ``i`` into ``adj_inputs``."""
     t, w = types(spec.dim, spec.dtype), wall(spec, k)
-    real, vec, ivec, GridInputs = t.real, t.vec, t.ivec, input_types(spec).GridInputs
+    real, vec, GridInputs = t.real, t.vec, input_types(spec).GridInputs
+    exact_vec = types(spec.dim, "float64").vec
     GridInputsAdj = input_adj_types(spec, wanted).GridInputsAdj
-    normal, velocity, plane, place = w.normal, w.velocity, w.plane, w.place
+    normal, velocity, plane = w.normal, w.velocity, w.plane
     respond_adj, moving = response_adj(spec, wanted, k), spec.moving
 
     @wp.func
     def motion_adj(
         inputs: GridInputs,
         world: int,
-        node: ivec,
-        spacing: wp.float64,
+        x: exact_vec,
         adj_n: vec,
         adj_u: vec,
         i: int,
@@ -107,14 +98,14 @@ def wall_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
         a = plane(inputs, world)
         length = real(wp.length(a))
         n = normal(inputs, world)
-        x = vec(place(node, spacing))
-        rate = (real(inputs.offset_rate[world, k]) - wp.dot(vec(inputs.normal_rate[world, k]), x)) / length
+        at = vec(x)
+        rate = (real(inputs.offset_rate[world, k]) - wp.dot(vec(inputs.normal_rate[world, k]), at)) / length
         adj_rate = wp.dot(n, adj_u)
         adj_unit = adj_n + rate * adj_u
         adj_a = (adj_unit - (wp.dot(adj_unit, n) + rate * adj_rate) * n) / length
         adj_inputs.offset_rate[k, i] = adj_inputs.offset_rate[k, i] + adj_rate / length
         adj_inputs.normal[k, i] = adj_inputs.normal[k, i] + adj_a
-        adj_normal_rate = real(inputs.elapsed[0]) * adj_a - (adj_rate / length) * x
+        adj_normal_rate = real(inputs.elapsed[0]) * adj_a - (adj_rate / length) * at
         adj_inputs.normal_rate[k, i] = adj_inputs.normal_rate[k, i] + adj_normal_rate
         adj_inputs.surface_velocity[k, i] = adj_inputs.surface_velocity[k, i] + adj_u
 
@@ -122,18 +113,17 @@ def wall_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
     def meet_adj(
         inputs: GridInputs,
         world: int,
-        node: ivec,
-        spacing: wp.float64,
+        x: exact_vec,
         v: vec,
         adj: vec,
         i: int,
         adj_inputs: GridInputsAdj,
     ) -> vec:
         if wp.static(moving):
-            u = velocity(inputs, world, node, spacing)
+            u = velocity(inputs, world, x)
             back = respond_adj(inputs, world, normal(inputs, world), v - u, adj, i, adj_inputs)
             if wp.static("wall" in wanted):
-                motion_adj(inputs, world, node, spacing, back.n, adj - back.v, i, adj_inputs)
+                motion_adj(inputs, world, x, back.n, adj - back.v, i, adj_inputs)
             return back.v
         else:
             still = respond_adj(inputs, world, normal(inputs, world), v, adj, i, adj_inputs)

@@ -23,8 +23,17 @@ def grid(spec: Spec) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
     real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
     GridInputs, dim, given = input_types(spec).GridInputs, spec.dim, spec.given
+    exact_vec = types(spec.dim, "float64").vec
     nodes = spline(spec.dim, spec.dtype)
     node_coordinates, momentum = nodes.node_coordinates, nodes.momentum
+
+    @wp.func
+    def position(constants: Constants, node: ivec) -> exact_vec:
+        """Position of a node at rest [m]; in float64, so that both precisions put it on the same side of a wall."""
+        x = exact_vec()
+        for axis in range(dim):
+            x[axis] = wp.float64(node[axis]) * constants.exact_spacing
+        return x
 
     @wp.func
     def gravity(constants: Constants, inputs: GridInputs, world: int) -> vec:
@@ -55,17 +64,17 @@ def grid(spec: Spec) -> SimpleNamespace:
         if count == 0:
 
             @wp.func
-            def after(constants: Constants, inputs: GridInputs, world: int, here: ivec, v: vec) -> vec:
+            def after(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, v: vec) -> vec:
                 return v
         else:
             before, last = after_walls(count - 1), wall(spec, count - 1)
             inside, meet = last.inside, last.meet
 
             @wp.func
-            def after(constants: Constants, inputs: GridInputs, world: int, here: ivec, v: vec) -> vec:
-                w = before(constants, inputs, world, here, v)
-                if inside(inputs, world, here, constants.exact_spacing):
-                    w = meet(inputs, world, here, constants.exact_spacing, w)
+            def after(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, v: vec) -> vec:
+                w = before(constants, inputs, world, x, v)
+                if inside(inputs, world, x):
+                    w = meet(inputs, world, x, w)
                 return w
 
         return after
@@ -74,13 +83,13 @@ def grid(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def node_velocity(
-        constants: Constants, inputs: GridInputs, world: int, here: ivec, p: vec, m: real
+        constants: Constants, inputs: GridInputs, world: int, x: exact_vec, p: vec, m: real
     ) -> vec:
-        """Velocity of the node at ``here`` from its momentum and mass."""
+        """Velocity of the node at ``x`` [m] from its momentum and mass."""
         v = vec()
         if m > real(0.0):
             free = free_velocity(constants, inputs, world, p / m)  # (G1)
-            v = after_all_walls(constants, inputs, world, here, free)  # (G2)
+            v = after_all_walls(constants, inputs, world, x, free)  # (G2)
         return v
 
     @wp.kernel(module=spec.module, enable_backward=False)
@@ -95,10 +104,11 @@ def grid(spec: Spec) -> SimpleNamespace:
     ):
         world, n = wp.tid()
         node_n = node[world, n]
-        here = node_coordinates(n, constants.shape)
-        velocity[world, n] = node_velocity(constants, inputs, world, here, momentum(node_n), node_n[dim])
+        x = position(constants, node_coordinates(n, constants.shape))
+        velocity[world, n] = node_velocity(constants, inputs, world, x, momentum(node_n), node_n[dim])
 
     return SimpleNamespace(
+        position=position,
         gravity=gravity,
         decay=decay,
         free_velocity=free_velocity,
@@ -110,7 +120,8 @@ def grid(spec: Spec) -> SimpleNamespace:
 @kernel_factory
 def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, forward = types(spec.dim, spec.dtype), grid(spec)
-    real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
+    real, vec, node_vec, Constants = t.real, t.vec, t.node, t.Constants
+    exact_vec, position = types(spec.dim, "float64").vec, forward.position
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     nodes, dim = spline(spec.dim, spec.dtype), spec.dim
     node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
@@ -131,7 +142,7 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 constants: Constants,
                 inputs: GridInputs,
                 world: int,
-                here: ivec,
+                x: exact_vec,
                 v: vec,
                 adj: vec,
                 i: int,
@@ -147,19 +158,19 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 constants: Constants,
                 inputs: GridInputs,
                 world: int,
-                here: ivec,
+                x: exact_vec,
                 v: vec,
                 adj: vec,
                 i: int,
                 adj_inputs: GridInputsAdj,
             ) -> vec:
-                meets = inside(inputs, world, here, constants.exact_spacing)
+                meets = inside(inputs, world, x)
                 w = v
                 if meets:
-                    w = meet(inputs, world, here, constants.exact_spacing, v)
-                adj_v = through_others(constants, inputs, world, here, w, adj, i, adj_inputs)
+                    w = meet(inputs, world, x, v)
+                adj_v = through_others(constants, inputs, world, x, w, adj, i, adj_inputs)
                 if meets:
-                    adj_v = meet_adj(inputs, world, here, constants.exact_spacing, v, adj_v, i, adj_inputs)
+                    adj_v = meet_adj(inputs, world, x, v, adj_v, i, adj_inputs)
                 return adj_v
 
         return back
@@ -171,7 +182,7 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         constants: Constants,
         inputs: GridInputs,
         world: int,
-        here: ivec,
+        x: exact_vec,
         p: vec,
         m: real,
         adj_velocity: vec,
@@ -183,7 +194,7 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if m > real(0.0):
             u = p / m
             free = free_velocity(constants, inputs, world, u)
-            adj_v = after_all_walls_adj(constants, inputs, world, here, free, adj_velocity, i, adj_inputs)
+            adj_v = after_all_walls_adj(constants, inputs, world, x, free, adj_velocity, i, adj_inputs)
             adj.p = adj_v / m  # (G1.adj)
             if wp.static(damped):
                 adj.p = decay(constants, inputs, world) * adj.p
@@ -210,13 +221,13 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         world, n = wp.tid()
         node_n = node[world, n]
-        here = node_coordinates(n, constants.shape)
+        x = position(constants, node_coordinates(n, constants.shape))
         i = world * node.shape[1] + n
         adj = node_velocity_adj(
             constants,
             inputs,
             world,
-            here,
+            x,
             momentum(node_n),
             node_n[dim],
             adj_velocity[world, n],

@@ -239,6 +239,11 @@ class Fast:
     def to_user(self, state: State | SortedState | SortedAdj) -> State:
         return state if isinstance(state, State) else state.state()
 
+    particles = to_user
+
+    def rest(self) -> State:
+        return self.model.rest()
+
     def _widen(self, run: FastRun) -> None:
         """After a particle left the window: centre it on the initial state the first time, enlarge it from then on."""
         layout = run.pool.layout

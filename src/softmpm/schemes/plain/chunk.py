@@ -126,3 +126,8 @@ class Plain:
 
     def to_user(self, state: State) -> State:
         return state
+
+    particles = to_user
+
+    def rest(self) -> State:
+        return self.model.rest()

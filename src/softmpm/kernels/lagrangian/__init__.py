@@ -1,0 +1,1 @@
+"""Kernels of the reference formulation: cells of particles at rest, and nodes that carry displacement and velocity."""

@@ -1,0 +1,69 @@
+"""Interpolation of the reference formulation: the nodes around the particles at rest, found once when a model is built.
+
+Derivation and labels: docs/math/lagrangian.md. With X_p a particle and X_i a node at rest, N_i the quadratic B-spline of the node:
+
+    ∇N_i(X_p) ≈ g_ip = (4/dx²) N_i(X_p) (X_i − X_p)                                                  (Q1)
+
+which is exact for affine fields, as the gradient of MLS-MPM (Hu et al. 2018), and bounded by N_i, so that no node with little mass
+limits the time step.
+"""
+
+import itertools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softmpm.scene.scene import Scene
+
+
+class RestGrid:
+    """Nodes that particles at rest have a share in, and cells: particles with the same base node.
+
+    Attributes:
+        count: Number of nodes.
+        nodes: Coordinates of the nodes in the grid, shape (node, dim), int32.
+        index: Number of each node in the grid, shape (node,).
+        fraction: Distance of each particle from its base node in cells, cell by cell, shape (particle, dim), float64.
+        particles: Particles cell by cell, shape (particle,), int32.
+        first: First entry of each cell in ``particles``, and their count, shape (cell + 1,), int32.
+        cell_nodes: Nodes of each cell, shape (cell, 3^dim), int32.
+        node_cells: Cell in which a node is number k of ``cell_nodes``, or -1, shape (node, 3^dim), int32.
+        stencil: Nodes of each particle, in the order of the particles, shape (particle, 3^dim).
+        weights: N_i(X_p), shape (particle, 3^dim), float64.
+        arms: X_i − X_p [m], shape (particle, 3^dim, dim), float64.
+        slopes: g_ip [1/m], of the same shape.
+    """
+
+    def __init__(self, scene: Scene, device: torch.device):
+        grid, dim = scene.grid, scene.grid.dim
+        positions = np.concatenate([body.particles.positions for body in scene.bodies]) / grid.spacing
+        base = np.floor(positions - 0.5).astype(np.int64)
+        f = positions - base
+        offsets = np.array(list(itertools.product(range(3), repeat=dim)))
+        splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+        weights = np.prod([splines[offsets[:, axis], :, axis] for axis in range(dim)], axis=0).T
+        cells, of = np.unique(base, axis=0, return_inverse=True)
+        of = of.reshape(-1)
+        at = np.ravel_multi_index(tuple(np.moveaxis(cells[:, None] + offsets, -1, 0)), grid.shape)
+        index, numbers = np.unique(at, return_inverse=True)
+        numbers = numbers.reshape(at.shape)
+        node_cells = np.full((len(index), len(offsets)), -1)
+        node_cells[numbers, np.arange(len(offsets))] = np.arange(len(cells))[:, None]
+        order = np.argsort(of, kind="stable")
+
+        def integers(values) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values, dtype=np.int32)).to(device)
+
+        def numbers_of(values) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+
+        self.count, self.cell_count = len(index), len(cells)
+        self.index = numbers_of(index)
+        self.nodes = integers(np.stack(np.unravel_index(index, grid.shape), axis=-1))
+        self.fraction, self.particles = numbers_of(f[order]), integers(order)
+        self.first = integers(np.searchsorted(of[order], np.arange(len(cells) + 1)))
+        self.cell_nodes, self.node_cells = integers(numbers), integers(node_cells)
+        self.stencil, self.weights = numbers_of(numbers[of]), numbers_of(weights)
+        self.arms = numbers_of((offsets - f[:, None]) * grid.spacing)
+        self.slopes = 4.0 / grid.spacing**2 * self.weights[..., None] * self.arms

@@ -1,0 +1,29 @@
+"""Memory of the reference formulation: displacement, velocity and momentum of the nodes around the particles at rest."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+from softmpm.planning.memory import Buffers, Plan, Sizes, input_bytes, sizes_of
+
+
+class LagrangianFootprint:
+    """See :class:`softmpm.planning.memory.Footprint`."""
+
+    numbers_per_node: ClassVar[dict[int, int]] = {2: 9, 3: 13}  # mass; u, v twice
+
+    def obstacle(self, shape: Sequence[int], particles: int) -> str | None:
+        return None
+
+    def node_count(self, model) -> int:
+        return model.rest_grid.count
+
+    def sizes(self, model) -> Sizes:
+        field = model.worlds * model.rest_grid.count * model.dim * model.dtype.itemsize
+        return sizes_of(model, inside=3 * field, nodes=0, between=2 * field)
+
+    def buffers(self, model, horizon, chosen: Plan) -> Buffers:
+        real, nodal = model.dtype.itemsize, model.sizes().inside
+        cells = model.worlds * model.rest_grid.cell_count * 3**model.dim * model.dim * real
+        forward = 2 * nodal + cells + input_bytes(model, 1)
+        kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
+        return Buffers(forward, kept, 2 * nodal + 2 * cells)
