@@ -57,6 +57,20 @@ def busy_scene(
     return softmpm.Scene(**(settings | changes))
 
 
+def full_scene(dim: int, *, driven=(1, 5), viscosity=0.02, **changes) -> softmpm.Scene:
+    """:func:`busy_scene` with every law, a chamber under pressure, viscosity, driven particles and a wall of each kind."""
+    full = busy_scene(dim, tuple(LAWS), per_law=8, **changes)
+    bodies = [
+        dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=viscosity))
+        for body in full.bodies
+    ]
+    chamber = softmpm.Pressure(particles=np.arange(2, 14), strength=6.0)
+    sticky = softmpm.Wall(normal=(1.0, 0.0, 0.1)[:dim], offset=0.33, contact="stick")
+    return dataclasses.replace(
+        full, bodies=bodies, driven=driven, walls=[*full.walls, sticky], muscles=[*full.muscles, chamber]
+    )
+
+
 def bar(law="neo_hookean", spacing=1 / 64, **changes) -> softmpm.Scene:
     """A free bar of 1/2 × 1/8 m, a muscle along each half, on cells of 1/32 m."""
     shape = softmpm.box((0.25, 0.45), (0.75, 0.575), spacing=spacing)
@@ -94,6 +108,37 @@ def busy_inputs(model: softmpm.Model, control_steps=2, seed=1) -> dict[str, torc
         density=params.density * (1 + 0.3 * torch.rand(lead, generator=generator).to(params.young)),
     )
     return {name: tensor.detach().requires_grad_() for name, tensor in inputs.items()}
+
+
+def given(model: softmpm.Model, names, steps: int, seed=7) -> dict[str, torch.Tensor]:
+    """Random values of these inputs, near those of the scene, for each world, as leaves that require gradients."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(name, low, high):
+        shape = model.shape_of(name, steps)
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    walls = model.scene.walls
+    dtype = {"wall_offset": torch.float64, "wall_normal": torch.float64}
+    made = {
+        "gravity": lambda: random("gravity", -9.0, 3.0),
+        "damping": lambda: random("damping", 0.2, 3.0),
+        "friction": lambda: random("friction", 0.05, 0.4),
+        "direction": lambda: random("direction", 0.2, 1.5),
+        "strength": lambda: random("strength", 5.0, 12.0),
+        "viscosity": lambda: random("viscosity", 0.01, 0.05),
+        "velocity": lambda: random("velocity", -0.6, 0.6),
+        "position": lambda: (
+            torch.from_numpy(model.exact_positions[list(model.scene.driven)])
+            + random("position", -5e-3, 5e-3)
+        ),
+        "force": lambda: random("force", -0.02, 0.02),
+        "wall_offset": lambda: torch.tensor([w.offset for w in walls]) + random("wall_offset", -2e-3, 2e-3),
+        "wall_normal": lambda: torch.tensor([w.normal for w in walls]) + random("wall_normal", -5e-3, 5e-3),
+        "wall_velocity": lambda: random("wall_velocity", -0.5, 0.5),
+    }
+    found = {name: made[name]().to(model.device, dtype.get(name, model.dtype)) for name in names}
+    return {name: tensor.detach().requires_grad_() for name, tensor in found.items()}
 
 
 def run(simulate, model_or_scene, inputs: dict[str, torch.Tensor], substeps: int) -> softmpm.State:

@@ -18,7 +18,7 @@ LAYERS = """
     checks
     reference_stress reference_walls
     reference kernels.physics
-    stability kernels.convert
+    stability kernels.convert reference_lagrangian
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian rest_grid
     describe
     model

@@ -1,7 +1,8 @@
 """The whole method again in plain PyTorch: slow, readable, the truth in tests; no code shared with kernels.
 
 Every function takes tensors with any leading axes and is differentiated by torch.autograd; meant for float64.
-The stress of a particle stands in ``reference_stress.py``, walls in ``reference_walls.py``. Derivations and labels: docs/math/.
+The stress of a particle stands in ``reference_stress.py``, walls in ``reference_walls.py``, the total Lagrangian formulation in
+``reference_lagrangian.py``. Derivations and labels: docs/math/.
 """
 
 import itertools
@@ -130,7 +131,7 @@ def stencil(scene: Scene, x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     for offset in itertools.product(range(3), repeat=len(shape)):
         node = base + torch.tensor(offset, dtype=x.dtype)
         r = node * dx - x
-        weight = _spline(r / dx).prod(-1)
+        weight = spline(r / dx).prod(-1)
         flat = torch.zeros(x.shape[:-1], dtype=torch.int64)
         for axis, count in enumerate(shape):
             flat = flat * count + node[..., axis].long()
@@ -138,7 +139,7 @@ def stencil(scene: Scene, x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     return nodes
 
 
-def _spline(distance: Tensor) -> Tensor:
+def spline(distance: Tensor) -> Tensor:
     """Quadratic B-spline of a distance in cells; |distance| ≤ 3/2 by the choice of the stencil."""
     d = distance.abs()
     return torch.where(d < 0.5, 0.75 - d**2, 0.5 * (1.5 - d) ** 2)
@@ -163,12 +164,14 @@ def grid_velocity(
     inputs: Inputs = SCENE,
     time: float = 0.0,
     duration: float = 1.0,
+    displacement: Tensor | None = None,
 ) -> Tensor:
     """Velocity of the nodes after gravity, damping and walls (G2), zero where there is no mass.
 
     Args:
         inputs: Of one control step, without that axis; one pose of the walls, or those at its two ends.
         time, duration: Since the beginning of the control step, and its length [s].
+        displacement: Of the nodes [m], shape (world, node, dim), where a wall meets them elsewhere; for walls at rest.
     """
     present = (mass > 0)[..., None]
     v = momentum / torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
@@ -181,7 +184,7 @@ def grid_velocity(
         where = surface(scene, k, inputs, v, time, duration)
         u = wall_velocity(scene, where)
         response = u + respond(wall, v - u, friction[:, k, None, None], where.unit[:, None])  # (C5)
-        v = torch.where(inside(scene, where)[..., None] & present, response, v)
+        v = torch.where(inside(scene, where, displacement)[..., None] & present, response, v)
     return torch.where(present, v, torch.zeros_like(v))
 
 
@@ -200,7 +203,7 @@ def _of_materials(scene: Scene, name: str) -> list[float]:
     return [getattr(body.material, name) for body in scene.bodies for _ in range(len(body.particles))]
 
 
-def _volume(scene: Scene, dtype: torch.dtype) -> Tensor:
+def rest_volume(scene: Scene, dtype: torch.dtype) -> Tensor:
     """Rest volumes V⁰ [m³], in 2D [m²], shape (particle,)."""
     return torch.cat([torch.tensor(body.particles.volume, dtype=dtype) for body in scene.bodies])
 
@@ -218,7 +221,7 @@ def step(
 ) -> State:
     """One substep: P2G, grid, G2P. ``activation`` (world, muscle) or None; material (world, particle)."""
     tau, D = stress(scene, state.F, mu, lam, activation, state.C, inputs), scene.grid.spacing**2 / 4
-    load = scene.dt * _volume(scene, mass.dtype) / D
+    load = scene.dt * rest_volume(scene, mass.dtype) / D
     affine = mass[..., None, None] * state.C - load[:, None, None] * tau
     pushed = mass[..., None] * state.v
     if inputs.force is not None:
@@ -247,10 +250,10 @@ def simulate(
     lead = start.x.shape[:2]
     young, poisson, density = (value.expand(lead) for value in params)
     mu, lam = lame(young, poisson)
-    mass, state = density * _volume(scene, density.dtype), start
-    steps = _control_steps(activation, inputs)
+    mass, state = density * rest_volume(scene, density.dtype), start
+    steps = control_steps(activation, inputs)
     for c in range(steps):
-        row, now = None if activation is None else activation[c], _of_control_step(inputs, c, steps)
+        row, now = None if activation is None else activation[c], of_control_step(inputs, c, steps)
         if now.position is not None:
             way = now.position - state.x[:, torch.tensor(list(scene.driven))]
             now = now._replace(velocity=way / (substeps * scene.dt), position=None)
@@ -260,7 +263,8 @@ def simulate(
     return state
 
 
-def _control_steps(activation: Tensor | None, inputs: Inputs) -> int:
+def control_steps(activation: Tensor | None, inputs: Inputs) -> int:
+    """Number of control steps: rows of ``activation``, without it of ``inputs``, else one."""
     if activation is not None:
         return len(activation)
     counts = [1]
@@ -271,7 +275,7 @@ def _control_steps(activation: Tensor | None, inputs: Inputs) -> int:
     return max(counts)
 
 
-def _of_control_step(inputs: Inputs, c: int, steps: int) -> Inputs:
+def of_control_step(inputs: Inputs, c: int, steps: int) -> Inputs:
     """Inputs of one control step: those that have that axis without it, the poses at its two ends."""
     now = {}
     for name, value in inputs._asdict().items():
@@ -292,7 +296,7 @@ def _of_control_step(inputs: Inputs, c: int, steps: int) -> Inputs:
 
 def rasterize(scene: Scene, state: State, density: Tensor) -> GridField:
     """Mass and velocity on the nodes without forces (O1); ``density`` broadcasts to (world, particle)."""
-    mass = (density * _volume(scene, density.dtype)).expand(state.x.shape[:2])
+    mass = (density * rest_volume(scene, density.dtype)).expand(state.x.shape[:2])
     affine = mass[..., None, None] * state.C
     node_mass, momentum = p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
     velocity = momentum / torch.where(node_mass > 0, node_mass, torch.ones_like(node_mass))[..., None]

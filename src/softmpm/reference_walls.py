@@ -74,12 +74,17 @@ def nodes(scene: Scene) -> Tensor:
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, -2)
 
 
-def inside(scene: Scene, wall: Surface) -> Tensor:
-    """Nodes that a wall acts on: a·x ≤ o, summed axis by axis in float64; shape (world, node). Not differentiable."""
-    x, a = nodes(scene), wall.normal.detach().double()
-    reach = a[:, :1] * x[:, 0]
+def inside(scene: Scene, wall: Surface, displacement: Tensor | None = None) -> Tensor:
+    """Nodes that a wall acts on: a·x ≤ o, summed axis by axis in float64; shape (world, node). Not differentiable.
+
+    ``displacement`` [m] of the nodes, shape (world, node, dim), where they are not at their places in the grid.
+    """
+    x, a = nodes(scene)[None], wall.normal.detach().double()
+    if displacement is not None:
+        x = x + displacement.detach().double()
+    reach = a[:, :1] * x[..., 0]
     for axis in range(1, scene.grid.dim):
-        reach = reach + a[:, axis, None] * x[:, axis]
+        reach = reach + a[:, axis, None] * x[..., axis]
     return reach <= wall.offset.detach().double()[:, None]
 
 

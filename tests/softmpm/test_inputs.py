@@ -1,11 +1,9 @@
 """Inputs of a call besides state, activation and material: every value and gradient against the float64 reference."""
 
-import dataclasses
 
-import numpy as np
 import pytest
 import torch
-from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory
+from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, given, little_memory
 
 import softmpm
 from softmpm import Inputs, reference
@@ -17,54 +15,9 @@ TIMED = {"activation", "velocity", "position", "force", *WALLS}
 STEPS = 3
 
 
-def scene(dim: int, *, driven=(1, 5), viscosity=0.02, **changes) -> softmpm.Scene:
-    """:func:`busy_scene` with every law, a chamber under pressure, viscosity, driven particles and a wall of each kind."""
-    full = busy_scene(dim, tuple(LAWS), per_law=8, **changes)
-    bodies = [
-        dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=viscosity))
-        for body in full.bodies
-    ]
-    chamber = softmpm.Pressure(particles=np.arange(2, 14), strength=6.0)
-    sticky = softmpm.Wall(normal=(1.0, 0.0, 0.1)[:dim], offset=0.33, contact="stick")
-    return dataclasses.replace(
-        full, bodies=bodies, driven=driven, walls=[*full.walls, sticky], muscles=[*full.muscles, chamber]
-    )
-
-
 def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     alarms = softmpm.Alarms(gap=None)
     return softmpm.build(made, device=settings.pop("device", "cpu"), alarms=alarms, **settings)
-
-
-def given(model: softmpm.Model, names, steps=STEPS, seed=7) -> dict[str, torch.Tensor]:
-    """Random values of these inputs, near those of the scene, for each world, as leaves that require gradients."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(name, low, high):
-        shape = model.shape_of(name, steps)
-        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
-
-    walls = model.scene.walls
-    dtype = {"wall_offset": torch.float64, "wall_normal": torch.float64}
-    made = {
-        "gravity": lambda: random("gravity", -9.0, 3.0),
-        "damping": lambda: random("damping", 0.2, 3.0),
-        "friction": lambda: random("friction", 0.05, 0.4),
-        "direction": lambda: random("direction", 0.2, 1.5),
-        "strength": lambda: random("strength", 5.0, 12.0),
-        "viscosity": lambda: random("viscosity", 0.01, 0.05),
-        "velocity": lambda: random("velocity", -0.6, 0.6),
-        "position": lambda: (
-            torch.from_numpy(model.exact_positions[list(model.scene.driven)])
-            + random("position", -5e-3, 5e-3)
-        ),
-        "force": lambda: random("force", -0.02, 0.02),
-        "wall_offset": lambda: torch.tensor([w.offset for w in walls]) + random("wall_offset", -2e-3, 2e-3),
-        "wall_normal": lambda: torch.tensor([w.normal for w in walls]) + random("wall_normal", -5e-3, 5e-3),
-        "wall_velocity": lambda: random("wall_velocity", -0.5, 0.5),
-    }
-    found = {name: made[name]().to(model.device, dtype.get(name, model.dtype)) for name in names}
-    return {name: tensor.detach().requires_grad_() for name, tensor in found.items()}
 
 
 def both(model: softmpm.Model, names, substeps=2, steps=STEPS):
@@ -101,7 +54,7 @@ def assert_equal(model: softmpm.Model, names, limit: float, **options) -> None:
 def test_every_input_is_the_references(dim, scheme, device):
     """All inputs at once, other ones in each of two worlds, with muscles and every kind of wall at work: ≤ 1e-10."""
     names = (*GIVEN, *WALLS)
-    model = build(scene(dim), device=device, dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
+    model = build(full_scene(dim), device=device, dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
     assert_equal(model, (*names, "strength", "velocity"), 1e-10)
 
 
@@ -109,7 +62,7 @@ def test_every_input_is_the_references(dim, scheme, device):
 def test_each_input_alone_is_the_references(name, scheme):
     """Kernels compiled for a single input: ≤ 1e-10."""
     changes = {} if name in ("velocity", "position") else {"driven": ()}
-    model = build(scene(2, **changes), dtype=torch.float64, scheme=scheme, worlds=2, inputs=(name,))
+    model = build(full_scene(2, **changes), dtype=torch.float64, scheme=scheme, worlds=2, inputs=(name,))
     assert_equal(model, (name,), 1e-10)
 
 
@@ -117,7 +70,7 @@ def test_each_input_alone_is_the_references(name, scheme):
 def test_inputs_in_single_precision(deterministic, device):
     """The fast scheme in float32, in floating and in fixed point: ≤ 5e-4 of every gradient."""
     names = (*GIVEN, *WALLS)
-    model = build(scene(2), device=device, worlds=2, inputs=names, deterministic=deterministic)
+    model = build(full_scene(2), device=device, worlds=2, inputs=names, deterministic=deterministic)
     assert_equal(model, (*names, "strength", "velocity"), 5e-4)
 
 
@@ -125,8 +78,8 @@ def test_inputs_over_chunks_that_begin_within_a_control_step(scheme):
     """Few states are checkpointed, chunks begin in the middle of control steps: walls are where they are: ≤ 1e-9."""
     names = (*GIVEN, *WALLS)
     settings = dict(dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
-    model = build(scene(2), **settings)
-    model = build(scene(2), **settings, **little_memory(model))
+    model = build(full_scene(2), **settings)
+    model = build(full_scene(2), **settings, **little_memory(model))
     assert_equal(model, (*names, "strength", "velocity"), 1e-9, substeps=7)
 
 
@@ -143,7 +96,7 @@ def test_gradcheck_of_inputs(dim):
         "wall_velocity",
         "wall_offset",
     )
-    model = build(scene(dim, driven=(1,)), dtype=torch.float64, inputs=names)
+    model = build(full_scene(dim, driven=(1,)), dtype=torch.float64, inputs=names)
     base, extra = busy_inputs(model, control_steps=2), given(model, names, steps=2)
     start = softmpm.State(*(base[name].detach() for name in "xvCF"))
     activation, params = base["activation"].detach(), model.params()
@@ -162,8 +115,8 @@ def test_gradcheck_of_inputs(dim):
 def test_worlds_equal_single_runs(dtype, scheme):
     """Three worlds, each with inputs of its own, give what each gives alone."""
     names = (*GIVEN, *WALLS)
-    many = build(scene(2), dtype=dtype, scheme=scheme, worlds=3, inputs=names)
-    one = build(scene(2), dtype=dtype, scheme=scheme, inputs=names)
+    many = build(full_scene(2), dtype=dtype, scheme=scheme, worlds=3, inputs=names)
+    one = build(full_scene(2), dtype=dtype, scheme=scheme, inputs=names)
     base, extra = busy_inputs(many, STEPS), given(many, (*names, "strength", "velocity"))
     limit = 2e-5 if dtype == torch.float32 else 1e-12
 
@@ -191,7 +144,7 @@ def test_worlds_equal_single_runs(dtype, scheme):
 
 def test_one_number_serves_every_world_and_control_step():
     """Inputs broadcast; their gradients are the sums."""
-    model = build(scene(2), dtype=torch.float64, worlds=2, inputs=("gravity", "force"))
+    model = build(full_scene(2), dtype=torch.float64, worlds=2, inputs=("gravity", "force"))
     gravity = torch.tensor([0.5, -3.0], dtype=torch.float64, requires_grad=True)
     force = torch.full((2,), 0.01, dtype=torch.float64, requires_grad=True)
     base = busy_inputs(model, STEPS)
@@ -211,7 +164,7 @@ def test_one_number_serves_every_world_and_control_step():
 
 def test_inputs_that_a_model_cannot_take():
     """Each message says the rule, what was given and a remedy."""
-    model = build(scene(2, driven=()), worlds=2, inputs=("friction", "wall_offset"))
+    model = build(full_scene(2, driven=()), worlds=2, inputs=("friction", "wall_offset"))
     wall = model.wall_count
 
     def call(**inputs):
@@ -242,7 +195,7 @@ def test_inputs_that_a_model_cannot_take():
         with pytest.raises(ValueError, match=said):
             call(**inputs)
     for name in ("wall_normal", "direction"):
-        steered = build(scene(2, driven=()), inputs=(name,))
+        steered = build(full_scene(2, driven=()), inputs=(name,))
         zero = torch.zeros(steered.shape_of(name, 1), dtype=torch.float64 if name == "wall_normal" else None)
         inputs = Inputs(**{name: zero})
         with pytest.raises(ValueError, match=rf"the length of inputs.{name} must be > 0, but .* is 0"):
@@ -253,7 +206,7 @@ def test_inputs_that_a_model_cannot_take():
     with pytest.raises(ValueError, match="2 in activation, 3 in inputs.wall_offset"):
         softmpm.simulate(model, model.rest(), activation, model.params(), substeps=1, inputs=inputs)
     with pytest.raises(ValueError, match="inputs must be among gravity"):
-        build(scene(2), inputs=("wind",))
+        build(full_scene(2), inputs=("wind",))
     with pytest.raises(ValueError, match="inputs has 'friction', but the scene has no walls"):
         build(busy_scene(2, walls=()), inputs=("friction",))
 
@@ -262,7 +215,7 @@ def test_inputs_that_a_model_cannot_take():
 @pytest.mark.parametrize("names", [(*GIVEN, *WALLS), ("friction", "gravity")], ids=["all", "two"])
 def test_a_graph_takes_inputs(names):
     """Two calls and their gradients, captured and replayed: ≤ 1e-5 of the same calls, also after gravity changed in place."""
-    model = build(scene(2), device="cuda", worlds=2, inputs=names)
+    model = build(full_scene(2), device="cuda", worlds=2, inputs=names)
     more = given(model, (*names, *(("strength", "position") if "force" in names else ())))
     leaves = busy_inputs(model, STEPS) | more
     params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))

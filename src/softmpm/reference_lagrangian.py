@@ -1,0 +1,196 @@
+"""Total Lagrangian MPM in plain float64 PyTorch: the truth in tests of ``formulation="reference"``; no code shared with kernels.
+
+The weights are those of the particles at rest, the nodes carry displacement and velocity, and the particles are quadrature points.
+Source: de Vaucorbeil et al. 2020, "A Total-Lagrangian Material Point Method for solid mechanics problems involving large
+deformations". Stress and walls are those of :mod:`softmpm.reference`, and so is the order of the nodes: row by row over
+``scene.grid.shape``. Everything is differentiated by PyTorch. Derivations: docs/math/lagrangian.md.
+
+    F_p = I + Σ u_i ⊗ g_ip,   Ḟ_p = Σ v_i ⊗ g_ip,   L = Ḟ F⁻¹            (Q1)
+    f_i = −Σ V_p P_p g_ip + Σ N_i f_p,   P = τ F⁻ᵀ,   m_i = Σ m_p N_i                (Q2)
+    v*_i = exp(−γ Δt) (v_i + Δt (f_i/m_i + g))                                       (Q3)
+    v'_i = W(v*_i) by the walls at X_i + u_i,   u'_i = u_i + Δt v'_i                 (Q4)
+    x = X + Σ N u,   v = Σ N v,   C = L                                              (Q5)
+    u_i = Σ m_p N_i [x_p − X_p + (F_p − I)(X_i − X_p)] / m_i
+    v_i = Σ m_p N_i [v_p + C_p F_p (X_i − X_p)] / m_i                                (Q6)
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from softmpm.inputs import Inputs
+from softmpm.reference import (
+    SCENE,
+    control_steps,
+    grid_velocity,
+    lame,
+    of_control_step,
+    rest_volume,
+    spline,
+    stencil,
+    stress,
+)
+from softmpm.scene.scene import Scene
+from softmpm.state import Params, State
+
+
+class Quadrature(NamedTuple):
+    """Weights of the 3^dim nodes of each particle at rest, the same in all worlds."""
+
+    X: Tensor
+    """Rest positions [m], shape (particle, dim)."""
+    node: Tensor
+    """Flat index of each node, shape (particle, 3^dim)."""
+    N: Tensor
+    """B-spline N_i(X_p), shape (particle, 3^dim)."""
+    slope: Tensor
+    """g_ip = (4/dx²) N_i (X_i − X_p) [1/m], the gradient of MLS-MPM, shape (particle, 3^dim, dim)."""
+    r: Tensor
+    """X_i − X_p [m], shape (particle, 3^dim, dim)."""
+
+
+def quadrature(scene: Scene) -> Quadrature:
+    """Nodes and weights of the scene's particles."""
+    X = torch.cat([torch.tensor(body.particles.positions) for body in scene.bodies])
+    nodes = stencil(scene, X[None])
+    node, N, r = (torch.stack([part[k][0] for part in nodes], 1) for k in range(3))
+    slope = 4.0 / scene.grid.spacing**2 * N[..., None] * r
+    return Quadrature(X, node, N, slope, r)
+
+
+def gather(points: Quadrature, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Σ N a and Σ a ⊗ g at the particles of a field a on the nodes, (world, node, dim)."""
+    near = values[:, points.node]
+    return torch.einsum("wpki,pk->wpi", near, points.N), torch.einsum("wpki,pkj->wpij", near, points.slope)
+
+
+def scatter(scene: Scene, points: Quadrature, share: Tensor) -> Tensor:
+    """Sum over the particles of what each gives to its nodes, (world, particle, 3^dim, ...), shape (world, node, ...)."""
+    sums = share.new_zeros(len(share), math.prod(scene.grid.shape), *share.shape[3:])
+    return sums.index_add(1, points.node.flatten(), share.flatten(1, 2))
+
+
+def node_mass(scene: Scene, points: Quadrature, mass: Tensor) -> Tensor:
+    """m_i (Q2) [kg], shape (world, node), of ``mass`` (world, particle)."""
+    return scatter(scene, points, mass[..., None] * points.N)
+
+
+def node_force(
+    scene: Scene,
+    points: Quadrature,
+    u: Tensor,
+    v: Tensor,
+    activation: Tensor | None,
+    mu: Tensor,
+    lam: Tensor,
+    inputs: Inputs = SCENE,
+) -> Tensor:
+    """f_i (Q2) [N], without gravity, shape (world, node, dim).
+
+    ``activation`` (world, muscle) or None; ``mu`` and ``lam`` [Pa] (world, particle).
+    """
+    F = torch.eye(u.shape[-1], dtype=u.dtype) + gather(points, u)[1]
+    inverse = torch.linalg.inv(F)
+    tau = stress(scene, F, mu, lam, activation, gather(points, v)[1] @ inverse, inputs)
+    load = rest_volume(scene, u.dtype)[:, None, None] * tau @ inverse.mT
+    share = -torch.einsum("wpij,pkj->wpki", load, points.slope)
+    if inputs.force is not None:
+        force = inputs.force.expand(*F.shape[:-1])
+        share = share + points.N[..., None] * force[:, :, None]
+    return scatter(scene, points, share)
+
+
+def step(
+    scene: Scene,
+    points: Quadrature,
+    u: Tensor,
+    v: Tensor,
+    activation: Tensor | None,
+    mu: Tensor,
+    lam: Tensor,
+    mass: Tensor,
+    inputs: Inputs = SCENE,
+) -> tuple[Tensor, Tensor]:
+    """One substep (Q1) to (Q4); ``mass`` of the nodes. Nodes without mass have the velocity zero."""
+    impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
+    v = grid_velocity(scene, mass, mass[..., None] * v + impulse, inputs, displacement=u)
+    return u + scene.dt * v, v
+
+
+def simulate(
+    scene: Scene,
+    u: Tensor,
+    v: Tensor,
+    activation: Tensor | None,
+    params: Params,
+    *,
+    substeps: int,
+    inputs: Inputs = SCENE,
+) -> tuple[Tensor, Tensor]:
+    """Advance the nodes; arguments and number of control steps as for :func:`softmpm.reference.simulate`.
+
+    Args:
+        u: Displacement of every node of the grid [m], shape (world, node, dim).
+        v: Velocity of every node [m/s], shape (world, node, dim).
+
+    Returns:
+        Both after ``control_step * substeps * dt`` seconds.
+    """
+    _need_walls_at_rest(scene, inputs)
+    points = quadrature(scene)
+    young, poisson, density = (value.expand(len(u), len(points.X)) for value in params)
+    mu, lam = lame(young, poisson)
+    mass = node_mass(scene, points, density * rest_volume(scene, density.dtype))
+    steps = control_steps(activation, inputs)
+    for c in range(steps):
+        row, now = None if activation is None else activation[c], of_control_step(inputs, c, steps)
+        for _ in range(substeps):
+            u, v = step(scene, points, u, v, row, mu, lam, mass, now)
+    return u, v
+
+
+def _need_walls_at_rest(scene: Scene, inputs: Inputs) -> None:
+    poses = ((inputs.wall_offset, 3), (inputs.wall_normal, 4))
+    moving = any(value is not None and value.ndim == axes and len(value) > 1 for value, axes in poses)
+    if moving or inputs.wall_velocity is not None:
+        raise NotImplementedError(
+            "the total Lagrangian reference has walls at rest only; give one pose of each."
+        )
+    if len(scene.driven) or inputs.velocity is not None or inputs.position is not None:
+        raise NotImplementedError(
+            "the total Lagrangian reference has no driven particles; use a sticking wall."
+        )
+
+
+def evaluate(scene: Scene, u: Tensor, v: Tensor) -> State:
+    """State of the particles (Q5) of nodes with displacement ``u`` [m] and velocity ``v`` [m/s], both (world, node, dim)."""
+    points = quadrature(scene)
+    (way, H), (velocity, rate) = gather(points, u), gather(points, v)
+    F = torch.eye(u.shape[-1], dtype=u.dtype) + H
+    return State(points.X + way, velocity, rate @ torch.linalg.inv(F), F)
+
+
+def project(scene: Scene, state: State, params: Params) -> tuple[Tensor, Tensor]:
+    """Displacement [m] and velocity [m/s] of the nodes, both (world, node, dim), from a state of the particles (Q6).
+
+    Exact for affine fields; others are smoothed, so that :func:`evaluate` gives back another state. Zero on nodes without mass. Only
+    the density of ``params`` counts.
+    """
+    points = quadrature(scene)
+    mass = params.density.expand(state.x.shape[:2]) * rest_volume(scene, state.x.dtype)
+    of_nodes = node_mass(scene, points, mass)
+    eye = torch.eye(state.x.shape[-1], dtype=state.x.dtype)
+    fields = ((state.x - points.X, state.F - eye), (state.v, state.C @ state.F))
+    u, v = (_average(scene, points, mass, of_nodes, value, slope) for value, slope in fields)
+    return u, v
+
+
+def _average(
+    scene: Scene, points: Quadrature, mass: Tensor, of_nodes: Tensor, value: Tensor, slope: Tensor
+) -> Tensor:
+    """Average on the nodes, weighted by mass, of each particle's affine field; zero where there is no mass."""
+    field = value[:, :, None] + torch.einsum("wpij,pkj->wpki", slope, points.r)
+    sums = scatter(scene, points, mass[..., None, None] * points.N[..., None] * field)
+    return sums / torch.where(of_nodes > 0, of_nodes, torch.ones_like(of_nodes))[..., None]

@@ -1,0 +1,201 @@
+"""The reference formulation: every value and gradient against the float64 reference, and what it promises."""
+
+import dataclasses
+
+import pytest
+import torch
+from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, given
+
+import softmpm
+from softmpm import Inputs, reference_lagrangian
+from softmpm.nodal import nodes_of, particles_of
+
+GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
+STEPS = 3
+
+
+def build(made: softmpm.Scene, **settings) -> softmpm.Model:
+    alarms = softmpm.Alarms(collapse=None)
+    return softmpm.build(
+        made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
+    )
+
+
+def by_reference(made, start, activation, params, substeps, inputs):
+    """:func:`softmpm.simulate` by the reference."""
+    u, v = reference_lagrangian.project(made, start, params)
+    u, v = reference_lagrangian.simulate(made, u, v, activation, params, substeps=substeps, inputs=inputs)
+    return reference_lagrangian.evaluate(made, u, v)
+
+
+def compare(model: softmpm.Model, names, limit: float, substeps=2) -> None:
+    """Assert that the end of a call and every gradient are those of the reference."""
+    leaves = busy_inputs(model, control_steps=STEPS) | given(model, names, STEPS)
+    copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
+    found = []
+    for kind, tensors in ((model, leaves), (model.scene, copies)):
+        start = softmpm.State(*(tensors[name] for name in "xvCF"))
+        params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
+        inputs, activation = Inputs(**{name: tensors[name] for name in names}), tensors["activation"]
+        if kind is model:
+            end = softmpm.simulate(model, start, activation, params, substeps=substeps, inputs=inputs)
+        else:
+            end = by_reference(kind, start, activation, params, substeps, inputs)
+        loss = dot(cotangent(end), end)
+        found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
+    for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
+        assert want.abs().max() > 0, f"the test does not exercise {name}"
+        assert_relative(got.detach().cpu().double(), want.detach(), limit, name)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_end_and_all_gradients_are_those_of_the_reference(dim, device):
+    """All laws, overlapping muscles, pressure, viscosity, walls of each kind, two worlds with other values each."""
+    made = full_scene(dim, driven=())
+    names = (*GIVEN, "strength")
+    compare(build(made, device=device, dtype=torch.float64, worlds=2, inputs=names), names, 1e-10)
+    compare(build(made, device=device, worlds=2, inputs=names), names, 5e-4)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_each_law_alone(law, dim, device):
+    """Without the features that the other test has: what is absent is not compiled."""
+    made = busy_scene(dim, (law,), muscles=[], walls=[], gravity=None, damping=0.0)
+    model = build(made, device=device, dtype=torch.float64)
+    leaves = busy_inputs(model)
+    del leaves["activation"]
+    copies = {name: t.detach().cpu().requires_grad_() for name, t in leaves.items()}
+    found = []
+    for tensors in (leaves, copies):
+        start = softmpm.State(*(tensors[name] for name in "xvCF"))
+        params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
+        if tensors is leaves:
+            end = softmpm.simulate(model, start, None, params, substeps=4)
+        else:
+            end = by_reference(made, start, None, params, 4, Inputs())
+        found.append([*end[:4], *torch.autograd.grad(dot(cotangent(end), end), list(tensors.values()))])
+    for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
+        assert_relative(got.detach().cpu(), want.detach(), 1e-10, name)
+
+
+@pytest.mark.parametrize("budget", [None, 40_000])
+def test_calls_in_turn_are_one_call(budget, device):
+    """A state with nodes continues without loss: values to the bit, gradients too, stored or recomputed."""
+    model = build(
+        full_scene(2, driven=()),
+        device=device,
+        dtype=torch.float64,
+        memory_budget=budget,
+        calls=1 if budget else 2,
+    )
+    inputs = busy_inputs(model, control_steps=4)
+    start = softmpm.State(*(inputs[name] for name in "xvCF"))
+    params = softmpm.Params(*(inputs[name] for name in softmpm.Params._fields))
+    rows = inputs["activation"]
+    whole = softmpm.simulate(model, start, rows, params, substeps=5)
+    first = softmpm.simulate(model, start, rows[:2], params, substeps=5)
+    parts = softmpm.simulate(model, first, rows[2:], params, substeps=5)
+    for got, want in zip(parts[:4], whole[:4], strict=True):
+        assert torch.equal(got, want)
+    found = [torch.autograd.grad(dot(cotangent(end), end), list(inputs.values())) for end in (whole, parts)]
+    for name, want, got in zip(inputs, *found, strict=True):
+        assert_relative(got, want, 1e-12, name)
+
+
+def test_the_same_bits_in_every_run(device):
+    """No atomic additions: also on a GPU, in float32, without ``deterministic``."""
+    model = build(full_scene(3, driven=()), device=device)
+    inputs = busy_inputs(model)
+    found = []
+    for _ in range(3):
+        start = softmpm.State(*(inputs[name] for name in "xvCF"))
+        nodes = nodes_of(model, start, model.mass.expand(1, -1)).detach()
+        state = particles_of(model, nodes)
+        leaves = [nodes.u.requires_grad_(), nodes.v.requires_grad_()]
+        end = softmpm.simulate(
+            model, state._replace(nodes=nodes), inputs["activation"], model.params(), substeps=8
+        )
+        assert end.nodes is not None
+        loss = (end.nodes.u.square().sum() + end.nodes.v.sum()) if found == [] else loss_of(end)
+        found.append([*end.nodes.detach(), *torch.autograd.grad(loss, leaves)])
+    for again in found[1:]:
+        for got, want in zip(again, found[0], strict=True):
+            assert torch.equal(got, want)
+
+
+def loss_of(end: softmpm.State) -> torch.Tensor:
+    return end.nodes.u.square().sum() + end.nodes.v.sum()
+
+
+def test_affine_states_are_projected_exactly(device):
+    """What particles show of the nodes of an affine state is that state."""
+    model = build(busy_scene(3), device=device, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    F = torch.eye(3, dtype=torch.float64) + 0.2 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    C = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    x = model.positions.cpu() @ F.T + 0.1
+    fields = (x, 0.3 + x @ C.T, C.expand(len(x), 3, 3), F.expand(len(x), 3, 3))
+    state = softmpm.State(*(field[None].to(model.device).contiguous() for field in fields))
+    shown = particles_of(model, nodes_of(model, state, model.mass.expand(1, -1)))
+    for name, got, want in zip("xvCF", shown[:4], state[:4], strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-11, atol=1e-11, msg=name)
+
+
+def test_a_changed_state_is_not_ignored():
+    """A state whose tensors differ from what its nodes show is refused; without nodes it runs."""
+    model = build(busy_scene(2), dtype=torch.float64)
+    state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=3)
+    changed = state._replace(v=state.v + 1.0)
+    with pytest.raises(ValueError, match="state.v was changed, but state.nodes was not"):
+        softmpm.simulate(model, changed, None, model.params(), substeps=1)
+    softmpm.simulate(model, changed._replace(nodes=None), None, model.params(), substeps=1)
+    moving = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64)
+    with pytest.raises(ValueError, match="state.nodes must be None with formulation='moving'"):
+        softmpm.simulate(moving, state, None, moving.params(), substeps=1)
+
+
+def test_what_the_formulation_lacks_is_refused():
+    """By name, before anything is launched."""
+    for made, settings, said in (
+        (full_scene(2), {}, "has no driven particles"),
+        (full_scene(2, driven=()), {"inputs": ("wall_offset",)}, "walls at rest only"),
+        (full_scene(2, driven=()), {"scheme": "fast"}, "leave scheme out"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            build(made, **settings)
+    with pytest.raises(ValueError, match="formulation must be 'moving' or 'reference'"):
+        softmpm.build(busy_scene(2), formulation="lagrangian")
+
+
+def test_a_particle_that_collapses_is_named():
+    """With world, particle and substep, and the state before it."""
+    made = busy_scene(2, ("fixed_corotated",), walls=[], muscles=[], per_law=30)
+    model = softmpm.build(made, device="cpu", dtype=torch.float64, worlds=2, formulation="reference")
+    state = model.rest()
+    state.F[1] = 0.3 * state.F[1]
+    state.C[1] = -400.0 * torch.eye(2, dtype=torch.float64)
+    center = state.x[1].mean(0)
+    state = state._replace(x=torch.stack([state.x[0], center + 0.3 * (state.x[1] - center)]))
+    with pytest.raises(softmpm.UnstableError, match="of world 1") as caught:
+        softmpm.simulate(model, state, None, model.params(), substeps=40)
+    assert caught.value.kind == "collapsed" and caught.value.substep >= 0
+    failures = softmpm.Failures()
+    end = softmpm.simulate(model, state, None, model.params(), substeps=40, failures=failures)
+    assert len(failures.errors) == 1 and torch.isfinite(end.x).all()
+    alone = softmpm.simulate(model, model.rest(), None, model.params(), substeps=40)
+    assert torch.equal(end.x[0], alone.x[0])
+
+
+def test_no_numerical_fracture():
+    """A bar that is stretched threefold, far beyond what the moving grid holds together, comes back."""
+    made = busy_scene(2, ("fixed_corotated",), walls=[], muscles=[], gravity=None, damping=0.0)
+    shape = softmpm.box((0.3, 0.4), (0.6, 0.5), spacing=0.05)
+    body = softmpm.Body(shape, softmpm.FixedCorotated(density=1.0, young=50.0, poisson=0.3, viscosity=0.05))
+    made = dataclasses.replace(made, bodies=[body], dt=5e-4)
+    model = softmpm.build(made, device="cpu", dtype=torch.float64, formulation="reference")
+    state = model.rest()
+    state.F[..., 0, 0] = 3.0
+    state.x[..., 0] = 0.45 + 3.0 * (state.x[..., 0] - 0.45)
+    end = softmpm.simulate(model, state, None, model.params(), substeps=4000)
+    torch.testing.assert_close(end.F, model.rest().F, rtol=0, atol=0.02)
