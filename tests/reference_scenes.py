@@ -72,7 +72,7 @@ def rest(scene: Scene, worlds=1) -> tuple[State, Params]:
 
 def shaken(scene: Scene, worlds=1, noise=1.0) -> tuple[State, Params]:
     """A random state and material near the scene's."""
-    (x, v, C, F, _low), params = rest(scene, worlds)
+    (x, v, C, F, *_), params = rest(scene, worlds)
     by = [noise * randn(*t.shape, seed=30 + k) for k, t in enumerate((x, v, C, F))]
     start = State(x + 0.01 * by[0], 0.5 * by[1], 2.0 * by[2], F + 0.1 * by[3])
     factor = 1 + 0.1 * randn(3, *x.shape[:2], seed=40)

@@ -28,7 +28,6 @@ from softmpm.reference import (
     lame,
     of_control_step,
     rest_volume,
-    spline,
     stencil,
     stress,
 )

@@ -1,11 +1,7 @@
 """Interpolation of the reference formulation: the nodes around the particles at rest, found once when a model is built.
 
-Derivation and labels: docs/math/lagrangian.md. With X_p a particle and X_i a node at rest, N_i the quadratic B-spline of the node:
-
-    ∇N_i(X_p) ≈ g_ip = (4/dx²) N_i(X_p) (X_i − X_p)                                                  (Q1)
-
-which is exact for affine fields, as the gradient of MLS-MPM (Hu et al. 2018), and bounded by N_i, so that no node with little mass
-limits the time step.
+With X_p a particle and X_i a node at rest, N_i(X_p) the quadratic B-spline of the node and g_ip = (4/dx²) N_i (X_i − X_p) its gradient
+as in MLS-MPM (Hu et al. 2018). Derivation: docs/math/lagrangian.md.
 """
 
 import itertools

@@ -1,6 +1,5 @@
 """Inputs of a call besides state, activation and material: every value and gradient against the float64 reference."""
 
-
 import pytest
 import torch
 from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, given, little_memory

@@ -180,7 +180,7 @@ def test_a_particle_that_collapses_is_named():
     with pytest.raises(softmpm.UnstableError, match="of world 1") as caught:
         softmpm.simulate(model, state, None, model.params(), substeps=40)
     assert caught.value.kind == "collapsed" and caught.value.substep >= 0
-    failures = softmpm.Failures()
+    failures = softmpm.Failures("freeze")
     end = softmpm.simulate(model, state, None, model.params(), substeps=40, failures=failures)
     assert len(failures.errors) == 1 and torch.isfinite(end.x).all()
     alone = softmpm.simulate(model, model.rest(), None, model.params(), substeps=40)
@@ -188,14 +188,14 @@ def test_a_particle_that_collapses_is_named():
 
 
 def test_no_numerical_fracture():
-    """A bar that is stretched threefold, far beyond what the moving grid holds together, comes back."""
-    made = busy_scene(2, ("fixed_corotated",), walls=[], muscles=[], gravity=None, damping=0.0)
+    """A bar that is stretched to 2.5 times its length, far beyond what the moving grid holds together, comes back."""
+    made = busy_scene(2, walls=[], muscles=[], gravity=None, damping=0.0)
     shape = softmpm.box((0.3, 0.4), (0.6, 0.5), spacing=0.05)
-    body = softmpm.Body(shape, softmpm.FixedCorotated(density=1.0, young=50.0, poisson=0.3, viscosity=0.05))
-    made = dataclasses.replace(made, bodies=[body], dt=5e-4)
+    body = softmpm.Body(shape, softmpm.BarrierCorotated(density=1.0, young=50.0, poisson=0.3, viscosity=0.2))
+    made = dataclasses.replace(made, bodies=[body], dt=2.5e-4)
     model = softmpm.build(made, device="cpu", dtype=torch.float64, formulation="reference")
     state = model.rest()
-    state.F[..., 0, 0] = 3.0
-    state.x[..., 0] = 0.45 + 3.0 * (state.x[..., 0] - 0.45)
-    end = softmpm.simulate(model, state, None, model.params(), substeps=4000)
+    state.F[..., 0, 0] = 2.5
+    state.x[..., 0] = 0.45 + 2.5 * (state.x[..., 0] - 0.45)
+    end = softmpm.simulate(model, state, None, model.params(), substeps=8000)
     torch.testing.assert_close(end.F, model.rest().F, rtol=0, atol=0.02)

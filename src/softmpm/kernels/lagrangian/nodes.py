@@ -1,11 +1,13 @@
 """Motion of the nodes. Derivation: docs/math/lagrangian.md.
 
-    m_i = Σ m_p N_i,  p_i = m_i v_i + Δt f_i                                                         (Q3)
-    v' = (G1), (G2) of p and m at X + u,  u' = u + Δt v'                                             (Q4)
-    v̄' += Δt ū',  p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                              (Q4.adj)
-    m̄_p += Σ N_i m̄_i                                                                                 (Q3.adj)
+    m_i = Σ m_p N_i                                                                                  (Q2)
+    v* = exp(−γ Δt) (p/m + Δt g),  p = m v + Δt f                                                    (Q3)
+    v' = W(v*) at X + u,  u' = u + Δt v'                                                             (Q4)
+    v̄' += Δt ū'                                                                                      (Q4.adj)
+    p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
+    m̄_p += Σ N_i m̄_i                                                                                 (Q2.adj)
 
-The side of a wall on which a node lies is taken as constant in the adjoint. Walls are at rest.
+(Q3) and (Q4) are the grid stage (G1), (G2) of the momentum p. The side of a wall on which a node lies is constant in the adjoint.
 """
 
 from types import SimpleNamespace
@@ -50,7 +52,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def masses(inputs: ParticleInputs, inside: Rest, mass: wp.array2d(dtype=real)):
-        """m of (Q3), in units of the heaviest particle's mass."""
+        """m of (Q2), in units of the heaviest particle's mass."""
         world, i = wp.tid()
         total = real(0.0)
         for n in range(r.count):
@@ -124,7 +126,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_mass: wp.array2d(dtype=real),
         adj_inputs: GridInputsAdj,
     ):
-        """(Q4.adj)"""
+        """(Q4.adj), (Q3.adj)"""
         world, i = wp.tid()
         m = mass[world, i]
         here = place(constants, inside, i, u[world, i])
@@ -154,7 +156,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def masses_adj(inside: Rest, adj_mass: wp.array2d(dtype=real), adj_inputs: ParticleInputsAdj):
-        """(Q3.adj)"""
+        """(Q2.adj)"""
         world, c = wp.tid()
         for at in range(inside.first[c], inside.first[c + 1]):
             w = weights(inside.fraction[at])

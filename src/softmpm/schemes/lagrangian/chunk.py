@@ -74,7 +74,9 @@ class LagrangianRun:
             self._use_inputs(s, s - 1)
             self._advance(s, keep)
         last = chunk.length if keep else chunk.length % 2
-        self.end = Nodal(self._u[last].clone(), self._v[last].clone())  # a result must not keep all states alive
+        self.end = Nodal(
+            self._u[last].clone(), self._v[last].clone()
+        )  # a result must not keep all states alive
         arguments = (model.constants, self._rest, chunk.length - 1, self._array(self.end.u))
         kernel, lead = cells(model.spec).check_end, self._partial.shape[:2]
         self._launch(kernel, lead, *arguments, self.words_array)
