@@ -8,11 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from softmpm.scene.scene import Actuator, Grid, Scene
+from softmpm.scene.outline import Outline
+from softmpm.scene.scene import Actuator, Grid, Particles, Scene
 from softmpm.validate import need
 
 SAME_PLACE = 1e-6
 """Two particles nearer than this share of a cell are one particle twice."""
+OPEN = 0.05
+"""Largest |Σ n A| of an outline as a share of its area; a cube without one face has 0.2, exact quadrature 0."""
 MOST_WALLS = 64
 """Each one is compiled into the kernels of the grid, and its numbers are passed with every launch."""
 MIXERS = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
@@ -24,6 +27,7 @@ def check_scene(scene: Scene) -> None:
     if not isinstance(scene, Scene):
         raise TypeError(f"a model is built from a softmpm.Scene, got {type(scene).__name__}.")
     _check_bodies(scene)
+    _check_outlines(scene)
     _check_distinct(scene)
     _check_muscles(scene)
     _check_indices("scene driven", np.asarray(scene.driven), scene)
@@ -105,6 +109,65 @@ def _check_bodies(scene: Scene) -> None:
 
 def _room(grid: Grid) -> str:
     return " × ".join(f"[{0.5 * grid.spacing:.5g}, {(n - 1.5) * grid.spacing:.5g})" for n in grid.shape)
+
+
+def _check_outlines(scene: Scene) -> None:
+    for b, body in enumerate(scene.bodies):
+        outline = body.particles.outline
+        if outline is not None:
+            _check_place(f"the outline of body {b}", outline, body.particles, scene.grid)
+            _check_closed(f"the outline of body {b}", outline, body.particles)
+
+
+def _check_place(name: str, outline: Outline, particles: Particles, grid: Grid) -> None:
+    """In the grid, and around the particles: moving one without the other is an easy mistake."""
+    reach = (np.array(grid.shape) - 1) * grid.spacing
+    outside = ((outline.points < 0) | (outline.points > reach)).any(axis=1)
+    if outside.any():
+        point = int(np.argmax(outside))
+        raise ValueError(
+            f"{name} leaves the grid: point {point} at {_tuple(outline.points[point])} m, and {outside.sum() - 1} more of its "
+            f"{len(outline)}; all must lie between the nodes, from 0 to {_tuple(reach)} m. Move the body or enlarge the grid."
+        )
+    slack = _apart(particles)
+    low, high = outline.points.min(axis=0) - slack, outline.points.max(axis=0) + slack
+    beyond = ((particles.positions < low) | (particles.positions > high)).any(axis=1)
+    if 2 * beyond.sum() > len(beyond):  # specks of a picture may be particles without an outline
+        particle = int(np.argmax(beyond))
+        raise ValueError(
+            f"{name} must surround its particles, but particle {particle} at {_tuple(particles.positions[particle])} m and "
+            f"{beyond.sum() - 1} more of {len(beyond)} lie beyond the outline, which spans {_tuple(low + slack)} to "
+            f"{_tuple(high - slack)} m. Move both together, or leave the outline out."
+        )
+
+
+def _check_closed(name: str, outline: Outline, particles: Particles) -> None:
+    """Closed, and around as much volume as the particles have.
+
+    A lattice takes its cells as a whole, so that its surface may lie half a spacing s off the true one. For a box that changes
+    the volume V to V (1 + s / 2h)^dim, h = dim V / A, and for other shapes by less.
+    """
+    area = float(outline.areas.sum())
+    rest = float(np.linalg.norm(outline.areas @ outline.normals))
+    need(
+        rest <= OPEN * area,
+        f"{name} must be closed: the sum of areas times normals has length {rest:.4g}, at most {OPEN:.0%} of its area of "
+        f"{area:.4g} are allowed. Add the missing parts of the surface, with normals out of the body.",
+    )
+    inside, volume = outline.enclosed_volume, float(np.sum(particles.volume))
+    need(inside > 0, f"{name} must have normals out of the body, got normals into it; use -normals.")
+    room = (1 + 0.5 * _apart(particles) * area / (outline.dim * inside)) ** outline.dim - 1
+    need(
+        abs(volume - inside) <= room * inside,
+        f"{name} must enclose the volume of its particles, {volume:.4g}, to half a particle spacing along the surface, "
+        f"got {inside:.4g} (± {room * inside:.2g} allowed). Give both in metres and each particle the volume of its cell, or "
+        "leave the outline out: Particles(positions, volume).",
+    )
+
+
+def _apart(particles: Particles) -> float:
+    """Mean particle spacing [m], from the volumes."""
+    return float(np.mean(particles.volume)) ** (1 / particles.positions.shape[1])
 
 
 def _check_distinct(scene: Scene) -> None:

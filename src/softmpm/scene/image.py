@@ -1,4 +1,4 @@
-"""Inside of a picture: its silhouette as booleans, and how much of each lattice cell that covers."""
+"""Inside of a picture: its silhouette as booleans, how much of each lattice cell that covers, and its contours."""
 
 import os
 import struct
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from softmpm.scene.contour import contours
 from softmpm.validate import need
 
 if TYPE_CHECKING:
@@ -44,17 +45,31 @@ def silhouette(source: Any, inside: Inside, threshold: float) -> np.ndarray:
     return values < threshold if inside == "dark" else values > threshold
 
 
-def coverage(mask: np.ndarray, count: np.ndarray, width: float) -> np.ndarray:
-    """Share of each cell that the mask covers, shape (x, y) with y up; a cell is ``width`` pixels wide."""
-    across = _overlap(count[0], mask.shape[1], width)
-    up = _overlap(count[1], mask.shape[0], width)
+def coverage(mask: np.ndarray, left: np.ndarray, bottom: np.ndarray, width: float) -> np.ndarray:
+    """Share of each square that the mask covers, shape (x, y) with y up.
+
+    The squares are ``width`` wide, with their lower corners at all pairs of ``left`` and ``bottom``; all in pixels.
+    """
+    across = _overlap(left, width, mask.shape[1])
+    up = _overlap(bottom, width, mask.shape[0])
     return across @ mask[::-1].T @ up.T
 
 
-def _overlap(cells: int, pixels: int, width: float) -> np.ndarray:
-    """Share of each cell that each pixel covers along one axis, shape (cell, pixel)."""
-    left = np.arange(cells)[:, None] * width
-    edge = np.arange(pixels)[None, :]
+def mask_contours(mask: np.ndarray, width: float) -> list[np.ndarray]:
+    """Closed polygons around the places whose square of this width is at least half covered; all in pixels, y up.
+
+    The square smooths the steps of the pixels and rounds corners at its own width; a straight edge along an axis stays where it is,
+    because the coverage is linear within half a width of it and is sampled twice for each.
+    """
+    step = width / 2
+    places = [step * np.arange(-1, np.ceil(pixels / step) + 2) for pixels in mask.shape[::-1]]
+    covered = coverage(mask, places[0] - width / 2, places[1] - width / 2, width)
+    return [step * (polygon - 1.0) for polygon in contours(covered, 0.5)]
+
+
+def _overlap(left: np.ndarray, width: float, pixels: int) -> np.ndarray:
+    """Share of each interval that each pixel covers along one axis, shape (interval, pixel)."""
+    left, edge = left[:, None], np.arange(pixels)[None, :]
     return np.clip(np.minimum(left + width, edge + 1) - np.maximum(left, edge), 0.0, None) / width
 
 

@@ -11,6 +11,9 @@ import numpy as np
 import warp as wp
 
 from softmpm.kernels.compile import launch
+from softmpm.scene.boundary import split_triangles, triangle_outline
+from softmpm.scene.cut_cells import share_inside
+from softmpm.scene.outline import Outline
 from softmpm.validate import need
 
 wp.set_module_options({"enable_backward": False})  # a shape is not differentiated
@@ -51,6 +54,53 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Inside test of points (point, 3), as booleans."""
+    return _nearest(vertices, faces, points)[0]
+
+
+def mesh_coverage(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, width: float) -> np.ndarray:
+    """Share of a small cube of this width around each point (point, 3) that lies inside."""
+    inside, nearest, face = _nearest(vertices, faces, points)
+    distance = np.linalg.norm(points - nearest, axis=1)
+    share = share_inside(np.where(inside, -distance, distance), width)
+    close = np.flatnonzero(inside & (share < 1.0))
+    corner = vertices[faces[face[close]]]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    beyond = nearest[close] + 0.05 * width * normal
+    share[close[winding_inside(vertices, faces, beyond)]] = 1.0  # that face lies within another part
+    return share
+
+
+def near_surface(
+    vertices: np.ndarray, faces: np.ndarray, lower: np.ndarray, count: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Cells of a lattice from ``lower`` that the surface may cross, as booleans (prod(count),)."""
+    from scipy.ndimage import binary_dilation
+
+    points = split_triangles(vertices[faces], spacing / 2).mean(
+        axis=1
+    )  # no part of a triangle is a cell away
+    cell = np.clip(np.floor((points - lower) / spacing).astype(np.int64), 0, count - 1)
+    near = np.zeros(count, dtype=bool)
+    near[tuple(cell.T)] = True
+    return binary_dilation(near, np.ones((3, 3, 3))).ravel()
+
+
+def mesh_outline(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> Outline:
+    """Outline of a closed surface: its triangles, split to the spacing, without those that lie within another part.
+
+    Exact where no parts overlap.
+    """
+    outline = triangle_outline(split_triangles(vertices[faces], spacing))
+    beyond = outline.points + 0.01 * spacing * outline.normals  # a surface has the outside there
+    free = ~winding_inside(vertices, faces, beyond)
+    return Outline(outline.points[free], outline.normals[free], outline.areas[free])
+
+
+def _nearest(
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inside test of points (point, 3), the nearest point of the surface, and its face."""
     low = vertices.min(axis=0)
     unit = float(np.ptp(vertices, axis=0).max())  # the query is in float32: keep its numbers near one
     surface = wp.Mesh(
@@ -60,22 +110,29 @@ def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
     )
     queries = wp.array((points - low) / unit, dtype=wp.vec3, device="cpu")
     inside = wp.zeros(len(points), dtype=wp.int32, device="cpu")
-    launch(_inside, len(points), [surface.id, queries, inside], wp.get_device("cpu"))
-    return inside.numpy().astype(bool)
+    nearest = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
+    face = wp.zeros(len(points), dtype=wp.int32, device="cpu")
+    launch(_query, len(points), [surface.id, queries, inside, nearest, face], wp.get_device("cpu"))
+    return inside.numpy().astype(bool), low + unit * nearest.numpy().astype(np.float64), face.numpy()
 
 
 @wp.kernel
-def _inside(
+def _query(
     # In:
     surface: wp.uint64,
     points: wp.array(dtype=wp.vec3),  # pyright: ignore
     # Out:
     inside: wp.array(dtype=wp.int32),  # pyright: ignore
+    nearest: wp.array(dtype=wp.vec3),  # pyright: ignore
+    face: wp.array(dtype=wp.int32),  # pyright: ignore
 ):
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(surface, points[i], 10.0)  # the mesh spans one
-    if query.result and query.sign < 0.0:  # pyright: ignore
-        inside[i] = 1
+    if query.result:  # pyright: ignore
+        nearest[i] = wp.mesh_eval_position(surface, query.face, query.u, query.v)  # pyright: ignore
+        face[i] = query.face  # pyright: ignore
+        if query.sign < 0.0:  # pyright: ignore
+            inside[i] = 1
 
 
 def _load(path: "str | os.PathLike[str]") -> Any:

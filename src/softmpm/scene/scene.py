@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from softmpm.scene.materials import Material
+from softmpm.scene.outline import Outline
 from softmpm.summary import counted, table
 from softmpm.validate import array, need, need_kind, numbers, read_only, restore, store_numbers, unit
 
@@ -55,6 +56,8 @@ class Particles:
     """Rest positions X [m], shape (particle, dim); copied, read-only."""
     volume: np.ndarray | float
     """Rest volume of each particle V⁰ [m³], in 2D [m²] of unit depth; one number or shape (particle,); copied, read-only."""
+    outline: Outline | None = None
+    """The true surface of the shape; None if it is not known."""
 
     def __post_init__(self):
         positions = np.array(array("positions", self.positions), dtype=np.float64, ndmin=2)
@@ -73,6 +76,12 @@ class Particles:
                 particle = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0][0]
                 raise ValueError(f"{name} must be finite; particle {particle} is not.")
         need(bool((volume > 0).all()), f"volume must be > 0, got {volume.min()}.")
+        if self.outline is not None:
+            need_kind("particles outline", self.outline, Outline)
+            need(
+                self.outline.dim == positions.shape[1],
+                f"an outline has as many axes as its particles, got {self.outline.dim}D and {positions.shape[1]}D.",
+            )
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "volume", read_only(np.broadcast_to(volume, (len(positions),)).copy()))
 

@@ -2,7 +2,8 @@
 
 Every particle sits in the middle of its lattice cell and has the cell's volume; the last axis runs fastest.
 A box is filled exactly: its mass is its density times its own volume. The other shapes keep the cells whose
-middle lies in them: their mass is exact to the lattice, density · particle count · spacingᵈ.
+middle lies in them: their mass is exact to the lattice, density · particle count · spacingᵈ. With ``cut_cells`` they keep
+every cell that they cross, with the volume and the centroid of its inner part.
 """
 
 import math
@@ -12,8 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softmpm.scene.image import Inside, coverage, silhouette
-from softmpm.scene.mesh import closed_surface, winding_inside
+from softmpm.scene.boundary import ball_outline, box_outline, polygon_outline
+from softmpm.scene.cut_cells import SAMPLES, inner_parts, merge_slivers, sample_points, share_inside
+from softmpm.scene.image import Inside, coverage, mask_contours, silhouette
+from softmpm.scene.mesh import closed_surface, mesh_coverage, mesh_outline, near_surface, winding_inside
 from softmpm.scene.scene import Particles
 from softmpm.validate import need
 
@@ -41,13 +44,17 @@ def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Parti
         "make the spacing smaller.",
     )
     step = (high - low) / count
-    return Particles(_lattice((low + high) / 2, count, step), float(step.prod()))
+    positions = _lattice((low + high) / 2, count, step)
+    return Particles(positions, float(step.prod()), box_outline(low, high, count))
 
 
-def ball(center: Sequence[float], radius: float | Sequence[float], spacing: float) -> Particles:
+def ball(
+    center: Sequence[float], radius: float | Sequence[float], spacing: float, *, cut_cells: bool = False
+) -> Particles:
     """Fill a disc (2D) or ball (3D); one ``radius`` [m] per axis makes an ellipse or ellipsoid.
 
-    The lattice mirrors itself about ``center`` [m], so the centre of mass is exact.
+    The lattice mirrors itself about ``center`` [m], so the centre of mass is exact. ``cut_cells`` makes the volume exact to
+    spacing², with particles of different volumes.
     """
     middle, spacing = _point("center", center), _spacing(spacing)
     radii = np.asarray(radius, dtype=np.float64)
@@ -56,9 +63,27 @@ def ball(center: Sequence[float], radius: float | Sequence[float], spacing: floa
         f"radius must be one number > 0 m, or {len(middle)} of them, one per axis, got {radius}.",
     )
     radii = np.broadcast_to(radii, middle.shape)
-    offset = _lattice(np.zeros_like(middle), 2 * _count(radii, spacing), spacing)
-    offset = offset[((offset / radii) ** 2).sum(axis=1) <= 1.0]
-    return Particles(_not_empty(middle + offset, spacing), spacing ** len(middle))
+    count = 2 * (_cover if cut_cells else _count)(radii, spacing)
+    offset, volume = _lattice(np.zeros_like(middle), count, spacing), spacing ** len(middle)
+    if cut_cells:
+        offset, volume = merge_slivers(*_cut_ball(radii, offset, spacing), count, spacing)
+    else:
+        offset = offset[((offset / radii) ** 2).sum(axis=1) <= 1.0]
+    return Particles(middle + _not_empty(offset, spacing), volume, ball_outline(middle, radii, spacing))
+
+
+def _cut_ball(radii: np.ndarray, middles: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each cell that is inside, and centroid of that part."""
+    share, centroid = np.zeros(len(middles)), middles.copy()
+    near = (((np.abs(middles) - spacing / 2) / radii) ** 2).sum(axis=1) < 1.0
+    share[(((np.abs(middles) + spacing / 2) / radii) ** 2).sum(axis=1) <= 1.0] = 1.0
+    cut = near & (share < 1.0)
+    samples = sample_points(middles[cut], spacing) / radii
+    level = np.linalg.norm(samples, axis=2)
+    distance = (level - 1.0) * level / np.linalg.norm(samples / radii, axis=2)  # to first order
+    weights = share_inside(distance, spacing / SAMPLES)
+    share[cut], centroid[cut] = inner_parts(middles[cut], weights, spacing)
+    return share, centroid
 
 
 def image(
@@ -69,6 +94,7 @@ def image(
     spacing: float,
     inside: Inside = "dark",
     threshold: float = 0.5,
+    cut_cells: bool = False,
 ) -> Particles:
     """Fill the silhouette in a picture with 2D particles; the picture's top is up.
 
@@ -82,40 +108,81 @@ def image(
         inside: ``dark`` takes what is dark on white paper (transparent is paper), ``light`` what is light on
             black, ``opaque`` what is not transparent.
         threshold: Grey or opacity, between 0 and 1, that parts the inside from the outside.
+        cut_cells: Take every cell that has something inside, with the volume and the centroid of that part: the volume is
+            exact, and the particles differ in volume.
     """
     corner, spacing = _point("lower", lower), _spacing(spacing)
     need(len(corner) == 2, f"a picture is flat: lower needs 2 numbers, got {lower}.")
     need(math.isfinite(height) and height > 0, f"height must be > 0 m, got {height}.")
     mask = silhouette(source, inside, threshold)
     pixel = height / len(mask)
-    count = _count(np.array(mask.shape[::-1]) * pixel, spacing)  # (x, y)
-    positions = _lattice(corner + count * spacing / 2, count, spacing)
-    covered = coverage(mask, count, spacing / pixel).ravel()
-    chosen = covered >= 0.5 - 1e-9  # a half-covered cell counts, whatever its rounding
+    size, width = np.array(mask.shape[::-1]) * pixel, spacing / pixel
+    count = (_cover if cut_cells else _count)(size, spacing)  # (x, y)
+    middles = _lattice(corner + count * spacing / 2, count, spacing)
+    if cut_cells:
+        parts = _cut_image(mask, middles, count, spacing, width)
+        positions, volume = merge_slivers(*parts, count, spacing)
+    else:
+        covered = coverage(mask, width * np.arange(count[0]), width * np.arange(count[1]), width).ravel()
+        half = covered >= 0.5 - 1e-9  # a half-covered cell counts, whatever its rounding
+        positions, volume = middles[half], spacing**2
     need(
-        bool(chosen.any()),
+        len(positions) > 0,
         f"the picture leaves no particle: {mask.mean():.1%} of its pixels are inside (inside={inside!r}, "
         f"threshold={threshold}), a particle is {spacing / pixel:.3g} pixels wide; "
         "try another inside, another threshold or a smaller spacing.",
     )
-    return Particles(positions[chosen], spacing**2)
+    polygons = [corner + pixel * polygon for polygon in mask_contours(mask, width)]
+    return Particles(positions, volume, polygon_outline(polygons, spacing))
 
 
-def mesh(source: "str | os.PathLike[str] | trimesh.Trimesh", spacing: float) -> Particles:
+def _cut_image(
+    mask: np.ndarray, middles: np.ndarray, count: np.ndarray, spacing: float, width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each cell that is inside, and centroid of that part."""
+    fine = width / SAMPLES
+    across, up = (fine * np.arange(SAMPLES * n) for n in count)
+    covered = coverage(mask, across, up, fine).reshape(count[0], SAMPLES, count[1], SAMPLES)
+    weights = covered.transpose(0, 2, 1, 3).reshape(len(middles), -1)
+    return inner_parts(middles, weights, spacing)
+
+
+def mesh(
+    source: "str | os.PathLike[str] | trimesh.Trimesh", spacing: float, *, cut_cells: bool = False
+) -> Particles:
     """Fill a closed triangle mesh with particles; needs trimesh (``pip install softmpm[mesh]``).
 
     Args:
         source: Path of a mesh file, or a ``trimesh.Trimesh``, in metres. A file in millimetres wants
             ``trimesh.load_mesh(path).apply_scale(1e-3)``.
         spacing: Distance of neighbouring particles [m]; the lattice is centred in the mesh's bounding box.
+        cut_cells: Take every cell that the mesh crosses, with the volume and the centroid of its inner part: the volume converges
+            with spacing², and the particles differ in volume.
     """
     spacing = _spacing(spacing)
     vertices, faces = closed_surface(source)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    count = _whole(np.ceil((high - low) / spacing - 1e-9))
-    positions = _lattice((low + high) / 2, count, spacing)
-    inside = winding_inside(vertices, faces, positions)
-    return Particles(_not_empty(positions[inside], spacing), spacing**3)
+    count = _cover(high - low, spacing)
+    middles = _lattice((low + high) / 2, count, spacing)
+    if cut_cells:
+        parts = _cut_mesh(vertices, faces, middles, count, spacing)
+        positions, volume = merge_slivers(*parts, count, spacing)
+    else:
+        positions, volume = middles[winding_inside(vertices, faces, middles)], spacing**3
+    return Particles(_not_empty(positions, spacing), volume, mesh_outline(vertices, faces, spacing))
+
+
+def _cut_mesh(
+    vertices: np.ndarray, faces: np.ndarray, middles: np.ndarray, count: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each cell that is inside, and centroid of that part."""
+    cut = near_surface(vertices, faces, middles[0] - spacing / 2, count, spacing)
+    share, centroid = np.zeros(len(middles)), middles.copy()
+    share[~cut] = winding_inside(vertices, faces, middles[~cut])
+    samples = sample_points(middles[cut], spacing)
+    weights = mesh_coverage(vertices, faces, samples.reshape(-1, 3), spacing / SAMPLES)
+    share[cut], centroid[cut] = inner_parts(middles[cut], weights.reshape(len(samples), -1), spacing)
+    return share, centroid
 
 
 def _point(name: str, value: Sequence[float]) -> np.ndarray:
@@ -148,6 +215,12 @@ def _count(extent: np.ndarray, spacing: float) -> np.ndarray:
     """Nearest whole number of cells along each axis; a tie goes up, whatever its rounding."""
     with np.errstate(over="ignore"):
         return _whole(np.floor(extent / spacing + 0.5 + 1e-9))
+
+
+def _cover(extent: np.ndarray, spacing: float) -> np.ndarray:
+    """Whole number of cells that covers the extent along each axis, whatever its rounding."""
+    with np.errstate(over="ignore"):
+        return _whole(np.ceil(extent / spacing - 1e-9))
 
 
 def _whole(count: np.ndarray) -> np.ndarray:

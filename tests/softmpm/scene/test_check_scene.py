@@ -12,7 +12,7 @@ from softmpm.scene import check_scene as checks
 from softmpm.scene.check_scene import check_precision, check_scene
 from softmpm.scene.materials import NeoHookean
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
-from softmpm.scene.shapes import box
+from softmpm.scene.shapes import ball, box
 
 SOFT = NeoHookean(density=1.0, young=10.0)
 DX = 0.125  # a power of two, so that places between nodes are exact
@@ -58,6 +58,59 @@ def test_dimensions_agree():
     muscle = Muscle(particles=[0], direction=(0, 1, 0), strength=1.0)
     refused(scene(muscles=[muscle]), "muscle 0 direction needs 2 numbers", "got (0, 1, 0)")
     refused(scene(walls=[Wall(normal=(0, 1, 0), offset=0)]), "wall 0 normal needs 2 numbers", "got (0, 1, 0)")
+
+
+def outlined(block: Particles, **changes) -> Scene:
+    """A body with these particles and an outline changed in some of its fields."""
+    assert block.outline is not None
+    outline = dataclasses.replace(block.outline, **changes)
+    return scene(Body(Particles(block.positions, block.volume, outline), SOFT))
+
+
+def test_outline_is_in_the_grid_around_its_particles():
+    """An outline outside of the nodes or apart from its particles is named; one that lies between the outermost nodes is not."""
+    block = box((0.0, 0.25), (0.5, 0.5), DX)
+    check_scene(scene(Body(block, SOFT)))
+    assert block.outline is not None
+    points = block.outline.points
+    refused(
+        outlined(block, points=points - (0.01, 0.0)),
+        "the outline of body 0 leaves the grid: point 0 at (-0.01, 0.3125) m, and 1 more of its 12",
+        "from 0 to (1, 1.25) m. Move the body or enlarge the grid.",
+    )
+    refused(
+        outlined(block, points=points + (0.5, 0.0)),
+        "the outline of body 0 must surround its particles, but particle 0 at (0.0625, 0.3125) m and 5 more of 8 lie",
+        "spans (0.5, 0.25) to (1, 0.5) m. Move both together",
+    )
+
+
+def test_outline_is_closed_around_the_volume_of_its_particles():
+    """A missing side, inward normals and lengths in other units are told apart."""
+    block = box((0.25, 0.25), (0.75, 0.75), DX)
+    outline = block.outline
+    assert outline is not None
+    rest = outline.normals[:, 1] < 0.5
+    refused(
+        outlined(block, **{name: getattr(outline, name)[rest] for name in ("points", "normals", "areas")}),
+        "body 0 must be closed: the sum of areas times normals has length 0.5, at most 5% of its area of 1.5",
+    )
+    refused(
+        outlined(block, normals=-outline.normals), "must have normals out of the body, got normals into it"
+    )
+    refused(
+        outlined(block, areas=3 * outline.areas),
+        "must enclose the volume of its particles, 0.25, to half a particle spacing along the surface, got 0.75",
+    )
+
+
+def test_lattices_agree_with_their_outlines():
+    """A disc of two or three particles across is as coarse as a lattice gets, and stays within the tolerance."""
+    for radius in np.linspace(0.71, 4.0, 60) * DX / 2:
+        for dim in (2, 3):
+            if dim == 2 or radius > 0.87 * DX / 2:
+                room = Grid(shape=(9, 9, 9)[:dim], spacing=DX)
+                check_scene(scene(Body(ball((0.5,) * dim, radius, DX / 2), SOFT), grid=room))
 
 
 def test_muscles_name_particles_of_the_scene():

@@ -56,6 +56,55 @@ def test_full_picture_is_a_box():
     np.testing.assert_allclose(particles.volume, want.volume, rtol=1e-14)
 
 
+def disc(pixels: int) -> np.ndarray:
+    """A disc of radius 0.8 in a picture of height 2, sampled at the pixels' middles."""
+    middle = (np.arange(pixels) + 0.5) * 2 / pixels - 1
+    return np.hypot(middle[:, None], middle) < 0.8
+
+
+def test_outline_of_a_disc_converges():
+    """Perimeter and area of a disc whose pixels are a fifth of the spacing or finer, radial normals."""
+    for spacing, tolerance in ((0.1, 0.006), (0.05, 0.002), (0.025, 0.001)):
+        outline = image(disc(int(10 / spacing)), (-1.0, -1.0), height=2.0, spacing=spacing).outline
+        assert outline is not None
+        assert outline.areas.sum() == pytest.approx(1.6 * np.pi, rel=tolerance)
+        assert outline.enclosed_volume == pytest.approx(0.64 * np.pi, rel=tolerance)
+        assert np.linalg.norm(outline.areas @ outline.normals) < 1e-13
+        radius = np.linalg.norm(outline.points, axis=1, keepdims=True)
+        assert radius == pytest.approx(0.8, abs=0.1 * spacing)
+        assert (outline.normals * outline.points / radius).sum(axis=1).min() > 0.97
+        assert np.ptp(outline.areas) < 0.05 * spacing
+
+
+def test_straight_sides_of_an_outline_are_exact():
+    """Sides of a rectangle with a hole lie where its pixels end, wherever the lattice has its cells."""
+    mask = np.zeros((60, 80), bool)
+    mask[7:52, 11:71] = True
+    mask[20:40, 30:50] = False
+    for spacing in (0.03, 0.0415, 0.05):  # a pixel is 0.01
+        outline = image(mask, (1.0, 2.0), height=0.6, spacing=spacing).outline
+        assert outline is not None
+        for n, offset in (((-1, 0), -1.11), ((1, 0), 1.71), ((0, -1), -2.08), ((0, 1), 2.53)):
+            level = outline.normals @ n > 1 - 1e-12
+            outer = level & (outline.points @ n > offset - 0.05)
+            assert outer.sum() * spacing > 0.3
+            assert outline.points[outer] @ n == pytest.approx(offset, abs=1e-12)
+        corners = 8 * 0.25 * spacing**2  # each is cut by less than a quarter of a cell
+        assert outline.enclosed_volume == pytest.approx(0.45 * 0.6 - 0.04, abs=corners)
+
+
+def test_outline_of_the_l():
+    """The outline of an L of pixels, upright and of its size; none for a silhouette that covers nowhere more than half a cell."""
+    outline = image(L_SHAPE, (1.0, 2.0), height=3.0, spacing=0.1).outline
+    assert outline is not None
+    assert outline.enclosed_volume == pytest.approx(5.0, abs=6 * 0.0025)
+    assert outline.areas.sum() == pytest.approx(12.0, rel=0.03)
+    assert outline.points.max(axis=0) == pytest.approx((4.0, 5.0), abs=1e-12)
+    assert outline.points[outline.points[:, 0] > 2.2][:, 1].max() == pytest.approx(3.0, abs=1e-12)
+    half = np.array([[True, True], [False, False]])
+    assert image(half, (0, 0), height=2.0, spacing=2.0).outline is None
+
+
 def picture(mode: str) -> PIL.Image.Image:
     """The L in several ways to say it: ink on paper, chalk on slate, on nothing, 16 bits, floats."""
     ink = np.where(L_SHAPE, 30, 220).astype(np.uint8)

@@ -29,6 +29,67 @@ def test_volume_converges(spacing, tolerance):
     assert mesh(solid, spacing).volume.sum() == pytest.approx(solid.volume, rel=tolerance)
 
 
+@pytest.mark.parametrize("spacing", [0.3, 0.05])
+def test_outline_is_exact(spacing):
+    """Whatever the spacing, the outline has the mesh's own area and volume, and unit normals; points are at most spacing² apart."""
+    capsule, box_mesh = (
+        trimesh.creation.capsule(height=1.0, radius=0.3),
+        trimesh.creation.box((1.0, 0.5, 0.2)),
+    )
+    for solid in (capsule, box_mesh, trimesh.creation.torus(1.0, 0.4)):
+        outline = mesh(solid, spacing).outline
+        assert outline is not None
+        assert outline.areas.sum() == pytest.approx(solid.area, rel=1e-12)
+        assert outline.enclosed_volume == pytest.approx(solid.volume, rel=1e-12)
+        assert outline.areas.max() <= spacing**2 * (1 + 1e-9)
+        assert np.linalg.norm(outline.normals, axis=1) == pytest.approx(1.0, abs=1e-14)
+        assert np.linalg.norm(outline.areas @ outline.normals) < 1e-12 * solid.area
+
+
+def test_outline_of_parts():
+    """Of parts that overlap only the free surface counts; that of a cavity does, with normals into it."""
+    part = trimesh.creation.box(extents=(1, 1, 1))
+    both = trimesh.util.concatenate(part, part.copy().apply_translation((0.5, 0.25, 0.25)))
+    common = np.array((0.5, 0.75, 0.75))
+    for spacing, tolerance in ((0.1, 0.05), (0.03, 0.015)):
+        outline = mesh(both, spacing).outline
+        assert outline is not None
+        area = 12 - 2 * (common.prod() / common).sum()
+        assert outline.areas.sum() == pytest.approx(area, rel=tolerance)
+        assert outline.enclosed_volume == pytest.approx(2 - common.prod(), rel=tolerance)
+    shell = trimesh.util.concatenate(part, trimesh.creation.box(extents=(0.5, 0.5, 0.5)))
+    shell.faces[len(part.faces) :] = shell.faces[len(part.faces) :, ::-1]
+    outline = mesh(shell, 0.1).outline
+    assert outline is not None
+    assert outline.areas.sum() == pytest.approx(7.5, rel=1e-12)
+    assert outline.enclosed_volume == pytest.approx(0.875, rel=1e-12)
+
+
+@pytest.mark.parametrize("spacing, tolerance", [(0.2, 2e-3), (0.1, 5e-4)])
+def test_cut_cells(spacing, tolerance):
+    """Volume and centre of mass of cut cells are those of the mesh, without slivers."""
+    for solid in (trimesh.creation.icosphere(subdivisions=3), trimesh.creation.torus(1.0, 0.4)):
+        solid.apply_translation((0.03, 0.01, 0.02))
+        particles = mesh(solid, spacing, cut_cells=True)
+        assert particles.volume.sum() == pytest.approx(solid.volume, rel=tolerance)
+        assert particles.volume.min() >= 0.35 * spacing**3
+        center = particles.volume @ particles.positions / particles.volume.sum()
+        assert center == pytest.approx(solid.center_mass, abs=1e-3 * spacing)
+
+
+def test_cut_cells_of_boxes():
+    """Sides that end between the cells cost no more than the samples at the edges, also where a part ends within another one."""
+    part = trimesh.creation.box(extents=(1, 1, 1))
+    both = trimesh.util.concatenate(part, part.copy().apply_translation((0.5, 0.13, 0.2)))
+    for solid, volume in ((part, 1.0), (both, 2 - 0.5 * 0.87 * 0.8)):
+        for spacing in (0.25, 0.13):
+            particles = mesh(solid, spacing, cut_cells=True)
+            assert particles.volume.sum() == pytest.approx(volume, rel=4e-3)
+    np.testing.assert_allclose(
+        mesh(part, 0.25, cut_cells=True).positions, mesh(part, 0.25).positions, atol=1e-5
+    )
+
+
 def test_inside_is_the_winding_number():
     """A ring and a capsule: each point is inside where the faces' solid angles add up to 4π."""
     rng = np.random.default_rng(0)
