@@ -31,7 +31,7 @@ from softmpm.reference_stress import (
     viscous_tangent,
 )
 from softmpm.reference_walls import inside, respond, surface, wall_velocity
-from softmpm.scene.scene import Actuator, Scene
+from softmpm.scene.scene import CONTACTS, Actuator, Scene
 from softmpm.state import GridField, Params, State
 
 __all__ = [
@@ -165,6 +165,7 @@ def grid_velocity(
     time: float = 0.0,
     duration: float = 1.0,
     displacement: Tensor | None = None,
+    contacts: Sequence[str] = CONTACTS,
 ) -> Tensor:
     """Velocity of the nodes after gravity, damping and walls (G2), zero where there is no mass.
 
@@ -172,6 +173,7 @@ def grid_velocity(
         inputs: Of one control step, without that axis; one pose of the walls, or those at its two ends.
         time, duration: Since the beginning of the control step, and its length [s].
         displacement: Of the nodes [m], shape (world, node, dim), where a wall meets them elsewhere; for walls at rest.
+        contacts: Kinds of the walls that act on nodes.
     """
     present = (mass > 0)[..., None]
     v = momentum / torch.where(mass > 0, mass, torch.ones_like(mass))[..., None]
@@ -181,6 +183,8 @@ def grid_velocity(
     v = (v + scene.dt * gravity[:, None]) * torch.exp(-scene.dt * damping)[:, None, None]
     friction = _given(inputs.friction, [wall.friction for wall in scene.walls], v, worlds, len(scene.walls))
     for k, wall in enumerate(scene.walls):
+        if wall.contact not in contacts:
+            continue
         where = surface(scene, k, inputs, v, time, duration)
         u = wall_velocity(scene, where)
         response = u + respond(wall, v - u, friction[:, k, None, None], where.unit[:, None])  # (C5)

@@ -31,7 +31,8 @@ from softmpm.reference import (
     stencil,
     stress,
 )
-from softmpm.scene.scene import Scene
+from softmpm.reference_contact import Surface, contact, start_anchor
+from softmpm.scene.scene import CONTACTS, Scene
 from softmpm.state import Params, State
 
 
@@ -111,11 +112,19 @@ def step(
     lam: Tensor,
     mass: Tensor,
     inputs: Inputs = SCENE,
-) -> tuple[Tensor, Tensor]:
-    """One substep (Q1) to (Q4); ``mass`` of the nodes. Nodes without mass have the velocity zero."""
+    surface: Surface | None = None,
+    anchor: Tensor | None = None,
+    smoothing: float = 0.0,
+) -> tuple[Tensor, ...]:
+    """One substep (Q1) to (Q4), with a surface also (K2) to (K5); ``mass`` of the nodes. Nodes without mass have the velocity zero."""
     impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
-    v = grid_velocity(scene, mass, mass[..., None] * v + impulse, inputs, displacement=u)
-    return u + scene.dt * v, v
+    contacts = CONTACTS if surface is None else ("stick", "slip")
+    v = grid_velocity(scene, mass, mass[..., None] * v + impulse, inputs, displacement=u, contacts=contacts)
+    if surface is None:
+        return u + scene.dt * v, v
+    anchor = start_anchor(scene, surface, u, inputs) if anchor is None else anchor
+    v, anchor, _ = contact(scene, surface, u, v, anchor, mass, inputs, smoothing)
+    return u + scene.dt * v, v, anchor
 
 
 def simulate(
@@ -127,27 +136,36 @@ def simulate(
     *,
     substeps: int,
     inputs: Inputs = SCENE,
-) -> tuple[Tensor, Tensor]:
+    surface: Surface | None = None,
+    anchor: Tensor | None = None,
+    smoothing: float = 0.0,
+) -> tuple[Tensor, ...]:
     """Advance the nodes; arguments and number of control steps as for :func:`softmpm.reference.simulate`.
 
     Args:
         u: Displacement of every node of the grid [m], shape (world, node, dim).
         v: Velocity of every node [m/s], shape (world, node, dim).
+        surface: Points that the separating walls act on, in place of the nodes.
+        anchor: Anchors of friction [m], shape (world, separating wall, point, dim); None is their start.
+        smoothing: Width of the onset of contact [m].
 
     Returns:
-        Both after ``control_step * substeps * dt`` seconds.
+        u and v after ``control_step * substeps * dt`` seconds, with a surface also the anchors.
     """
     _need_walls_at_rest(scene, inputs)
     points = quadrature(scene)
     young, poisson, density = (value.expand(len(u), len(points.X)) for value in params)
     mu, lam = lame(young, poisson)
     mass = node_mass(scene, points, density * rest_volume(scene, density.dtype))
+    if surface is not None and anchor is None:
+        anchor = start_anchor(scene, surface, u, inputs)
     steps = control_steps(activation, inputs)
     for c in range(steps):
         row, now = None if activation is None else activation[c], of_control_step(inputs, c, steps)
         for _ in range(substeps):
-            u, v = step(scene, points, u, v, row, mu, lam, mass, now)
-    return u, v
+            u, v, *moved = step(scene, points, u, v, row, mu, lam, mass, now, surface, anchor, smoothing)
+            anchor = moved[0] if moved else None
+    return (u, v) if anchor is None else (u, v, anchor)
 
 
 def _need_walls_at_rest(scene: Scene, inputs: Inputs) -> None:

@@ -1,0 +1,142 @@
+"""Contact with friction at surface points in plain float64 PyTorch. Part of :mod:`softmpm.reference_lagrangian`.
+
+The outline of a body at rest has points with an area and constant weights on the nodes. One pass over the separating walls finds an
+impulse per area at each point from the predicted penetration, with an anchored friction, and the nodes gather it. Derivations:
+docs/math/contact.md.
+
+    D_s = Σ_i |w_si| L_i / m_i,   L_i = Σ_r |w_ri| A_r                                       (K1)
+    x_s = X_s + Σ w_si u_i,   v_s = Σ w_si v*_i                                              (K2)
+    d = −(y + Δt v_n),   P = H(d) / (Δt D_s),   y = n·x_s − o                                (K3)
+    T = −c e, |T| ≤ μ P,   e = x_t + Δt v_t − a,   c = k Δt / (1 + D_s k Δt²)                (K4)
+    v'_i = v*_i + (1/m_i) Σ_s w_si A_s Σ_k J_k,   J_k = P n + T                              (K5)
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from softmpm.inputs import Inputs
+from softmpm.reference import SCENE
+from softmpm.reference_walls import surface as wall_at
+from softmpm.scene.scene import Scene
+
+
+class Surface(NamedTuple):
+    """Points of the outline at rest and their weights on the nodes, the same in all worlds."""
+
+    X: Tensor
+    """Rest positions [m], shape (point, dim)."""
+    node: Tensor
+    """Flat index of each node in the grid, shape (point, 3^dim)."""
+    w: Tensor
+    """Weights, shape (point, 3^dim): their sum is 1 and they reproduce linear fields."""
+    area: Tensor
+    """Area of each point A [m²], in 2D [m] of unit depth, shape (point,)."""
+    stiffness: Tensor
+    """Tangential stiffness k = 4 (λ + 2μ) / dx of the body of each point [Pa/m], shape (point,). A constant."""
+
+
+def separating(scene: Scene) -> list[int]:
+    """Numbers of the walls that act on surface points."""
+    return [k for k, wall in enumerate(scene.walls) if wall.contact == "separate"]
+
+
+def gather(surface: Surface, values: Tensor) -> Tensor:
+    """Σ w a at the surface points of a field a on the nodes, (world, node, ...)."""
+    return torch.einsum("wsk...,sk->ws...", values[:, surface.node], surface.w)
+
+
+def delassus(scene: Scene, surface: Surface, mass: Tensor) -> Tensor:
+    """D_s (K1) [m²/kg], shape (world, point), of ``mass`` (world, node)."""
+    w = surface.w.abs()
+    load = w.new_zeros(math.prod(scene.grid.shape))
+    load = load.index_add(0, surface.node.flatten(), (w * surface.area[:, None]).flatten())
+    return (w * _per_mass(load.expand_as(mass), mass)[:, surface.node]).sum(-1)
+
+
+def _per_mass(values: Tensor, mass: Tensor) -> Tensor:
+    """Values divided by the mass of the nodes, zero where there is none."""
+    return torch.where(mass > 0, values / torch.where(mass > 0, mass, torch.ones_like(mass)), 0.0)
+
+
+def contact(
+    scene: Scene,
+    surface: Surface,
+    u: Tensor,
+    v: Tensor,
+    anchor: Tensor,
+    mass: Tensor,
+    inputs: Inputs = SCENE,
+    smoothing: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Response of the separating walls to one substep (K2) to (K5).
+
+    Args:
+        u: Displacement of the nodes at the beginning of the substep [m], shape (world, node, dim).
+        v: Their velocity v* after forces and the other walls [m/s].
+        anchor: Anchors a [m], shape (world, separating wall, point, dim).
+        mass: Of the nodes [kg], shape (world, node).
+        inputs: Of one control step, with walls at rest.
+        smoothing: Width s of the hinge H [m].
+
+    Returns:
+        Velocity of the nodes [m/s], anchors, and impulses per area J [N s/m²], shaped like the anchors.
+    """
+    D = delassus(scene, surface, mass)[..., None]
+    x, at_points = surface.X + gather(surface, u), gather(surface, v)
+    friction = inputs.friction
+    if friction is None:
+        friction = torch.tensor([wall.friction for wall in scene.walls], dtype=v.dtype)
+    friction = friction.expand(len(v), len(scene.walls))
+    anchors, impulses = [], []
+    for number, k in enumerate(separating(scene)):
+        wall = wall_at(scene, k, inputs, v, 0.0, 1.0)
+        n, offset, mu = wall.unit[:, None], wall.offset[:, None, None], friction[:, k, None, None]
+        y, v_n = (x * n).sum(-1, keepdim=True) - offset, (at_points * n).sum(-1, keepdim=True)
+        x_t, v_t = _tangential(x, n), at_points - v_n * n
+        P = hinge(-(y + scene.dt * v_n), smoothing) / (scene.dt * D)
+        T, moved = _friction(surface, scene.dt, D, P, mu, x_t, v_t, anchor[:, number])
+        impulses.append(P * n + T)
+        anchors.append(moved)
+        at_points = at_points + D * impulses[-1]
+    if not impulses:
+        return v, anchor, torch.zeros_like(anchor)
+    J = torch.stack(impulses, 1)
+    share = (surface.w * surface.area[:, None])[..., None] * J.sum(1)[:, :, None]
+    sums = torch.zeros_like(v).index_add(1, surface.node.flatten(), share.flatten(1, 2))
+    return v + _per_mass(sums, mass[..., None]), torch.stack(anchors, 1), J
+
+
+def hinge(d: Tensor, smoothing: float) -> Tensor:
+    """H(d) of (K3) [m]."""
+    if smoothing == 0:
+        return torch.where(d > 0, d, 0.0)
+    above = torch.where(d < 2 * smoothing, d**2 / (4 * smoothing), d - smoothing)
+    return torch.where(d > 0, above, 0.0)
+
+
+def _friction(
+    surface: Surface, dt: float, D: Tensor, P: Tensor, mu: Tensor, x_t: Tensor, v_t: Tensor, anchor: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Tangential impulse per area T and the anchor after the substep (K4)."""
+    k = surface.stiffness[:, None]
+    T = -k * dt / (1 + D * k * dt**2) * (x_t + dt * v_t - anchor)
+    squared, touches = (T**2).sum(-1, keepdim=True), P > 0
+    sliding = touches & ((squared > (mu * P) ** 2) | (mu == 0))  # a smooth wall holds no point
+    size = torch.sqrt(torch.where(sliding & (squared > 0), squared, 1.0))
+    T = torch.where(sliding, mu * P * T / size, torch.where(touches, T, 0.0))
+    slipped = x_t + dt * (v_t + D * T) + T / (k * dt)
+    return T, torch.where(sliding, slipped, torch.where(touches, anchor, x_t + dt * v_t))
+
+
+def _tangential(vectors: Tensor, n: Tensor) -> Tensor:
+    return vectors - (vectors * n).sum(-1, keepdim=True) * n
+
+
+def start_anchor(scene: Scene, surface: Surface, u: Tensor, inputs: Inputs = SCENE) -> Tensor:
+    """Anchors x_t of the displacement ``u`` (world, node, dim), shape (world, separating wall, point, dim)."""
+    x = surface.X + gather(surface, u)
+    normals = [wall_at(scene, k, inputs, u, 0.0, 1.0).unit[:, None] for k in separating(scene)]
+    return torch.stack([_tangential(x, n) for n in normals], 1) if normals else x[:, None][:, :0]
