@@ -18,8 +18,10 @@ LAYERS = """
     checks
     reference_stress reference_walls
     reference kernels.physics
+    reference_contact
     stability kernels.convert reference_lagrangian
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian rest_grid
+    surface_grid
     describe
     model
     nodal schemes

@@ -18,10 +18,11 @@ from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
+from softmpm.scene.outline import Outline
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
-from softmpm.state import GridField, Low, Params, State
+from softmpm.state import GridField, Low, Nodal, Params, State
 from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 
@@ -42,6 +43,8 @@ __all__ = [
     "Model",
     "Muscle",
     "NeoHookean",
+    "Nodal",
+    "Outline",
     "Params",
     "Particles",
     "Pressure",

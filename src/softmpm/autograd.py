@@ -259,7 +259,7 @@ class _SimulateBackward(_Function):
         call, wanted, *tensors = given
         values, state = call.split(tensors)
         kind: Any = Nodal if call.model.formulation == "reference" else State
-        count = len(state) // 2 if kind is Nodal else 4
+        count = 3 if kind is Nodal else 4
         pairs = zip(state[-count:], state[:count], strict=True)
         adj_end = kind(*(torch.zeros_like(like) if adj is None else adj for adj, like in pairs))
         with explain_out_of_memory(call.model, call.horizon, gradient=True):

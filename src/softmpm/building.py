@@ -25,6 +25,8 @@ def build(
     memory_budget: int | None = None,
     scheme: str = "auto",
     formulation: str = "moving",
+    contact: str = "auto",
+    contact_width: float = 0.0,
     inputs: Iterable[str] = (),
     deterministic: bool = False,
     calls: int = 1,
@@ -43,6 +45,9 @@ def build(
             docs/performance.md.
         formulation: "moving": material point method, whose grid is reset in each substep. "reference": total Lagrangian, with weights
             taken once at rest; see docs/formulations.md.
+        contact: What meets the separating walls in the reference formulation: "nodes", "surface" (the points of the outlines,
+            :class:`softmpm.Outline`), or "auto": the surface if every body has an outline. The moving formulation has nodes.
+        contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower, and in the plain scheme
@@ -82,6 +87,9 @@ def build(
     if alarms.step is not None:
         need_stable(scene, alarms.step)
     warn_sparse(scene)
+    surface = on_surface(scene, formulation, contact)
+    if not 0.0 <= contact_width < 1.0:
+        raise ValueError(f"contact_width must be in [0, 1) cells, got {contact_width!r}.")
     if formulation == "reference":
         check_reference(scene, given, scheme)
         scheme, reason = "lagrangian", "formulation='reference'"
@@ -98,6 +106,8 @@ def build(
         SCHEMES[scheme].footprint,
         alarms,
         formulation=formulation,
+        surface=surface,
+        contact_width=float(contact_width),
         given=given,
         deterministic=bool(deterministic),
         fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme),
@@ -105,6 +115,51 @@ def build(
         memory_budget=memory_budget,
         calls=int(calls),
     )
+
+
+def on_surface(scene: Scene, formulation: str, contact: str) -> bool:
+    """True if the separating walls act on surface points.
+
+    Raises:
+        ValueError: That was asked for and cannot be.
+    """
+    if contact not in ("auto", "nodes", "surface"):
+        raise ValueError(f"contact must be 'auto', 'nodes' or 'surface', got {contact!r}.")
+    outlined = all(body.particles.outline is not None for body in scene.bodies)
+    separating = any(wall.contact == "separate" for wall in scene.walls)
+    if contact == "surface":
+        if formulation != "reference":
+            raise ValueError(
+                "contact='surface' needs formulation='reference'; the moving formulation has contact='nodes'."
+            )
+        if not outlined:
+            raise ValueError(
+                "contact='surface' needs an outline of every body (softmpm.Outline), which the shapes have and plain Particles have "
+                "if they are given one; take contact='nodes'."
+            )
+        if not separating:
+            raise ValueError(
+                "contact='surface' needs a wall of the kind 'separate', and the scene has none; leave contact out."
+            )
+    chosen = formulation == "reference" and contact != "nodes" and outlined and separating
+    if chosen:
+        check_reach(scene)
+    return chosen
+
+
+def check_reach(scene: Scene) -> None:
+    """Raise ValueError unless all 3^dim nodes around each surface point are nodes of the grid."""
+    grid = scene.grid
+    points = np.concatenate(
+        [b.particles.outline.points for b in scene.bodies if b.particles.outline is not None]
+    )
+    base = np.floor(points / grid.spacing - 0.5)
+    outside = ((base < 0) | (base > np.array(grid.shape) - 3)).any(axis=1)
+    if outside.any():
+        raise ValueError(
+            f"surface points need the nodes around them, from half a cell to one and a half cells inside the grid, but one is at "
+            f"{points[outside][0].tolist()} m; move the body, enlarge the grid, or take contact='nodes'."
+        )
 
 
 def check_reference(scene: Scene, given: tuple[str, ...], scheme: str) -> None:

@@ -40,6 +40,8 @@ class Sizes(Protocol):
     def formulation(self) -> str: ...
     @property
     def rest_grid(self) -> Any: ...
+    @property
+    def anchor_shape(self) -> tuple[int, ...]: ...
     def shape_of(self, name: str, control_steps: int) -> tuple[int, ...]: ...
 
 
@@ -73,8 +75,8 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
             "formulation='reference'."
         )
     shape = (model.worlds, model.rest_grid.count, model.dim)
-    for name in Nodal._fields:
-        _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), shape)
+    for name, wanted in zip(Nodal._fields, (shape, shape, model.anchor_shape), strict=True):
+        _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
 
 
 def check_shown(state: State, shown: State) -> None:

@@ -26,6 +26,7 @@ def describe(model, substeps: int) -> str:
         f"  muscles    {muscles if spec.muscle_slots else 'left out'}",
         f"  driven     {f'{model.driven_count} particles' if spec.driven else 'left out'}",
         f"  walls      {contacts or 'left out'}",
+        f"  contact    {_contact(model)}",
         f"  friction   {has(spec.friction)}",
         f"  gravity    {has(spec.gravity)}",
         f"  damping    {has(spec.damping)}",
@@ -34,11 +35,18 @@ def describe(model, substeps: int) -> str:
         f"  gradients  of the start always; of {', '.join(groups(spec))} only in a backward pass that asks for them",
         f"  alarms     {_alarms(model)}",
         f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
+        f"  form       {model.formulation} formulation",
         f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
         f"  sums       {_sums(model)}",
         f"  memory     {_memory(model, substeps)}",
     ]
     return "\n".join(lines)
+
+
+def _contact(model) -> str:
+    if model.surface is None:
+        return "at nodes"
+    return f"{model.surface.count} surface points with separating walls, nodes with others"
 
 
 def _memory(model, substeps: int) -> str:

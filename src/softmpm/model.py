@@ -24,6 +24,7 @@ from softmpm.scene.scene import Scene
 from softmpm.stability import stiffening_signs
 from softmpm.state import Low, Params, State
 from softmpm.summary import counted
+from softmpm.surface_grid import SurfaceGrid
 from softmpm.workspace import Workspace
 
 
@@ -52,6 +53,8 @@ class Model:
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
         formulation: "moving" or "reference".
+        surface: Surface points that meet the separating walls, or None if the nodes do.
+        contact_width: Width over which surface contact sets in [cells].
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
         footprint: Memory of that scheme.
         workspace: What calls leave for later calls; no part of the model's value.
@@ -68,6 +71,8 @@ class Model:
         alarms: Alarms,
         *,
         formulation: str,
+        surface: bool,
+        contact_width: float,
         given: tuple[str, ...],
         deterministic: bool,
         fixed_point: bool,
@@ -93,7 +98,9 @@ class Model:
         self.deterministic, self.workspace = deterministic, Workspace()
         self.formulation = formulation
         self._rest_grid = RestGrid(scene, device) if formulation == "reference" else None
-        self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point)
+        self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
+        self.contact_width = contact_width
+        self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface)
         self.strength = self._tensor([m.strength for m in scene.muscles])
         self.stiffening = self._tensor(stiffening_signs(scene))
         # Computed now, not on first use: that may be during a capture, which runs nothing.
@@ -235,6 +242,12 @@ class Model:
         return self._rest_grid
 
     @property
+    def anchor_shape(self) -> tuple[int, ...]:
+        """Shape of :attr:`softmpm.state.Nodal.anchor`."""
+        points = 0 if self.surface is None else self.surface.count
+        return self.worlds, len(self.spec.surface_walls), points, self.dim
+
+    @property
     def rest_low(self) -> Tensor:
         """Remainders of rounding the rest positions [m], shape (particle, dim); zeros in float64."""
         return torch.zeros_like(self.positions) if self._low is None else self._low
@@ -303,7 +316,9 @@ def kernel_of(part: object, package: str) -> str:
     return name
 
 
-def _spec(scene: Scene, dtype: torch.dtype, slots: int, given: tuple[str, ...], fixed_point: bool) -> Spec:
+def _spec(
+    scene: Scene, dtype: torch.dtype, slots: int, given: tuple[str, ...], fixed_point: bool, surface: bool
+) -> Spec:
 
     def has(name: str) -> bool:
         """True if the scene has a quantity other than zero, or calls give it."""
@@ -325,6 +340,7 @@ def _spec(scene: Scene, dtype: torch.dtype, slots: int, given: tuple[str, ...], 
         driven=len(scene.driven) > 0,
         given=given,
         deterministic=fixed_point,
+        surface=surface,
     )
 
 

@@ -19,14 +19,23 @@ def particles_of(model: Model, nodes: Nodal) -> State:
     """What the particles show of a nodal state (Q5), which the result carries along."""
     grid = model.rest_grid
     weights, slopes = grid.weights.to(model.dtype), grid.slopes.to(model.dtype)
-    u, v = (field[:, grid.stencil] for field in nodes)  # (world, particle, node, dim)
+    u, v = (field[:, grid.stencil] for field in nodes[:2])  # (world, particle, node, dim)
     eye = torch.eye(model.dim, dtype=model.dtype, device=model.device)
     x = model.positions + torch.einsum("wpnd,pn->wpd", u, weights)
     F = eye + torch.einsum("wpnd,pne->wpde", u, slopes)
     rate = torch.einsum("wpnd,pne->wpde", v, slopes)
-    # C F = Ḟ:
-    C = torch.linalg.solve(F.transpose(-1, -2), rate.transpose(-1, -2)).transpose(-1, -2)
-    return State(x, torch.einsum("wpnd,pn->wpd", v, weights), C, F, nodes=nodes)
+    return State(x, torch.einsum("wpnd,pn->wpd", v, weights), rate @ inverse(F), F, nodes=nodes)
+
+
+def inverse(F: Tensor) -> Tensor:
+    """Inverse of 2 × 2 or 3 × 3 matrices; PyTorch's own waits for a GPU, which no capture allows."""
+    if F.shape[-1] == 2:
+        (a, b), (c, d) = ([F[..., i, j] for j in range(2)] for i in range(2))
+        adjugate = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
+        return adjugate / (a * d - b * c)[..., None, None]
+    a, b, c = F.unbind(-2)
+    columns = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
+    return torch.stack(columns, -1) / (a * columns[0]).sum(-1)[..., None, None]
 
 
 def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
@@ -44,10 +53,23 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     u = moved[:, :, None] + torch.einsum("wpde,pne->wpnd", state.F - eye, arms)
     v = state.v[:, :, None] + torch.einsum("wpde,pne->wpnd", state.C @ state.F, arms)
     total = _added(grid, share[..., None])
-    return Nodal(*(_added(grid, share[..., None] * field) / total for field in (u, v)))
+    u, v = (_added(grid, share[..., None] * field) / total for field in (u, v))
+    return Nodal(u, v, _anchors(model, u))
+
+
+def _anchors(model: Model, u: Tensor) -> Tensor:
+    """Anchors of surface points that touch nothing yet: their places across the normal of each separating wall."""
+    surface = model.surface
+    if surface is None:
+        return u.new_zeros(model.anchor_shape)
+    near = u[:, surface.stencil.long()]
+    x = surface.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, surface.weights.to(u.dtype))
+    normals = surface.normals.to(u.dtype)
+    return x[:, None] - torch.einsum("wpd,kd->wkp", x, normals)[..., None] * normals[:, None]
 
 
 def _added(grid, terms: Tensor) -> Tensor:
-    """Sums over the particles of each node, shape (world, node, ...)."""
-    total = terms.new_zeros(len(terms), grid.count, terms.shape[-1])
-    return total.index_add(1, grid.stencil.reshape(-1), terms.flatten(1, 2))
+    """Sums over the particles of each node in a fixed order, shape (world, node, ...)."""
+    flat = terms.flatten(1, 2)
+    padded = torch.cat([flat, flat.new_zeros(len(flat), 1, flat.shape[-1])], 1)
+    return padded[:, grid.members].sum(2)

@@ -25,6 +25,7 @@ class RestGrid:
         first: First entry of each cell in ``particles``, and their count, shape (cell + 1,), int32.
         cell_nodes: Nodes of each cell, shape (cell, 3^dim), int32.
         node_cells: Cell in which a node is number k of ``cell_nodes``, or -1, shape (node, 3^dim), int32.
+        members: Entries of ``stencil``, flat, that each node has, filled up with their count, shape (node, most).
         stencil: Nodes of each particle, in the order of the particles, shape (particle, 3^dim).
         weights: N_i(X_p), shape (particle, 3^dim), float64.
         arms: X_i − X_p [m], shape (particle, 3^dim, dim), float64.
@@ -61,5 +62,14 @@ class RestGrid:
         self.first = integers(np.searchsorted(of[order], np.arange(len(cells) + 1)))
         self.cell_nodes, self.node_cells = integers(numbers), integers(node_cells)
         self.stencil, self.weights = numbers_of(numbers[of]), numbers_of(weights)
+        self.members = numbers_of(grouped(numbers[of].reshape(-1), len(index)))
         self.arms = numbers_of((offsets - f[:, None]) * grid.spacing)
         self.slopes = 4.0 / grid.spacing**2 * self.weights[..., None] * self.arms
+
+
+def grouped(owners: np.ndarray, count: int) -> np.ndarray:
+    """Positions of each owner 0 … count − 1 in a list of owners, one row each, filled up with the length of the list."""
+    order, sizes = np.argsort(owners, kind="stable"), np.bincount(owners, minlength=count)
+    rows = np.full((count, sizes.max()), len(owners))
+    rows[np.arange(rows.shape[1]) < sizes[:, None]] = order
+    return rows

@@ -53,21 +53,24 @@ class Nodal(NamedTuple):
     """Displacements [m], shape (world, node, dim)."""
     v: Tensor
     """Velocities [m/s], shape (world, node, dim)."""
+    anchor: Tensor
+    """Places on the walls where surface points adhere [m], shape (world, wall, point, dim), of the separating walls; no walls or no
+    points without surface contact."""
 
     def __repr__(self) -> str:
         return _text(self)
 
     def detach(self) -> "Nodal":
         """The same state without its history."""
-        return Nodal(self.u.detach(), self.v.detach())
+        return Nodal(*(tensor.detach() for tensor in self))
 
     def clone(self) -> "Nodal":
         """The same state in memory of its own. Differentiable."""
-        return Nodal(self.u.clone(), self.v.clone())
+        return Nodal(*(tensor.clone() for tensor in self))
 
     def to(self, *args: Any, **kwargs: Any) -> "Nodal":
-        """Both tensors on another device or in another precision; arguments as for ``torch.Tensor.to``."""
-        return Nodal(self.u.to(*args, **kwargs), self.v.to(*args, **kwargs))
+        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``."""
+        return Nodal(*(tensor.to(*args, **kwargs) for tensor in self))
 
 
 class State(NamedTuple):

@@ -39,6 +39,7 @@ class Spec:
     driven: bool = False
     given: tuple[str, ...] = ()  # fields of softmpm.Inputs that calls give
     deterministic: bool = False  # sums over particles in fixed point
+    surface: bool = False  # separating walls act on surface points, not on nodes
 
     @property
     def moving(self) -> bool:
@@ -46,9 +47,14 @@ class Spec:
         return any(name.startswith("wall_") for name in self.given)
 
     @property
+    def surface_walls(self) -> tuple[int, ...]:
+        """Numbers of the walls that act on surface points."""
+        return tuple(k for k, kind in enumerate(self.contacts) if self.surface and kind == "separate")
+
+    @property
     def module(self) -> str:
         """Name of the Warp module that holds every kernel of this specialisation."""
-        names = ("friction", "gravity", "damping", "viscosity", "driven", "deterministic")
+        names = ("friction", "gravity", "damping", "viscosity", "driven", "deterministic", "surface")
         features = [name for name in names if getattr(self, name)]
         actuators = [f"{name}s" for name in self.actuators if name != "muscle"]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []

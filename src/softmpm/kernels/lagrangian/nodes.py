@@ -29,7 +29,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     GridInputs, dim = input_types(spec).GridInputs, spec.dim
     position, node_velocity = g.position, g.node_velocity
     running = status.report(spec.dim, spec.dtype).running
-    weights, weight, offset = r.weights, r.weight, r.offset
+    weights, weight, offset, surface = r.weights, r.weight, r.offset, bool(spec.surface_walls)
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
@@ -80,6 +80,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         new_u: wp.array2d(dtype=vec),
         new_v: wp.array2d(dtype=vec),
     ):
+        """(Q3), (Q4). With surface contact the new velocity is v*, and surface.py goes on."""
         world, i = wp.tid()
         here = u[world, i]
         new = v[world, i]
@@ -89,7 +90,8 @@ def nodes(spec: Spec) -> SimpleNamespace:
             p[world, i] = momentum
             new = node_velocity(constants, inputs, world, place(constants, inside, i, here), momentum, m)
             here += constants.dt * new  # (Q4)
-        new_u[world, i] = here
+        if wp.static(not surface):
+            new_u[world, i] = here
         new_v[world, i] = new
 
     return SimpleNamespace(masses=masses, advance=advance, gathered=gathered, place=place)
@@ -103,7 +105,8 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
     gathered, place = one.gathered, one.place
-    weights, weight, offset, viscous = r.weights, r.weight, r.offset, spec.viscosity
+    weights, weight, offset = r.weights, r.weight, r.offset
+    viscous, surface = spec.viscosity, bool(spec.surface_walls)
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -113,6 +116,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         inputs: GridInputs,
         inside: Rest,
         mass: wp.array2d(dtype=real),
+        held: int,  # accumulators of one world
         # In:
         u: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
@@ -130,8 +134,10 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, i = wp.tid()
         m = mass[world, i]
         here = place(constants, inside, i, u[world, i])
-        adj_new = adj_v[world, i] + constants.dt * adj_u[world, i]
-        number = world * mass.shape[1] + i
+        adj_new = adj_v[world, i]
+        if wp.static(not surface):  # else done already
+            adj_new += constants.dt * adj_u[world, i]
+        number = world * held + i
         adj = node_velocity_adj(constants, inputs, world, here, p[world, i], m, adj_new, number, adj_inputs)
         adj_f[world, i] = constants.dt * adj.p
         adj_v[world, i] = m * adj.p

@@ -14,13 +14,14 @@ from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
-from softmpm.nodal import particles_of
+from softmpm.nodal import nodes_of, particles_of
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, grid_struct, particle_struct
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
+from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.state import Nodal, State
 
 
@@ -67,16 +68,19 @@ class LagrangianRun:
         self._launch(nodes(model.spec).masses, self._mass.shape, *arguments)
         stored = chunk.length if keep else 1
         self._u, self._v, self._p = self._nodal(stored + 1), self._nodal(stored + 1), self._nodal(stored)
-        self._u[0].copy_(start.u.detach())
-        self._v[0].copy_(start.v.detach())
+        self._anchor = self._tensor(stored + 1, *model.anchor_shape)
+        for own, given in zip((self._u, self._v, self._anchor), start, strict=True):
+            own[0].copy_(given.detach())
         self._partial = self._cells()
+        self._contact = None
+        if model.surface is not None:
+            self._contact = SurfaceContact(model, self._mass, self._anchor, self._launch)
         for s in range(chunk.length):
             self._use_inputs(s, s - 1)
             self._advance(s, keep)
         last = chunk.length if keep else chunk.length % 2
-        self.end = Nodal(
-            self._u[last].clone(), self._v[last].clone()
-        )  # a result must not keep all states alive
+        # A result must not keep all states alive:
+        self.end = Nodal(*(tensor[last].clone() for tensor in (self._u, self._v, self._anchor)))
         arguments = (model.constants, self._rest, chunk.length - 1, self._array(self.end.u))
         kernel, lead = cells(model.spec).check_end, self._partial.shape[:2]
         self._launch(kernel, lead, *arguments, self.words_array)
@@ -117,31 +121,48 @@ class LagrangianRun:
         new = self._array(self._u[then]), self._array(self._v[then])
         parameters = (model.constants, self._grid_inputs, self._rest, self._array(self._mass), partial)
         kernel = nodes(model.spec).advance
-        self._launch(kernel, self._mass.shape, *parameters, self.words_array, *state, *new)
+        velocity = new[1] if self._contact is None else self._contact.free
+        self._launch(kernel, self._mass.shape, *parameters, self.words_array, *state, new[0], velocity)
+        if self._contact is not None:
+            self._contact.advance(self._grid_inputs, self.words_array, now, then, u, v, *new)
 
     def vjp(self, adj_end: Nodal, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Nodal:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         model, chunk = self.model, self.chunk
         self.words.fill_(NEVER)
         rows = chunk.row(chunk.length - 1) + 1
-        found = Accumulators(model, wanted, rows, model.rest_grid.count)
-        adj = Nodal(adj_end.u.clone(), adj_end.v.clone())
+        found = Accumulators(model, wanted, rows, self._held)
+        adj = Nodal(*(tensor.clone() for tensor in adj_end))
         adj_mass = torch.zeros_like(self._mass)
         adj_f, partial_v = self._nodal(), self._partial
         if model.spec.viscosity:
             partial_v = self._cells()
-        arrays = [self._array(tensor) for tensor in (*adj, adj_f, self._partial, partial_v)]
-        adj_mass_array = view(adj_mass, self.types.real)
+        arrays = [self._array(tensor) for tensor in (*adj[:2], adj_f, self._partial, partial_v)]
+        adj_mass_array, contact = view(adj_mass, self.types.real), None
+        if self._contact is not None:
+            given = (wanted, self._held, adj.anchor, adj_mass_array)
+            contact = SurfaceContactAdj(self._contact, *given)
         for s in reversed(range(chunk.length)):
             self._use_inputs(s, s + 1)
+            if contact is not None:
+                structs = (self._grid_inputs, found.grid_struct(chunk.row(s)), self._rest)
+                stored = [self._array(t) for t in (self._u[s], self._p[s], self._v[s + 1])]
+                contact.advance(s, *structs, *stored, *arrays[:2])
             self._advance_adj(s, wanted, found, arrays, adj_mass_array)
             if s == 0 or chunk.row(s) != chunk.row(s - 1):
                 found.collect(chunk.row(s), model.fixed, self._launch)
+        if contact is not None:
+            contact.finish()
         arguments = (self._rest, adj_mass_array, found.particle_struct())
         self._launch(nodes_adj(model.spec, wanted).masses_adj, self._partial.shape[:2], *arguments)
         adj_inputs.add(found, chunk.rows)
         adj_inputs.add_particles(found, chunk.rows)
         return adj
+
+    @property
+    def _held(self) -> int:
+        """Accumulators of each world for what acts on nodes or surface points."""
+        return max(self.model.rest_grid.count, self._anchor.shape[3])
 
     def _advance_adj(
         self, s: int, wanted: RequestedGrads, found: Accumulators, arrays: list[wp.array], adj_mass: wp.array
@@ -149,7 +170,7 @@ class LagrangianRun:
         """Adjoint of substep ``s``; ``arrays`` are those of the adjoints and of scratch memory."""
         model, spec, row = self.model, self.model.spec, self.chunk.row(s)
         adj_u, adj_v, adj_f, partial_u, partial_v = arrays
-        parameters = (model.constants, self._grid_inputs, self._rest, self._array(self._mass))
+        parameters = (model.constants, self._grid_inputs, self._rest, self._array(self._mass), self._held)
         u, v, p = (self._array(tensor[s]) for tensor in (self._u, self._v, self._p))
         out = (adj_u, adj_v, adj_f, adj_mass, found.grid_struct(row))
         kernel, lead = nodes_adj(spec, wanted), self._mass.shape
@@ -196,8 +217,7 @@ class Lagrangian:
 
     def rest(self) -> Nodal:
         model = self.model
-        shape = (model.worlds, model.rest_grid.count, model.dim)
-        return Nodal(*(torch.zeros(shape, dtype=model.dtype, device=model.device) for _ in "uv"))
+        return nodes_of(model, model.rest(), model.mass.expand(model.worlds, -1))
 
     def to_user(self, state: Nodal) -> Nodal:
         return state

@@ -1,5 +1,6 @@
 """Memory of the reference formulation: displacement, velocity and momentum of the nodes around the particles at rest."""
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -19,7 +20,8 @@ class LagrangianFootprint:
 
     def sizes(self, model) -> Sizes:
         field = model.worlds * model.rest_grid.count * model.dim * model.dtype.itemsize
-        return sizes_of(model, inside=3 * field, nodes=0, between=2 * field)
+        anchors = math.prod(model.anchor_shape) * model.dtype.itemsize
+        return sizes_of(model, inside=3 * field + anchors, nodes=0, between=2 * field + anchors)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         real, nodal = model.dtype.itemsize, model.sizes().inside

@@ -1,0 +1,112 @@
+"""Contact of surface points in a chunk of the reference formulation: its buffers and launches."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.kernels.lagrangian.surface import surface, surface_adj, surface_type
+from softmpm.kernels.structs import RequestedGrads, types
+from softmpm.model import Model
+from softmpm.schemes.buffers import view
+
+
+def surface_struct(model: Model):
+    """Struct on the surface points."""
+    t, points = types(model.spec.dim, model.spec.dtype), model.surface
+    assert points is not None
+    struct = surface_type(model.spec.dim, model.spec.dtype)()
+    struct.points = view(points.points, types(model.spec.dim, "float64").vec)
+    for name in ("areas", "loads", "weights"):
+        setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
+    struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
+    for name in ("stencil", "first", "members"):
+        setattr(struct, name, view(getattr(points, name), wp.int32))
+    return struct
+
+
+class SurfaceContact:
+    """Contact of the surface points with the separating walls, from the velocity without it to the new state.
+
+    Args:
+        mass: Masses of the nodes, shape (world, node).
+        anchors: Anchors of each stored state, shape (state, world, wall, point, dim).
+        launch: Launches a kernel.
+
+    Attributes:
+        free: Nodal velocities without contact.
+    """
+
+    def __init__(self, model: Model, mass: Tensor, anchors: Tensor, launch: Callable[..., None]):
+        self.model, self._launch, self.anchors = model, launch, anchors
+        self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
+        self._vec, self._real = (
+            getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
+        )
+        self._struct, self._mass = surface_struct(model), view(mass, self._real)
+        self._width = model.contact_width * model.scene.grid.spacing
+        self.free = self._vectors(self.nodes)
+        self._impulse = self._vectors(self.points)
+        self._D = view(torch.empty(self.points, dtype=model.dtype, device=model.device), self._real)
+        launch(surface(model.spec).delassus, self.points, self._struct, self._mass, self._D)
+
+    def _vectors(self, lead: tuple[int, ...]) -> wp.array:
+        model = self.model
+        return view(torch.empty(*lead, model.dim, dtype=model.dtype, device=model.device), self._vec)
+
+    def advance(self, inputs: Any, words: wp.array, now: int, then: int, u, v, new_u, new_v) -> None:
+        """From :attr:`free` and the state before the substep to that after it; ``now`` and ``then`` count their anchors."""
+        model, kernels = self.model, surface(self.model.spec)
+        anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
+        parameters = (model.constants, inputs, self._struct, self._width, words, self._D)
+        arguments = (u, self.free, anchors[0], self._impulse, anchors[1])
+        self._launch(kernels.press, self.points, *parameters, *arguments)
+        parameters = (model.constants, self._struct, self._mass, self._impulse, words)
+        self._launch(kernels.settle, self.nodes, *parameters, u, v, self.free, new_u, new_v)
+
+
+class SurfaceContactAdj:
+    """Adjoint of :class:`SurfaceContact`.
+
+    Args:
+        held: Accumulators of one world in the structs of the inputs' adjoints.
+        adj_anchor: Adjoint of the anchors, updated in place.
+        adj_mass: Adjoint of the masses of the nodes, added into.
+    """
+
+    def __init__(
+        self,
+        forward: SurfaceContact,
+        wanted: RequestedGrads,
+        held: int,
+        adj_anchor: Tensor,
+        adj_mass: wp.array,
+    ):
+        self.forward, self.held, self._adj_mass = forward, held, adj_mass
+        self._kernels = surface_adj(forward.model.spec, wanted)
+        self._adj_anchor = view(adj_anchor, forward._vec)
+        self._shared = forward._vectors(forward.nodes)
+        self._adj_x, self._adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
+        model = forward.model
+        zeros = torch.zeros(forward.points, dtype=model.dtype, device=model.device)
+        self._adj_D = view(zeros, forward._real)
+
+    def advance(self, s: int, inputs: Any, adj_inputs: Any, rest: Any, u, p, new_v, adj_u, adj_v) -> None:
+        """Adjoint of substep ``s``, from that of the new state to that of the velocity without contact, in ``adj_v``."""
+        one, launch = self.forward, self.forward._launch
+        constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
+        arguments = (u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
+        launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, one._mass, *arguments)
+        parameters = (constants, inputs, one._struct, one._width, one._D, self.held)
+        arguments = (u, one.free, view(one.anchors[s], one._vec), self._shared, self._adj_anchor)
+        out = (*adj_points, self._adj_D, adj_inputs)
+        launch(self._kernels.press_adj, one.points, *parameters, *arguments, *out)
+        launch(self._kernels.spread_adj, one.nodes, one._struct, *adj_points, adj_u, adj_v)
+
+    def finish(self) -> None:
+        """Add what the mobility D of all substeps gives to the masses."""
+        one = self.forward
+        arguments = (one._struct, one._mass, self._adj_D, self._adj_mass)
+        one._launch(self._kernels.delassus_adj, one.nodes, *arguments)

@@ -1,0 +1,102 @@
+"""Interpolation at the surface points of bodies in the reference formulation, found once when a model is built.
+
+Weights of nodes that hold next to no mass are dropped, and the others corrected by an affine function of the distance, so that affine
+fields stay exact: such a node would move far at the touch of a wall. Derivation: docs/math/contact.md.
+"""
+
+import itertools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softmpm.rest_grid import RestGrid
+from softmpm.scene.materials import Material
+from softmpm.scene.scene import Scene
+
+LEAST = 1e-3
+"""Least mass of a node that takes part, in units of that of a full cell."""
+
+
+class SurfaceGrid:
+    """Surface points of all bodies.
+
+    Attributes:
+        count: Number of points.
+        points: Rest positions [m], shape (point, dim), float64.
+        areas: Area of each point [m²], shape (point,), float64.
+        stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
+        stencil: Nodes of each point, numbers in the grid at rest, shape (point, 3^dim), int32.
+        weights: Their weights, 0 for nodes that take no part, shape (point, 3^dim), float64.
+        loads: Area that each node carries [m²], L of (K1), shape (node,), float64.
+        normals: Unit normals of the separating walls, shape (wall, dim), float64.
+        first: First entry of each node in ``members``, and their count, shape (node + 1,), int32.
+        members: Entries of ``stencil``, flat, node by node, shape (entry,), int32.
+    """
+
+    def __init__(self, scene: Scene, rest: RestGrid, device: torch.device):
+        grid, dim = scene.grid, scene.grid.dim
+        outlines = [body.particles.outline for body in scene.bodies if body.particles.outline is not None]
+        points = np.concatenate([outline.points for outline in outlines])
+        areas = np.concatenate([outline.areas for outline in outlines])
+        counts = [len(outline) for outline in outlines]
+        density = np.repeat([body.material.density for body in scene.bodies], counts)
+        stiffness = (
+            np.repeat([longitudinal_modulus(body.material) for body in scene.bodies], counts)
+            * 4.0
+            / grid.spacing
+        )
+        place = points / grid.spacing
+        base = np.floor(place - 0.5).astype(np.int64)
+        f = place - base
+        offsets = np.array(list(itertools.product(range(3), repeat=dim)))
+        splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+        weights = np.prod([splines[offsets[:, axis], :, axis] for axis in range(dim)], axis=0).T
+        at = np.ravel_multi_index(tuple(np.moveaxis(base[:, None] + offsets, -1, 0)), grid.shape)
+        index = rest.index.cpu().numpy()
+        numbers = np.searchsorted(index, at).clip(max=len(index) - 1)
+        mass = np.zeros(len(index))
+        of_particles = np.concatenate(
+            [body.material.density * body.particles.volume for body in scene.bodies]
+        )
+        np.add.at(mass, rest.stencil.cpu().numpy(), of_particles[:, None] * rest.weights.cpu().numpy())
+        held = (index[numbers] == at) & (mass[numbers] > LEAST * density[:, None] * grid.spacing**dim)
+        weights = consistent(np.where(held, weights, 0.0), offsets - f[:, None])
+        members = np.flatnonzero(weights)
+        owners = numbers.reshape(-1)[members]
+        order = np.argsort(owners, kind="stable")
+        loads = np.zeros(len(index))
+        np.add.at(loads, numbers, np.abs(weights) * areas[:, None])
+
+        def tensor(values, dtype) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values, dtype=dtype)).to(device)
+
+        self.count = len(points)
+        normals = [wall.normal for wall in scene.walls if wall.contact == "separate"]
+        self.normals = tensor(np.array(normals), np.float64)
+        self.points, self.areas = tensor(points, np.float64), tensor(areas, np.float64)
+        self.stiffness, self.loads = tensor(stiffness, np.float64), tensor(loads, np.float64)
+        self.stencil, self.weights = tensor(numbers, np.int32), tensor(weights, np.float64)
+        self.members = tensor(members[order], np.int32)
+        self.first = tensor(np.searchsorted(owners[order], np.arange(len(index) + 1)), np.int32)
+
+
+def longitudinal_modulus(material: Material) -> float:
+    """λ + 2μ [Pa]."""
+    young, poisson = material.young, material.poisson
+    return young * (1 - poisson) / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def consistent(weights: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """Weights times an affine function of the arms, so that Σ w = 1 and Σ w r = 0.
+
+    Args:
+        weights: Shape (point, node); zero for nodes that take no part.
+        arms: Distance of each node from the point in cells, shape (point, node, dim).
+    """
+    terms = np.concatenate([np.ones_like(arms[..., :1]), arms], axis=-1)
+    moments = np.einsum("pn,pni,pnj->pij", weights, terms, terms)
+    wanted = np.zeros(moments.shape[:2])
+    wanted[:, 0] = 1.0
+    solved = np.einsum("pij,pj->pi", np.linalg.pinv(moments, rcond=1e-9), wanted)
+    return weights * np.einsum("pni,pi->pn", terms, solved)

@@ -1,0 +1,186 @@
+"""Contact of surface points in the reference formulation: every value and gradient against the float64 reference, and facts."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers import assert_relative, busy_inputs, cotangent, dot, given
+
+import softmpm
+from softmpm import Inputs, reference_contact, reference_lagrangian
+from softmpm.surface_grid import consistent
+
+STEPS = 3
+NAMES = ("gravity", "friction", "viscosity")
+
+
+def block(dim: int, **changes) -> softmpm.Scene:
+    """A block on a rough floor and at a rough side wall, with a muscle; the sides of the block stand off the grid lines."""
+    lower, upper = (0.33, 0.3, 0.34)[:dim], (0.52, 0.49, 0.53)[:dim]
+    shape = softmpm.box(lower, upper, spacing=0.05)
+    material = softmpm.NeoHookean(density=1.2, young=80.0, poisson=0.3, viscosity=0.02)
+    settings = dict(
+        grid=softmpm.Grid(shape=(12, 11, 10)[:dim], spacing=0.1),
+        bodies=[softmpm.Body(shape, material)],
+        muscles=[softmpm.Muscle(particles=np.arange(6), direction=(1.0, 0.4, 0.2)[:dim], strength=10.0)],
+        walls=[
+            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.35, friction=0.4),
+            softmpm.Wall(normal=(1.0, 0.2, 0.0)[:dim], offset=0.4, friction=0.2),
+            softmpm.Wall(normal=(-1.0, 0.0, 0.0)[:dim], offset=-0.5, contact="slip"),
+        ],
+        gravity=(0.3, -9.8, 0.2)[:dim],
+        damping=0.7,
+        dt=1e-3,
+    )
+    return softmpm.Scene(**(settings | changes))
+
+
+def build(made: softmpm.Scene, **settings) -> softmpm.Model:
+    alarms = softmpm.Alarms(collapse=None)
+    return softmpm.build(
+        made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
+    )
+
+
+def surface_of(model: softmpm.Model) -> reference_contact.Surface:
+    """The model's surface points for the reference, which does not compute weights."""
+    points, rest = model.surface, model.rest_grid
+    assert points is not None
+    node = rest.index.cpu()[points.stencil.cpu().long()]
+    return reference_contact.Surface(
+        points.points.cpu(), node, points.weights.cpu(), points.areas.cpu(), points.stiffness.cpu()
+    )
+
+
+def by_reference(model, start, activation, params, substeps, inputs) -> softmpm.State:
+    surface, made = surface_of(model), model.scene
+    width = model.contact_width * made.grid.spacing
+    u, v = reference_lagrangian.project(made, start, params)
+    anchor = reference_contact.start_anchor(made, surface, u)
+    settings = dict(surface=surface, anchor=anchor, smoothing=width)
+    u, v, _ = reference_lagrangian.simulate(
+        made, u, v, activation, params, substeps=substeps, inputs=inputs, **settings
+    )
+    return reference_lagrangian.evaluate(made, u, v)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.05])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_end_and_all_gradients_are_those_of_the_reference(dim, width, device):
+    """Two rough walls at once, points that stick, slip and hang free, with a sharp and a smooth hinge."""
+    for dtype, limit in ((torch.float64, 1e-10), (torch.float32, 2e-3)):
+        settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact_width=width)
+        model = build(block(dim), **settings)
+        leaves = busy_inputs(model, control_steps=STEPS) | given(model, NAMES, STEPS)
+        copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
+        found = []
+        for tensors in (leaves, copies):
+            start = softmpm.State(*(tensors[name] for name in "xvCF"))
+            params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
+            inputs, activation = Inputs(**{name: tensors[name] for name in NAMES}), tensors["activation"]
+            if tensors is leaves:
+                end = softmpm.simulate(model, start, activation, params, substeps=2, inputs=inputs)
+            else:
+                end = by_reference(model, start, activation, params, 2, inputs)
+            loss = dot(cotangent(end), end)
+            found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
+        for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
+            assert want.abs().max() > 0, f"the test does not exercise {name}"
+            assert_relative(got.detach().cpu().double(), want.detach(), limit, f"{name} in {dtype}")
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_corrected_weights_are_exact_for_affine_fields(dim):
+    """Σ w = 1 and Σ w r = 0 at every surface point, whatever nodes are left out."""
+    made = block(dim)
+    points = build(made).surface
+    assert points is not None
+    nodes = build(made).rest_grid.nodes.double()[points.stencil.long()] * made.grid.spacing
+    weights = points.weights
+    torch.testing.assert_close(weights.sum(1), torch.ones(points.count).double(), rtol=0, atol=1e-12)
+    at = (weights[..., None] * nodes).sum(1)
+    torch.testing.assert_close(at, points.points, rtol=0, atol=1e-12)
+    arms = np.array([[[-1.0], [0.0], [1.0]]])
+    assert np.allclose(consistent(np.array([[0.25, 0.5, 0.0]]), arms), [[0.0, 1.0, 0.0]])
+
+
+def test_calls_in_turn_are_one_call(device):
+    """The anchors travel with the state."""
+    model = build(block(2), device=device, dtype=torch.float64)
+    inputs = busy_inputs(model, control_steps=4)
+    start = softmpm.State(*(inputs[name] for name in "xvCF"))
+    params = softmpm.Params(*(inputs[name] for name in softmpm.Params._fields))
+    rows = inputs["activation"]
+    whole = softmpm.simulate(model, start, rows, params, substeps=5)
+    first = softmpm.simulate(model, start, rows[:2], params, substeps=5)
+    parts = softmpm.simulate(model, first, rows[2:], params, substeps=5)
+    for got, want in zip(parts[:4], whole[:4], strict=True):
+        assert torch.equal(got, want)
+    found = [torch.autograd.grad(dot(cotangent(end), end), list(inputs.values())) for end in (whole, parts)]
+    for name, want, got in zip(inputs, *found, strict=True):
+        assert_relative(got, want, 1e-12, name)
+
+
+def incline(degrees: float, contact: str) -> tuple[float, float]:
+    """Acceleration between .4 and .6 s [m/s²] and final speed [m/s] of a viscous block that is put on an incline of the angle of
+    friction plus ``degrees``, by its mean velocity.
+    """
+    h, friction, mu = 1 / 32, 0.5, 2e5 / 2.6
+    angle, corner = np.arctan(friction) + np.radians(degrees), (3.5 * h, 3.5 * h)
+    shape = softmpm.box(corner, (corner[0] + 10 * h, corner[1] + 3 * h), spacing=h / 2)
+    material = softmpm.NeoHookean(density=1000.0, young=2e5, poisson=0.3, viscosity=4e-3 * mu)
+    made = softmpm.Scene(
+        grid=softmpm.Grid(shape=(24, 14), spacing=h),
+        bodies=[softmpm.Body(shape, material)],
+        walls=[softmpm.Wall(normal=(0.0, 1.0), offset=corner[1], friction=friction)],
+        gravity=(9.81 * np.sin(angle), -9.81 * np.cos(angle)),
+        dt=2e-4,
+    )
+    model = softmpm.build(made, device="cpu", dtype=torch.float64, formulation="reference", contact=contact)
+    before = softmpm.simulate(model, model.rest(), None, model.params(), substeps=2000)
+    end = softmpm.simulate(model, before, None, model.params(), substeps=1000)
+    speeds = [state.v.mean((0, 1))[0].item() for state in (before, end)]
+    return (speeds[1] - speeds[0]) / 0.2, speeds[1]
+
+
+@pytest.mark.parametrize("degrees", [3.0, 0.5])
+def test_a_block_slides_as_a_rigid_one(degrees):
+    """Above the angle of friction, within 0.5 % of g (sin − μ cos)."""
+    angle = np.arctan(0.5) + np.radians(degrees)
+    exact = 9.81 * (np.sin(angle) - 0.5 * np.cos(angle))
+    assert abs(incline(degrees, "surface")[0] / exact - 1) < 5e-3
+
+
+def test_a_block_sticks():
+    """Half a degree below the angle of friction, without creeping."""
+    assert abs(incline(-0.5, "surface")[1]) < 1e-6
+
+
+def at_the_edge(made: softmpm.Scene) -> softmpm.Scene:
+    """The scene with the block in a corner of the grid, where its particles have all their nodes and its outline has not."""
+    shape = softmpm.box((0.03, 0.03), (0.23, 0.23), spacing=0.05)
+    body = softmpm.Body(shape, made.bodies[0].material)
+    return dataclasses.replace(made, bodies=[body], walls=made.walls[:1])
+
+
+def test_what_is_asked_for_must_be_possible():
+    """Contact of surfaces needs outlines, a separating wall and the reference formulation; nodes are always possible."""
+    made = block(2)
+    bare = softmpm.Particles(made.bodies[0].particles.positions, made.bodies[0].particles.volume)
+    without = dataclasses.replace(made, bodies=[softmpm.Body(bare, made.bodies[0].material)])
+    assert build(without).surface is None and build(made, contact="nodes").surface is None
+    for scene, settings, said in (
+        (without, dict(formulation="reference", contact="surface"), "needs an outline of every body"),
+        (made, dict(contact="surface"), "needs formulation='reference'"),
+        (
+            dataclasses.replace(made, walls=made.walls[2:]),
+            dict(formulation="reference", contact="surface"),
+            "needs a wall",
+        ),
+        (at_the_edge(made), dict(formulation="reference"), "surface points need the nodes around them"),
+        (made, dict(contact="points"), "contact must be"),
+        (made, dict(contact_width=-1.0), "contact_width must be"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            softmpm.build(scene, device="cpu", **settings)
