@@ -39,11 +39,11 @@ INTEGERS = (
         "unpack_base",
         "node_index",
         "node_coordinates",
-        "place_of",
     ),
+    *("place_of", "place", "present", "height"),  # in float64, which a factor of the model's precision is not
     *("coordinates", "offset", "range", "len", "law_of", "actuator_of"),
 )
-"""Calls that return integers."""
+"""Calls that return integers, or numbers of another precision."""
 STRUCTS = (
     *(
         "moved_adj",
@@ -56,10 +56,13 @@ STRUCTS = (
         "slide_adj",
         "placed",
     ),
-    *("stress_adj_of", "active_stress_adj_of"),
+    *("stress_adj_of", "active_stress_adj_of", "touch", "touch_adj"),
 )
 """Calls that return structs, which cannot be multiplied by a factor; their fields are terms where they are used."""
-FIELDS = ("shape", "count", "muscle", "base", "origin", "order", "places", "law", "driven", "actuator")
+FIELDS = (
+    *("shape", "count", "muscle", "base", "origin", "order", "places", "law", "driven", "actuator"),
+    *("particles", "first", "members", "stencil", "cell_nodes", "node_cells", "number"),
+)
 """Attributes and arrays of integers."""
 
 

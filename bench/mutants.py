@@ -30,6 +30,8 @@ ROOT = Path(__file__).parents[1]
 TESTS = (
     "tests/softmpm/test_adjoint_terms.py",
     "tests/softmpm/test_inputs.py",
+    "tests/softmpm/test_surface_contact.py",
+    "tests/softmpm/test_lagrangian.py",
     "tests/softmpm/test_rollout.py",
     "tests/softmpm/test_autograd.py",
     "tests/softmpm/test_warp_api.py",

@@ -87,9 +87,9 @@ def build(
     if alarms.step is not None:
         need_stable(scene, alarms.step)
     warn_sparse(scene)
-    surface = on_surface(scene, formulation, contact)
     if not 0.0 <= contact_width < 1.0:
         raise ValueError(f"contact_width must be in [0, 1) cells, got {contact_width!r}.")
+    surface = on_surface(scene, formulation, contact, contact_width)
     if formulation == "reference":
         check_reference(scene, given, scheme)
         scheme, reason = "lagrangian", "formulation='reference'"
@@ -117,11 +117,11 @@ def build(
     )
 
 
-def on_surface(scene: Scene, formulation: str, contact: str) -> bool:
+def on_surface(scene: Scene, formulation: str, contact: str, width: float) -> bool:
     """True if the separating walls act on surface points.
 
     Raises:
-        ValueError: That was asked for and cannot be.
+        ValueError: That was asked for and cannot be, or a width was given in vain.
     """
     if contact not in ("auto", "nodes", "surface"):
         raise ValueError(f"contact must be 'auto', 'nodes' or 'surface', got {contact!r}.")
@@ -144,6 +144,10 @@ def on_surface(scene: Scene, formulation: str, contact: str) -> bool:
     chosen = formulation == "reference" and contact != "nodes" and outlined and separating
     if chosen:
         check_reach(scene)
+    elif width > 0:
+        raise ValueError(
+            f"contact_width is for contact at surface points, but nodes meet the walls here; got {width!r}, leave it out."
+        )
     return chosen
 
 

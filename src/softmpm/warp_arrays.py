@@ -164,6 +164,16 @@ def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
     return array
 
 
+def _check_moving(model: Model, wants: str) -> None:
+    """Raise unless this is a model of the moving formulation."""
+    check_model(model, wants)
+    if model.formulation != "moving":
+        raise ValueError(
+            f"{wants} and softmpm.step need formulation='moving', got a model with formulation={model.formulation!r}; take "
+            "softmpm.simulate."
+        )
+
+
 def check_own(model: Model, wants: str, **given: WarpState | WarpSolid) -> None:
     """Raise unless these are the model's own: the kernels trust shapes and types."""
     check_model(model, wants)
@@ -208,7 +218,7 @@ def warp_state(model: Model, state: State | None = None, *, requires_grad: bool 
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model and the state.
         UnstableError: A particle is off the grid.
     """
-    check_model(model, "warp_state")
+    _check_moving(model, "warp_state")
     if state is not None:
         check_state(model, state)
         if not is_capturing(model):
@@ -262,7 +272,7 @@ def warp_solid(
     Raises:
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model, the material, the activation and the inputs.
     """
-    check_model(model, "warp_solid")
+    _check_moving(model, "warp_solid")
     params = model.params() if params is None else params
     check_params(model, params)
     check_row(model, activation)

@@ -164,6 +164,10 @@ def test_what_the_formulation_lacks_is_refused():
     ):
         with pytest.raises(ValueError, match=said):
             build(made, **settings)
+    model = build(full_scene(2, driven=()))
+    for make in (softmpm.warp_state, softmpm.warp_solid):
+        with pytest.raises(ValueError, match="and softmpm.step need formulation='moving'"):
+            make(model)
     with pytest.raises(ValueError, match="formulation must be 'moving' or 'reference'"):
         softmpm.build(busy_scene(2), formulation="lagrangian")
 
