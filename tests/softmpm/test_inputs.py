@@ -116,7 +116,7 @@ def test_worlds_equal_single_runs(dtype, scheme):
     names = (*GIVEN, *WALLS)
     many = build(full_scene(2), dtype=dtype, scheme=scheme, worlds=3, inputs=names)
     one = build(full_scene(2), dtype=dtype, scheme=scheme, inputs=names)
-    base, extra = busy_inputs(many, STEPS), given(many, (*names, "strength", "velocity"))
+    base, extra = busy_inputs(many, STEPS), given(many, (*names, "strength", "velocity"), STEPS)
     limit = 2e-5 if dtype == torch.float32 else 1e-12
 
     def run(model, pick):
@@ -215,7 +215,7 @@ def test_inputs_that_a_model_cannot_take():
 def test_a_graph_takes_inputs(names):
     """Two calls and their gradients, captured and replayed: ≤ 1e-5 of the same calls, also after gravity changed in place."""
     model = build(full_scene(2), device="cuda", worlds=2, inputs=names)
-    more = given(model, (*names, *(("strength", "position") if "force" in names else ())))
+    more = given(model, (*names, *(("strength", "position") if "force" in names else ())), STEPS)
     leaves = busy_inputs(model, STEPS) | more
     params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
 
