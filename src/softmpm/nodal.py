@@ -53,6 +53,7 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     u = moved[:, :, None] + torch.einsum("wpde,pne->wpnd", state.F - eye, arms)
     v = state.v[:, :, None] + torch.einsum("wpde,pne->wpnd", state.C @ state.F, arms)
     total = _added(grid, share[..., None])
+    total = torch.where(total > 0, total, 1.0)  # a node at the very edge of a spline has no mass
     u, v = (_added(grid, share[..., None] * field) / total for field in (u, v))
     return Nodal(u, v, _anchors(model, u))
 

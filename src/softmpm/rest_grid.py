@@ -34,12 +34,9 @@ class RestGrid:
 
     def __init__(self, scene: Scene, device: torch.device):
         grid, dim = scene.grid, scene.grid.dim
-        positions = np.concatenate([body.particles.positions for body in scene.bodies]) / grid.spacing
-        base = np.floor(positions - 0.5).astype(np.int64)
-        f = positions - base
+        positions = np.concatenate([body.particles.positions for body in scene.bodies])
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
-        splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
-        weights = np.prod([splines[offsets[:, axis], :, axis] for axis in range(dim)], axis=0).T
+        base, f, weights = stencils(positions / grid.spacing, offsets)
         cells, of = np.unique(base, axis=0, return_inverse=True)
         of = of.reshape(-1)
         at = np.ravel_multi_index(tuple(np.moveaxis(cells[:, None] + offsets, -1, 0)), grid.shape)
@@ -65,6 +62,20 @@ class RestGrid:
         self.members = numbers_of(grouped(numbers[of].reshape(-1), len(index)))
         self.arms = numbers_of((offsets - f[:, None]) * grid.spacing)
         self.slopes = 4.0 / grid.spacing**2 * self.weights[..., None] * self.arms
+
+
+def stencils(places: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Base node, distance from it, and B-spline weights of the 3^dim nodes around each place, all in cells.
+
+    Args:
+        places: Shape (point, dim).
+        offsets: Offsets of the nodes from the base node, shape (3^dim, dim).
+    """
+    base = np.floor(places - 0.5).astype(np.int64)
+    f = places - base
+    splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+    weights = np.prod([splines[offsets[:, axis], :, axis] for axis in range(f.shape[1])], axis=0).T
+    return base, f, weights
 
 
 def grouped(owners: np.ndarray, count: int) -> np.ndarray:

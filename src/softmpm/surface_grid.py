@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.rest_grid import RestGrid
+from softmpm.rest_grid import RestGrid, stencils
 from softmpm.scene.materials import Material
 from softmpm.scene.scene import Scene
+from softmpm.validate import need
 
 LEAST = 1e-3
 """Least mass of a node that takes part, in units of that of a full cell."""
@@ -46,12 +47,8 @@ class SurfaceGrid:
             * 4.0
             / grid.spacing
         )
-        place = points / grid.spacing
-        base = np.floor(place - 0.5).astype(np.int64)
-        f = place - base
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
-        splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
-        weights = np.prod([splines[offsets[:, axis], :, axis] for axis in range(dim)], axis=0).T
+        base, f, weights = stencils(points / grid.spacing, offsets)
         at = np.ravel_multi_index(tuple(np.moveaxis(base[:, None] + offsets, -1, 0)), grid.shape)
         index = rest.index.cpu().numpy()
         numbers = np.searchsorted(index, at).clip(max=len(index) - 1)
@@ -62,6 +59,12 @@ class SurfaceGrid:
         np.add.at(mass, rest.stencil.cpu().numpy(), of_particles[:, None] * rest.weights.cpu().numpy())
         held = (index[numbers] == at) & (mass[numbers] > LEAST * density[:, None] * grid.spacing**dim)
         weights = consistent(np.where(held, weights, 0.0), offsets - f[:, None])
+        far = np.abs(weights.sum(axis=1) - 1.0) > 1e-6
+        need(
+            not far.any(),
+            f"surface points need particles near them, but the nodes around the one at {points[far][:1].tolist()} m hold next to none; "
+            "give the body an outline that fits its particles, a finer spacing, or take contact='nodes'.",
+        )
         members = np.flatnonzero(weights)
         owners = numbers.reshape(-1)[members]
         order = np.argsort(owners, kind="stable")

@@ -1,14 +1,16 @@
 """Contact of the surface points of bodies with separating walls, in one pass. Derivation: docs/math/contact.md.
 
-D_s = Σ |w_si| L_i / m_i                                                                         (K1)
-x_s = X_s + Σ w_si u_i,  v_s = Σ w_si v*_i                                                       (K2)
-wall by wall: J by (K3), (K4), then v_s += D_s J
-v'_i = v*_i + Σ w_si A_s J / m_i,  u'_i = u_i + Δt v'_i                                          (K5)
+    D_s = Σ |w_si| L_i / m_i                                                                         (K1)
+    x_s = X_s + Σ w_si u_i,  v_s = Σ w_si v*_i                                                       (K2)
+    wall by wall: J by (K3), (K4), then v_s += D_s J
+    v'_i = v*_i + Σ w_si A_s J / m_i,  u'_i = u_i + Δt v'_i                                          (K5)
 
-J̄_s = A_s Σ w_si v̄'_i / m_i,  m̄_i −= (v'_i − v*_i)·v̄'_i / m_i                                   (K5.adj)
-from the last wall to the first: J̄ += D v̄_s,  D̄ += J·v̄_s, then (K4.adj), (K3.adj)
-v̄*_i += Σ w_si v̄_s,  ū_i += Σ w_si x̄_s                                                           (K2.adj)
-m̄_i −= Σ D̄_s |w_si| L_i / m_i²                                                                   (K1.adj)
+    J̄_s = A_s Σ w_si v̄'_i / m_i,  m̄_i −= (v'_i − v*_i)·v̄'_i / m_i                                   (K5.adj)
+    from the last wall to the first: J̄ += D v̄_s,  D̄ += J·v̄_s, then (K4.adj), (K3.adj)
+    v̄*_i += Σ w_si v̄_s,  ū_i += Σ w_si x̄_s                                                           (K2.adj)
+    m̄_i −= Σ D̄_s |w_si| L_i / m_i²                                                                   (K1.adj)
+
+Nodes gather what the points give them in a fixed order, as in nodes.py.
 """
 
 from types import SimpleNamespace
