@@ -24,7 +24,7 @@ LAYERS = """
     surface_grid
     describe
     model
-    nodal schemes
+    schemes
     schemes.plain schemes.fast schemes.lagrangian recording
     schemes.registry
     kernel_inputs

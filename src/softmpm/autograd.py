@@ -25,12 +25,12 @@ from softmpm.inputs import Inputs, differentiable
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model, check_model
-from softmpm.nodal import nodes_of, particles_of
 from softmpm.planning.chunks import Horizon
 from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
+from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 from softmpm.state import GridField, Low, Nodal, Params, State
 
 _SECOND = (

@@ -97,7 +97,9 @@ class Model:
         self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
         self.deterministic, self.workspace = deterministic, Workspace()
         self.formulation = formulation
-        self._rest_grid = RestGrid(scene, device) if formulation == "reference" else None
+        self._rest_grid = None
+        if formulation == "reference":
+            self._rest_grid = RestGrid(scene, device, dtype, worlds, "force" in given)
         self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
         self.contact_width = contact_width
         self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface)

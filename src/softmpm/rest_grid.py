@@ -10,58 +10,138 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softmpm.kernels.lagrangian.bricks import LARGEST_LATTICE, bricks_for
 from softmpm.scene.scene import Scene
 
 
 class RestGrid:
-    """Nodes that particles at rest have a share in, and cells: particles with the same base node.
+    """Nodes that particles at rest have a share in, and bricks of cells: boxes of particles that are summed together.
+
+    The particles are ordered brick by brick, and the nodes by the first brick that has them in its window.
 
     Attributes:
+        bricks: Size of the bricks.
         count: Number of nodes.
         nodes: Coordinates of the nodes in the grid, shape (node, dim), int32.
-        index: Number of each node in the grid, shape (node,).
-        fraction: Distance of each particle from its base node in cells, cell by cell, shape (particle, dim), float64.
-        particles: Particles cell by cell, shape (particle,), int32.
-        first: First entry of each cell in ``particles``, and their count, shape (cell + 1,), int32.
-        cell_nodes: Nodes of each cell, shape (cell, 3^dim), int32.
-        node_cells: Cell in which a node is number k of ``cell_nodes``, or -1, shape (node, 3^dim), int32.
-        members: Entries of ``stencil``, flat, that each node has, filled up with their count, shape (node, most).
-        stencil: Nodes of each particle, in the order of the particles, shape (particle, 3^dim).
-        weights: N_i(X_p), shape (particle, 3^dim), float64.
-        arms: X_i − X_p [m], shape (particle, 3^dim, dim), float64.
-        slopes: g_ip [1/m], of the same shape.
+        index: Number of each node in the grid, shape (node,), int64.
+        order: Particle at each place, shape (place,), int32.
+        fraction: Distance of each particle from its base node in cells, place by place, shape (place, dim).
+        rows: First row of each brick in ``places``, and their count, shape (brick + 1,), int32.
+        places: Place of the particle in each slot of a row, or -1, shape (row, slot), int32. Of each cell of the brick in turn the
+            first particles, then the next ones; on a lattice the slots are layers, and the rows their particles.
+        lattice: Places of the particles along each axis in every cell, shape (axis, place), or None.
+        corners: First node of each of these cells in the window of its brick, or -1, shape (brick, cell), int32.
+        window: Nodes of each brick, or -1 where there is none, shape (brick, node of the window), int32.
+        shares: Entries of ``window``, flat, that are a node, or -1, shape (2^dim, node), int32.
     """
 
-    def __init__(self, scene: Scene, device: torch.device):
+    def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, loaded: bool):
+        """``loaded`` says whether forces act on the particles, which lattices do not have."""
         grid, dim = scene.grid, scene.grid.dim
         positions = np.concatenate([body.particles.positions for body in scene.bodies])
-        offsets = np.array(list(itertools.product(range(3), repeat=dim)))
-        base, f, weights = stencils(positions / grid.spacing, offsets)
-        cells, of = np.unique(base, axis=0, return_inverse=True)
+        base, fraction = bases(positions / grid.spacing)
+        lattice, number_of = (None, None) if loaded else lattice_of(base, fraction)
+        places = 0 if lattice is None else lattice.shape[1]
+        bricks = bricks_for(dim, worlds * len(base), device, dtype, places)
+        size, first = np.array(bricks.cells), base.min(axis=0)
+        box, inside = np.divmod(base - first, size)
+        boxes, brick = np.unique(box, axis=0, return_inverse=True)
+        cell = np.ravel_multi_index(tuple(inside.T), bricks.cells)
+
+        # Cells of each brick in turn, and the particles of each cell in turn
+        cells, of = np.unique(brick.reshape(-1) * size.prod() + cell, return_inverse=True)
         of = of.reshape(-1)
-        at = np.ravel_multi_index(tuple(np.moveaxis(cells[:, None] + offsets, -1, 0)), grid.shape)
-        index, numbers = np.unique(at, return_inverse=True)
-        numbers = numbers.reshape(at.shape)
-        node_cells = np.full((len(index), len(offsets)), -1)
-        node_cells[numbers, np.arange(len(offsets))] = np.arange(len(cells))[:, None]
+        brick_of_cell = cells // size.prod()
+        turn = np.arange(len(cells)) - np.searchsorted(brick_of_cell, np.arange(len(boxes)))[brick_of_cell]
+        corner = np.stack(np.unravel_index(cells % size.prod(), bricks.cells), axis=-1)
+        corners = np.full((len(boxes), size.prod()), -1)
+        corners[brick_of_cell, turn] = flat(corner, bricks.window)
         order = np.argsort(of, kind="stable")
+        if bricks.lattice:
+            number, heights = number_of, np.full(len(boxes), bricks.layer)
+        else:
+            number = np.empty(len(of), dtype=np.int64)
+            number[order] = np.arange(len(of)) - np.searchsorted(of[order], np.arange(len(cells)))[of[order]]
+            heights = np.zeros(len(boxes), dtype=np.int64)
+            np.maximum.at(heights, brick_of_cell[of], number // bricks.parts + 1)
+        rows = np.concatenate([[0], np.cumsum(heights)])
+        row = rows[brick_of_cell[of]] + number // bricks.parts
+        slot = number % bricks.parts * size.prod() + turn[of]
+        order = np.argsort(row * bricks.slots + slot, kind="stable")
+        places = np.full((rows[-1], bricks.slots), -1)
+        places[row[order], slot[order]] = np.arange(len(order))
+
+        # Nodes
+        offsets = np.array(list(itertools.product(range(3), repeat=dim)))
+        _, where = np.unique(of, return_index=True)
+        held = np.unique(flat(base[where][:, None] + offsets, grid.shape))
+        around = np.array(list(itertools.product(*map(range, bricks.window))))
+        windows = first + boxes[:, None] * size + around
+        within = (windows < grid.shape).all(axis=-1)
+        at = np.where(within, flat(np.where(within[..., None], windows, 0), grid.shape), -1)
+        found = np.isin(at, held)
+        index, entry, node = np.unique(at[found], return_index=True, return_inverse=True)
+        rank = np.argsort(np.argsort(entry, kind="stable"), kind="stable")
+        window = np.full(at.shape, -1)
+        window[found] = rank[node.reshape(-1)]
+        index = index[np.argsort(rank)]
+        entries = np.flatnonzero(found)
+        owners = window.reshape(-1)[entries]
+        by_node = np.argsort(owners, kind="stable")
+        turn = (
+            np.arange(len(owners)) - np.searchsorted(owners[by_node], np.arange(len(index)))[owners[by_node]]
+        )
+        shares = np.full((2**dim, len(index)), -1)
+        shares[turn, owners[by_node]] = entries[by_node]
 
         def integers(values) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values, dtype=np.int32)).to(device)
 
-        def numbers_of(values) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(values)).to(device)
-
-        self.count, self.cell_count = len(index), len(cells)
-        self.index = numbers_of(index)
+        self.bricks, self.count, self.brick_count = bricks, len(index), len(boxes)
+        self.index = torch.from_numpy(index).to(device)
         self.nodes = integers(np.stack(np.unravel_index(index, grid.shape), axis=-1))
-        self.fraction, self.particles = numbers_of(f[order]), integers(order)
-        self.first = integers(np.searchsorted(of[order], np.arange(len(cells) + 1)))
-        self.cell_nodes, self.node_cells = integers(numbers), integers(node_cells)
-        self.stencil, self.weights = numbers_of(numbers[of]), numbers_of(weights)
-        self.members = numbers_of(grouped(numbers[of].reshape(-1), len(index)))
-        self.arms = numbers_of((offsets - f[:, None]) * grid.spacing)
-        self.slopes = 4.0 / grid.spacing**2 * self.weights[..., None] * self.arms
+        self.order, self.rows, self.places = integers(order), integers(rows), integers(places)
+        self.fraction = torch.from_numpy(fraction[order]).to(device, dtype)
+        self.corners, self.window, self.shares = integers(corners), integers(window), integers(shares)
+        self.lattice = lattice if bricks.lattice else None
+
+
+def lattice_of(base: np.ndarray, fraction: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Places of the particles along each axis, shape (axis, place), if they are the same in every cell, and the number of each particle
+    in its cell; else None. No two particles may have one place."""
+    axes, indices = [], []
+    for one in fraction.T:
+        order = np.argsort(one)
+        new = np.diff(one[order], prepend=-1.0) > SAME
+        if new.sum() > LARGEST_LATTICE:
+            return None, None
+        axes.append(one[order][new])
+        index = np.empty(len(one), dtype=np.int64)
+        index[order] = np.cumsum(new) - 1
+        indices.append(index)
+    count = len(axes[0])
+    if any(len(found) != count for found in axes):
+        return None, None
+    number = np.asarray(np.ravel_multi_index(tuple(indices), (count,) * len(axes)))
+    keys = np.unique(np.column_stack([base, number]), axis=0)
+    return (None, None) if len(keys) < len(base) else (np.array(axes), number)
+
+
+SAME = 1e-11
+"""Distance within which two places in a cell are the same [cells]: the rounding of positions."""
+
+
+def bases(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Base node of each place and the distance from it, in cells. Places midway between nodes, where the third weight is zero on both
+    sides, have the upper one.
+    """
+    base = np.floor(places - 0.5 + SAME).astype(np.int64)
+    return base, places - base
+
+
+def flat(coordinates: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers of nodes in the grid, from their coordinates in the last axis."""
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(coordinates, -1, 0)), shape))
 
 
 def stencils(places: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,16 +151,7 @@ def stencils(places: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.nd
         places: Shape (point, dim).
         offsets: Offsets of the nodes from the base node, shape (3^dim, dim).
     """
-    base = np.floor(places - 0.5).astype(np.int64)
-    f = places - base
+    base, f = bases(places)
     splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
     weights = np.prod([splines[offsets[:, axis], :, axis] for axis in range(f.shape[1])], axis=0).T
     return base, f, weights
-
-
-def grouped(owners: np.ndarray, count: int) -> np.ndarray:
-    """Positions of each owner 0 … count − 1 in a list of owners, one row each, filled up with the length of the list."""
-    order, sizes = np.argsort(owners, kind="stable"), np.bincount(owners, minlength=count)
-    rows = np.full((count, sizes.max()), len(owners))
-    rows[np.arange(rows.shape[1]) < sizes[:, None]] = order
-    return rows

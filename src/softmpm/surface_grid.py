@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.rest_grid import RestGrid, stencils
+from softmpm.rest_grid import RestGrid, flat, stencils
 from softmpm.scene.materials import Material
 from softmpm.scene.scene import Scene
 from softmpm.validate import need
@@ -49,16 +49,19 @@ class SurfaceGrid:
         )
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
         base, f, weights = stencils(points / grid.spacing, offsets)
-        at = np.ravel_multi_index(tuple(np.moveaxis(base[:, None] + offsets, -1, 0)), grid.shape)
+        at = flat(base[:, None] + offsets, grid.shape)
         index = rest.index.cpu().numpy()
+        sorting = np.argsort(index)
+        index = index[sorting]
         numbers = np.searchsorted(index, at).clip(max=len(index) - 1)
         mass = np.zeros(len(index))
-        of_particles = np.concatenate(
-            [body.material.density * body.particles.volume for body in scene.bodies]
-        )
-        np.add.at(mass, rest.stencil.cpu().numpy(), of_particles[:, None] * rest.weights.cpu().numpy())
+        for body in scene.bodies:
+            near, _, share = stencils(body.particles.positions / grid.spacing, offsets)
+            share *= body.material.density * np.asarray(body.particles.volume)[:, None]
+            np.add.at(mass, np.searchsorted(index, flat(near[:, None] + offsets, grid.shape)), share)
         held = (index[numbers] == at) & (mass[numbers] > LEAST * density[:, None] * grid.spacing**dim)
         weights = consistent(np.where(held, weights, 0.0), offsets - f[:, None])
+        numbers = sorting[numbers]
         far = np.abs(weights.sum(axis=1) - 1.0) > 1e-6
         need(
             not far.any(),

@@ -9,7 +9,7 @@ from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, d
 
 import softmpm
 from softmpm import Inputs, reference_lagrangian
-from softmpm.nodal import nodes_of, particles_of
+from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
 STEPS = 3
@@ -78,6 +78,31 @@ def test_each_law_alone(law, dim, device):
         found.append([*end[:4], *torch.autograd.grad(dot(cotangent(end), end), list(tensors.values()))])
     for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
         assert_relative(got.detach().cpu(), want.detach(), 1e-10, name)
+
+
+def on_lattice(made: softmpm.Scene, places: int) -> softmpm.Scene:
+    """The scene with its particles at random places of a lattice, with holes."""
+    generator, dim, h = np.random.default_rng(3), made.grid.dim, made.grid.spacing / places
+    lattice = np.stack(np.meshgrid(*[np.arange(round(0.3 / h), round(0.65 / h))] * dim), -1).reshape(-1, dim)
+    positions = (generator.permutation(lattice) + 0.5) * h
+    bodies, first = [], 0
+    for body in made.bodies:
+        count = len(body.particles)
+        particles = softmpm.Particles(positions[first : first + count], body.particles.volume)
+        bodies.append(dataclasses.replace(body, particles=particles))
+        first += count
+    return dataclasses.replace(made, bodies=bodies)
+
+
+@pytest.mark.parametrize(("dim", "places"), [(2, 3), (3, 2)])
+def test_lattices_have_the_values_and_gradients_of_the_reference(dim, places, device):
+    """Cells whose particles share their weights have kernels of their own."""
+    made = on_lattice(full_scene(dim, driven=()), places)
+    names = ("gravity", "damping", "friction", "direction", "viscosity", "strength")
+    model = build(made, device=device, dtype=torch.float64, worlds=2, inputs=names)
+    assert model.rest_grid.lattice is not None and model.rest_grid.lattice.shape == (dim, places)
+    compare(model, names, 1e-10)
+    compare(build(made, device=device, worlds=2, inputs=names), names, 5e-4)
 
 
 @pytest.mark.parametrize("budget", [None, 40_000])

@@ -1,7 +1,7 @@
 """Registry of the schemes by name."""
 
 from softmpm.schemes.fast.scheme import Fast
-from softmpm.schemes.lagrangian.chunk import Lagrangian
+from softmpm.schemes.lagrangian.scheme import Lagrangian
 from softmpm.schemes.plain.chunk import Plain
 from softmpm.schemes.scheme import Scheme
 

@@ -6,8 +6,7 @@
     with viscosity, L = Ḟ F⁻¹:  Ḟ̄ = L̄ F⁻ᵀ,  F̄ −= Lᵀ L̄ F⁻ᵀ
     ū_i += F̄ g_i,  v̄_i += Ḟ̄ g_i                                                                      (Q1.adj)
 
-A thread adds up one cell and writes the sums of its nodes; nodes.py adds those of the cells around a node. There are no atomic
-additions, so results are the same bits in every run.
+A brick of cells takes its sums together (bricks.py); nodes.py adds those of the bricks around a node.
 """
 
 from types import SimpleNamespace
@@ -16,7 +15,8 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, field, layers, meet, sums
+from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.stress import total_stress, total_stress_adj
@@ -25,30 +25,20 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_
 
 
 @kernel_factory
-def cells(spec: Spec) -> SimpleNamespace:
-    t, r, k = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
-    real, vec, mat, Constants, Rest, dim = t.real, t.vec, t.mat, t.Constants, r.Rest, spec.dim
-    ParticleInputs, total, sums = input_types(spec).ParticleInputs, total_stress(spec), r.sums
-    rotation, stress, identity, volume_change = total.rotation, total.stress, k.identity, k.volume_change
-    viscous_stress, report = (
-        viscosity(dim, spec.dtype).viscous_stress,
-        status.report(dim, spec.dtype).report,
+def particle_forces(spec: Spec) -> SimpleNamespace:
+    """Functions of one particle."""
+    t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
+    real, mat, Constants, dim = t.real, t.mat, t.Constants, spec.dim
+    ParticleInputs, total_of = input_types(spec).ParticleInputs, total_stress(spec)
+    rotation, stress, identity, volume_change = (
+        total_of.rotation,
+        total_of.stress,
+        k.identity,
+        k.volume_change,
     )
-    weights, weight, offset, slope = r.weights, r.weight, r.offset, r.slope
-    viscous, forced, largest = spec.viscosity, "force" in spec.given, 1.0e12
+    viscous_stress, viscous = viscosity(dim, spec.dtype).viscous_stress, spec.viscosity
+    report, largest = status.report(dim, spec.dtype).report, 1.0e12
     collapsed, not_finite = int(Kind.COLLAPSED), int(Kind.NOT_FINITE)
-    module = lagrangian_module(spec.module + ".lagrangian")
-    table = wp.types.matrix((3, dim), real)
-
-    @wp.func
-    def gradient(
-        nodal: wp.array2d(dtype=vec), world: int, inside: Rest, c: int, w: table, fx: vec, rate: real
-    ) -> mat:
-        """Σ a_i ⊗ g_i of a nodal field."""
-        total = mat()
-        for n in range(r.count):
-            total += wp.outer(nodal[world, inside.cell_nodes[c, n]], slope(w, n, fx, rate))
-        return total
 
     @wp.func
     def piola(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat, L: mat, inverse: mat) -> mat:
@@ -57,6 +47,17 @@ def cells(spec: Spec) -> SimpleNamespace:
         if wp.static(viscous):
             tau += viscous_stress(identity() + H, L, inputs.viscosity[world, p])
         return tau * wp.transpose(inverse)
+
+    @wp.func
+    def forced(inputs: ParticleInputs, world: int, p: int, H: mat, rate: mat) -> mat:
+        """−V P of a particle; ``rate`` is Ḟ."""
+        inverse = wp.inverse(identity() + H)
+        L = mat()
+        if wp.static(viscous):
+            L = rate * inverse
+        return -inputs.volume[world, p] * piola(
+            inputs, world, p, H, rotation(inputs, world, p, H), L, inverse
+        )
 
     @wp.func
     def check(
@@ -70,7 +71,23 @@ def cells(spec: Spec) -> SimpleNamespace:
                 kind = not_finite
             report(words, world, substep, kind, p)
 
-    @wp.kernel(module=module, enable_backward=False)
+    return SimpleNamespace(piola=piola, forced=forced, check=check)
+
+
+@kernel_factory
+def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
+    t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
+    vec, mat, Constants, dim = t.vec, t.mat, t.Constants, spec.dim
+    ParticleInputs, forced, check = input_types(spec).ParticleInputs, one.forced, one.check
+    of_u, of_v = (field(dim, spec.dtype, bricks, number) for number in range(2))
+    stage_u, stage_v, gradient_u, gradient_v = of_u.stage, of_v.stage, of_u.gradient, of_v.gradient
+    viscous, loaded, settings = spec.viscosity, "force" in spec.given, bricks.settings
+    of_f = sums(dim, spec.dtype, bricks, loaded)
+    line, clear, add, write, place_of = of_f.line, of_f.clear, of_f.add, of_f.write, of_f.place_of
+    count, turns, threads = bricks.cell_count, bricks.turns, bricks.threads
+    module = brick_module(f"{spec.module}.lagrangian.{bricks.name}")
+
+    @wp.kernel(module=module, **settings)
     def forces(
         # Parameters:
         constants: Constants,
@@ -82,38 +99,37 @@ def cells(spec: Spec) -> SimpleNamespace:
         v: wp.array2d(dtype=vec),
         # Out:
         words: wp.array(dtype=wp.int64),
-        partial: wp.array3d(dtype=vec),
+        partial: wp.array2d(dtype=vec),
     ):
-        world, c = wp.tid()
-        total = sums()
-        for at in range(inside.first[c], inside.first[c + 1]):
-            p = inside.particles[at]
-            fx = inside.fraction[at]
-            w = weights(fx)
-            H = gradient(u, world, inside, c, w, fx, constants.rate)  # (Q1)
-            if substep > 0:
-                check(constants, words, world, p, substep - 1, H)
-            inverse = wp.inverse(identity() + H)
-            L = mat()
-            if wp.static(viscous):
-                L = gradient(v, world, inside, c, w, fx, constants.rate) * inverse
-            P = piola(inputs, world, p, H, rotation(inputs, world, p, H), L, inverse)
-            A = inputs.volume[world, p] * P
-            for n in range(r.count):  # (Q2)
-                f = A * slope(w, n, fx, constants.rate)
-                for axis in range(dim):
-                    total[n, axis] = total[n, axis] - f[axis]
-                if wp.static(forced):
-                    share = weight(w, offset(n)) * inputs.force[world, p]
-                    for axis in range(dim):
-                        total[n, axis] = total[n, axis] + share[axis]
-        for n in range(r.count):
-            f = vec()
-            for axis in range(dim):
-                f[axis] = total[n, axis]
-            partial[world, c, n] = f
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+        clear(partial, world, brick)
+        meet()
+        total = line()
+        for row in range(inside.rows[brick], inside.rows[brick + 1]):
+            for slot in range(lane, turns, threads):
+                p = place_of(inside, row, slot)
+                corner = inside.corners[brick, slot % count]
+                fx = vec()
+                A = mat()
+                b = vec()
+                if p >= 0:
+                    fx = inside.fraction[p]
+                    H = gradient_u(u, inside, world, brick, corner, fx, constants.rate)  # (Q1)
+                    rate = mat()
+                    if wp.static(viscous):
+                        rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
+                    if substep > 0:
+                        check(constants, words, world, inside.order[p], substep - 1, H)
+                    A = constants.rate * forced(inputs, world, p, H, rate)  # (Q2)
+                    if wp.static(loaded):
+                        b = inputs.force[world, p]
+                total = add(total, partial, world, brick, slot, corner, fx, A, b)
+        write(total, partial, inside, world, brick, lane)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, **settings)
     def check_end(
         # Parameters:
         constants: Constants,
@@ -125,30 +141,169 @@ def cells(spec: Spec) -> SimpleNamespace:
         words: wp.array(dtype=wp.int64),
     ):
         """Check a state that no forces are computed of: the final one of a chunk, or the initial one of a call."""
-        world, c = wp.tid()
-        for at in range(inside.first[c], inside.first[c + 1]):
-            fx = inside.fraction[at]
-            H = gradient(u, world, inside, c, weights(fx), fx, constants.rate)
-            check(constants, words, world, inside.particles[at], substep, H)
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        meet()
+        for row in range(inside.rows[brick], inside.rows[brick + 1]):
+            for slot in range(lane, turns, threads):
+                p = place_of(inside, row, slot)
+                if p >= 0:
+                    corner = inside.corners[brick, slot % count]
+                    H = gradient_u(u, inside, world, brick, corner, inside.fraction[p], constants.rate)
+                    check(constants, words, world, inside.order[p], substep, H)
 
-    return SimpleNamespace(forces=forces, check_end=check_end, gradient=gradient, piola=piola)
+    return SimpleNamespace(forces=forces, check_end=check_end)
 
 
 @kernel_factory
-def cells_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
-    t, r, k = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
-    vec, mat, Constants, Rest, dim = t.vec, t.mat, t.Constants, r.Rest, spec.dim
-    ParticleInputs, total, sums = input_types(spec).ParticleInputs, total_stress(spec), r.sums
-    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
-    rotation, identity, stress_adj = total.rotation, k.identity, total_stress_adj(spec, wanted).stress_adj
-    viscous_stress_adj, one = viscosity(dim, spec.dtype).viscous_stress_adj, cells(spec)
-    gradient, piola = one.gradient, one.piola
-    weights, weight, offset, slope = r.weights, r.weight, r.offset, r.slope
-    viscous, forced = spec.viscosity, "force" in wanted
-    report, bad_gradient = status.report(dim, spec.dtype).report, int(Kind.GRADIENT)
-    module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
+def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
+    """As :func:`cells`, for particles on a lattice without external forces of their own."""
+    t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
+    vec, Constants, dim = t.vec, t.Constants, spec.dim
+    ParticleInputs, forced, check = input_types(spec).ParticleInputs, one.forced, one.check
+    of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
+    stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
+    layer_of, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
+    Lattice, block, taken, put, add = (
+        layer_of.Lattice,
+        layer_of.block,
+        layer_of.taken,
+        layer_of.put,
+        layer_of.add[0],
+    )
+    gradients_u, gradients_v, points = layer_of.gradients[0], layer_of.gradients[1], bricks.layer
+    count, slots, threads, settings = (
+        bricks.cell_count,
+        bricks.slots,
+        bricks.layer_threads,
+        bricks.layer_settings,
+    )
+    module = brick_module(f"{spec.module}.lagrangian.{bricks.name}.layers")
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=module, **settings)
+    def forces(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        partial: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+        clear(partial, world, brick)
+        meet()
+        for slot in range(lane, slots, threads):
+            layer = slot / count
+            corner = inside.corners[brick, slot % count]
+            A = block()
+            if corner >= 0:
+                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
+                rate = block()
+                if wp.static(viscous):
+                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+                for n in range(points):
+                    p = inside.places[brick * points + n, slot]
+                    if p >= 0:
+                        Hn = constants.rate * taken(H, n)
+                        if substep > 0:
+                            check(constants, words, world, inside.order[p], substep - 1, Hn)
+                        A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
+                        A = put(A, n, constants.rate * A_n)
+            add(A, partial, world, brick, corner, layer, lane, lattice)
+
+    return SimpleNamespace(forces=forces)
+
+
+@kernel_factory
+def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
+    """Adjoint of the functions of one particle."""
+    t, identity = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype).identity
+    mat, rotation, piola = t.mat, total_stress(spec).rotation, particle_forces(spec).piola
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
+    stress_adj, viscous = total_stress_adj(spec, wanted).stress_adj, spec.viscosity
+    viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
+    report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
+
+    @wp.struct
+    class ForceAdj:
+        F: mat
+        rate: mat
+
+    @wp.func
+    def forced_adj(
+        inputs: ParticleInputs,
+        world: int,
+        p: int,
+        H: mat,
+        rate: mat,
+        G: mat,  # Σ f̄_i ⊗ g_i
+        adj_inputs: ParticleInputsAdj,
+    ) -> ForceAdj:
+        """(Q2.adj)"""
+        inverse = wp.inverse(identity() + H)
+        Q = rotation(inputs, world, p, H)
+        L = mat()
+        if wp.static(viscous):
+            L = rate * inverse
+        P = piola(inputs, world, p, H, Q, L, inverse)
+        adj_P = -inputs.volume[world, p] * G
+        adj_tau = adj_P * inverse
+        adj = ForceAdj()
+        adj.F = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
+        adj.F -= wp.transpose(inverse) * wp.transpose(adj_P) * P
+        if wp.static(viscous):
+            found = viscous_stress_adj(identity() + H, L, inputs.viscosity[world, p], adj_tau)
+            adj.rate = found.C * wp.transpose(inverse)
+            adj.F += found.F - wp.transpose(L) * adj.rate
+            if wp.static("viscosity" in wanted):
+                adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + found.eta
+        return adj
+
+    @wp.func
+    def check_adj(words: wp.array(dtype=wp.int64), world: int, p: int, substep: int, adj: ForceAdj):
+        """Report a gradient that is not finite."""
+        if not wp.isfinite(wp.ddot(adj.F, adj.F) + wp.ddot(adj.rate, adj.rate)):
+            report(words, world, substep, bad_gradient, p)
+
+    return SimpleNamespace(forced_adj=forced_adj, check_adj=check_adj, ForceAdj=ForceAdj)
+
+
+@kernel_factory
+def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNamespace:
+    t, Rest, one = (
+        types(spec.dim, spec.dtype),
+        rest(spec.dim, spec.dtype).Rest,
+        particle_forces_adj(spec, wanted),
+    )
+    vec, mat, Constants, dim = t.vec, t.mat, t.Constants, spec.dim
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
+    forced_adj, check_adj = one.forced_adj, one.check_adj
+    of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number) for number in range(3))
+    stage_u, stage_f, stage_v = of_u.stage, of_f.stage, of_v.stage
+    gradient_u, gradient_f, gradient_v, value_f = of_u.gradient, of_f.gradient, of_v.gradient, of_f.value
+    total_of, viscous, loaded = sums(dim, spec.dtype, bricks, False), spec.viscosity, "force" in wanted
+    line, clear, add, write, place_of = (
+        total_of.line,
+        total_of.clear,
+        total_of.add,
+        total_of.write,
+        total_of.place_of,
+    )
+    count, turns, threads, settings = bricks.cell_count, bricks.turns, bricks.threads, bricks.settings
+    module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}")
+
+    @wp.kernel(module=module, **settings)
     def forces_adj(
         # Parameters:
         constants: Constants,
@@ -164,60 +319,135 @@ def cells_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         # Out, added into:
         adj_inputs: ParticleInputsAdj,
         # Out:
-        partial_u: wp.array3d(dtype=vec),
-        partial_v: wp.array3d(dtype=vec),
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
     ):
-        world, c = wp.tid()
-        total_u = sums()
-        total_v = sums()
-        for at in range(inside.first[c], inside.first[c + 1]):
-            p = inside.particles[at]
-            fx = inside.fraction[at]
-            w = weights(fx)
-            H = gradient(u, world, inside, c, w, fx, constants.rate)
-            inverse = wp.inverse(identity() + H)
-            Q = rotation(inputs, world, p, H)
-            L = mat()
-            if wp.static(viscous):
-                L = gradient(v, world, inside, c, w, fx, constants.rate) * inverse
-            P = piola(inputs, world, p, H, Q, L, inverse)
-            adj_P = -inputs.volume[world, p] * gradient(
-                adj_f, world, inside, c, w, fx, constants.rate
-            )  # (Q2.adj)
-            adj_tau = adj_P * inverse
-            adj_F = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
-            adj_F -= wp.transpose(inverse) * wp.transpose(adj_P) * P
-            adj_rate = mat()
-            if wp.static(viscous):
-                adj_viscous = viscous_stress_adj(identity() + H, L, inputs.viscosity[world, p], adj_tau)
-                adj_rate = adj_viscous.C * wp.transpose(inverse)
-                adj_F += adj_viscous.F - wp.transpose(L) * adj_rate
-                if wp.static("viscosity" in wanted):
-                    adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + adj_viscous.eta
-            if not wp.isfinite(wp.ddot(adj_F, adj_F) + wp.ddot(adj_rate, adj_rate)):
-                report(words, world, substep, bad_gradient, p)
-            for n in range(r.count):
-                g = slope(w, n, fx, constants.rate)
-                share = adj_F * g  # (Q1.adj)
-                for axis in range(dim):
-                    total_u[n, axis] = total_u[n, axis] + share[axis]
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        stage_f(adj_f, inside, world, brick, lane)
+        clear(partial_u, world, brick)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+            clear(partial_v, world, brick)
+        meet()
+        total_u = line()
+        total_v = line()
+        for row in range(inside.rows[brick], inside.rows[brick + 1]):
+            for slot in range(lane, turns, threads):
+                p = place_of(inside, row, slot)
+                corner = inside.corners[brick, slot % count]
+                fx = vec()
+                A = mat()
+                B = mat()
+                if p >= 0:
+                    fx = inside.fraction[p]
+                    H = gradient_u(u, inside, world, brick, corner, fx, constants.rate)
+                    G = gradient_f(adj_f, inside, world, brick, corner, fx, constants.rate)
+                    rate = mat()
+                    if wp.static(viscous):
+                        rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
+                    adj = forced_adj(inputs, world, p, H, rate, G, adj_inputs)
+                    check_adj(words, world, inside.order[p], substep, adj)
+                    A = constants.rate * adj.F  # (Q1.adj)
+                    B = constants.rate * adj.rate
+                    if wp.static(loaded):
+                        share = value_f(adj_f, inside, world, brick, corner, fx)
+                        adj_inputs.force[world, p] = adj_inputs.force[world, p] + share
+                total_u = add(total_u, partial_u, world, brick, slot, corner, fx, A, vec())
                 if wp.static(viscous):
-                    rate = adj_rate * g
-                    for axis in range(dim):
-                        total_v[n, axis] = total_v[n, axis] + rate[axis]
-                if wp.static(forced):
-                    adj_inputs.force[world, p] = (
-                        adj_inputs.force[world, p]
-                        + weight(w, offset(n)) * adj_f[world, inside.cell_nodes[c, n]]
-                    )
-        for n in range(r.count):
-            share = vec()
-            rate = vec()
-            for axis in range(dim):
-                share[axis] = total_u[n, axis]
-                rate[axis] = total_v[n, axis]
-            partial_u[world, c, n] = share
+                    total_v = add(total_v, partial_v, world, brick, slot, corner, fx, B, vec())
+        write(total_u, partial_u, inside, world, brick, lane)
+        if wp.static(viscous):
+            write(total_v, partial_v, inside, world, brick, lane)
+
+    return SimpleNamespace(forces_adj=forces_adj)
+
+
+@kernel_factory
+def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNamespace:
+    """As :func:`cells_adj`, for particles on a lattice without external forces of their own."""
+    t, Rest, one = (
+        types(spec.dim, spec.dtype),
+        rest(spec.dim, spec.dtype).Rest,
+        particle_forces_adj(spec, wanted),
+    )
+    vec, Constants, dim = t.vec, t.Constants, spec.dim
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
+    forced_adj, check_adj, layer_of = one.forced_adj, one.check_adj, layers(dim, spec.dtype, bricks)
+    of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(3))
+    stage_u, stage_f, stage_v = of_u.stage, of_f.stage, of_v.stage
+    clear, viscous = sums(dim, spec.dtype, bricks, False).clear, spec.viscosity
+    Lattice, block, taken, put, points = (
+        layer_of.Lattice,
+        layer_of.block,
+        layer_of.taken,
+        layer_of.put,
+        bricks.layer,
+    )
+    gradients_u, gradients_f, gradients_v = layer_of.gradients
+    add_u, add_v = layer_of.add
+    count, slots, threads, settings = (
+        bricks.cell_count,
+        bricks.slots,
+        bricks.layer_threads,
+        bricks.layer_settings,
+    )
+    module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
+
+    @wp.kernel(module=module, **settings)
+    def forces_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        # Out, added into:
+        adj_inputs: ParticleInputsAdj,
+        # Out:
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        stage_f(adj_f, inside, world, brick, lane)
+        clear(partial_u, world, brick)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+            clear(partial_v, world, brick)
+        meet()
+        for slot in range(lane, slots, threads):
+            layer = slot / count
+            corner = inside.corners[brick, slot % count]
+            A = block()
+            B = block()
+            if corner >= 0:
+                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
+                G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
+                rate = block()
+                if wp.static(viscous):
+                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+                for n in range(points):
+                    p = inside.places[brick * points + n, slot]
+                    if p >= 0:
+                        Hn = constants.rate * taken(H, n)
+                        Gn = constants.rate * taken(G, n)
+                        adj = forced_adj(
+                            inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs
+                        )
+                        check_adj(words, world, inside.order[p], substep, adj)
+                        A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
+                        if wp.static(viscous):
+                            B = put(B, n, constants.rate * adj.rate)
+            add_u(A, partial_u, world, brick, corner, layer, lane, lattice)
             if wp.static(viscous):
-                partial_v[world, c, n] = rate
+                add_v(B, partial_v, world, brick, corner, layer, lane, lattice)
 
     return SimpleNamespace(forces_adj=forces_adj)

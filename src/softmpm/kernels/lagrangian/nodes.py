@@ -1,11 +1,9 @@
 """Motion of the nodes. Derivation: docs/math/lagrangian.md.
 
-    m_i = Σ m_p N_i                                                                                  (Q2)
     v* = exp(−γ Δt) (p/m + Δt g),  p = m v + Δt f                                                    (Q3)
     v' = W(v*) at X + u,  u' = u + Δt v'                                                             (Q4)
     v̄' += Δt ū'                                                                                      (Q4.adj)
     p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
-    m̄_p += Σ N_i m̄_i                                                                                 (Q2.adj)
 
 (Q3) and (Q4) are the grid stage (G1), (G2) of the momentum p. The side of a wall on which a node lies is constant in the adjoint.
 """
@@ -22,14 +20,32 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_
 
 
 @kernel_factory
+def gathering(dim: int, dtype: str):
+    vec, Rest, most = types(dim, dtype).vec, rest(dim, dtype).Rest, 2**dim
+
+    @wp.func
+    def gathered(partial: wp.array2d(dtype=vec), inside: Rest, world: int, i: int) -> vec:
+        """Sum of what the bricks around a node have for it, in a fixed order."""
+        total = vec()
+        for n in range(most):
+            entry = inside.shares[n, i]
+            if entry >= 0:
+                total += partial[world, entry]
+        return total
+
+    return gathered
+
+
+@kernel_factory
 def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
-    exact_vec, ParticleInputs = types(spec.dim, "float64").vec, input_types(spec).ParticleInputs
+    exact_vec = types(spec.dim, "float64").vec
     GridInputs, dim = input_types(spec).GridInputs, spec.dim
     position, node_velocity = g.position, g.node_velocity
+    gathered = gathering(spec.dim, spec.dtype)
     running = status.report(spec.dim, spec.dtype).running
-    weights, weight, offset, surface = r.weights, r.weight, r.offset, bool(spec.surface_walls)
+    surface = bool(spec.surface_walls)
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
@@ -40,29 +56,6 @@ def nodes(spec: Spec) -> SimpleNamespace:
             x[axis] = x[axis] + wp.float64(u[axis])
         return x
 
-    @wp.func
-    def gathered(partial: wp.array3d(dtype=vec), inside: Rest, world: int, i: int) -> vec:
-        """Sum of what the cells around a node have for it, in a fixed order."""
-        total = vec()
-        for n in range(r.count):
-            c = inside.node_cells[i, n]
-            if c >= 0:
-                total += partial[world, c, n]
-        return total
-
-    @wp.kernel(module=module, enable_backward=False)
-    def masses(inputs: ParticleInputs, inside: Rest, mass: wp.array2d(dtype=real)):
-        """m of (Q2), in units of the heaviest particle's mass."""
-        world, i = wp.tid()
-        total = real(0.0)
-        for n in range(r.count):
-            c = inside.node_cells[i, n]
-            if c >= 0:
-                for at in range(inside.first[c], inside.first[c + 1]):
-                    share = weight(weights(inside.fraction[at]), offset(n))
-                    total += share * inputs.mass[world, inside.particles[at]]
-        mass[world, i] = total
-
     @wp.kernel(module=module, enable_backward=False)
     def advance(
         # Parameters:
@@ -70,7 +63,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         inputs: GridInputs,
         inside: Rest,
         mass: wp.array2d(dtype=real),
-        partial: wp.array3d(dtype=vec),
+        partial: wp.array2d(dtype=vec),
         words: wp.array(dtype=wp.int64),
         # In:
         u: wp.array2d(dtype=vec),
@@ -94,7 +87,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
             new_u[world, i] = here
         new_v[world, i] = new
 
-    return SimpleNamespace(masses=masses, advance=advance, gathered=gathered, place=place)
+    return SimpleNamespace(advance=advance, place=place)
 
 
 @kernel_factory
@@ -102,10 +95,8 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, r, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), nodes(spec)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
-    gathered, place = one.gathered, one.place
-    weights, weight, offset = r.weights, r.weight, r.offset
+    gathered, place = gathering(spec.dim, spec.dtype), one.place
     viscous, surface = spec.viscosity, bool(spec.surface_walls)
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
@@ -148,8 +139,8 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         # Parameters:
         inside: Rest,
         # In:
-        partial_u: wp.array3d(dtype=vec),
-        partial_v: wp.array3d(dtype=vec),
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
         # Out, added into:
         adj_u: wp.array2d(dtype=vec),
         adj_v: wp.array2d(dtype=vec),
@@ -160,17 +151,4 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if wp.static(viscous):
             adj_v[world, i] = adj_v[world, i] + gathered(partial_v, inside, world, i)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def masses_adj(inside: Rest, adj_mass: wp.array2d(dtype=real), adj_inputs: ParticleInputsAdj):
-        """(Q2.adj)"""
-        world, c = wp.tid()
-        for at in range(inside.first[c], inside.first[c + 1]):
-            w = weights(inside.fraction[at])
-            total = real(0.0)
-            for n in range(r.count):
-                total += weight(w, offset(n)) * adj_mass[world, inside.cell_nodes[c, n]]
-            p = inside.particles[at]
-            if wp.static("material" in wanted):
-                adj_inputs.mass[world, p] = adj_inputs.mass[world, p] + total
-
-    return SimpleNamespace(advance_adj=advance_adj, gather_adj=gather_adj, masses_adj=masses_adj)
+    return SimpleNamespace(advance_adj=advance_adj, gather_adj=gather_adj)

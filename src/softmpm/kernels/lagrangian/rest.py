@@ -1,4 +1,4 @@
-"""Struct of the nodes and cells at rest, and the gradient of their splines."""
+"""Struct of the nodes, bricks and particles at rest."""
 
 from types import SimpleNamespace
 
@@ -21,32 +21,35 @@ def lagrangian_module(name: str) -> str:
 @kernel_factory
 def rest(dim: int, dtype: str) -> SimpleNamespace:
     t, s = types(dim, dtype), spline(dim, dtype)
-    real, vec = t.real, t.vec
-    weight, offset, position = s.weight, s.offset, s.position
-    table = wp.types.matrix((3, dim), real)
 
     class Rest:
         """See :class:`softmpm.rest_grid.RestGrid`."""
 
         nodes: wp.array(dtype=t.ivec)
-        fraction: wp.array(dtype=vec)
-        particles: wp.array(dtype=wp.int32)
-        first: wp.array(dtype=wp.int32)
-        cell_nodes: wp.array2d(dtype=wp.int32)
-        node_cells: wp.array2d(dtype=wp.int32)
+        shares: wp.array2d(dtype=wp.int32)
+        window: wp.array2d(dtype=wp.int32)
+        rows: wp.array(dtype=wp.int32)
+        places: wp.array2d(dtype=wp.int32)
+        corners: wp.array2d(dtype=wp.int32)
+        order: wp.array(dtype=wp.int32)
+        fraction: wp.array(dtype=t.vec)
+
+    real, vec = t.real, t.vec
+    table = wp.types.matrix((3, dim), real)
 
     @wp.func
-    def slope(w: table, n: int, fx: vec, rate: real) -> vec:
-        """g of (Q1) [1/m] at node ``n`` of the cell; ``rate`` is 4/dx."""
-        o = offset(n)
-        return (rate * weight(w, o)) * (position(o) - fx)
+    def lean(w: table, fx: vec) -> table:
+        """w (o − f) of each node o along each axis."""
+        out = table()
+        for axis in range(dim):
+            out[0, axis] = -w[0, axis] * fx[axis]
+            out[1, axis] = w[1, axis] * (real(1.0) - fx[axis])
+            out[2, axis] = w[2, axis] * (real(2.0) - fx[axis])
+        return out
 
     return SimpleNamespace(
+        lean=lean,
         Rest=wp.struct(Rest, module=f"softmpm.types.d{dim}.{dtype}"),
-        sums=wp.types.matrix((s.count, dim), real),
         count=s.count,
-        slope=slope,
         weights=s.weights,
-        weight=weight,
-        offset=offset,
     )

@@ -10,10 +10,10 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
-from softmpm.schemes.fast.sorted_inputs import add_unsorted, unsort
 from softmpm.schemes.fast.sorted_state import SortedAdj
 from softmpm.schemes.inputs import Accumulators, InputsAdj
 from softmpm.schemes.launch import RebindableLaunch
+from softmpm.schemes.sorted_inputs import add_unsorted, unsort
 from softmpm.state import State
 
 

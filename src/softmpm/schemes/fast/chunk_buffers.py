@@ -21,10 +21,10 @@ from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.launch_size import LaunchSize
 from softmpm.schemes.fast.particle_order import ParticleLayout
-from softmpm.schemes.fast.sorted_inputs import SortedInputs
 from softmpm.schemes.fast.sorted_state import SortedState
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.launch import RebindableLaunch
+from softmpm.schemes.sorted_inputs import SortedInputs
 from softmpm.state import State
 
 

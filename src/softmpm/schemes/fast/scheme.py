@@ -1,9 +1,8 @@
 """The fast scheme: chunks of substeps run as captured graphs, on particles sorted by cell and the grid nodes near them."""
 
-import threading
 import weakref
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,88 +20,26 @@ from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
 from softmpm.schemes.fast.footprint import FastFootprint
 from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacker
+from softmpm.schemes.graph_cache import GraphCache, Lease
 from softmpm.schemes.inputs import InputsAdj, Values
 from softmpm.state import State
 
 
-class CachedGraph(NamedTuple):
-    """A chunk graph and its adjoint graphs, which refer to it."""
-
-    graph: ChunkGraph
-    adjoints: dict[RequestedGrads, ChunkGraphAdj]
-
-
-RETAINED_SHAPES = {False: 4, True: 2}
-"""Number of chunk shapes whose graphs are always retained in the cache, for graphs that store their intermediate states (True) or not
-(False). A call has at most two shapes, and graphs that store nothing serve calls both with and without gradient."""
-
-
-class _FreeList(list[CachedGraph]):
-    """Free chunk graphs of one shape: a list that can be weakly referenced, see :func:`_return_to_cache`."""
-
-
-def _return_to_cache(free: weakref.ref[_FreeList], cached: CachedGraph) -> None:
-    """Return a leased graph to its cache, if that still exists; the lease itself does not keep the cache alive."""
-    if (graphs := free()) is not None:
-        graphs.append(cached)
-
-
-class GraphCache:
-    """Cache of the chunk graphs that were built for one particle layout and are not in use.
-
-    Graphs of the most recent chunk shapes are always retained. Older ones are retained only while all of them fit into one call's
-    share of the memory budget, since calls of different lengths have different shapes.
-    """
+class LayoutGraphs(GraphCache):
+    """Chunk graphs that were built for one particle layout."""
 
     def __init__(self, model: Model, layout: ParticleLayout, unpacker: Unpacker):
-        self.model, self.layout, self.unpacker = model, layout, unpacker
-        # By whether they store their intermediate states, then by shape, the most recent last:
-        self._free: dict[bool, dict[tuple, _FreeList]] = {False: {}, True: {}}
-        self._shared_adjoints: dict[RequestedGrads, SharedAdjoint] = {}
-        # Guards the shared adjoints: the backward pass of this thread's calls may run in other threads.
-        self.lock = threading.Lock()
+        super().__init__(model)
+        self.layout, self.unpacker = layout, unpacker
 
-    def take(self, chunk: Chunk, keep: bool) -> tuple[CachedGraph, _FreeList]:
-        """Acquire a graph, and the list that it is returned to; only this thread adds lists to the cache."""
-        shapes = self._free[keep]
-        free = shapes[chunk.shape] = shapes.pop(chunk.shape, _FreeList())
-        if free:
-            cached = free.pop()
-            if is_capturing(self.model):
-                # With its adjoints: their graphs must not be destroyed during a capture.
-                keep_alive(cached)
-            return cached, free
-        if not is_capturing(self.model):  # else no graph may be destroyed
-            self._forget(keep)
-        return CachedGraph(ChunkGraph(self.model, self.layout, chunk, keep), {}), free
+    def new_graph(self, chunk: Chunk, keep: bool) -> ChunkGraph:
+        return ChunkGraph(self.model, self.layout, chunk, keep)
 
-    def _forget(self, keep: bool) -> None:
-        """Evict old shapes to make room for another graph."""
-        shapes, part = self._free[keep], self.model.budget // self.model.calls
-        for shape in list(shapes)[: -RETAINED_SHAPES[keep]]:
-            if sum(cached.graph.buffers.bytes for free in shapes.values() for cached in free) <= part:
-                break
-            del shapes[shape]
+    def new_shared(self, graph: ChunkGraph, wanted: RequestedGrads) -> SharedAdjoint:
+        return SharedAdjoint(graph.buffers, wanted)
 
-    def adjoint(self, cached: CachedGraph, wanted: RequestedGrads) -> ChunkGraphAdj:
-        """The adjoint of a graph for the requested gradients, built on first use."""
-        graph, adjoints = cached
-        if is_capturing(self.model):
-            return ChunkGraphAdj(graph, SharedAdjoint(graph.buffers, wanted))
-        if wanted not in self._shared_adjoints:
-            self._shared_adjoints[wanted] = SharedAdjoint(graph.buffers, wanted)
-        if wanted not in adjoints:
-            adjoints[wanted] = ChunkGraphAdj(graph, self._shared_adjoints[wanted])
-        return adjoints[wanted]
-
-
-class _Lease:
-    """Lease of a chunk graph; returned to the cache when no result references its buffers."""
-
-    def __init__(self, pool: GraphCache, chunk: Chunk, keep: bool):
-        self.cached, free = pool.take(chunk, keep)
-        if not is_capturing(pool.model):  # else it belongs to the graph that is being captured
-            weakref.finalize(self, _return_to_cache, weakref.ref(free), self.cached)
+    def new_adjoint(self, graph: ChunkGraph, shared: SharedAdjoint) -> ChunkGraphAdj:
+        return ChunkGraphAdj(graph, shared)
 
 
 class FastRun:
@@ -117,7 +54,7 @@ class FastRun:
 
     def __init__(
         self,
-        pool: GraphCache,
+        pool: LayoutGraphs,
         updated: bool,
         chunk: Chunk,
         start: State | SortedState,
@@ -126,7 +63,7 @@ class FastRun:
         frozen: Sequence[int] = (),
     ):
         self.pool, self.updated, self.chunk, self.start = pool, updated, chunk, start
-        self._lease = _Lease(pool, chunk, keep)
+        self._lease = Lease(pool, chunk, keep)
         graph, stream = self._lease.cached.graph, stream_of(pool.model.device)
         buffers = graph.buffers
         buffers.load(stream, chunk, start, values, frozen)
@@ -160,7 +97,7 @@ class Fast:
 
     def __init__(self, model: Model):
         self.model = model
-        self._pool: GraphCache | None = None
+        self._pool: LayoutGraphs | None = None
         self._unpacker = Unpacker(model)
         self._start_check: StartCheck | None = None
         self._widened = False  # the window was just centred on the initial state of the next chunk
@@ -222,7 +159,7 @@ class Fast:
         return resorted
 
     def _use(self, layout: ParticleLayout) -> None:
-        self._pool = GraphCache(self.model, layout, self._unpacker)
+        self._pool = LayoutGraphs(self.model, layout, self._unpacker)
 
     def accept(self, run: FastRun, words: list[int]) -> bool:
         """Update the staleness of the layout; False if a particle left the window."""

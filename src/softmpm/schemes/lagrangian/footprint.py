@@ -25,7 +25,7 @@ class LagrangianFootprint:
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         real, nodal = model.dtype.itemsize, model.sizes().inside
-        cells = model.worlds * model.rest_grid.cell_count * 3**model.dim * model.dim * real
-        forward = 2 * nodal + cells + input_bytes(model, 1)
+        sums = model.worlds * model.rest_grid.window.numel() * model.dim * real
+        forward = 2 * nodal + sums + input_bytes(model, 1)
         kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
-        return Buffers(forward, kept, 2 * nodal + 2 * cells)
+        return Buffers(forward, kept, 2 * nodal + 2 * sums)

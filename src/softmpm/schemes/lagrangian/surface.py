@@ -10,7 +10,7 @@ from torch import Tensor
 from softmpm.kernels.lagrangian.surface import surface, surface_adj, surface_type
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
-from softmpm.schemes.buffers import view
+from softmpm.schemes.buffers import clear, view
 
 
 def surface_struct(model: Model):
@@ -33,14 +33,13 @@ class SurfaceContact:
     Args:
         mass: Masses of the nodes, shape (world, node).
         anchors: Anchors of each stored state, shape (state, world, wall, point, dim).
-        launch: Launches a kernel.
 
     Attributes:
         free: Nodal velocities without contact.
     """
 
-    def __init__(self, model: Model, mass: Tensor, anchors: Tensor, launch: Callable[..., None]):
-        self.model, self._launch, self.anchors = model, launch, anchors
+    def __init__(self, model: Model, mass: Tensor, anchors: Tensor):
+        self.model, self.anchors = model, anchors
         self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
         self._vec, self._real = (
             getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
@@ -50,21 +49,35 @@ class SurfaceContact:
         self.free = self._vectors(self.nodes)
         self._impulse = self._vectors(self.points)
         self._D = view(torch.empty(self.points, dtype=model.dtype, device=model.device), self._real)
-        launch(surface(model.spec).delassus, self.points, self._struct, self._mass, self._D)
 
     def _vectors(self, lead: tuple[int, ...]) -> wp.array:
         model = self.model
         return view(torch.empty(*lead, model.dim, dtype=model.dtype, device=model.device), self._vec)
 
-    def advance(self, inputs: Any, words: wp.array, now: int, then: int, u, v, new_u, new_v) -> None:
+    def begin(self, launch: Callable[..., None]) -> None:
+        """Launch what depends on the masses only."""
+        launch(surface(self.model.spec).delassus, self.points, self._struct, self._mass, self._D)
+
+    def advance(
+        self,
+        launch: Callable[..., None],
+        inputs: Any,
+        words: wp.array,
+        now: int,
+        then: int,
+        u: wp.array,
+        v: wp.array,
+        new_u: wp.array,
+        new_v: wp.array,
+    ) -> None:
         """From :attr:`free` and the state before the substep to that after it; ``now`` and ``then`` count their anchors."""
         model, kernels = self.model, surface(self.model.spec)
         anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
         parameters = (model.constants, inputs, self._struct, self._width, words, self._D)
         arguments = (u, self.free, anchors[0], self._impulse, anchors[1])
-        self._launch(kernels.press, self.points, *parameters, *arguments)
+        launch(kernels.press, self.points, *parameters, *arguments)
         parameters = (model.constants, self._struct, self._mass, self._impulse, words)
-        self._launch(kernels.settle, self.nodes, *parameters, u, v, self.free, new_u, new_v)
+        launch(kernels.settle, self.nodes, *parameters, u, v, self.free, new_u, new_v)
 
 
 class SurfaceContactAdj:
@@ -90,12 +103,28 @@ class SurfaceContactAdj:
         self._shared = forward._vectors(forward.nodes)
         self._adj_x, self._adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
         model = forward.model
-        zeros = torch.zeros(forward.points, dtype=model.dtype, device=model.device)
-        self._adj_D = view(zeros, forward._real)
+        self._total_D = torch.empty(forward.points, dtype=model.dtype, device=model.device)
+        self._adj_D = view(self._total_D, forward._real)
 
-    def advance(self, s: int, inputs: Any, adj_inputs: Any, rest: Any, u, p, new_v, adj_u, adj_v) -> None:
+    def clear(self) -> None:
+        """Set all sums to zero."""
+        clear(self._total_D)
+
+    def advance(
+        self,
+        launch: Callable[..., None],
+        s: int,
+        inputs: Any,
+        adj_inputs: Any,
+        rest: Any,
+        u: wp.array,
+        p: wp.array,
+        new_v: wp.array,
+        adj_u: wp.array,
+        adj_v: wp.array,
+    ) -> None:
         """Adjoint of substep ``s``, from that of the new state to that of the velocity without contact, in ``adj_v``."""
-        one, launch = self.forward, self.forward._launch
+        one = self.forward
         constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
         arguments = (u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
         launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, one._mass, *arguments)
@@ -105,8 +134,8 @@ class SurfaceContactAdj:
         launch(self._kernels.press_adj, one.points, *parameters, *arguments, *out)
         launch(self._kernels.spread_adj, one.nodes, one._struct, *adj_points, adj_u, adj_v)
 
-    def finish(self) -> None:
+    def finish(self, launch: Callable[..., None]) -> None:
         """Add what the mobility D of all substeps gives to the masses."""
         one = self.forward
         arguments = (one._struct, one._mass, self._adj_D, self._adj_mass)
-        one._launch(self._kernels.delassus_adj, one.nodes, *arguments)
+        launch(self._kernels.delassus_adj, one.nodes, *arguments)

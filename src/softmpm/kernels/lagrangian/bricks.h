@@ -1,0 +1,266 @@
+// Memory of a brick of cells: nodal fields of its window, what the particles of a row give, and the sums for the nodes of the window. On a
+// GPU a block of threads shares all of it; on the CPU one thread has a brick, reads nodes where they are and adds to the partial sums.
+// No two threads add to one number, and the order of the terms is always the same.
+namespace softmpm {
+
+template <typename T, unsigned DIM> struct alignas(DIM == 2 ? 2 * sizeof(T) : 16) Node {
+    T at[DIM == 2 ? 2 : 4];  // three numbers and one that is not used are read at once
+};
+
+#if defined(__CUDA_ARCH__)
+template <int FIELD, int NODES, typename T, unsigned DIM> CUDA_CALLABLE inline Node<T, DIM>* shared_nodes()
+{
+    __shared__ Node<T, DIM> nodes[NODES];
+    return nodes;
+}
+
+template <int SIZE, typename T> CUDA_CALLABLE inline T* shared_terms()
+{
+    __shared__ T terms[SIZE];
+    return terms;
+}
+#else  // never read: on the CPU bricks are serial
+template <int, int, typename T, unsigned DIM> CUDA_CALLABLE inline Node<T, DIM>* shared_nodes() { return nullptr; }
+template <int, typename T> CUDA_CALLABLE inline T* shared_terms() { return nullptr; }
+#endif
+
+CUDA_CALLABLE inline void meet()
+{
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+}
+
+// Copy a nodal field of the window; complete after meet().
+template <int FIELD, int NODES, int THREADS, typename T, unsigned DIM>
+CUDA_CALLABLE inline void stage(
+    const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int lane)
+{
+    Node<T, DIM>* nodes = shared_nodes<FIELD, NODES, T, DIM>();
+    const int* node = window.data + brick * NODES;
+    const wp::vec_t<DIM, T>* first = values.data + size_t(world) * values.shape[1];
+    for (int k = lane; k < NODES; k += THREADS) {
+        int i = node[k];
+        for (unsigned axis = 0; axis < DIM; ++axis)
+            nodes[k].at[axis] = i >= 0 ? first[i].c[axis] : T(0);
+    }
+}
+
+// Node k of the window
+template <int FIELD, int NODES, typename T, unsigned DIM>
+CUDA_CALLABLE inline wp::vec_t<DIM, T> fetch(
+    const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int k)
+{
+#if defined(__CUDA_ARCH__)
+    Node<T, DIM> node = shared_nodes<FIELD, NODES, T, DIM>()[k];
+    wp::vec_t<DIM, T> value;
+    for (unsigned axis = 0; axis < DIM; ++axis)
+        value.c[axis] = node.at[axis];
+    return value;
+#else
+    return values.data[size_t(world) * values.shape[1] + window.data[brick * NODES + k]];
+#endif
+}
+
+// Vectors of the particle of each thread; `number` counts them.
+template <int SIZE, int THREADS, typename T, unsigned DIM>
+CUDA_CALLABLE inline void give(int number, int lane, const wp::vec_t<DIM, T>& value)
+{
+    for (unsigned axis = 0; axis < DIM; ++axis)
+        shared_terms<SIZE, T>()[(number * DIM + axis) * THREADS + lane] = value.c[axis];
+}
+
+template <int SIZE, int THREADS, typename T, unsigned DIM>
+CUDA_CALLABLE inline wp::vec_t<DIM, T> given(int number, int lane)
+{
+    wp::vec_t<DIM, T> value;
+    for (unsigned axis = 0; axis < DIM; ++axis)
+        value.c[axis] = shared_terms<SIZE, T>()[(number * DIM + axis) * THREADS + lane];
+    return value;
+}
+
+// Set the partial sums of a brick to zero, on the CPU.
+template <int NODES, typename T, unsigned DIM>
+CUDA_CALLABLE inline void clear_sums(const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick)
+{
+#if !defined(__CUDA_ARCH__)
+    wp::vec_t<DIM, T>* out = partial.data + size_t(world) * partial.shape[1] + brick * NODES;
+    for (int k = 0; k < NODES; ++k)
+        out[k] = {};
+#endif
+}
+
+// Write the sums that each thread has for one component of the COUNT nodes of a cell, of which `corner` is the first in the window, or -1.
+// The threads of a component are apart from those of the others, and all cells add to the same node of theirs at a time.
+template <int NODES, int THREADS, int COUNT, int ACROSS, int ALONG, typename T, unsigned DIM>
+CUDA_CALLABLE inline void write_sums(
+    const wp::vec_t<COUNT, T>& total, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick, int corner, int axis,
+    int lane)
+{
+    T* sums = shared_terms<NODES * int(DIM), T>();
+    for (int k = lane; k < NODES * int(DIM); k += THREADS)
+        sums[k] = T(0);
+    meet();
+    T* own = sums + axis * NODES + corner;
+#pragma unroll
+    for (int n = 0; n < COUNT; ++n) {
+        if (corner >= 0)
+            own[DIM == 2 ? n / 3 * ALONG + n % 3 : (n / 9 * ACROSS + n / 3 % 3) * ALONG + n % 3] += total.c[n];
+        meet();
+    }
+    T* out = reinterpret_cast<T*>(partial.data + size_t(world) * partial.shape[1] + brick * NODES);
+    for (int k = lane; k < NODES * int(DIM); k += THREADS)
+        out[k] = sums[k % DIM * NODES + k / DIM];
+    meet();  // the sums may be used again
+}
+
+// Lattices: the particles of every cell have the same K places along each axis. A thread has those of a cell with one place along the
+// last axis; w and e are the weights w and w (o - f) of node o, [axis][place][o] in rows of three.
+
+// Sums a (x) g / rate over the nodes of a cell, for the K^(DIM - 1) particles of a layer, DIM rows for each.
+template <int FIELD, int NODES, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
+CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradients(
+    const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int corner, int layer,
+    const wp::mat_t<K * DIM, 3, T>& w, const wp::mat_t<K * DIM, 3, T>& e)
+{
+    constexpr int LAST = (DIM - 1) * K, Q = DIM == 2 ? 1 : K;  // places along the middle axis
+    wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> out(T(0));
+    T wl[3], el[3];
+    for (int o = 0; o < 3; ++o) {
+        wl[o] = w.data[LAST + layer][o];
+        el[o] = e.data[LAST + layer][o];
+    }
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        T a[Q][DIM][DIM] = {};  // with the slope along the first axis to come, along the middle one and the last
+#pragma unroll
+        for (int j = 0; j < (DIM == 2 ? 1 : 3); ++j) {
+            T s[DIM] = {}, d[DIM] = {};
+#pragma unroll
+            for (int k = 0; k < 3; ++k) {
+                wp::vec_t<DIM, T> n = fetch<FIELD, NODES, T, DIM>(
+                    values, window, world, brick, corner + (DIM == 2 ? i : i * ACROSS + j) * ALONG + k);
+#pragma unroll
+                for (unsigned c = 0; c < DIM; ++c) {
+                    s[c] += wl[k] * n.c[c];
+                    d[c] += el[k] * n.c[c];
+                }
+            }
+#pragma unroll
+            for (int q = 0; q < Q; ++q)
+#pragma unroll
+                for (unsigned c = 0; c < DIM; ++c)
+                    if constexpr (DIM == 2) {
+                        a[q][0][c] = s[c];
+                        a[q][1][c] = d[c];
+                    } else {
+                        a[q][0][c] += w.data[K + q][j] * s[c];
+                        a[q][1][c] += e.data[K + q][j] * s[c];
+                        a[q][2][c] += w.data[K + q][j] * d[c];
+                    }
+        }
+#pragma unroll
+        for (int r = 0; r < K; ++r)
+#pragma unroll
+            for (int q = 0; q < Q; ++q)
+#pragma unroll
+                for (unsigned c = 0; c < DIM; ++c) {
+                    T* h = out.data[(r * Q + q) * DIM + c];
+                    h[0] += e.data[r][i] * a[q][0][c];
+                    for (unsigned axis = 1; axis < DIM; ++axis)
+                        h[axis] += w.data[r][i] * a[q][axis][c];
+                }
+    }
+    return out;
+}
+
+// Add A g / rate of the particles of a layer to the sums of the brick. All threads of a block come here together, those without a cell
+// with a negative corner. Each layer has planes of its own, for every first offset.
+template <int SUM, int NODES, int CELLS, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
+CUDA_CALLABLE inline void add_layer(
+    const wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T>& A, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick,
+    int corner, int layer, int lane, const wp::mat_t<K * DIM, 3, T>& w, const wp::mat_t<K * DIM, 3, T>& e)
+{
+    constexpr int LAST = (DIM - 1) * K, Q = DIM == 2 ? 1 : K, MIDDLE = DIM == 2 ? 1 : 3;
+    wp::vec_t<DIM, T>* out = partial.data + size_t(world) * partial.shape[1] + brick * NODES;
+#if defined(__CUDA_ARCH__)
+    constexpr int THREADS = CELLS * K;
+    Node<T, DIM>* planes = shared_nodes<-1 - SUM, 3 * K * NODES, T, DIM>();
+    for (int k = lane; k < 3 * K * NODES; k += THREADS)
+        planes[k] = {};
+    meet();
+#else
+    if (corner < 0)
+        return;
+#endif
+    T x[3][Q][DIM], y[3][Q][DIM], z[3][Q][DIM];
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+        for (int q = 0; q < Q; ++q)
+#pragma unroll
+            for (unsigned c = 0; c < DIM; ++c) {
+                T sums[3] = {};
+#pragma unroll
+                for (int r = 0; r < K; ++r) {
+                    const T* h = A.data[(r * Q + q) * DIM + c];
+                    sums[0] += e.data[r][i] * h[0];
+                    for (unsigned axis = 1; axis < DIM; ++axis)
+                        sums[axis] += w.data[r][i] * h[axis];
+                }
+                x[i][q][c] = sums[0], y[i][q][c] = sums[1], z[i][q][c] = sums[2];
+            }
+#pragma unroll
+    for (int j = 0; j < MIDDLE; ++j) {
+        T plain[3][DIM], sloped[3][DIM];
+#pragma unroll
+        for (int i = 0; i < 3; ++i)
+#pragma unroll
+            for (unsigned c = 0; c < DIM; ++c) {
+                if constexpr (DIM == 2) {
+                    plain[i][c] = x[i][0][c], sloped[i][c] = y[i][0][c];
+                } else {
+                    T p = T(0), s = T(0);
+#pragma unroll
+                    for (int q = 0; q < Q; ++q) {
+                        p += w.data[K + q][j] * x[i][q][c] + e.data[K + q][j] * y[i][q][c];
+                        s += w.data[K + q][j] * z[i][q][c];
+                    }
+                    plain[i][c] = p, sloped[i][c] = s;
+                }
+            }
+#pragma unroll
+        for (int k = 0; k < 3; ++k) {
+            T wl = w.data[LAST + layer][k], el = e.data[LAST + layer][k];
+#if defined(__CUDA_ARCH__)
+            if (corner >= 0)
+#pragma unroll
+                for (int i = 0; i < 3; ++i) {
+                    Node<T, DIM>* node = planes + (layer * 3 + i) * NODES + corner + (DIM == 2 ? i : i * ACROSS + j) * ALONG + k;
+                    Node<T, DIM> sum = *node;
+                    for (unsigned c = 0; c < DIM; ++c)
+                        sum.at[c] += wl * plain[i][c] + el * sloped[i][c];
+                    *node = sum;
+                }
+            meet();
+#else
+            for (int i = 0; i < 3; ++i)
+                for (unsigned c = 0; c < DIM; ++c)
+                    out[corner + (DIM == 2 ? i : i * ACROSS + j) * ALONG + k].c[c] += wl * plain[i][c] + el * sloped[i][c];
+#endif
+        }
+    }
+#if defined(__CUDA_ARCH__)
+    for (int k = lane; k < NODES; k += THREADS) {
+        wp::vec_t<DIM, T> sum = {};
+#pragma unroll
+        for (int plane = 0; plane < 3 * K; ++plane) {
+            Node<T, DIM> node = planes[plane * NODES + k];
+            for (unsigned c = 0; c < DIM; ++c)
+                sum.c[c] += node.at[c];
+        }
+        out[k] = sum;
+    }
+#endif
+}
+}  // namespace softmpm

@@ -1,0 +1,103 @@
+"""Cache of chunk graphs: launches of a chunk that were captured on fixed buffers and are leased to one call at a time."""
+
+import threading
+import weakref
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+from softmpm.kernels.structs import RequestedGrads
+from softmpm.model import Model
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.capture import is_capturing, keep_alive
+
+
+class CachedGraph(NamedTuple):
+    """A chunk graph and its adjoint graphs, which refer to it."""
+
+    graph: Any
+    adjoints: dict[RequestedGrads, Any]
+
+
+RETAINED_SHAPES = {False: 4, True: 2}
+"""Number of chunk shapes whose graphs are always retained in the cache, for graphs that store their intermediate states (True) or not
+(False). A call has at most two shapes, and graphs that store nothing serve calls both with and without gradient."""
+
+
+class _FreeList(list[CachedGraph]):
+    """Free chunk graphs of one shape: a list that can be weakly referenced, see :func:`_return_to_cache`."""
+
+
+def _return_to_cache(free: weakref.ref[_FreeList], cached: CachedGraph) -> None:
+    """Return a leased graph to its cache, if that still exists; the lease itself does not keep the cache alive."""
+    if (graphs := free()) is not None:
+        graphs.append(cached)
+
+
+class GraphCache(ABC):
+    """Cache of the chunk graphs that are not in use.
+
+    Graphs of the most recent chunk shapes are always retained. Older ones are retained only while all of them fit into one call's
+    share of the memory budget, since calls of different lengths have different shapes.
+    """
+
+    def __init__(self, model: Model):
+        self.model = model
+        # By whether they store their intermediate states, then by shape, the most recent last:
+        self._free: dict[bool, dict[tuple, _FreeList]] = {False: {}, True: {}}
+        self._shared_adjoints: dict[RequestedGrads, Any] = {}
+        # Guards the shared adjoints: the backward pass of this thread's calls may run in other threads.
+        self.lock = threading.Lock()
+
+    @abstractmethod
+    def new_graph(self, chunk: Chunk, keep: bool) -> Any:
+        """Graph of the chunks of one shape, with ``buffers.bytes``; ``keep`` says whether it stores its intermediate states."""
+
+    @abstractmethod
+    def new_shared(self, graph: Any, wanted: RequestedGrads) -> Any:
+        """Buffers that all backward passes for the requested gradients share."""
+
+    @abstractmethod
+    def new_adjoint(self, graph: Any, shared: Any) -> Any:
+        """Adjoint of a graph on these buffers."""
+
+    def take(self, chunk: Chunk, keep: bool) -> tuple[CachedGraph, _FreeList]:
+        """Acquire a graph, and the list that it is returned to; only this thread adds lists to the cache."""
+        shapes = self._free[keep]
+        free = shapes[chunk.shape] = shapes.pop(chunk.shape, _FreeList())
+        if free:
+            cached = free.pop()
+            if is_capturing(self.model):
+                # With its adjoints: their graphs must not be destroyed during a capture.
+                keep_alive(cached)
+            return cached, free
+        if not is_capturing(self.model):  # else no graph may be destroyed
+            self._forget(keep)
+        return CachedGraph(self.new_graph(chunk, keep), {}), free
+
+    def _forget(self, keep: bool) -> None:
+        """Evict old shapes to make room for another graph."""
+        shapes, part = self._free[keep], self.model.budget // self.model.calls
+        for shape in list(shapes)[: -RETAINED_SHAPES[keep]]:
+            if sum(cached.graph.buffers.bytes for free in shapes.values() for cached in free) <= part:
+                break
+            del shapes[shape]
+
+    def adjoint(self, cached: CachedGraph, wanted: RequestedGrads) -> Any:
+        """The adjoint of a graph for the requested gradients, built on first use."""
+        graph, adjoints = cached
+        if is_capturing(self.model):
+            return self.new_adjoint(graph, self.new_shared(graph, wanted))
+        if wanted not in self._shared_adjoints:
+            self._shared_adjoints[wanted] = self.new_shared(graph, wanted)
+        if wanted not in adjoints:
+            adjoints[wanted] = self.new_adjoint(graph, self._shared_adjoints[wanted])
+        return adjoints[wanted]
+
+
+class Lease:
+    """Lease of a chunk graph; returned to the cache when no result references its buffers."""
+
+    def __init__(self, pool: GraphCache, chunk: Chunk, keep: bool):
+        self.cached, free = pool.take(chunk, keep)
+        if not is_capturing(pool.model):  # else it belongs to the graph that is being captured
+            weakref.finalize(self, _return_to_cache, weakref.ref(free), self.cached)

@@ -1,0 +1,68 @@
+"""Launches over the bricks and the nodes at rest."""
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.kernels.lagrangian.bricks import layers
+from softmpm.kernels.lagrangian.rest import rest
+from softmpm.kernels.structs import types
+from softmpm.model import Model
+from softmpm.schemes.buffers import view
+from softmpm.schemes.launch import KernelLauncher
+
+
+def rest_struct(model: Model) -> Any:
+    """Struct on the nodes, bricks and particles at rest."""
+
+    def make():
+        t, grid = types(model.spec.dim, model.spec.dtype), model.rest_grid
+        struct = rest(model.spec.dim, model.spec.dtype).Rest()
+        struct.nodes, struct.fraction = view(grid.nodes, t.ivec), view(grid.fraction, t.vec)
+        for name in ("shares", "window", "rows", "places", "corners", "order"):
+            setattr(struct, name, view(getattr(grid, name), wp.int32))
+        return struct
+
+    return model.workspace.get(rest_struct, make)
+
+
+def lattice_struct(model: Model) -> Any:
+    """Struct of the weights of a lattice."""
+
+    def make():
+        assert model.rest_grid.lattice is not None
+        lattice = layers(model.spec.dim, model.spec.dtype, model.rest_grid.bricks).Lattice()
+        f = torch.from_numpy(model.rest_grid.lattice.reshape(-1)).to(model.dtype)
+        square = (f - 1.0) ** 2 + 0.5 - 0.5  # as in kernels/physics/spline.py
+        outer = 0.125 + 0.5 * square
+        w = torch.stack([outer - 0.5 * (f - 1.0), 0.75 - square, outer + 0.5 * (f - 1.0)], -1)
+        e = w * (torch.arange(3) - f[:, None])
+        e[:, 1] = -(e[:, 0] + e[:, 2])  # their sum is zero to the last bit
+        lattice.w, lattice.e = w.flatten().tolist(), e.flatten().tolist()
+        return lattice
+
+    return model.workspace.get(lattice_struct, make)
+
+
+def brick_launch(model: Model, launch: KernelLauncher, kernel, *inputs, layered: bool = False) -> None:
+    """Launch a kernel of bricks: a block of threads for each on a GPU, one thread on the CPU."""
+    grid = model.rest_grid
+    threads = grid.bricks.layer_threads if layered else grid.bricks.threads
+    launch(kernel, (model.worlds, grid.brick_count, threads), *inputs, block_dim=threads)
+
+
+def node_launch(model: Model, launch: KernelLauncher, kernel, *inputs) -> None:
+    """Launch a kernel of nodes."""
+    launch(kernel, (model.worlds, model.rest_grid.count), *inputs, block_dim=NODE_BLOCK)
+
+
+NODE_BLOCK = 128
+"""Threads per block of kernels of nodes."""
+
+
+def empty_partial(model: Model) -> Tensor:
+    """Memory for the sums of all bricks for the nodes of their windows."""
+    grid = model.rest_grid
+    return torch.empty(model.worlds, grid.window.numel(), model.dim, dtype=model.dtype, device=model.device)

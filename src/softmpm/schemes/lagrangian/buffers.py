@@ -1,0 +1,161 @@
+"""Buffers of a chunk of the reference formulation, forward and adjoint."""
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.errors import FROZEN, NEVER
+from softmpm.kernels.structs import RequestedGrads, types
+from softmpm.model import Model
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.capture import is_capturing
+from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
+from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
+from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
+from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
+from softmpm.state import Nodal
+
+
+class ChunkBuffers:
+    """Everything that the launches of a chunk read and write.
+
+    Attributes:
+        u, v, anchor: Nodal states, one more than substeps if ``keep``, else two in turn.
+        p: Momenta of the nodes, one for each substep if ``keep``, else one.
+        mass: Masses of the nodes.
+        partial: Sums of the bricks for the nodes of their windows.
+        words: Status words, see errors.py; shape (world,).
+        inputs: Inputs, those of particles in the order of their places.
+        contact: Contact of surface points, or None.
+    """
+
+    def __init__(self, model: Model, chunk: Chunk, keep: bool):
+        self.model, self.chunk, self.keep = model, chunk, keep
+        self.types, self.rest = types(model.spec.dim, model.spec.dtype), rest_struct(model)
+        nodal = model.worlds, model.rest_grid.count, model.dim
+        stored, momenta = (chunk.length + 1, chunk.length) if keep else (2, 1)
+        self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
+        self.p, self.mass = self.tensor(momenta, *nodal), self.tensor(*nodal[:2])
+        self.anchor, self.partial = self.tensor(stored, *model.anchor_shape), empty_partial(model)
+        self.words = torch.empty(model.worlds, dtype=torch.int64, device=model.device)
+        self._loaded = False
+        order = model.rest_grid.order.expand(model.worlds, -1).contiguous()
+        self.order, self.inputs = order, SortedInputs(model, chunk, order)
+        vec, real = self.types.vec, self.types.real
+        self.u_arrays, self.v_arrays, self.p_arrays = (
+            [view(one, vec) for one in stored] for stored in (self.u, self.v, self.p)
+        )
+        self.mass_array, self.partial_array = view(self.mass, real), view(self.partial, vec)
+        self.placed_mass = view(self.inputs.values["mass"], real)
+        self.words_array = view(self.words, wp.int64)
+        self.contact = None
+        if model.surface is not None:
+            self.contact = SurfaceContact(model, self.mass, self.anchor)
+
+    def tensor(self, *shape: int) -> Tensor:
+        return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the buffers."""
+        return sum(one.nbytes for one in (self.u, self.v, self.p, self.mass, self.anchor, self.partial))
+
+    def index(self, s: int) -> int:
+        """Number of the state before substep ``s``."""
+        return s if self.keep else s % 2
+
+    def load(
+        self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Sequence[int]
+    ) -> None:
+        """Copy the initial state and the inputs of a chunk into the buffers."""
+        first = is_capturing(self.model) or not self._loaded
+        self._loaded = False
+        self.words.fill_(NEVER)
+        if frozen:
+            self.words[list(frozen)] = FROZEN
+        self.inputs.take(stream, chunk, values, first)
+        for own, given in zip((self.u, self.v, self.anchor), start, strict=True):
+            own[0].copy_(given.detach())
+        self._loaded = True
+
+    def end(self) -> Nodal:
+        """Copy of the final state: a result must not keep all states alive."""
+        last = self.index(self.chunk.length)
+        return Nodal(*(one[last].clone() for one in (self.u, self.v, self.anchor)))
+
+
+class SharedAdjoint:
+    """Buffers that a backward pass needs only while it runs; all chunks share them.
+
+    Attributes:
+        u, v, anchor: Adjoint of the state.
+        f: Adjoint of the forces on the nodes.
+        mass: Adjoint of the masses of the nodes.
+        partials: Sums of the bricks for the adjoints of displacements and velocities.
+    """
+
+    def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
+        self.model, self.wanted = buffers.model, wanted
+        self.u, self.v, self.anchor = (
+            torch.empty_like(one[0]) for one in (buffers.u, buffers.v, buffers.anchor)
+        )
+        self.f, self.mass = torch.empty_like(self.u), torch.empty_like(buffers.mass)
+        viscous = self.model.spec.viscosity
+        self.partials = [empty_partial(self.model)]
+        self.partials.append(empty_partial(self.model) if viscous else self.partials[0])
+        self.held = max(self.model.rest_grid.count, self.model.anchor_shape[2])
+        """Accumulators of each world for what acts on nodes or surface points."""
+        vec = buffers.types.vec
+        self.u_array, self.v_array, self.f_array = (view(one, vec) for one in (self.u, self.v, self.f))
+        self.mass_array = view(self.mass, buffers.types.real)
+        self.partial_arrays = [view(one, vec) for one in self.partials]
+        self._accumulators: dict[int, Accumulators] = {}
+
+    def accumulators(self, rows: int) -> Accumulators:
+        """Accumulators for chunks that touch this number of control steps, built on first use."""
+        if rows not in self._accumulators:
+            self._accumulators[rows] = Accumulators(self.model, self.wanted, rows, self.held)
+        return self._accumulators[rows]
+
+
+class ChunkAdjoint:
+    """Adjoint buffers of the chunks of one shape.
+
+    Attributes:
+        forward: Buffers with the stored states.
+        shared: Buffers that other chunks use as well.
+        found: Accumulated adjoints of the inputs, those of particles in the order of their places.
+    """
+
+    def __init__(self, forward: ChunkBuffers, shared: SharedAdjoint):
+        self.forward, self.shared, self.model = forward, shared, forward.model
+        chunk = forward.chunk
+        self.found = shared.accumulators(chunk.row(chunk.length - 1) + 1)
+        self._unsort = unsort(self.model, forward.order, self.found)
+        self.adj_placed_mass = None
+        if "mass" in self.found.tensors:
+            self.adj_placed_mass = view(self.found.tensors["mass"], forward.types.real)
+        self.contact = None
+        if forward.contact is not None:
+            given = shared.wanted, shared.held, shared.anchor, shared.mass_array
+            self.contact = SurfaceContactAdj(forward.contact, *given)
+
+    def load(self, adj_end: Nodal) -> None:
+        """Copy the adjoint of the final state into the buffers, and clear all sums."""
+        self.found.clear()
+        self.forward.words.fill_(NEVER)
+        clear(self.shared.mass)
+        if self.contact is not None:
+            self.contact.clear()
+        shared = self.shared
+        for own, given in zip((shared.u, shared.v, shared.anchor), adj_end, strict=True):
+            own.copy_(given)
+
+    def unload(self, stream: wp.Stream | None, chunk: Chunk, adj_inputs: InputsAdj) -> Nodal:
+        """Add the adjoints of the inputs into ``adj_inputs``; returns that of the initial state."""
+        adj_inputs.add(self.found, chunk.rows)
+        add_unsorted(stream, self._unsort, self.found, chunk.rows, adj_inputs)
+        return Nodal(*(one.clone() for one in (self.shared.u, self.shared.v, self.shared.anchor)))

@@ -1,0 +1,113 @@
+"""Launches of a chunk of the reference formulation, forward and adjoint, in their order."""
+
+from softmpm.kernels.lagrangian.cells import cells, cells_adj, lattice_cells, lattice_cells_adj
+from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
+from softmpm.kernels.lagrangian.projection import masses
+from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node_launch
+from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
+from softmpm.schemes.lagrangian.nodal import launch_masses
+from softmpm.schemes.launch import KernelLauncher
+
+
+def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
+    """Advance the first state by all substeps of the chunk, then check the last one."""
+    model = buffers.model
+    masses = buffers.placed_mass, buffers.partial_array, buffers.mass_array
+    launch_masses(model, launch, buffers.rest, *masses)
+    if buffers.contact is not None:
+        buffers.contact.begin(launch)
+    for s in range(buffers.chunk.length):
+        _forces(buffers, s, launch)
+        _advance(buffers, s, launch)
+    last = buffers.chunk.length
+    kernel, u = cells(model.spec, model.rest_grid.bricks).check_end, buffers.u_arrays[buffers.index(last)]
+    brick_launch(model, launch, kernel, model.constants, buffers.rest, last - 1, u, buffers.words_array)
+
+
+def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
+    """Internal and external forces of substep ``s`` on the nodes of each brick."""
+    model, now = buffers.model, buffers.index(s)
+    inputs, bricks = buffers.inputs.particle_struct(s, s), model.rest_grid.bricks
+    state = buffers.u_arrays[now], buffers.v_arrays[now]
+    arguments = (s, *state, buffers.words_array, buffers.partial_array)
+    if bricks.lattice:
+        parameters = (model.constants, inputs, buffers.rest, lattice_struct(model))
+        kernel = lattice_cells(model.spec, bricks).forces
+        brick_launch(model, launch, kernel, *parameters, *arguments, layered=True)
+    else:
+        kernel = cells(model.spec, bricks).forces
+        brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
+
+
+def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
+    """Motion of the nodes in substep ``s``, with contact."""
+    model, now, then = buffers.model, buffers.index(s), buffers.index(s + 1)
+    inputs, contact = buffers.inputs.grid_struct(s), buffers.contact
+    state = buffers.u_arrays[now], buffers.v_arrays[now]
+    new = buffers.u_arrays[then], buffers.v_arrays[then]
+    p = buffers.p_arrays[s if buffers.keep else 0]
+    velocity = new[1] if contact is None else contact.free
+    sums = buffers.mass_array, buffers.partial_array, buffers.words_array
+    arguments = (model.constants, inputs, buffers.rest, *sums, *state, p, new[0], velocity)
+    node_launch(model, launch, nodes(model.spec).advance, *arguments)
+    if contact is not None:
+        contact.advance(launch, inputs, buffers.words_array, now, then, *state, *new)
+
+
+def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
+    """Turn the adjoint of the final state into that of the initial state, and accumulate those of the inputs."""
+    forward, shared = adjoint.forward, adjoint.shared
+    model, chunk = forward.model, forward.chunk
+    for s in reversed(range(chunk.length)):
+        _advance_adj(adjoint, s, launch)
+        _forces_adj(adjoint, s, launch)
+        if s == 0 or chunk.row(s) != chunk.row(s - 1):
+            adjoint.found.collect(chunk.row(s), forward.inputs.values, launch)
+    if adjoint.contact is not None:
+        adjoint.contact.finish(launch)
+    if adjoint.adj_placed_mass is not None:
+        kernel = masses(model.spec.dim, model.spec.dtype, model.rest_grid.bricks).masses_adj
+        brick_launch(model, launch, kernel, forward.rest, shared.mass_array, adjoint.adj_placed_mass)
+
+
+def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
+    """Adjoint of the motion of the nodes in substep ``s``."""
+    forward, shared = adjoint.forward, adjoint.shared
+    model, row = forward.model, forward.chunk.row(s)
+    inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(row)
+    u, v, p = forward.u_arrays[s], forward.v_arrays[s], forward.p_arrays[s]
+    if adjoint.contact is not None:
+        stored = u, p, forward.v_arrays[s + 1]
+        structs = inputs, adj_inputs, forward.rest
+        adjoint.contact.advance(launch, s, *structs, *stored, shared.u_array, shared.v_array)
+    parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held)
+    out = (shared.u_array, shared.v_array, shared.f_array, shared.mass_array, adj_inputs)
+    kernel = nodes_adj(model.spec, shared.wanted).advance_adj
+    node_launch(model, launch, kernel, *parameters, u, v, p, *out)
+
+
+def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
+    """Adjoint of the forces of substep ``s``."""
+    forward, shared = adjoint.forward, adjoint.shared
+    model, row = forward.model, forward.chunk.row(s)
+    inputs, adj_inputs = forward.inputs.particle_struct(s, s), adjoint.found.particle_struct(row, row)
+    parameters, bricks = (model.constants, inputs, forward.rest), model.rest_grid.bricks
+    state = (forward.u_arrays[s], forward.v_arrays[s], shared.f_array)
+    arguments = (
+        forward.chunk.length - 1 - s,
+        *state,
+        forward.words_array,
+        adj_inputs,
+        *shared.partial_arrays,
+    )
+    if bricks.lattice:
+        kernel, lattice = (
+            lattice_cells_adj(model.spec, shared.wanted, bricks).forces_adj,
+            lattice_struct(model),
+        )
+        brick_launch(model, launch, kernel, *parameters, lattice, *arguments, layered=True)
+    else:
+        kernel = cells_adj(model.spec, shared.wanted, bricks).forces_adj
+        brick_launch(model, launch, kernel, *parameters, *arguments)
+    kernel = nodes_adj(model.spec, shared.wanted).gather_adj
+    node_launch(model, launch, kernel, forward.rest, *shared.partial_arrays, shared.u_array, shared.v_array)

@@ -1,0 +1,189 @@
+"""The two representations of a state in the reference formulation: nodes, and the particles that show them. Differentiable.
+
+Equations: kernels/lagrangian/projection.py.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from softmpm.kernels.lagrangian.projection import masses, node_sums, projection
+from softmpm.kernels.structs import types
+from softmpm.model import Model
+from softmpm.schemes.buffers import view
+from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
+from softmpm.schemes.launch import KernelLauncher
+from softmpm.state import Nodal, State
+
+
+def particles_of(model: Model, nodes: Nodal) -> State:
+    """What the particles show of a nodal state (Q5), which the result carries along."""
+    shown: Any = _Show.apply(model, nodes.u, nodes.v)
+    return State(*shown, nodes=nodes)
+
+
+def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
+    """Nodal state from the four fields of the particles (Q6).
+
+    Args:
+        mass: Mass of the particles in any unit, shape (world, particle).
+    """
+    moved = state.x - model.positions
+    moved = moved if state.low is None else moved + (state.low.x - model.rest_low)
+    placed = mass.index_select(1, model.rest_grid.order)
+    found: Any = _Project.apply(model, moved, state.v, state.C, state.F, placed)
+    u, v = found
+    return Nodal(u, v, _anchors(model, u))
+
+
+class _Arrays:
+    """Warp arrays on tensors, and launches, of one model."""
+
+    def __init__(self, model: Model):
+        self.model, self.types = model, types(model.spec.dim, model.spec.dtype)
+        self.rest, self.launch = rest_struct(model), KernelLauncher(model, stream_of(model.device))
+        self.kernels = projection(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
+        self.sums = node_sums(model.spec.dim, model.spec.dtype)
+
+    def particles(self) -> list[Tensor]:
+        """Tensors for the four fields of a state."""
+        lead, d, device = (self.model.worlds, self.model.particle_count), self.model.dim, self.model.device
+        return [
+            torch.empty(*lead, *tail, dtype=self.model.dtype, device=device)
+            for tail in ((d,), (d,), (d, d), (d, d))
+        ]
+
+    def nodal(self) -> list[Tensor]:
+        """Tensors for displacements and velocities of the nodes."""
+        shape = self.model.worlds, self.model.rest_grid.count, self.model.dim
+        return [torch.empty(shape, dtype=self.model.dtype, device=self.model.device) for _ in range(2)]
+
+    def partials(self) -> list[wp.array]:
+        return [view(empty_partial(self.model), self.types.vec) for _ in range(2)]
+
+    def views(self, *tensors: Tensor) -> list[wp.array]:
+        """Scalars, vectors or matrices, by the number of axes."""
+        kinds = {2: self.types.real, 3: self.types.vec, 4: self.types.mat}
+        return [view(tensor.contiguous(), kinds[tensor.ndim]) for tensor in tensors]
+
+    def node_masses(self, mass: Tensor) -> Tensor:
+        """Masses of the nodes, from those of the places."""
+        out = torch.empty(self.model.worlds, self.model.rest_grid.count, dtype=mass.dtype, device=mass.device)
+        launch_masses(
+            self.model, self.launch, self.rest, *self.views(mass), self.partials()[0], *self.views(out)
+        )
+        return out
+
+
+def launch_masses(
+    model: Model, launch: KernelLauncher, rest: Any, mass: wp.array, partial: wp.array, out: wp.array
+):
+    """Launch (Q2)."""
+    kernels = masses(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
+    brick_launch(model, launch, kernels.bricks_of_masses, rest, mass, partial)
+    node_launch(model, launch, node_sums(model.spec.dim, model.spec.dtype).mass, rest, partial, out)
+
+
+class _Show(torch.autograd.Function):
+    """(Q5)"""
+
+    @staticmethod
+    def forward(ctx, model: Model, u: Tensor, v: Tensor):
+        found = _show(model, u, v)
+        ctx.model = model
+        ctx.save_for_backward(*found[2:])
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *adj):
+        return (None, *_show_adj(ctx.model, *ctx.saved_tensors, *adj))
+
+
+@on_its_gpu
+def _show(model: Model, u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
+    one = _Arrays(model)
+    found = one.particles()
+    rest_x = view(model.positions, one.types.vec)
+    arguments = (model.constants, one.rest, rest_x, *one.views(u, v, *found))
+    brick_launch(model, one.launch, one.kernels.show, *arguments)
+    return tuple(found)
+
+
+@on_its_gpu
+def _show_adj(model: Model, C: Tensor, F: Tensor, *adj: Tensor) -> list[Tensor]:
+    one = _Arrays(model)
+    partials, found = one.partials(), one.nodal()
+    brick_launch(
+        model, one.launch, one.kernels.show_adj, model.constants, one.rest, *one.views(C, F, *adj), *partials
+    )
+    node_launch(model, one.launch, one.sums.fields, one.rest, *partials, *one.views(*found))
+    return found
+
+
+class _Project(torch.autograd.Function):
+    """(Q6)"""
+
+    @staticmethod
+    def forward(ctx, model: Model, moved: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor):
+        node_mass, nodal_u, nodal_v = _project(model, moved, v, C, F, mass)
+        ctx.model = model
+        ctx.save_for_backward(moved, v, C, F, mass, node_mass, nodal_u, nodal_v)
+        return nodal_u, nodal_v
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *adj):
+        return (None, *_project_adj(ctx.model, *ctx.saved_tensors, *adj))
+
+
+@on_its_gpu
+def _project(model: Model, moved: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor) -> list[Tensor]:
+    one = _Arrays(model)
+    partials, found, node_mass = one.partials(), one.nodal(), one.node_masses(mass)
+    given = one.views(mass, moved, v, C, F)
+    brick_launch(model, one.launch, one.kernels.project, model.constants, one.rest, *given, *partials)
+    arguments = (one.rest, *one.views(node_mass), *partials, *one.views(*found))
+    node_launch(model, one.launch, one.sums.means, *arguments)
+    return [node_mass, *found]
+
+
+@on_its_gpu
+def _project_adj(
+    model: Model,
+    moved: Tensor,
+    v: Tensor,
+    C: Tensor,
+    F: Tensor,
+    mass: Tensor,
+    node_mass: Tensor,
+    nodal_u: Tensor,
+    nodal_v: Tensor,
+    adj_u: Tensor,
+    adj_v: Tensor,
+) -> list[Tensor]:
+    one = _Arrays(model)
+    each, adj_node_mass = [adj_u.clone(), adj_v.clone()], torch.empty_like(node_mass)
+    arguments = one.views(node_mass, nodal_u, nodal_v, *each, adj_node_mass)
+    node_launch(model, one.launch, one.sums.means_adj, *arguments)
+    found, adj_mass = one.particles(), torch.zeros_like(mass)
+    arguments = one.views(mass, moved, v, C, F, *each, *found, adj_mass)
+    brick_launch(model, one.launch, one.kernels.project_adj, model.constants, one.rest, *arguments)
+    kernels = masses(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
+    brick_launch(model, one.launch, kernels.masses_adj, one.rest, *one.views(adj_node_mass, adj_mass))
+    return [*found, adj_mass]
+
+
+def _anchors(model: Model, u: Tensor) -> Tensor:
+    """Anchors of surface points that touch nothing yet: their places across the normal of each separating wall."""
+    surface = model.surface
+    if surface is None:
+        return u.new_zeros(model.anchor_shape)
+    near = u[:, surface.stencil.long()]
+    x = surface.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, surface.weights.to(u.dtype))
+    normals = surface.normals.to(u.dtype)
+    return x[:, None] - torch.einsum("wpd,kd->wkp", x, normals)[..., None] * normals[:, None]

@@ -1,0 +1,148 @@
+"""The scheme of the reference formulation: chunks of substeps on the nodes at rest, any precision, any device."""
+
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from softmpm.errors import NEVER
+from softmpm.kernels.lagrangian.cells import cells
+from softmpm.kernels.structs import RequestedGrads, types
+from softmpm.model import Model
+from softmpm.planning.chunks import Chunk
+from softmpm.planning.memory import Footprint
+from softmpm.schemes.buffers import view
+from softmpm.schemes.device import stream_of
+from softmpm.schemes.graph_cache import GraphCache, Lease
+from softmpm.schemes.inputs import InputsAdj, Values
+from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
+from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers, SharedAdjoint
+from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
+from softmpm.schemes.lagrangian.launches import launch_chunk, launch_chunk_adj
+from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
+from softmpm.schemes.launch import KernelLauncher, LaunchReplay
+from softmpm.state import Nodal, State
+
+
+class ChunkGraph:
+    """Captured launches of the chunks of one shape."""
+
+    def __init__(self, model: Model, chunk: Chunk, keep: bool):
+        self.buffers = ChunkBuffers(model, chunk, keep)
+        self._replay = LaunchReplay(model)
+
+    def run(self, stream: wp.Stream | None) -> None:
+        """Launch all substeps on what the buffers hold."""
+        self._replay.run(stream, lambda launch: launch_chunk(self.buffers, launch))
+
+
+class ChunkGraphAdj:
+    """Captured adjoint launches of the chunks whose states a chunk graph stores."""
+
+    def __init__(self, graph: ChunkGraph, shared: SharedAdjoint):
+        self.buffers = ChunkAdjoint(graph.buffers, shared)
+        self._replay = LaunchReplay(graph.buffers.model)
+
+    def run(self, stream: wp.Stream | None) -> None:
+        """Turn the adjoint of the final state in the buffers into that of the initial state."""
+        self._replay.run(stream, lambda launch: launch_chunk_adj(self.buffers, launch))
+
+
+class LagrangianGraphs(GraphCache):
+    """Chunk graphs of one model."""
+
+    def new_graph(self, chunk: Chunk, keep: bool) -> ChunkGraph:
+        return ChunkGraph(self.model, chunk, keep)
+
+    def new_shared(self, graph: ChunkGraph, wanted: RequestedGrads) -> SharedAdjoint:
+        return SharedAdjoint(graph.buffers, wanted)
+
+    def new_adjoint(self, graph: ChunkGraph, shared: SharedAdjoint) -> ChunkGraphAdj:
+        return ChunkGraphAdj(graph, shared)
+
+
+class LagrangianRun:
+    """One chunk that was launched.
+
+    Attributes:
+        start, end: Nodal state before and after it; the end is passed on once the run is kept.
+        words: Status words, see errors.py; shape (world,).
+        outgrow: None, since nodes do not leave the grid at rest.
+    """
+
+    outgrow: Callable[[], None] | None = None
+
+    def __init__(
+        self,
+        pool: LagrangianGraphs,
+        chunk: Chunk,
+        start: Nodal,
+        values: Values,
+        keep: bool,
+        frozen: Sequence[int] = (),
+    ):
+        self.pool, self.chunk, self.start = pool, chunk, start
+        self._lease = Lease(pool, chunk, keep)
+        graph, stream = self._lease.cached.graph, stream_of(pool.model.device)
+        graph.buffers.load(stream, chunk, start, values, frozen)
+        graph.run(stream)
+        self.end, self.words = graph.buffers.end(), graph.buffers.words
+
+    def vjp(self, adj_end: Nodal, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Nodal:
+        """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
+        with self.pool.lock:
+            adjoint = self.pool.adjoint(self._lease.cached, wanted)
+            adjoint.buffers.load(adj_end)
+            stream = stream_of(self.pool.model.device)
+            adjoint.run(stream)
+            return adjoint.buffers.unload(stream, self.chunk, adj_inputs)
+
+
+class Lagrangian:
+    """See :class:`softmpm.schemes.scheme.Scheme`. Its states are nodal. Each thread and stream has its own, since its buffers serve one
+    run at a time.
+    """
+
+    footprint: ClassVar[Footprint] = LagrangianFootprint()
+
+    @classmethod
+    def of(cls, model: Model) -> "Lagrangian":
+        """The scheme of this stream, cached in the model's workspace; it refers to the model weakly, to avoid a cycle."""
+        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
+        return model.workspace.get((cls, stream), lambda: cls(weakref.proxy(model)))
+
+    def __init__(self, model: Model):
+        self.model, self._pool = model, LagrangianGraphs(model)
+
+    def run(
+        self, chunk: Chunk, start: Nodal, values: Values, keep: bool, frozen: Sequence[int] = ()
+    ) -> LagrangianRun:
+        return LagrangianRun(self._pool, chunk, start, values, keep, frozen)
+
+    def check_start(self, start: Nodal, values: Values) -> Tensor:
+        model = self.model
+        words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+        u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
+        arguments = (model.constants, rest_struct(model), 0, u, view(words, wp.int64))
+        kernel = cells(model.spec, model.rest_grid.bricks).check_end
+        brick_launch(model, KernelLauncher(model, stream_of(model.device)), kernel, *arguments)
+        return words
+
+    def accept(self, run: LagrangianRun, words: list[int]) -> bool:
+        return True
+
+    def checkpoint(self, state: Nodal) -> Nodal:
+        return state
+
+    def rest(self) -> Nodal:
+        model = self.model
+        return nodes_of(model, model.rest(), model.mass.expand(model.worlds, -1))
+
+    def to_user(self, state: Nodal) -> Nodal:
+        return state
+
+    def particles(self, state: Any) -> State:
+        return particles_of(self.model, state)
