@@ -19,6 +19,7 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.rest_step import rest_step
 from softmpm.kernels.physics.stress import total_stress, total_stress_adj
 from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
@@ -36,7 +37,8 @@ def cells(spec: Spec) -> SimpleNamespace:
     )
     weights, weight, offset, slope = r.weights, r.weight, r.offset, r.slope
     viscous, forced, largest = spec.viscosity, "force" in spec.given, 1.0e12
-    collapsed, not_finite = int(Kind.COLLAPSED), int(Kind.NOT_FINITE)
+    collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
+    step_is_stable = rest_step(spec).step_is_stable
     module = lagrangian_module(spec.module + ".lagrangian")
     table = wp.types.matrix((3, dim), real)
 
@@ -70,6 +72,21 @@ def cells(spec: Spec) -> SimpleNamespace:
                 kind = not_finite
             report(words, world, substep, kind, p)
 
+    @wp.func
+    def check_step(
+        constants: Constants,
+        inputs: ParticleInputs,
+        words: wp.array(dtype=wp.int64),
+        world: int,
+        p: int,
+        substep: int,
+        H: mat,
+    ):
+        """Report a particle for which Δt is too long in the substep that begins with this H."""
+        if wp.isfinite(constants.step):  # else the alarm is off
+            if not step_is_stable(constants, inputs, world, p, H):
+                report(words, world, substep, too_long, p)
+
     @wp.kernel(module=module, enable_backward=False)
     def forces(
         # Parameters:
@@ -93,6 +110,7 @@ def cells(spec: Spec) -> SimpleNamespace:
             H = gradient(u, world, inside, c, w, fx, constants.rate)  # (Q1)
             if substep > 0:
                 check(constants, words, world, p, substep - 1, H)
+            check_step(constants, inputs, words, world, p, substep, H)
             inverse = wp.inverse(identity() + H)
             L = mat()
             if wp.static(viscous):
@@ -124,14 +142,36 @@ def cells(spec: Spec) -> SimpleNamespace:
         # Out:
         words: wp.array(dtype=wp.int64),
     ):
-        """Check a state that no forces are computed of: the final one of a chunk, or the initial one of a call."""
+        """Check the final state of a chunk, of which no forces are computed."""
         world, c = wp.tid()
         for at in range(inside.first[c], inside.first[c + 1]):
             fx = inside.fraction[at]
             H = gradient(u, world, inside, c, weights(fx), fx, constants.rate)
             check(constants, words, world, inside.particles[at], substep, H)
 
-    return SimpleNamespace(forces=forces, check_end=check_end, gradient=gradient, piola=piola)
+    @wp.kernel(module=module, enable_backward=False)
+    def check_start(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        # In:
+        u: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+    ):
+        """Check the initial state of a call."""
+        world, c = wp.tid()
+        for at in range(inside.first[c], inside.first[c + 1]):
+            p = inside.particles[at]
+            fx = inside.fraction[at]
+            H = gradient(u, world, inside, c, weights(fx), fx, constants.rate)
+            check(constants, words, world, p, 0, H)
+            check_step(constants, inputs, words, world, p, 0, H)
+
+    return SimpleNamespace(
+        forces=forces, check_end=check_end, check_start=check_start, gradient=gradient, piola=piola
+    )
 
 
 @kernel_factory

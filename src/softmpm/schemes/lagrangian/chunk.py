@@ -19,7 +19,14 @@ from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, grid_struct, particle_struct
+from softmpm.schemes.inputs import (
+    Accumulators,
+    InputsAdj,
+    Values,
+    grid_struct,
+    particle_struct,
+    stiffest,
+)
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.state import Nodal, State
@@ -203,9 +210,10 @@ class Lagrangian:
         model = self.model
         words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
-        arguments = (model.constants, rest_struct(model), 0, u, view(words, wp.int64))
+        inputs = particle_struct(model, model.fixed | stiffest(model, values))
+        arguments = (model.constants, inputs, rest_struct(model), u, view(words, wp.int64))
         lead = (model.worlds, model.rest_grid.cell_count)
-        kernel = cells(model.spec).check_end
+        kernel = cells(model.spec).check_start
         launch(kernel, lead, arguments, device=model.wp_device, stream=stream_of(model.device))
         return words
 
