@@ -1,12 +1,14 @@
 """The two representations of a state in the reference formulation: nodes, and the particles that show them. Differentiable.
 
-    x = X + Σ N_i u_i,  v = Σ N_i v_i,  F = I + Σ u_i ⊗ g_i,  C = Ḟ F⁻¹ with Ḟ = Σ v_i ⊗ g_i          (Q5)
-    u_i = Σ m_p N_i (x_p − X_p + (F_p − I)(X_i − X_p)) / m_i                                         (Q6)
+    x = X + shift + Σ N_i u_i,  v = Σ N_i v_i,  F = I + Σ u_i ⊗ g_i,  C = Ḟ F⁻¹ with Ḟ = Σ v_i ⊗ g_i          (Q5)
+    u_i = Σ m_p N_i (x_p − X_p − shift + (F_p − I)(X_i − X_p)) / m_i                                 (Q6)
     v_i = Σ m_p N_i (v_p + C_p F_p (X_i − X_p)) / m_i
 
-(Q6) is exact for affine fields; what else particles hold is smoothed, as by P2G (APIC, Jiang et al. 2015). Derivation:
-docs/math/lagrangian.md.
+(Q6) is exact for affine fields; what else particles hold is smoothed, as by P2G (APIC, Jiang et al. 2015). The shift is a constant of
+the derivatives. Derivation: docs/math/lagrangian.md.
 """
+
+import math
 
 import torch
 from torch import Tensor
@@ -20,8 +22,10 @@ def particles_of(model: Model, nodes: Nodal) -> State:
     grid = model.rest_grid
     weights, slopes = grid.weights.to(model.dtype), grid.slopes.to(model.dtype)
     u, v = (field[:, grid.stencil] for field in nodes[:2])  # (world, particle, node, dim)
+    shift = shift_of(model, nodes)[:, None]
     eye = torch.eye(model.dim, dtype=model.dtype, device=model.device)
-    x = model.positions + torch.einsum("wpnd,pn->wpd", u, weights)
+    way = torch.einsum("wpnd,pn->wpd", u, weights)
+    x = (model.positions.double() + shift + way.double()).to(model.dtype)
     F = eye + torch.einsum("wpnd,pne->wpde", u, slopes)
     rate = torch.einsum("wpnd,pne->wpde", v, slopes)
     return State(x, torch.einsum("wpnd,pn->wpd", v, weights), rate @ inverse(F), F, nodes=nodes)
@@ -48,14 +52,29 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     share = mass[..., None] * grid.weights.to(model.dtype)  # (world, particle, node)
     arms = grid.arms.to(model.dtype)
     eye = torch.eye(model.dim, dtype=model.dtype, device=model.device)
-    moved = state.x - model.positions
-    moved = moved if state.low is None else moved + (state.low.x - model.rest_low)
+    moved = state.x.double() - model.positions.double()
+    moved = moved if state.low is None else moved + (state.low.x.double() - model.rest_low.double())
+    mean, step = moved.detach().mean(1), quantum(model)
+    shift = torch.where(mean.abs() > step, step * (mean / step).round(), 0.0)
+    moved = (moved - shift[:, None]).to(model.dtype)
     u = moved[:, :, None] + torch.einsum("wpde,pne->wpnd", state.F - eye, arms)
     v = state.v[:, :, None] + torch.einsum("wpde,pne->wpnd", state.C @ state.F, arms)
     total = _added(grid, share[..., None])
     total = torch.where(total > 0, total, 1.0)  # a node at the very edge of a spline has no mass
     u, v = (_added(grid, share[..., None] * field) / total for field in (u, v))
-    return Nodal(u, v, _anchors(model, u))
+    return Nodal(u, v, _anchors(model, u), shift)
+
+
+def quantum(model: Model) -> float:
+    """Of the shift [m]: the power of two from a cell on, so that u changes without rounding."""
+    return 2.0 ** math.ceil(math.log2(model.scene.grid.spacing))
+
+
+def shift_of(model: Model, nodes: Nodal) -> Tensor:
+    """Shift of a nodal state, zero if it has none."""
+    if nodes.shift is not None:
+        return nodes.shift
+    return torch.zeros(model.worlds, model.dim, dtype=torch.float64, device=model.device)
 
 
 def _anchors(model: Model, u: Tensor) -> Tensor:

@@ -30,6 +30,7 @@ class RestGrid:
         weights: N_i(X_p), shape (particle, 3^dim), float64.
         arms: X_i − X_p [m], shape (particle, 3^dim, dim), float64.
         slopes: g_ip [1/m], of the same shape.
+        middle: A node with many particles near the middle of them all.
     """
 
     def __init__(self, scene: Scene, device: torch.device):
@@ -62,6 +63,10 @@ class RestGrid:
         self.members = numbers_of(grouped(numbers[of].reshape(-1), len(index)))
         self.arms = numbers_of((offsets - f[:, None]) * grid.spacing)
         self.slopes = 4.0 / grid.spacing**2 * self.weights[..., None] * self.arms
+        share = np.bincount(numbers[of].reshape(-1), weights.reshape(-1), minlength=len(index))
+        nodes = np.stack(np.unravel_index(index, grid.shape), axis=-1) * grid.spacing
+        away = np.linalg.norm(nodes - positions.mean(axis=0), axis=1)
+        self.middle = int(np.where(share > 0.5 * share.max(), away, np.inf).argmin())
 
 
 def stencils(places: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
     m_i = Σ m_p N_i                                                                                  (Q2)
     v* = exp(−γ Δt) (p/m + Δt g),  p = m v + Δt f                                                    (Q3)
-    v' = W(v*) at X + u,  u' = u + Δt v'                                                             (Q4)
+    v' = W(v*) at X + shift + u,  u' = u − d + Δt v'                                                 (Q4), (Q9)
     v̄' += Δt ū'                                                                                      (Q4.adj)
     p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
     m̄_p += Σ N_i m̄_i                                                                                 (Q2.adj)
@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
@@ -26,19 +27,17 @@ def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
     exact_vec, ParticleInputs = types(spec.dim, "float64").vec, input_types(spec).ParticleInputs
-    GridInputs, dim = input_types(spec).GridInputs, spec.dim
+    GridInputs = input_types(spec).GridInputs
     position, node_velocity = g.position, g.node_velocity
-    running = status.report(spec.dim, spec.dtype).running
+    f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
+    Frame, recentring, exact = f.Frame, f.recentring, f.exact
     weights, weight, offset, surface = r.weights, r.weight, r.offset, bool(spec.surface_walls)
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
-    def place(constants: Constants, inside: Rest, i: int, u: vec) -> exact_vec:
-        """Present position X_i + u_i of a node [m]."""
-        x = position(constants, inside.nodes[i])
-        for axis in range(dim):
-            x[axis] = x[axis] + wp.float64(u[axis])
-        return x
+    def place(constants: Constants, inside: Rest, i: int, shift: exact_vec, u: vec) -> exact_vec:
+        """Present position of a node [m]."""
+        return position(constants, inside.nodes[i]) + shift + exact(u)
 
     @wp.func
     def gathered(partial: wp.array3d(dtype=vec), inside: Rest, world: int, i: int) -> vec:
@@ -69,14 +68,17 @@ def nodes(spec: Spec) -> SimpleNamespace:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
+        body: Frame,
         mass: wp.array2d(dtype=real),
         partial: wp.array3d(dtype=vec),
         words: wp.array(dtype=wp.int64),
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         # Out:
         p: wp.array2d(dtype=vec),
+        new_shift: wp.array(dtype=exact_vec),
         new_u: wp.array2d(dtype=vec),
         new_v: wp.array2d(dtype=vec),
     ):
@@ -84,12 +86,17 @@ def nodes(spec: Spec) -> SimpleNamespace:
         world, i = wp.tid()
         here = u[world, i]
         new = v[world, i]
+        d = vec()
         if running(words, world):
+            d = recentring(body, u, world)
             m = mass[world, i]
             momentum = m * new + constants.dt * gathered(partial, inside, world, i)  # (Q3)
             p[world, i] = momentum
-            new = node_velocity(constants, inputs, world, place(constants, inside, i, here), momentum, m)
-            here += constants.dt * new  # (Q4)
+            x = place(constants, inside, i, shift[world], here)
+            new = node_velocity(constants, inputs, world, x, momentum, m)
+            here = (here - d) + constants.dt * new  # (Q4)
+        if i == 0:
+            new_shift[world] = shift[world] + exact(d)
         if wp.static(not surface):
             new_u[world, i] = here
         new_v[world, i] = new
@@ -104,7 +111,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
-    gathered, place = one.gathered, one.place
+    gathered, place, exact_vec = one.gathered, one.place, types(spec.dim, "float64").vec
     weights, weight, offset = r.weights, r.weight, r.offset
     viscous, surface = spec.viscosity, bool(spec.surface_walls)
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
@@ -118,6 +125,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         mass: wp.array2d(dtype=real),
         held: int,  # accumulators of one world
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         p: wp.array2d(dtype=vec),
@@ -133,7 +141,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         """(Q4.adj), (Q3.adj)"""
         world, i = wp.tid()
         m = mass[world, i]
-        here = place(constants, inside, i, u[world, i])
+        here = place(constants, inside, i, shift[world], u[world, i])
         adj_new = adj_v[world, i]
         if wp.static(not surface):  # else done already
             adj_new += constants.dt * adj_u[world, i]

@@ -14,7 +14,7 @@ from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
-from softmpm.nodal import nodes_of, particles_of
+from softmpm.nodal import nodes_of, particles_of, shift_of
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
@@ -28,7 +28,7 @@ from softmpm.schemes.inputs import (
     stiffest,
 )
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
-from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
+from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj, frame_struct
 from softmpm.state import Nodal, State
 
 
@@ -63,7 +63,7 @@ class LagrangianRun:
         self.model, self.chunk, self.start = model, chunk, start
         self.types, self.stream = types(model.spec.dim, model.spec.dtype), stream_of(model.device)
         self._values = model.fixed | values  # the structs only see their tensors
-        self._rest = rest_struct(model)
+        self._rest, self._frame = rest_struct(model), frame_struct(model)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         self.words_array = view(self.words, wp.int64)
         self.outgrow: Callable[[], None] | None = None
@@ -76,18 +76,23 @@ class LagrangianRun:
         stored = chunk.length if keep else 1
         self._u, self._v, self._p = self._nodal(stored + 1), self._nodal(stored + 1), self._nodal(stored)
         self._anchor = self._tensor(stored + 1, *model.anchor_shape)
-        for own, given in zip((self._u, self._v, self._anchor), start, strict=True):
+        self._shift = torch.empty(
+            stored + 1, model.worlds, model.dim, dtype=torch.float64, device=model.device
+        )
+        given_states = (*start[:3], shift_of(model, start))
+        for own, given in zip((self._u, self._v, self._anchor, self._shift), given_states, strict=True):
             own[0].copy_(given.detach())
         self._partial = self._cells()
         self._contact = None
         if model.surface is not None:
-            self._contact = SurfaceContact(model, self._mass, self._anchor, self._launch)
+            self._contact = SurfaceContact(model, self._mass, self._anchor, self._shift, self._launch)
         for s in range(chunk.length):
             self._use_inputs(s, s - 1)
             self._advance(s, keep)
         last = chunk.length if keep else chunk.length % 2
         # A result must not keep all states alive:
-        self.end = Nodal(*(tensor[last].clone() for tensor in (self._u, self._v, self._anchor)))
+        stored_states = (self._u, self._v, self._anchor, self._shift)
+        self.end = Nodal(*(tensor[last].clone() for tensor in stored_states))
         arguments = (model.constants, self._rest, chunk.length - 1, self._array(self.end.u))
         kernel, lead = cells(model.spec).check_end, self._partial.shape[:2]
         self._launch(kernel, lead, *arguments, self.words_array)
@@ -105,6 +110,9 @@ class LagrangianRun:
 
     def _array(self, tensor: Tensor) -> wp.array:
         return view(tensor, self.types.real if tensor is self._mass else self.types.vec)
+
+    def _shift_array(self, s: int) -> wp.array:
+        return view(self._shift[s], types(self.model.spec.dim, "float64").vec)
 
     def _launch(self, kernel, dim: Sequence[int], *inputs) -> None:
         launch(kernel, tuple(dim), inputs, device=self.model.wp_device, stream=self.stream)
@@ -124,9 +132,16 @@ class LagrangianRun:
         parameters = (model.constants, self._particle_inputs, self._rest, s)
         kernel = cells(model.spec).forces
         self._launch(kernel, self._partial.shape[:2], *parameters, u, v, self.words_array, partial)
-        state = (u, v, self._array(self._p[s if keep else 0]))
+        state = (
+            self._shift_array(now),
+            u,
+            v,
+            self._array(self._p[s if keep else 0]),
+            self._shift_array(then),
+        )
         new = self._array(self._u[then]), self._array(self._v[then])
-        parameters = (model.constants, self._grid_inputs, self._rest, self._array(self._mass), partial)
+        parameters = (model.constants, self._grid_inputs, self._rest, self._frame)
+        parameters = (*parameters, self._array(self._mass), partial)
         kernel = nodes(model.spec).advance
         velocity = new[1] if self._contact is None else self._contact.free
         self._launch(kernel, self._mass.shape, *parameters, self.words_array, *state, new[0], velocity)
@@ -139,7 +154,7 @@ class LagrangianRun:
         self.words.fill_(NEVER)
         rows = chunk.row(chunk.length - 1) + 1
         found = Accumulators(model, wanted, rows, self._held)
-        adj = Nodal(*(tensor.clone() for tensor in adj_end))
+        adj = adj_end.clone()
         adj_mass = torch.zeros_like(self._mass)
         adj_f, partial_v = self._nodal(), self._partial
         if model.spec.viscosity:
@@ -181,7 +196,7 @@ class LagrangianRun:
         u, v, p = (self._array(tensor[s]) for tensor in (self._u, self._v, self._p))
         out = (adj_u, adj_v, adj_f, adj_mass, found.grid_struct(row))
         kernel, lead = nodes_adj(spec, wanted), self._mass.shape
-        self._launch(kernel.advance_adj, lead, *parameters, u, v, p, *out)
+        self._launch(kernel.advance_adj, lead, *parameters, self._shift_array(s), u, v, p, *out)
         parameters = (model.constants, self._particle_inputs, self._rest, self.chunk.length - 1 - s)
         out = (self.words_array, found.particle_struct(row, row), partial_u, partial_v)
         forces_adj = cells_adj(spec, wanted).forces_adj
