@@ -26,7 +26,8 @@ class Alarms:
     4/3 cells spring back, those at 3/2 do not: they break for numerical reasons alone (numerical fracture)."""
     step: float | None = 1.0
     """Largest ratio of dt and the stable step of a particle alone on the grid with its present deformation, material and activation
-    [-], checked at the start of a call and after each chunk. Particles that share nodes bear 1.1 to 1.6 of it."""
+    [-], checked at the start of a call and after each chunk, in the reference formulation in every substep. Particles that share
+    nodes bear 1.1 to 1.6 of it."""
 
     def __post_init__(self):
         for field in fields(self):

@@ -30,6 +30,7 @@ from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
+from softmpm.schemes.lagrangian.frame import shift_of
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 from softmpm.state import GridField, Low, Nodal, Params, State
 
@@ -109,12 +110,13 @@ def _simulate(
     if start.nodes is not None and not is_capturing(model):
         check_shown(start, particles_of(model, start.nodes.detach()))
     nodes = nodes_of(model, start, values["mass"]) if start.nodes is None else start.nodes
+    nodes = nodes._replace(shift=shift_of(model, nodes).detach())
     return particles_of(model, _run(model, horizon, nodes, values, failures))
 
 
 def _run(model: Model, horizon: Horizon, start: Any, values: Values, failures: Failures | None) -> Any:
     """The final state, of the type of the initial one."""
-    tensors = (*values.values(), *start[:4])
+    tensors = (*values.values(), *start[: _count(model)])
     needed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     call = _Call(model, horizon, tuple(values), needed, failures)
     if not needed and not _has_transform_or_tangent(tensors):
@@ -165,7 +167,14 @@ def _cast(model: Model, value: Any) -> Any:
         return value
     if isinstance(value, Tensor):
         return value.to(model.dtype) if value.is_floating_point() else value
+    if isinstance(value, Nodal):
+        return value.to(model.dtype)
     return type(value)(*(_cast(model, part) for part in value))
+
+
+def _count(model: Model) -> int:
+    """Tensors of a state that are differentiable, its first ones."""
+    return 3 if model.formulation == "reference" else 4
 
 
 @dataclass(eq=False)
@@ -191,8 +200,8 @@ class _Call:
         return State(x, v, C, F, None if low_x is None else Low(low_x, low_F))
 
     def rounding(self, state: Any) -> tuple:
-        """The low-order parts of a state of the moving formulation, or None in their place."""
-        return () if isinstance(state, Nodal) else tuple(state.low or (None, None))
+        """What is not differentiable of a state: the shift, or in the moving formulation the low-order parts or None in their place."""
+        return (state.shift,) if isinstance(state, Nodal) else tuple(state.low or (None, None))
 
     def run(self, start: Any, values: Values) -> Any:
         """The end, after the trail is kept."""
@@ -228,12 +237,12 @@ class _Simulate(_Function):
         call, *tensors = given
         values, state = call.split(tensors)
         end = call.run(call.state(state), values)
-        return (*end[:4], *call.rounding(end))
+        return (*end[: _count(call.model)], *call.rounding(end))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
         ctx.call, *tensors = inputs
-        ctx.mark_non_differentiable(*(t for t in output[4:] if t is not None))
+        ctx.mark_non_differentiable(*(t for t in output[_count(ctx.call.model) :] if t is not None))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place
 
@@ -242,8 +251,9 @@ class _Simulate(_Function):
         refuse_batches(adj_end)
         needed = dict(zip(ctx.call.names, ctx.needs_input_grad[1:], strict=False))
         found = [one.group for one in differentiable(ctx.call.model.spec) if needed.get(one.name)]
-        rounding = len(adj_end) - len(adj_end[:4])
-        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:4]
+        count = _count(ctx.call.model)
+        rounding = len(adj_end) - count
+        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:count]
         # It may be differentiated once more:
         again = torch.is_grad_enabled() or _has_transform_or_tangent(given[2:])
         backward = _SimulateBackward.apply if again else _SimulateBackward.forward
@@ -258,10 +268,11 @@ class _SimulateBackward(_Function):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
         call, wanted, *tensors = given
         values, state = call.split(tensors)
-        kind: Any = Nodal if call.model.formulation == "reference" else State
-        count = 3 if kind is Nodal else 4
+        count = _count(call.model)
         pairs = zip(state[-count:], state[:count], strict=True)
-        adj_end = kind(*(torch.zeros_like(like) if adj is None else adj for adj, like in pairs))
+        filled = [torch.zeros_like(like) if adj is None else adj for adj, like in pairs]
+        kind: Any = Nodal if count == 3 else State
+        adj_end = kind(*filled, *([torch.zeros_like(state[count])] if kind is Nodal else []))
         with explain_out_of_memory(call.model, call.horizon, gradient=True):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
         found = (adj_inputs.tensors.get(name) for name in call.names)
@@ -269,7 +280,7 @@ class _SimulateBackward(_Function):
             adj if adj is None else adj.to(value.dtype)
             for adj, value in zip(found, values.values(), strict=True)
         )
-        return *exact, *adj[:4]
+        return *exact, *adj[:count]
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -93,7 +93,7 @@ def build(
     if formulation == "reference":
         check_reference(scene, given, scheme)
         scheme, reason = "lagrangian", "formulation='reference'"
-        alarms = dataclasses.replace(alarms, gap=None, step=None)
+        alarms = dataclasses.replace(alarms, gap=None)
     else:
         scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
     place = device_of(device)

@@ -75,8 +75,10 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
             "formulation='reference'."
         )
     shape = (model.worlds, model.rest_grid.count, model.dim)
-    for name, wanted in zip(Nodal._fields, (shape, shape, model.anchor_shape), strict=True):
+    for name, wanted in {"u": shape, "v": shape, "anchor": model.anchor_shape}.items():
         _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
+    if nodes.shift is not None:
+        _check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
 
 
 def check_shown(state: State, shown: State) -> None:

@@ -33,6 +33,7 @@ class RestGrid:
         corners: First node of each of these cells in the window of its brick, or -1, shape (brick, cell), int32.
         window: Nodes of each brick, or -1 where there is none, shape (brick, node of the window), int32.
         shares: Entries of ``window``, flat, that are a node, or -1, shape (2^dim, node), int32.
+        middle: A node with many particles near the middle of them all.
     """
 
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, loaded: bool):
@@ -57,7 +58,7 @@ class RestGrid:
         corners = np.full((len(boxes), size.prod()), -1)
         corners[brick_of_cell, turn] = flat(corner, bricks.window)
         order = np.argsort(of, kind="stable")
-        if bricks.lattice:
+        if number_of is not None and bricks.lattice:
             number, heights = number_of, np.full(len(boxes), bricks.layer)
         else:
             number = np.empty(len(of), dtype=np.int64)
@@ -104,6 +105,12 @@ class RestGrid:
         self.fraction = torch.from_numpy(fraction[order]).to(device, dtype)
         self.corners, self.window, self.shares = integers(corners), integers(window), integers(shares)
         self.lattice = lattice if bricks.lattice else None
+        around = flat(base[:, None] + offsets, grid.shape)
+        share = np.bincount(around.reshape(-1), stencils(positions / grid.spacing, offsets)[2].reshape(-1))[
+            index
+        ]
+        away = np.linalg.norm(self.nodes.cpu().numpy() * grid.spacing - positions.mean(axis=0), axis=1)
+        self.middle = int(np.where(share > 0.5 * share.max(), away, np.inf).argmin())
 
 
 def lattice_of(base: np.ndarray, fraction: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

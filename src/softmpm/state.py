@@ -50,27 +50,35 @@ class Nodal(NamedTuple):
     """State of the nodes in the reference formulation (docs/formulations.md). Differentiable."""
 
     u: Tensor
-    """Displacements [m], shape (world, node, dim)."""
+    """Displacements in addition to the shift [m], shape (world, node, dim)."""
     v: Tensor
     """Velocities [m/s], shape (world, node, dim)."""
     anchor: Tensor
-    """Places on the walls where surface points adhere [m], shape (world, wall, point, dim), of the separating walls; no walls or no
-    points without surface contact."""
+    """Places on the walls where surface points adhere, in addition to the shift [m], shape (world, wall, point, dim), of the separating
+    walls; no walls or no points without surface contact."""
+    shift: Tensor | None = None
+    """Translation of all nodes of a world [m], shape (world, dim), in float64 in every precision; None is none. It follows the bodies,
+    so that u keeps its digits over long ways. A constant of the gradient: that with respect to u is that with respect to the sum."""
 
     def __repr__(self) -> str:
         return _text(self)
 
     def detach(self) -> "Nodal":
         """The same state without its history."""
-        return Nodal(*(tensor.detach() for tensor in self))
+        return self._each(lambda tensor: tensor.detach())
 
     def clone(self) -> "Nodal":
         """The same state in memory of its own. Differentiable."""
-        return Nodal(*(tensor.clone() for tensor in self))
+        return self._each(lambda tensor: tensor.clone())
 
     def to(self, *args: Any, **kwargs: Any) -> "Nodal":
-        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``."""
-        return Nodal(*(tensor.to(*args, **kwargs) for tensor in self))
+        """Every tensor on another device or in another precision, but for the shift's; arguments as for ``torch.Tensor.to``."""
+        moved = self._each(lambda tensor: tensor.to(*args, **kwargs))
+        return moved if self.shift is None else moved._replace(shift=self.shift.to(moved.u.device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "Nodal":
+        shift = None if self.shift is None else change(self.shift)
+        return Nodal(change(self.u), change(self.v), change(self.anchor), shift)
 
 
 class State(NamedTuple):

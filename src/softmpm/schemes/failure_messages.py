@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from softmpm import reference_step
 from softmpm.errors import Kind
 from softmpm.model import Model
 from softmpm.schemes.inputs import Values
@@ -169,13 +170,12 @@ class Case:
         active_stress = [0.0] * model.muscle_count
         if "active_stress" in values:
             active_stress = values["active_stress"][0, self.world].tolist()
-        directions = values["fibre"][self.world] if "fibre" in values else None
         density = mass / model.specific_volume[p].item()
         F = self.end.F[self.world, p]
-        viscosity = self._viscosity()
-        return running_limit(
-            model.scene, p, mu, lam, density, F, active_stress, viscosity, directions=directions
-        )
+        about = (model.scene, p, mu, lam, density, F, active_stress, self._viscosity())
+        if model.formulation == "reference":
+            return reference_step.running_limit(*about)
+        return running_limit(*about, directions=values["fibre"][self.world] if "fibre" in values else None)
 
     def _viscosity(self) -> float:
         """Viscosity of the particle in the call [Pa s]."""

@@ -19,6 +19,7 @@ from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, field, layer
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.rest_step import rest_step
 from softmpm.kernels.physics.stress import total_stress, total_stress_adj
 from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
@@ -38,7 +39,8 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     )
     viscous_stress, viscous = viscosity(dim, spec.dtype).viscous_stress, spec.viscosity
     report, largest = status.report(dim, spec.dtype).report, 1.0e12
-    collapsed, not_finite = int(Kind.COLLAPSED), int(Kind.NOT_FINITE)
+    collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
+    step_is_stable = rest_step(spec).step_is_stable
 
     @wp.func
     def piola(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat, L: mat, inverse: mat) -> mat:
@@ -71,14 +73,31 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
                 kind = not_finite
             report(words, world, substep, kind, p)
 
-    return SimpleNamespace(piola=piola, forced=forced, check=check)
+    @wp.func
+    def check_step(
+        constants: Constants,
+        inputs: ParticleInputs,
+        words: wp.array(dtype=wp.int64),
+        world: int,
+        place: int,
+        p: int,
+        substep: int,
+        H: mat,
+    ):
+        """Report a particle for which Δt is too long in the substep that begins with this H."""
+        if wp.isfinite(constants.step):  # else the alarm is off
+            if not step_is_stable(constants, inputs, world, place, H):
+                report(words, world, substep, too_long, p)
+
+    return SimpleNamespace(piola=piola, forced=forced, check=check, check_step=check_step)
 
 
 @kernel_factory
 def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     vec, mat, Constants, dim = t.vec, t.mat, t.Constants, spec.dim
-    ParticleInputs, forced, check = input_types(spec).ParticleInputs, one.forced, one.check
+    ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
+    check, check_step = one.check, one.check_step
     of_u, of_v = (field(dim, spec.dtype, bricks, number) for number in range(2))
     stage_u, stage_v, gradient_u, gradient_v = of_u.stage, of_v.stage, of_u.gradient, of_v.gradient
     viscous, loaded, settings = spec.viscosity, "force" in spec.given, bricks.settings
@@ -123,6 +142,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
                     if substep > 0:
                         check(constants, words, world, inside.order[p], substep - 1, H)
+                    check_step(constants, inputs, words, world, p, inside.order[p], substep, H)
                     A = constants.rate * forced(inputs, world, p, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
@@ -140,7 +160,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         # Out:
         words: wp.array(dtype=wp.int64),
     ):
-        """Check a state that no forces are computed of: the final one of a chunk, or the initial one of a call."""
+        """Check the final state of a chunk, of which no forces are computed."""
         world, brick, lane = wp.tid()
         stage_u(u, inside, world, brick, lane)
         meet()
@@ -152,7 +172,32 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     H = gradient_u(u, inside, world, brick, corner, inside.fraction[p], constants.rate)
                     check(constants, words, world, inside.order[p], substep, H)
 
-    return SimpleNamespace(forces=forces, check_end=check_end)
+    @wp.kernel(module=module, **settings)
+    def check_start(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        # In:
+        u: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+    ):
+        """Check the initial state of a call; ``inputs`` are in the user's order."""
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        meet()
+        for row in range(inside.rows[brick], inside.rows[brick + 1]):
+            for slot in range(lane, turns, threads):
+                place = place_of(inside, row, slot)
+                if place >= 0:
+                    p = inside.order[place]
+                    corner = inside.corners[brick, slot % count]
+                    H = gradient_u(u, inside, world, brick, corner, inside.fraction[place], constants.rate)
+                    check(constants, words, world, p, 0, H)
+                    check_step(constants, inputs, words, world, p, p, 0, H)
+
+    return SimpleNamespace(forces=forces, check_end=check_end, check_start=check_start)
 
 
 @kernel_factory
@@ -160,7 +205,8 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     """As :func:`cells`, for particles on a lattice without external forces of their own."""
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     vec, Constants, dim = t.vec, t.Constants, spec.dim
-    ParticleInputs, forced, check = input_types(spec).ParticleInputs, one.forced, one.check
+    ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
+    check, check_step = one.check, one.check_step
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
     layer_of, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
@@ -216,6 +262,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         Hn = constants.rate * taken(H, n)
                         if substep > 0:
                             check(constants, words, world, inside.order[p], substep - 1, Hn)
+                        check_step(constants, inputs, words, world, p, inside.order[p], substep, Hn)
                         A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
                         A = put(A, n, constants.rate * A_n)
             add(A, partial, world, brick, corner, layer, lane, lattice)

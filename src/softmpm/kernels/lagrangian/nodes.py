@@ -1,7 +1,7 @@
 """Motion of the nodes. Derivation: docs/math/lagrangian.md.
 
     v* = exp(−γ Δt) (p/m + Δt g),  p = m v + Δt f                                                    (Q3)
-    v' = W(v*) at X + u,  u' = u + Δt v'                                                             (Q4)
+    v' = W(v*) at X + shift + u,  u' = u − d + Δt v'                                                 (Q4), (Q9)
     v̄' += Δt ū'                                                                                      (Q4.adj)
     p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
 
@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
@@ -40,21 +41,17 @@ def gathering(dim: int, dtype: str):
 def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
-    exact_vec = types(spec.dim, "float64").vec
-    GridInputs, dim = input_types(spec).GridInputs, spec.dim
+    exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
     position, node_velocity = g.position, g.node_velocity
-    gathered = gathering(spec.dim, spec.dtype)
-    running = status.report(spec.dim, spec.dtype).running
-    surface = bool(spec.surface_walls)
+    gathered, surface = gathering(spec.dim, spec.dtype), bool(spec.surface_walls)
+    f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
+    Frame, recentring, exact = f.Frame, f.recentring, f.exact
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
-    def place(constants: Constants, inside: Rest, i: int, u: vec) -> exact_vec:
-        """Present position X_i + u_i of a node [m]."""
-        x = position(constants, inside.nodes[i])
-        for axis in range(dim):
-            x[axis] = x[axis] + wp.float64(u[axis])
-        return x
+    def place(constants: Constants, inside: Rest, i: int, shift: exact_vec, u: vec) -> exact_vec:
+        """Present position of a node [m]."""
+        return position(constants, inside.nodes[i]) + shift + exact(u)
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
@@ -62,14 +59,17 @@ def nodes(spec: Spec) -> SimpleNamespace:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
+        body: Frame,
         mass: wp.array2d(dtype=real),
         partial: wp.array2d(dtype=vec),
         words: wp.array(dtype=wp.int64),
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         # Out:
         p: wp.array2d(dtype=vec),
+        new_shift: wp.array(dtype=exact_vec),
         new_u: wp.array2d(dtype=vec),
         new_v: wp.array2d(dtype=vec),
     ):
@@ -77,12 +77,18 @@ def nodes(spec: Spec) -> SimpleNamespace:
         world, i = wp.tid()
         here = u[world, i]
         new = v[world, i]
+        m = mass[world, i]
+        f = gathered(partial, inside, world, i)  # loaded while the status is awaited
+        d = vec()
         if running(words, world):
-            m = mass[world, i]
-            momentum = m * new + constants.dt * gathered(partial, inside, world, i)  # (Q3)
+            d = recentring(body, u, world)
+            momentum = m * new + constants.dt * f  # (Q3)
             p[world, i] = momentum
-            new = node_velocity(constants, inputs, world, place(constants, inside, i, here), momentum, m)
-            here += constants.dt * new  # (Q4)
+            x = place(constants, inside, i, shift[world], here)
+            new = node_velocity(constants, inputs, world, x, momentum, m)
+            here = (here - d) + constants.dt * new  # (Q4)
+        if i == 0:
+            new_shift[world] = shift[world] + exact(d)
         if wp.static(not surface):
             new_u[world, i] = here
         new_v[world, i] = new
@@ -96,7 +102,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
-    gathered, place = gathering(spec.dim, spec.dtype), one.place
+    gathered, place, exact_vec = gathering(spec.dim, spec.dtype), one.place, types(spec.dim, "float64").vec
     viscous, surface = spec.viscosity, bool(spec.surface_walls)
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
@@ -109,6 +115,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         mass: wp.array2d(dtype=real),
         held: int,  # accumulators of one world
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         p: wp.array2d(dtype=vec),
@@ -124,7 +131,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         """(Q4.adj), (Q3.adj)"""
         world, i = wp.tid()
         m = mass[world, i]
-        here = place(constants, inside, i, u[world, i])
+        here = place(constants, inside, i, shift[world], u[world, i])
         adj_new = adj_v[world, i]
         if wp.static(not surface):  # else done already
             adj_new += constants.dt * adj_u[world, i]

@@ -2,9 +2,9 @@
 docs/math/lagrangian.md.
 
     m_i = Σ m_p N_i                                                                                  (Q2)
-    x = X + Σ N_i u_i,  v = Σ N_i v_i,  F = I + Σ u_i ⊗ g_i,  C = Ḟ F⁻¹ with Ḟ = Σ v_i ⊗ g_i          (Q5)
+    x = X + shift + Σ N_i u_i,  v = Σ N_i v_i,  F = I + Σ u_i ⊗ g_i,  C = Ḟ F⁻¹ with Ḟ = Σ v_i ⊗ g_i          (Q5)
     Ḟ̄ = C̄ F⁻ᵀ,  F̄ −= Cᵀ Ḟ̄,  ū_i = Σ N_i x̄ + F̄ g_i,  v̄_i = Σ N_i v̄ + Ḟ̄ g_i                            (Q5.adj)
-    u_i = Σ N_i a / m_i,  a = m (x − X + (F − I) r),  v_i = Σ N_i b / m_i,  b = m (v + C F r)         (Q6)
+    u_i = Σ N_i a / m_i,  a = m (x − X − shift + (F − I) r),  v_i = Σ N_i b / m_i,  b = m (v + C F r)         (Q6)
     ũ = ū_i/m_i,  ṽ = v̄_i/m_i,  U = Σ ũ ⊗ N_i r,  V = Σ ṽ ⊗ N_i r
     x̄ = m Σ N_i ũ,  F̄ = m (U + Cᵀ V),  v̄ = m Σ N_i ṽ,  C̄ = m V Fᵀ
     m̄ += (x − X)·Σ N_i ũ + (F − I):U + v·Σ N_i ṽ + (C F):V − Σ N_i (ũ·u_i + ṽ·v_i)                   (Q6.adj)
@@ -18,6 +18,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, field, meet, sums
+from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.nodes import gathering
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics.kinematics import kinematics
@@ -85,6 +86,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     stage_u, gradient_u, value_u = field_u.stage, field_u.gradient, field_u.value
     stage_v, gradient_v, value_v = field_v.stage, field_v.gradient, field_v.value
     total_of, settings = sums(dim, dtype, bricks, True), bricks.settings
+    exact_vec, exact = types(dim, "float64").vec, frame(dim, dtype).exact
     cells, turns, threads, place_of = bricks.cell_count, bricks.turns, bricks.threads, total_of.place_of
     line, clear, add, write = total_of.line, total_of.clear, total_of.add, total_of.write
     module = brick_module(f"softmpm.d{dim}.{dtype}.projection.{bricks.name}")
@@ -95,6 +97,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         constants: Constants,
         inside: Rest,
         rest_x: wp.array(dtype=vec),
+        shift: wp.array(dtype=exact_vec),
         # In:
         u: wp.array2d(dtype=vec),
         nodal_v: wp.array2d(dtype=vec),
@@ -118,7 +121,8 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     fx = inside.fraction[place]
                     here = identity() + gradient_u(u, inside, world, brick, corner, fx, constants.rate)
                     rate = gradient_v(nodal_v, inside, world, brick, corner, fx, constants.rate)
-                    x[world, p] = rest_x[p] + value_u(u, inside, world, brick, corner, fx)
+                    way = value_u(u, inside, world, brick, corner, fx)
+                    x[world, p] = vec(exact(rest_x[p]) + shift[world] + exact(way))
                     v[world, p] = value_v(nodal_v, inside, world, brick, corner, fx)
                     C[world, p] = rate * wp.inverse(here)
                     F[world, p] = here

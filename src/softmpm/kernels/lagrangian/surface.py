@@ -1,7 +1,7 @@
 """Contact of the surface points of bodies with separating walls, in one pass. Derivation: docs/math/contact.md.
 
     D_s = Σ |w_si| L_i / m_i                                                                         (K1)
-    x_s = X_s + Σ w_si u_i,  v_s = Σ w_si v*_i                                                       (K2)
+    x_s = X_s + shift + Σ w_si u_i,  v_s = Σ w_si v*_i                                               (K2)
     wall by wall: J by (K3), (K4), then v_s += D_s J
     v'_i = v*_i + Σ w_si A_s J / m_i,  u'_i = u_i + Δt v'_i                                          (K5)
 
@@ -10,7 +10,8 @@
     v̄*_i += Σ w_si v̄_s,  ū_i += Σ w_si x̄_s                                                           (K2.adj)
     m̄_i −= Σ D̄_s |w_si| L_i / m_i²                                                                   (K1.adj)
 
-Nodes gather what the points give them in a fixed order, as in nodes.py.
+Nodes gather what the points give them in a fixed order, as in nodes.py. Only the height over a wall sees the shift; anchors move with
+the frame.
 """
 
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.nodes import nodes
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
@@ -61,7 +63,9 @@ def surface(spec: Spec) -> SimpleNamespace:
     walls = spec.surface_walls
     number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
     count, each_world, rough, arms = len(walls), "friction" in spec.given, spec.friction, r.count
-    touch, running = block.touch, status.report(dim, spec.dtype).running
+    touch, across, running = block.touch, block.across, status.report(dim, spec.dtype).running
+    f = frame(dim, spec.dtype)
+    Frame, recentring, exact_of = f.Frame, f.recentring, f.exact
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
@@ -108,11 +112,8 @@ def surface(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def present(body: Surface, p: int, u: vec) -> exact_vec:
-        """x of (K2)."""
-        x = body.points[p]
-        for axis in range(dim):
-            x[axis] = x[axis] + wp.float64(u[axis])
-        return x
+        """x of (K2) without the shift."""
+        return body.points[p] + exact_of(u)
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus(body: Surface, mass: wp.array2d(dtype=real), D: wp.array2d(dtype=real)):
@@ -131,10 +132,12 @@ def surface(spec: Spec) -> SimpleNamespace:
         constants: Constants,
         inputs: GridInputs,
         body: Surface,
+        moving: Frame,
         smoothing: real,
         words: wp.array(dtype=wp.int64),
         D: wp.array2d(dtype=real),
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         free: wp.array2d(dtype=vec),
         anchor: wp.array3d(dtype=vec),
@@ -146,8 +149,10 @@ def surface(spec: Spec) -> SimpleNamespace:
         world, p = wp.tid()
         total = vec()
         if running(words, world):
+            d = recentring(moving, u, world)
             exact = present(body, p, at_point(body, u, world, p))
             x = vec(exact)
+            exact += shift[world]
             v = at_point(body, free, world, p)
             for q in range(count):
                 k = number[q]
@@ -163,7 +168,7 @@ def surface(spec: Spec) -> SimpleNamespace:
                     constants.dt,
                     smoothing,
                 )
-                new_anchor[world, q, p] = found.anchor
+                new_anchor[world, q, p] = found.anchor - across(normal_of(inputs, k), d)
                 total += found.J
                 v += D[world, p] * found.J
         else:
@@ -176,6 +181,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         # Parameters:
         constants: Constants,
         body: Surface,
+        moving: Frame,
         mass: wp.array2d(dtype=real),
         impulse: wp.array2d(dtype=vec),
         words: wp.array(dtype=wp.int64),
@@ -195,7 +201,7 @@ def surface(spec: Spec) -> SimpleNamespace:
             new = free[world, i]
             if body.first[i + 1] > body.first[i]:
                 new += from_points(body, impulse, world, i) / mass[world, i]
-            here += constants.dt * new
+            here = (here - recentring(moving, u, world)) + constants.dt * new
         new_u[world, i] = here
         new_v[world, i] = new
 
@@ -227,6 +233,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     friction_of, normal_of, height, present = one.friction_of, one.normal_of, one.height, one.present
     at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
     arms, place, before_wall = r.count, nodes(spec).place, wp.types.matrix((count, dim), real)
+    exact_vec = types(dim, "float64").vec
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -237,6 +244,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         inside: Rest,
         mass: wp.array2d(dtype=real),
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         p: wp.array2d(dtype=vec),
         new_v: wp.array2d(dtype=vec),
@@ -252,7 +260,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m."""
         world, i = wp.tid()
         m = mass[world, i]
-        v = node_velocity(constants, inputs, world, place(constants, inside, i, u[world, i]), p[world, i], m)
+        x = place(constants, inside, i, shift[world], u[world, i])
+        v = node_velocity(constants, inputs, world, x, p[world, i], m)
         adj = adj_v[world, i] + constants.dt * adj_u[world, i]
         free[world, i] = v
         adj_v[world, i] = adj
@@ -272,6 +281,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         D: wp.array2d(dtype=real),
         held: int,  # accumulators of one world
         # In:
+        shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         free: wp.array2d(dtype=vec),
         anchor: wp.array3d(dtype=vec),
@@ -288,6 +298,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, p = wp.tid()
         exact = present(body, p, at_point(body, u, world, p))
         x = vec(exact)
+        exact += shift[world]
         v = at_point(body, free, world, p)
         dv = D[world, p]
         reached = before_wall()

@@ -102,4 +102,4 @@ def alarm(spec: Spec) -> SimpleNamespace:
             d[axis] = apart[axis] + real(cells[axis])
         return not (wp.dot(d, d) > constants.gap)
 
-    return SimpleNamespace(step_is_stable=step_is_stable, near=near)
+    return SimpleNamespace(step_is_stable=step_is_stable, near=near, viscous_rate=viscous_rate)

@@ -4,6 +4,7 @@
     F̄ = 2μ T (2F − R) + λ p' tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,   T = (τ̄ + τ̄ᵀ) / 2
     μ̄ = 2 ⟨T F, F − R⟩,   λ̄ = tr(τ̄) p(j)
     K ≤ 2μ max(2s² − s, 0) + d max(λ J p', 0)            with the largest principal stretch s, in d dimensions
+    σ = 2μ,  f' = λ p/J,  f'' = λ (p/J)'                                                              in (Q8)
 
 Forward and adjoint of a particle share Q. S is symmetric but for rounding, which would turn a free body: the half below the diagonal
 stands for both. Source: Stomakhin et al. 2012, "Energetically consistent invertible elasticity".
@@ -16,12 +17,16 @@ import warp as wp
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.laws import law_adj_type
 from softmpm.kernels.physics.polar import polar
+from softmpm.kernels.physics.tangent import moduli_type
 from softmpm.kernels.structs import types
 
 
-def corotated(dim: int, dtype: str, pressure: wp.Function, pressure_slope: wp.Function) -> SimpleNamespace:
-    """Functions of the law with the pressure λ p(j), from p and p' = ∂p/∂J."""
+def corotated(
+    dim: int, dtype: str, pressure: wp.Function, pressure_slope: wp.Function, energy_slopes: wp.Function
+) -> SimpleNamespace:
+    """Functions of the law with the pressure λ p(j), from p, p' = ∂p/∂J and the pair of p/J and its derivative."""
     t, k, LawAdj = types(dim, dtype), kinematics(dim, dtype), law_adj_type(dim, dtype)
+    Moduli = moduli_type(dtype)
     real, mat = t.real, t.mat
     identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
     rotation, rotation_adj = polar(dim, dtype).rotation, polar(dim, dtype).rotation_adj
@@ -56,4 +61,15 @@ def corotated(dim: int, dtype: str, pressure: wp.Function, pressure_slope: wp.Fu
         volume = wp.max(lam * (real(1.0) + j) * pressure_slope(j), real(0.0))
         return real(2.0) * mu * shape + real(dim) * volume
 
-    return SimpleNamespace(rotation=rotation, stress=stress, stress_adj=stress_adj, bound=bound)
+    @wp.func
+    def moduli(j: real, trace: real, mu: real, lam: real) -> Moduli:
+        slopes = energy_slopes(j)
+        m = Moduli()
+        m.shear = real(2.0) * mu
+        m.slope = lam * slopes[0]
+        m.curvature = wp.max(lam * slopes[1], real(0.0))
+        return m
+
+    return SimpleNamespace(
+        rotation=rotation, stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli
+    )

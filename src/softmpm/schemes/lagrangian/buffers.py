@@ -14,6 +14,7 @@ from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
+from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
 from softmpm.state import Nodal
@@ -23,7 +24,7 @@ class ChunkBuffers:
     """Everything that the launches of a chunk read and write.
 
     Attributes:
-        u, v, anchor: Nodal states, one more than substeps if ``keep``, else two in turn.
+        u, v, anchor, shift: Nodal states, one more than substeps if ``keep``, else two in turn.
         p: Momenta of the nodes, one for each substep if ``keep``, else one.
         mass: Masses of the nodes.
         partial: Sums of the bricks for the nodes of their windows.
@@ -40,6 +41,8 @@ class ChunkBuffers:
         self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
         self.p, self.mass = self.tensor(momenta, *nodal), self.tensor(*nodal[:2])
         self.anchor, self.partial = self.tensor(stored, *model.anchor_shape), empty_partial(model)
+        self.shift = torch.empty(stored, model.worlds, model.dim, dtype=torch.float64, device=model.device)
+        self.frame = frame_struct(model)
         self.words = torch.empty(model.worlds, dtype=torch.int64, device=model.device)
         self._loaded = False
         order = model.rest_grid.order.expand(model.worlds, -1).contiguous()
@@ -48,12 +51,13 @@ class ChunkBuffers:
         self.u_arrays, self.v_arrays, self.p_arrays = (
             [view(one, vec) for one in stored] for stored in (self.u, self.v, self.p)
         )
+        self.shift_arrays = [view(one, types(model.spec.dim, "float64").vec) for one in self.shift]
         self.mass_array, self.partial_array = view(self.mass, real), view(self.partial, vec)
         self.placed_mass = view(self.inputs.values["mass"], real)
         self.words_array = view(self.words, wp.int64)
         self.contact = None
         if model.surface is not None:
-            self.contact = SurfaceContact(model, self.mass, self.anchor)
+            self.contact = SurfaceContact(model, self.mass, self.anchor, self.shift)
 
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
@@ -77,14 +81,15 @@ class ChunkBuffers:
         if frozen:
             self.words[list(frozen)] = FROZEN
         self.inputs.take(stream, chunk, values, first)
-        for own, given in zip((self.u, self.v, self.anchor), start, strict=True):
+        given_states = (*start[:3], shift_of(self.model, start))
+        for own, given in zip((self.u, self.v, self.anchor, self.shift), given_states, strict=True):
             own[0].copy_(given.detach())
         self._loaded = True
 
     def end(self) -> Nodal:
         """Copy of the final state: a result must not keep all states alive."""
         last = self.index(self.chunk.length)
-        return Nodal(*(one[last].clone() for one in (self.u, self.v, self.anchor)))
+        return Nodal(*(one[last].clone() for one in (self.u, self.v, self.anchor, self.shift)))
 
 
 class SharedAdjoint:
@@ -151,7 +156,7 @@ class ChunkAdjoint:
         if self.contact is not None:
             self.contact.clear()
         shared = self.shared
-        for own, given in zip((shared.u, shared.v, shared.anchor), adj_end, strict=True):
+        for own, given in zip((shared.u, shared.v, shared.anchor), adj_end[:3], strict=True):
             own.copy_(given)
 
     def unload(self, stream: wp.Stream | None, chunk: Chunk, adj_inputs: InputsAdj) -> Nodal:

@@ -48,7 +48,9 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     p = buffers.p_arrays[s if buffers.keep else 0]
     velocity = new[1] if contact is None else contact.free
     sums = buffers.mass_array, buffers.partial_array, buffers.words_array
-    arguments = (model.constants, inputs, buffers.rest, *sums, *state, p, new[0], velocity)
+    shift, new_shift = buffers.shift_arrays[now], buffers.shift_arrays[then]
+    parameters = (model.constants, inputs, buffers.rest, buffers.frame)
+    arguments = (*parameters, *sums, shift, *state, p, new_shift, new[0], velocity)
     node_launch(model, launch, nodes(model.spec).advance, *arguments)
     if contact is not None:
         contact.advance(launch, inputs, buffers.words_array, now, then, *state, *new)
@@ -83,7 +85,7 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held)
     out = (shared.u_array, shared.v_array, shared.f_array, shared.mass_array, adj_inputs)
     kernel = nodes_adj(model.spec, shared.wanted).advance_adj
-    node_launch(model, launch, kernel, *parameters, u, v, p, *out)
+    node_launch(model, launch, kernel, *parameters, forward.shift_arrays[s], u, v, p, *out)
 
 
 def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:

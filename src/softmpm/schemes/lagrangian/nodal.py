@@ -16,13 +16,14 @@ from softmpm.model import Model
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
+from softmpm.schemes.lagrangian.frame import quantum, shift_of
 from softmpm.schemes.launch import KernelLauncher
 from softmpm.state import Nodal, State
 
 
 def particles_of(model: Model, nodes: Nodal) -> State:
     """What the particles show of a nodal state (Q5), which the result carries along."""
-    shown: Any = _Show.apply(model, nodes.u, nodes.v)
+    shown: Any = _Show.apply(model, nodes.u, nodes.v, shift_of(model, nodes))
     return State(*shown, nodes=nodes)
 
 
@@ -32,12 +33,15 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     Args:
         mass: Mass of the particles in any unit, shape (world, particle).
     """
-    moved = state.x - model.positions
-    moved = moved if state.low is None else moved + (state.low.x - model.rest_low)
+    moved = state.x.double() - model.positions.double()
+    moved = moved if state.low is None else moved + (state.low.x.double() - model.rest_low.double())
+    mean, step = moved.detach().mean(1), quantum(model)
+    shift = torch.where(mean.abs() > step, step * (mean / step).round(), 0.0)
+    moved = (moved - shift[:, None]).to(model.dtype)
     placed = mass.index_select(1, model.rest_grid.order)
     found: Any = _Project.apply(model, moved, state.v, state.C, state.F, placed)
     u, v = found
-    return Nodal(u, v, _anchors(model, u))
+    return Nodal(u, v, _anchors(model, u), shift)
 
 
 class _Arrays:
@@ -73,9 +77,8 @@ class _Arrays:
     def node_masses(self, mass: Tensor) -> Tensor:
         """Masses of the nodes, from those of the places."""
         out = torch.empty(self.model.worlds, self.model.rest_grid.count, dtype=mass.dtype, device=mass.device)
-        launch_masses(
-            self.model, self.launch, self.rest, *self.views(mass), self.partials()[0], *self.views(out)
-        )
+        given, found = self.views(mass, out)
+        launch_masses(self.model, self.launch, self.rest, given, self.partials()[0], found)
         return out
 
 
@@ -92,8 +95,8 @@ class _Show(torch.autograd.Function):
     """(Q5)"""
 
     @staticmethod
-    def forward(ctx, model: Model, u: Tensor, v: Tensor):
-        found = _show(model, u, v)
+    def forward(ctx, model: Model, u: Tensor, v: Tensor, shift: Tensor):
+        found = _show(model, u, v, shift)
         ctx.model = model
         ctx.save_for_backward(*found[2:])
         return found
@@ -101,15 +104,16 @@ class _Show(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *adj):
-        return (None, *_show_adj(ctx.model, *ctx.saved_tensors, *adj))
+        return (None, *_show_adj(ctx.model, *ctx.saved_tensors, *adj), None)
 
 
 @on_its_gpu
-def _show(model: Model, u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
+def _show(model: Model, u: Tensor, v: Tensor, shift: Tensor) -> tuple[Tensor, ...]:
     one = _Arrays(model)
     found = one.particles()
-    rest_x = view(model.positions, one.types.vec)
-    arguments = (model.constants, one.rest, rest_x, *one.views(u, v, *found))
+    exact = types(model.spec.dim, "float64").vec
+    given = view(model.positions, one.types.vec), view(shift, exact)
+    arguments = (model.constants, one.rest, *given, *one.views(u, v, *found))
     brick_launch(model, one.launch, one.kernels.show, *arguments)
     return tuple(found)
 

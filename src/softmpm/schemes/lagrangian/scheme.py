@@ -17,7 +17,7 @@ from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.graph_cache import GraphCache, Lease
-from softmpm.schemes.inputs import InputsAdj, Values
+from softmpm.schemes.inputs import InputsAdj, Values, particle_struct, stiffest
 from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers, SharedAdjoint
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
@@ -126,8 +126,9 @@ class Lagrangian:
         model = self.model
         words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
-        arguments = (model.constants, rest_struct(model), 0, u, view(words, wp.int64))
-        kernel = cells(model.spec, model.rest_grid.bricks).check_end
+        inputs = particle_struct(model, model.fixed | stiffest(model, values))
+        arguments = (model.constants, inputs, rest_struct(model), u, view(words, wp.int64))
+        kernel = cells(model.spec, model.rest_grid.bricks).check_start
         brick_launch(model, KernelLauncher(model, stream_of(model.device)), kernel, *arguments)
         return words
 

@@ -11,6 +11,7 @@ from softmpm.kernels.lagrangian.surface import surface, surface_adj, surface_typ
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.lagrangian.frame import frame_struct
 
 
 def surface_struct(model: Model):
@@ -33,13 +34,15 @@ class SurfaceContact:
     Args:
         mass: Masses of the nodes, shape (world, node).
         anchors: Anchors of each stored state, shape (state, world, wall, point, dim).
+        shifts: Translation of each stored state, shape (state, world, dim).
 
     Attributes:
         free: Nodal velocities without contact.
     """
 
-    def __init__(self, model: Model, mass: Tensor, anchors: Tensor):
-        self.model, self.anchors = model, anchors
+    def __init__(self, model: Model, mass: Tensor, anchors: Tensor, shifts: Tensor):
+        self.model, self.anchors, self.shifts = model, anchors, shifts
+        self._frame = frame_struct(model)
         self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
         self._vec, self._real = (
             getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
@@ -73,11 +76,15 @@ class SurfaceContact:
         """From :attr:`free` and the state before the substep to that after it; ``now`` and ``then`` count their anchors."""
         model, kernels = self.model, surface(self.model.spec)
         anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
-        parameters = (model.constants, inputs, self._struct, self._width, words, self._D)
-        arguments = (u, self.free, anchors[0], self._impulse, anchors[1])
+        parameters = (model.constants, inputs, self._struct, self._frame, self._width, words, self._D)
+        arguments = (self.shift(now), u, self.free, anchors[0], self._impulse, anchors[1])
         launch(kernels.press, self.points, *parameters, *arguments)
-        parameters = (model.constants, self._struct, self._mass, self._impulse, words)
+        parameters = (model.constants, self._struct, self._frame, self._mass, self._impulse, words)
         launch(kernels.settle, self.nodes, *parameters, u, v, self.free, new_u, new_v)
+
+    def shift(self, s: int) -> wp.array:
+        """Translation of a stored state."""
+        return view(self.shifts[s], types(self.model.spec.dim, "float64").vec)
 
 
 class SurfaceContactAdj:
@@ -126,10 +133,11 @@ class SurfaceContactAdj:
         """Adjoint of substep ``s``, from that of the new state to that of the velocity without contact, in ``adj_v``."""
         one = self.forward
         constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
-        arguments = (u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
+        arguments = (one.shift(s), u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
         launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, one._mass, *arguments)
         parameters = (constants, inputs, one._struct, one._width, one._D, self.held)
-        arguments = (u, one.free, view(one.anchors[s], one._vec), self._shared, self._adj_anchor)
+        anchors = view(one.anchors[s], one._vec)
+        arguments = (one.shift(s), u, one.free, anchors, self._shared, self._adj_anchor)
         out = (*adj_points, self._adj_D, adj_inputs)
         launch(self._kernels.press_adj, one.points, *parameters, *arguments, *out)
         launch(self._kernels.spread_adj, one.nodes, one._struct, *adj_points, adj_u, adj_v)

@@ -12,13 +12,14 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.actuators import actuator_adj_type
+from softmpm.kernels.physics.tangent import moduli_type
 from softmpm.kernels.structs import types
 
 
 @kernel_factory
 def actuator(dim: int, dtype: str) -> SimpleNamespace:
     t, ActuatorAdj = types(dim, dtype), actuator_adj_type(dim, dtype)
-    real, vec, mat = t.real, t.vec, t.mat
+    real, vec, mat, Moduli = t.real, t.vec, t.mat, moduli_type(dtype)
 
     @wp.func
     def stress(H: mat, fibre: vec, p: real) -> mat:
@@ -40,4 +41,10 @@ def actuator(dim: int, dtype: str) -> SimpleNamespace:
         f = F * fibre
         return real(2.0) * wp.max(p, real(0.0)) * wp.dot(f, f)
 
-    return SimpleNamespace(stress=stress, stress_adj=stress_adj, bound=bound)
+    @wp.func
+    def moduli(p: real) -> Moduli:
+        m = Moduli()
+        m.shear = wp.max(p, real(0.0))
+        return m
+
+    return SimpleNamespace(stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli)

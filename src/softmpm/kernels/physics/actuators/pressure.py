@@ -13,13 +13,14 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.actuators import actuator_adj_type
 from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.tangent import moduli_type
 from softmpm.kernels.structs import types
 
 
 @kernel_factory
 def actuator(dim: int, dtype: str) -> SimpleNamespace:
     t, k, ActuatorAdj = types(dim, dtype), kinematics(dim, dtype), actuator_adj_type(dim, dtype)
-    real, vec, mat = t.real, t.vec, t.mat
+    real, vec, mat, Moduli = t.real, t.vec, t.mat, moduli_type(dtype)
     identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
 
     @wp.func
@@ -38,4 +39,10 @@ def actuator(dim: int, dtype: str) -> SimpleNamespace:
     def bound(F: mat, j: real, fibre: vec, p: real) -> real:
         return real(dim) * wp.max(-p * (real(1.0) + j), real(0.0))
 
-    return SimpleNamespace(stress=stress, stress_adj=stress_adj, bound=bound)
+    @wp.func
+    def moduli(p: real) -> Moduli:
+        m = Moduli()
+        m.slope = -p
+        return m
+
+    return SimpleNamespace(stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli)

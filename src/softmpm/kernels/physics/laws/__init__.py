@@ -7,6 +7,7 @@ A file has a factory ``law(dim, dtype)``, which gives the Warp functions
     stress_adj(H, Q, mu, lam, τ̄) → LawAdj   adjoints of F, μ and λ
     bound(square, j, trace, mu, lam) → K    at least the stiffness of (W3) [Pa], and equal to it at rest, from the square of the largest
                                             principal stretch or more, j = J − 1 and the trace of F Fᵀ
+    moduli(j, trace, mu, lam) → Moduli      those of (Q8), for the step limit of the reference formulation
 """
 
 import importlib

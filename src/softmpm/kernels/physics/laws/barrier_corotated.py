@@ -15,6 +15,7 @@ from softmpm.kernels.structs import types
 @kernel_factory
 def law(dim: int, dtype: str) -> SimpleNamespace:
     real, divide = types(dim, dtype).real, types(dim, dtype).divide
+    pair = wp.types.vector(2, real)
 
     @wp.func
     def pressure(j: real) -> real:
@@ -27,4 +28,10 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
         J = real(1.0) + j
         return real(0.5) * (J + divide(real(1.0), J * J * J))
 
-    return corotated(dim, dtype, pressure, pressure_slope)
+    @wp.func
+    def energy_slopes(j: real) -> pair:
+        J = real(1.0) + j
+        fourth = divide(real(3.0), J * J * J * J)
+        return pair(divide(pressure(j), J), real(0.25) * (real(1.0) + fourth))
+
+    return corotated(dim, dtype, pressure, pressure_slope, energy_slopes)

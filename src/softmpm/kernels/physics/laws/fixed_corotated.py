@@ -16,6 +16,7 @@ from softmpm.kernels.structs import types
 def law(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real = t.real
+    pair = wp.types.vector(2, real)
 
     @wp.func
     def pressure(j: real) -> real:
@@ -25,4 +26,8 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
     def pressure_slope(j: real) -> real:
         return real(1.0) + real(2.0) * j
 
-    return corotated(dim, dtype, pressure, pressure_slope)
+    @wp.func
+    def energy_slopes(j: real) -> pair:
+        return pair(j, real(1.0))
+
+    return corotated(dim, dtype, pressure, pressure_slope, energy_slopes)

@@ -3,6 +3,7 @@
 τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                                          (E1)
 F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
 K ≤ 2μ s² + d max(λ, 0)                              with the largest principal stretch s, in d dimensions
+σ = μ,  f' = (λ log J − μ)/J,  f'' ≤ (μ + max(λ (1 − log J), 0))/J²                                  in (Q8)
 """
 
 from types import SimpleNamespace
@@ -12,12 +13,14 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.laws import law_adj_type, no_rotation
+from softmpm.kernels.physics.tangent import moduli_type
 from softmpm.kernels.structs import types
 
 
 @kernel_factory
 def law(dim: int, dtype: str) -> SimpleNamespace:
     t, k, LawAdj = types(dim, dtype), kinematics(dim, dtype), law_adj_type(dim, dtype)
+    Moduli = moduli_type(dtype)
     real, mat, divide = t.real, t.mat, t.divide
     identity, cofactor, volume_change, log1p = k.identity, k.cofactor, k.volume_change, k.log1p
 
@@ -40,6 +43,16 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
     def bound(square: real, j: real, trace: real, mu: real, lam: real) -> real:
         return real(2.0) * mu * square + real(dim) * wp.max(lam, real(0.0))
 
+    @wp.func
+    def moduli(j: real, trace: real, mu: real, lam: real) -> Moduli:
+        inverse = divide(real(1.0), real(1.0) + j)
+        pressure = lam * log1p(j)
+        m = Moduli()
+        m.shear = mu
+        m.slope = (pressure - mu) * inverse
+        m.curvature = (mu + wp.max(lam - pressure, real(0.0))) * inverse * inverse
+        return m
+
     return SimpleNamespace(
-        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound
+        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli
     )

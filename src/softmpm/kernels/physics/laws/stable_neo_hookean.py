@@ -4,6 +4,7 @@
     F̄ = 2μ ((1 + k) T + k' ⟨T, B⟩ I) F + p' tr(τ̄) cof(F),   k' = 4 / (3 (4 + s)²),   T = (τ̄ + τ̄ᵀ) / 2
     μ̄ = ⟨T, E + k B⟩ + tr(τ̄) (⅚ (1 + j) − 1) j,   λ̄ = tr(τ̄) (1 + j) j
     K ≤ 2μ ((1 + k) s₁² + k' s₁² tr B) + d max(p' J, 0),   p' = (λ + ⅚ μ) (2J − 1) − μ
+    σ = μ (1 + k),  κ = 2μ k',  f' = (λ + ⅚ μ) j − μ,  f'' ≤ max(λ, 0) + ⅚ μ                             in (Q8)
 
 with B = F Fᵀ, the largest principal stretch s₁ and d dimensions; μ and λ are those of linear elasticity at rest.
 """
@@ -15,12 +16,14 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.laws import law_adj_type, no_rotation
+from softmpm.kernels.physics.tangent import moduli_type
 from softmpm.kernels.structs import types
 
 
 @kernel_factory
 def law(dim: int, dtype: str) -> SimpleNamespace:
     t, k, LawAdj = types(dim, dtype), kinematics(dim, dtype), law_adj_type(dim, dtype)
+    Moduli = moduli_type(dtype)
     real, mat, divide = t.real, t.mat, t.divide
     identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
     five_sixths, four_thirds = (
@@ -84,6 +87,16 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
         volume = wp.max(pressure_slope(j, mu, lam) * (real(1.0) + j), real(0.0))
         return real(2.0) * mu * shape + real(dim) * volume
 
+    @wp.func
+    def moduli(j: real, trace: real, mu: real, lam: real) -> Moduli:
+        s = trace - real(dim)
+        m = Moduli()
+        m.shear = mu * (real(1.0) + softening(s))
+        m.outer = real(2.0) * mu * softening_slope(s)
+        m.slope = bulk(mu, lam) * j - mu
+        m.curvature = bulk(mu, wp.max(lam, real(0.0)))
+        return m
+
     return SimpleNamespace(
-        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound
+        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli
     )

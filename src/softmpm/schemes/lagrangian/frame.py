@@ -1,0 +1,30 @@
+"""Translation of a world in the reference formulation, see kernels/lagrangian/frame.py."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from softmpm.kernels.lagrangian.frame import frame
+from softmpm.model import Model
+from softmpm.state import Nodal
+
+
+def quantum(model: Model) -> float:
+    """Of the shift [m]: the power of two from a cell on, so that u changes without rounding."""
+    return 2.0 ** math.ceil(math.log2(model.scene.grid.spacing))
+
+
+def frame_struct(model: Model) -> Any:
+    """Struct of the rule by which u is kept small."""
+    struct = frame(model.spec.dim, model.spec.dtype).Frame()
+    struct.middle, struct.quantum = model.rest_grid.middle, quantum(model)
+    return struct
+
+
+def shift_of(model: Model, nodes: Nodal) -> Tensor:
+    """Shift of a nodal state, zero if it has none."""
+    if nodes.shift is not None:
+        return nodes.shift
+    return torch.zeros(model.worlds, model.dim, dtype=torch.float64, device=model.device)
