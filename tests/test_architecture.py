@@ -21,7 +21,7 @@ LAYERS = """
     reference_contact
     stability kernels.convert reference_lagrangian
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian rest_grid
-    surface_grid
+    surface_grid mirror_grid
     describe
     model
     nodal schemes

@@ -4,8 +4,8 @@
     u_i = Σ m_p N_i (x_p − X_p + (F_p − I)(X_i − X_p)) / m_i                                         (Q6)
     v_i = Σ m_p N_i (v_p + C_p F_p (X_i − X_p)) / m_i
 
-(Q6) is exact for affine fields; what else particles hold is smoothed, as by P2G (APIC, Jiang et al. 2015). Derivation:
-docs/math/lagrangian.md.
+(Q6) is exact for affine fields; what else particles hold is smoothed, as by P2G (APIC, Jiang et al. 2015). Clamps and planes of
+symmetry then hold and reflect the nodes by (B1). Derivation: docs/math/lagrangian.md.
 """
 
 import torch
@@ -52,9 +52,11 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     moved = moved if state.low is None else moved + (state.low.x - model.rest_low)
     u = moved[:, :, None] + torch.einsum("wpde,pne->wpnd", state.F - eye, arms)
     v = state.v[:, :, None] + torch.einsum("wpde,pne->wpnd", state.C @ state.F, arms)
-    total = _added(grid, share[..., None])
-    total = torch.where(total > 0, total, 1.0)  # a node at the very edge of a spline has no mass
+    of_nodes = _added(grid, share[..., None])
+    total = torch.where(of_nodes > 0, of_nodes, 1.0)  # a node at the very edge of a spline has no mass
     u, v = (_added(grid, share[..., None] * field) / total for field in (u, v))
+    if model.mirror is not None:
+        u, v = model.mirror.reflected(of_nodes[..., 0], u, v)
     return Nodal(u, v, _anchors(model, u))
 
 

@@ -227,6 +227,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     friction_of, normal_of, height, present = one.friction_of, one.normal_of, one.height, one.present
     at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
     arms, place, before_wall = r.count, nodes(spec).place, wp.types.matrix((count, dim), real)
+    mirrored = bool(spec.mirrors)
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -243,8 +244,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_u: wp.array2d(dtype=vec),
         # In and out:
         adj_v: wp.array2d(dtype=vec),
-        # Out:
+        # Out, with clamps in:
         free: wp.array2d(dtype=vec),
+        # Out:
         shared: wp.array2d(dtype=vec),
         # Out, added into:
         adj_mass: wp.array2d(dtype=real),
@@ -253,6 +255,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, i = wp.tid()
         m = mass[world, i]
         v = node_velocity(constants, inputs, world, place(constants, inside, i, u[world, i]), p[world, i], m)
+        if wp.static(mirrored):
+            v = free[world, i]  # reflected already
         adj = adj_v[world, i] + constants.dt * adj_u[world, i]
         free[world, i] = v
         adj_v[world, i] = adj

@@ -21,6 +21,7 @@ from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, grid_struct, particle_struct
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
+from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.state import Nodal, State
 
@@ -72,7 +73,9 @@ class LagrangianRun:
         for own, given in zip((self._u, self._v, self._anchor), start, strict=True):
             own[0].copy_(given.detach())
         self._partial = self._cells()
-        self._contact = None
+        self._contact = self._reflection = None
+        if model.mirror is not None:
+            self._reflection = Reflection(model, self._mass, self._launch)
         if model.surface is not None:
             self._contact = SurfaceContact(model, self._mass, self._anchor, self._launch)
         for s in range(chunk.length):
@@ -123,8 +126,12 @@ class LagrangianRun:
         kernel = nodes(model.spec).advance
         velocity = new[1] if self._contact is None else self._contact.free
         self._launch(kernel, self._mass.shape, *parameters, self.words_array, *state, new[0], velocity)
+        if self._reflection is not None:
+            self._reflection.advance(self.words_array, u, velocity, new[0])
         if self._contact is not None:
             self._contact.advance(self._grid_inputs, self.words_array, now, then, u, v, *new)
+            if self._reflection is not None:
+                self._reflection.advance(self.words_array, u, new[1], new[0])
 
     def vjp(self, adj_end: Nodal, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Nodal:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
@@ -138,16 +145,25 @@ class LagrangianRun:
         if model.spec.viscosity:
             partial_v = self._cells()
         arrays = [self._array(tensor) for tensor in (*adj[:2], adj_f, self._partial, partial_v)]
-        adj_mass_array, contact = view(adj_mass, self.types.real), None
+        adj_mass_array, contact, reflection = view(adj_mass, self.types.real), None, None
+        if self._reflection is not None:
+            reflection = ReflectionAdj(
+                self._reflection, self._contact, wanted, self.words_array, adj_mass_array
+            )
         if self._contact is not None:
             given = (wanted, self._held, adj.anchor, adj_mass_array)
             contact = SurfaceContactAdj(self._contact, *given)
         for s in reversed(range(chunk.length)):
             self._use_inputs(s, s + 1)
-            if contact is not None:
-                structs = (self._grid_inputs, found.grid_struct(chunk.row(s)), self._rest)
+            if contact is not None or reflection is not None:
                 stored = [self._array(t) for t in (self._u[s], self._p[s], self._v[s + 1])]
-                contact.advance(s, *structs, *stored, *arrays[:2])
+                if reflection is not None:
+                    reflection.begin(self._grid_inputs, self._rest, *stored, *arrays[:2])
+                if contact is not None:
+                    structs = (self._grid_inputs, found.grid_struct(chunk.row(s)), self._rest)
+                    contact.advance(s, *structs, *stored, *arrays[:2])
+                if reflection is not None:
+                    reflection.finish(*arrays[:2])
             self._advance_adj(s, wanted, found, arrays, adj_mass_array)
             if s == 0 or chunk.row(s) != chunk.row(s - 1):
                 found.collect(chunk.row(s), model.fixed, self._launch)
