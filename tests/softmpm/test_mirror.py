@@ -141,7 +141,7 @@ def test_a_reflection_is_a_projection_that_takes_energy(device):
 
 
 def test_calls_in_turn_are_one_call(device):
-    """A state with nodes continues to the bit, and so do worlds beside one that is frozen."""
+    """A state with nodes continues to the bit, with its gradient."""
     model = build(corner(2), device=device, dtype=torch.float64)
     inputs = busy_inputs(model, control_steps=4)
     start = softmpm.State(*(inputs[name] for name in "xvCF"))
