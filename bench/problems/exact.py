@@ -65,8 +65,8 @@ def tip_of_beam(
 def softening_of_section(poisson: float, height: float, bent: float = 2.0) -> float:
     """Of a neo-Hookean strip in plane strain [m²], from its moment at the curvature ``bent`` [1/m].
 
-    A strip bent to a ring has the stretches λ₁ = κ r and λ₂ = dr/dY at the radius r(Y). Equilibrium is dP₂/dY = κ P₁. P₂ = 0 at both faces
-    gives the inner radius, and the moment is ∫ P₁ r dY.
+    A strip bent to a ring has the stretches λ₁ = κ r and λ₂ = dr/dY at the radius r(Y), and dP₂/dY = κ P₁ in equilibrium. P₂ = 0 at
+    both faces gives the inner radius, and the moment is ∫ P₁ r dY.
     """
     mu, lam = 1 / (2 * (1 + poisson)), poisson / ((1 + poisson) * (1 - 2 * poisson))
 
