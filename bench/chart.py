@@ -1,4 +1,4 @@
-"""The charts of docs/performance.md from bench/results: `python bench/chart.py`."""
+"""The charts of docs/performance.md and docs/accuracy.md from bench/results: `python bench/chart.py`."""
 
 import json
 from pathlib import Path
@@ -21,6 +21,13 @@ BARS = {
     "plain, backward": ("gradient.plain", "backward, kept", "#8f8f8f"),
     "fast, forward": ("step", "falling us", "#7fb3e0"),
     "fast, backward": ("gradient", "backward, kept", "#1f5f9e"),
+}
+
+
+KINDS = {
+    "reference": ("reference, clamp", "#1f5f9e"),
+    "reference, stick": ("reference, sticking wall", "#7fb3e0"),
+    "moving": ("moving, sticking wall", "#8f8f8f"),
 }
 
 
@@ -72,6 +79,46 @@ def peers() -> None:
     figure.savefig(IMAGES / "peers.png", dpi=150)
 
 
+def accuracy() -> None:
+    found = json.loads((HERE / "results" / "accuracy.cpu.json").read_text())["rows"]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for kind, (label, colour) in KINDS.items():
+        of_kind = [row for row in found if row["formulation"] == kind]
+        beams = [row for row in of_kind if row["problem"].startswith("beam, tip sinks by 0.2")]
+        costs, errors = ([abs(row[name]) for row in beams] for name in ("cost M", "error %"))
+        left.loglog(costs, errors, "o", color=colour, label=label)
+        for row, cost, error in zip(beams, costs, errors, strict=True):
+            beside = (6, -8) if row["cells"] == 3 else (6, 3)
+            place = dict(xytext=beside, textcoords="offset points", fontsize=8, color=colour)
+            left.annotate(f"{row['cells']}, {row['per cell']}", (cost, error), **place)
+        for problem, mark in (("clamped bar", "o-"), ("column", "s--")):
+            if kind == "reference, stick":
+                continue  # on those of the moving formulation
+            rows = [row for row in of_kind if row["problem"].startswith(problem)]
+            values = [abs(row["error %"]) for row in rows]
+            right.loglog(
+                [row["cells"] for row in rows], values, mark, color=colour, label=f"{problem}, {label}"
+            )
+    left.set_title("Cantilever, tip sinks by a fifth (cells across, particles per axis)", fontsize=10)
+    left.axhline(0.5, color="#c9c9c9", linewidth=1, zorder=0)
+    left.annotate("error of the theory of beams, about", (0.135, 0.36), fontsize=8, color="#8f8f8f")
+    left.set_xlabel("million particle-substeps")
+    left.set_xticks([0.2, 0.4, 0.8, 1.6], ["0.2", "0.4", "0.8", "1.6"])
+    left.set_xlim(0.13, 2.0)
+    left.minorticks_off()
+    left.set_ylabel("error in %")
+    right.set_title("Frequency of a clamped bar, sinking of a column", fontsize=10)
+    right.set_xlabel("cells along the body")
+    right.set_ylim(2e-5, 10)
+    right.set_xticks([8, 16, 32], ["8", "16", "32"])
+    right.minorticks_off()
+    for axes in (left, right):
+        axes.legend(frameon=False, fontsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(IMAGES / "accuracy.png", dpi=150)
+
+
 if __name__ == "__main__":
     schemes()
     peers()
+    accuracy()

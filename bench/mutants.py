@@ -32,6 +32,7 @@ TESTS = (
     "tests/softmpm/test_inputs.py",
     "tests/softmpm/test_surface_contact.py",
     "tests/softmpm/test_lagrangian.py",
+    "tests/softmpm/test_mirror.py",
     "tests/softmpm/test_rollout.py",
     "tests/softmpm/test_autograd.py",
     "tests/softmpm/test_warp_api.py",

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 import softmpm
+from softmpm import reference_contact
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
 
@@ -146,6 +147,16 @@ def run(simulate, model_or_scene, inputs: dict[str, torch.Tensor], substeps: int
     start = softmpm.State(*(inputs[name] for name in "xvCF"))
     params = softmpm.Params(*(inputs[name] for name in softmpm.Params._fields))
     return simulate(model_or_scene, start, inputs.get("activation"), params, substeps=substeps)
+
+
+def surface_of(model: softmpm.Model) -> reference_contact.Surface:
+    """The model's surface points for the reference, which does not compute weights."""
+    points, rest = model.surface, model.rest_grid
+    assert points is not None
+    node = rest.index.cpu()[points.stencil.cpu().long()]
+    return reference_contact.Surface(
+        points.points.cpu(), node, points.weights.cpu(), points.areas.cpu(), points.stiffness.cpu()
+    )
 
 
 def cotangent(state: softmpm.State, seed=2) -> softmpm.State:

@@ -22,7 +22,7 @@ LAYERS = """
     stability kernels.convert reference_lagrangian
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     rest_grid
-    surface_grid
+    surface_grid mirror_grid
     describe
     model
     schemes

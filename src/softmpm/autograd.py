@@ -16,6 +16,7 @@ from softmpm.checks import (
     check_horizon,
     check_inputs,
     check_inputs_bounds,
+    check_reflected,
     check_shown,
     check_state,
     control_steps,
@@ -109,6 +110,8 @@ def _simulate(
         return _run(model, horizon, start, values, failures)
     if start.nodes is not None and not is_capturing(model):
         check_shown(start, particles_of(model, start.nodes.detach()))
+        if model.mirror is not None:
+            check_reflected(model.mirror.apart(start.nodes.u.detach(), start.nodes.v.detach()))
     nodes = nodes_of(model, start, values["mass"]) if start.nodes is None else start.nodes
     nodes = nodes._replace(shift=shift_of(model, nodes).detach())
     return particles_of(model, _run(model, horizon, nodes, values, failures))

@@ -12,7 +12,7 @@ from softmpm.devices import device_of
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.model import Model
 from softmpm.scene.check_scene import check_precision, check_scene
-from softmpm.scene.scene import Scene
+from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.schemes.registry import SCHEMES
 from softmpm.stability import need_stable, warn_sparse
 
@@ -95,6 +95,7 @@ def build(
         scheme, reason = "lagrangian", "formulation='reference'"
         alarms = dataclasses.replace(alarms, gap=None)
     else:
+        check_moving(scene)
         scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
     place = device_of(device)
     return Model(
@@ -164,6 +165,17 @@ def check_reach(scene: Scene) -> None:
             f"surface points need the nodes around them, from half a cell to one and a half cells inside the grid, but one is at "
             f"{points[outside][0].tolist()} m; move the body, enlarge the grid, or take contact='nodes'."
         )
+
+
+def check_moving(scene: Scene) -> None:
+    """Raise ValueError for what the moving formulation cannot do."""
+    for k, wall in enumerate(scene.walls):
+        if wall.contact in MIRRORS:
+            other = {"clamp": "stick", "symmetry": "slip"}[wall.contact]
+            raise ValueError(
+                f"wall {k} is a {wall.contact}, which reflects the nodes at rest and needs formulation='reference'; take that, or "
+                f"contact='{other}' and a body that reaches three cells into the wall."
+            )
 
 
 def check_reference(scene: Scene, given: tuple[str, ...], scheme: str) -> None:

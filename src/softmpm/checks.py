@@ -94,6 +94,15 @@ def check_shown(state: State, shown: State) -> None:
         )
 
 
+def check_reflected(apart: Tensor) -> None:
+    """Nodes of a state are their own images in clamps and symmetries, from which they differ by this. Reads back once."""
+    need(
+        not bool(apart > 0),
+        f"state.nodes must be zero or reflected at clamps and planes of symmetry, got {float(apart):g} besides; take "
+        "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
+    )
+
+
 def check_activation(model: Sizes, activation: Tensor | None) -> None:
     """Shape (control_step, world, muscle), dtype and device; None is no activation."""
     if activation is None:

@@ -44,9 +44,11 @@ def describe(model, substeps: int) -> str:
 
 
 def _contact(model) -> str:
-    if model.surface is None:
-        return "at nodes"
-    return f"{model.surface.count} surface points with separating walls, nodes with others"
+    text = "at nodes"
+    if model.surface is not None:
+        text = f"{model.surface.count} surface points with separating walls, nodes with others"
+    held = "" if model.mirror is None else f"; {model.mirror.count} groups of nodes held or reflected"
+    return text + held
 
 
 def _memory(model, substeps: int) -> str:

@@ -17,10 +17,11 @@ from softmpm.describe import describe
 from softmpm.inputs import QUANTITIES, direction_of, stored
 from softmpm.kernels import physics
 from softmpm.kernels.structs import Spec, types
+from softmpm.mirror_grid import MirrorGrid
 from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
 from softmpm.rest_grid import RestGrid
 from softmpm.scene.neighbours import rest_neighbours
-from softmpm.scene.scene import Scene
+from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.stability import stiffening_signs
 from softmpm.state import Low, Params, State
 from softmpm.summary import counted
@@ -54,6 +55,7 @@ class Model:
         deterministic: Whether results are the same bits from run to run.
         formulation: "moving" or "reference".
         surface: Surface points that meet the separating walls, or None if the nodes do.
+        mirror: Nodes that clamps and planes of symmetry hold or reflect, or None if the scene has neither.
         contact_width: Width over which surface contact sets in [cells].
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
         footprint: Memory of that scheme.
@@ -103,6 +105,7 @@ class Model:
         self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
         self.contact_width = contact_width
         self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface)
+        self.mirror = MirrorGrid(scene, self.rest_grid, device) if self.spec.mirrors else None
         self.strength = self._tensor([m.strength for m in scene.muscles])
         self.stiffening = self._tensor(stiffening_signs(scene))
         # Computed now, not on first use: that may be during a capture, which runs nothing.
@@ -343,6 +346,7 @@ def _spec(
         given=given,
         deterministic=fixed_point,
         surface=surface,
+        mirrors=tuple(k for k, wall in enumerate(scene.walls) if wall.contact in MIRRORS),
     )
 
 

@@ -9,6 +9,7 @@ deformations". Stress and walls are those of :mod:`softmpm.reference`, and so is
     f_i = −Σ V_p P_p g_ip + Σ N_i f_p,   P = τ F⁻ᵀ,   m_i = Σ m_p N_i                (Q2)
     v*_i = exp(−γ Δt) (v_i + Δt (f_i/m_i + g))                                       (Q3)
     v'_i = W(v*_i) by the walls at X_i + u_i,   u'_i = u_i + Δt v'_i                 (Q4)
+    v'_i from Σ m_j s_j v'_j over the images of a node in clamps and symmetries      (B1)
     x = X + Σ N u,   v = Σ N v,   C = L                                              (Q5)
     u_i = Σ m_p N_i [x_p − X_p + (F_p − I)(X_i − X_p)] / m_i
     v_i = Σ m_p N_i [v_p + C_p F_p (X_i − X_p)] / m_i                                (Q6)
@@ -32,7 +33,7 @@ from softmpm.reference import (
     stress,
 )
 from softmpm.reference_contact import Surface, contact, start_anchor
-from softmpm.scene.scene import CONTACTS, Scene
+from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
 
@@ -118,13 +119,40 @@ def step(
 ) -> tuple[Tensor, ...]:
     """One substep (Q1) to (Q4), with a surface also (K2) to (K5); ``mass`` of the nodes. Nodes without mass have the velocity zero."""
     impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
-    contacts = CONTACTS if surface is None else ("stick", "slip")
+    contacts = ("stick", "slip", "separate") if surface is None else ("stick", "slip")
     v = grid_velocity(scene, mass, mass[..., None] * v + impulse, inputs, displacement=u, contacts=contacts)
+    v = reflected(scene, mass, v)
     if surface is None:
         return u + scene.dt * v, v
     anchor = start_anchor(scene, surface, u, inputs) if anchor is None else anchor
     v, anchor, _ = contact(scene, surface, u, v, anchor, mass, inputs, smoothing)
+    v = reflected(scene, mass, v)
     return u + scene.dt * v, v, anchor
+
+
+def reflected(scene: Scene, mass: Tensor, field: Tensor) -> Tensor:
+    """The mean of a field on the nodes and its images in clamps and symmetries, weighted by mass (B1).
+
+    Planes that face each other must be three cells apart here.
+    """
+    mirrors = [wall for wall in scene.walls if wall.contact in ("clamp", "symmetry")]
+    if not mirrors:
+        return field
+    shape, dim = scene.grid.shape, scene.grid.dim
+    total, weighted = mass.unflatten(1, shape), (mass[..., None] * field).unflatten(1, shape)
+    for wall in mirrors:
+        axis = [abs(n) for n in wall.normal].index(1.0)
+        image = round(2 * wall.offset * wall.normal[axis] / scene.grid.spacing) - torch.arange(shape[axis])
+        there = (image >= 0) & (image < shape[axis])
+        source = image.clamp(0, shape[axis] - 1)
+        there = there.to(mass.dtype).view(-1, *(1,) * (dim - 1 - axis))
+        sign = torch.ones(dim, dtype=mass.dtype)
+        sign[slice(None) if wall.contact == "clamp" else axis] = -1.0
+        total = total + there * total.index_select(1 + axis, source)
+        weighted = weighted + there[..., None] * sign * weighted.index_select(1 + axis, source)
+    total, weighted = total.flatten(1, dim), weighted.flatten(1, dim)
+    mean = weighted / torch.where(total > 0, total, torch.ones_like(total))[..., None]
+    return torch.where((mass > 0)[..., None], mean, torch.zeros_like(mean))
 
 
 def simulate(
@@ -201,7 +229,7 @@ def project(scene: Scene, state: State, params: Params) -> tuple[Tensor, Tensor]
     eye = torch.eye(state.x.shape[-1], dtype=state.x.dtype)
     fields = ((state.x - points.X, state.F - eye), (state.v, state.C @ state.F))
     u, v = (_average(scene, points, mass, of_nodes, value, slope) for value, slope in fields)
-    return u, v
+    return reflected(scene, of_nodes, u), reflected(scene, of_nodes, v)
 
 
 def _average(

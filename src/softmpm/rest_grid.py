@@ -33,6 +33,7 @@ class RestGrid:
         corners: First node of each of these cells in the window of its brick, or -1, shape (brick, cell), int32.
         window: Nodes of each brick, or -1 where there is none, shape (brick, node of the window), int32.
         shares: Entries of ``window``, flat, that are a node, or -1, shape (2^dim, node), int32.
+        weight: Σ N of all particles, shape (node,), float64.
         middle: A node with many particles near the middle of them all.
     """
 
@@ -105,10 +106,9 @@ class RestGrid:
         self.fraction = torch.from_numpy(fraction[order]).to(device, dtype)
         self.corners, self.window, self.shares = integers(corners), integers(window), integers(shares)
         self.lattice = lattice if bricks.lattice else None
-        around = flat(base[:, None] + offsets, grid.shape)
-        share = np.bincount(around.reshape(-1), stencils(positions / grid.spacing, offsets)[2].reshape(-1))[
-            index
-        ]
+        around = flat(base[:, None] + offsets, grid.shape).reshape(-1)
+        share = np.bincount(around, stencils(positions / grid.spacing, offsets)[2].reshape(-1))[index]
+        self.weight = torch.from_numpy(share).to(device)
         away = np.linalg.norm(self.nodes.cpu().numpy() * grid.spacing - positions.mean(axis=0), axis=1)
         self.middle = int(np.where(share > 0.5 * share.max(), away, np.inf).argmin())
 

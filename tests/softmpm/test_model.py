@@ -22,7 +22,7 @@ from softmpm import autograd
 from softmpm.inputs import groups
 from softmpm.kernels.structs import RequestedGrads, adj_module, input_types
 from softmpm.planning.chunks import Horizon
-from softmpm.scene.scene import CONTACTS
+from softmpm.scene.scene import CONTACTS, MIRRORS
 from softmpm.schemes.buffers import passing
 from softmpm.schemes.inputs import Accumulators
 from softmpm.schemes.plain.substep import Substep
@@ -133,7 +133,7 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
 
 def test_modules_of_many_walls_have_names_short_enough_for_files():
     """With everything a scene can have, 64 walls of changing kinds among it; Warp adds numbers of its own."""
-    kinds = itertools.islice(itertools.cycle(CONTACTS), 64)
+    kinds = itertools.islice(itertools.cycle(kind for kind in CONTACTS if kind not in MIRRORS), 64)
     walls = [softmpm.Wall(normal=(0, 1), offset=0.3, contact=kind) for kind in kinds]
     spec = softmpm.build(busy_scene(2, walls=walls), device="cpu", deterministic=True).spec
     name = adj_module(spec, RequestedGrads(groups(spec))) + ".fused.few"

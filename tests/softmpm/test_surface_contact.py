@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, cotangent, dot, given
+from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
 
 import softmpm
 from softmpm import Inputs, reference_contact, reference_lagrangian
@@ -40,16 +40,6 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     alarms = softmpm.Alarms(collapse=None)
     return softmpm.build(
         made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
-    )
-
-
-def surface_of(model: softmpm.Model) -> reference_contact.Surface:
-    """The model's surface points for the reference, which does not compute weights."""
-    points, rest = model.surface, model.rest_grid
-    assert points is not None
-    node = rest.index.cpu()[points.stencil.cpu().long()]
-    return reference_contact.Surface(
-        points.points.cpu(), node, points.weights.cpu(), points.areas.cpu(), points.stiffness.cpu()
     )
 
 

@@ -40,6 +40,7 @@ class Spec:
     given: tuple[str, ...] = ()  # fields of softmpm.Inputs that calls give
     deterministic: bool = False  # sums over particles in fixed point
     surface: bool = False  # separating walls act on surface points, not on nodes
+    mirrors: tuple[int, ...] = ()  # numbers of the walls that reflect the motion of the nodes at rest
 
     @property
     def moving(self) -> bool:
@@ -50,6 +51,12 @@ class Spec:
     def surface_walls(self) -> tuple[int, ...]:
         """Numbers of the walls that act on surface points."""
         return tuple(k for k, kind in enumerate(self.contacts) if self.surface and kind == "separate")
+
+    @property
+    def node_walls(self) -> tuple[int, ...]:
+        """Numbers of the walls that act on the nodes inside them."""
+        others = (*self.surface_walls, *self.mirrors)
+        return tuple(k for k in range(len(self.contacts)) if k not in others)
 
     @property
     def module(self) -> str:

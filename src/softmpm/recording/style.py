@@ -6,7 +6,13 @@ BODY = np.array([(205, 208, 214), (216, 206, 190), (194, 210, 196), (210, 198, 2
 MUSCLE_SHADE = 0.86  # a muscle at rest is this much darker than its body
 CONTRACT, EXTEND = np.array((206, 32, 41), float), np.array((24, 88, 200), float)
 STRAIN = np.array([(52, 34, 110), (42, 92, 160), (32, 150, 148), (128, 196, 84), (250, 222, 60)], float)
-WALL = {b"stick": (70, 70, 78), b"slip": (120, 160, 190), b"separate": (120, 112, 104)}
+WALL = {
+    b"stick": (70, 70, 78),
+    b"slip": (120, 160, 190),
+    b"separate": (120, 112, 104),
+    b"clamp": (52, 52, 60),
+    b"symmetry": (150, 180, 205),
+}
 MOST_ARROWS = 3000
 
 

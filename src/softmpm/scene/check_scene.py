@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from softmpm.scene.check_mirrors import check_mirrors
 from softmpm.scene.outline import Outline
 from softmpm.scene.scene import Actuator, Grid, Particles, Scene
 from softmpm.validate import need
@@ -32,6 +33,7 @@ def check_scene(scene: Scene) -> None:
     _check_muscles(scene)
     _check_indices("scene driven", np.asarray(scene.driven), scene)
     _check_walls(scene)
+    check_mirrors(scene)
 
 
 def check_precision(scene: Scene, dtype: torch.dtype) -> None:

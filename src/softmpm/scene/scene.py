@@ -15,8 +15,10 @@ from softmpm.scene.outline import Outline
 from softmpm.summary import counted, table
 from softmpm.validate import array, need, need_kind, numbers, read_only, restore, store_numbers, unit
 
-Contact = Literal["stick", "slip", "separate"]
-CONTACTS: tuple[Contact, ...] = ("stick", "slip", "separate")
+Contact = Literal["stick", "slip", "separate", "clamp", "symmetry"]
+CONTACTS: tuple[Contact, ...] = ("stick", "slip", "separate", "clamp", "symmetry")
+MIRRORS: tuple[Contact, ...] = ("clamp", "symmetry")
+"""Kinds of a wall in whose plane a body begins and is reflected."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -183,6 +185,10 @@ class Wall:
 
     ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the
     wall and applies Coulomb friction to the rest.
+
+    ``clamp`` holds the face with which a body begins at the wall's plane, and ``symmetry`` leaves it free to slide in that plane: both
+    reflect the body's motion there, and converge with spacing² where ``stick`` and ``slip`` converge with the spacing. They need
+    ``formulation="reference"``, and a plane along the grid's axes that lies on nodes or midway between them.
     """
 
     normal: Sequence[float]
@@ -190,7 +196,7 @@ class Wall:
     offset: float
     """The wall's surface is n·x = offset [m]."""
     contact: Contact = "separate"
-    """Response of a node inside the wall, see above."""
+    """Kind of the wall, see above."""
     friction: float = 0.0
     """Coulomb coefficient [-], for ``separate`` only. Good values: 0.3 to 1.0 for a floor that is walked on."""
 

@@ -61,7 +61,7 @@ def scene(**changes) -> Scene:
         (lambda: Muscle(particles=[0], direction=(1, 0), strength=np.inf), "strength must be finite"),
         (
             lambda: Wall(normal=(0, 1), offset=0, contact="sticky"),
-            "one of stick, slip, separate, got 'sticky'",
+            "one of stick, slip, separate, clamp, symmetry, got 'sticky'",
         ),
         (lambda: Wall(normal=(0, 1), offset=np.nan), "wall offset must be finite"),
         (lambda: Wall(normal=(0, 0), offset=0), "wall normal must not be zero"),

@@ -233,7 +233,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     friction_of, normal_of, height, present = one.friction_of, one.normal_of, one.height, one.present
     at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
     arms, place, before_wall = r.count, nodes(spec).place, wp.types.matrix((count, dim), real)
-    exact_vec = types(dim, "float64").vec
+    exact_vec, mirrored = types(dim, "float64").vec, bool(spec.mirrors)
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -251,8 +251,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_u: wp.array2d(dtype=vec),
         # In and out:
         adj_v: wp.array2d(dtype=vec),
-        # Out:
+        # Out, with clamps in:
         free: wp.array2d(dtype=vec),
+        # Out:
         shared: wp.array2d(dtype=vec),
         # Out, added into:
         adj_mass: wp.array2d(dtype=real),
@@ -262,6 +263,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         m = mass[world, i]
         x = place(constants, inside, i, shift[world], u[world, i])
         v = node_velocity(constants, inputs, world, x, p[world, i], m)
+        if wp.static(mirrored):
+            v = free[world, i]  # reflected already
         adj = adj_v[world, i] + constants.dt * adj_u[world, i]
         free[world, i] = v
         adj_v[world, i] = adj

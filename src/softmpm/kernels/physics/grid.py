@@ -66,7 +66,7 @@ def grid(spec: Spec) -> SimpleNamespace:
             @wp.func
             def after(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, v: vec) -> vec:
                 return v
-        elif count - 1 in spec.surface_walls:
+        elif count - 1 not in spec.node_walls:
             return after_walls(count - 1)
         else:
             before, last = after_walls(count - 1), wall(spec, count - 1)
@@ -151,7 +151,7 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 adj_inputs: GridInputsAdj,
             ) -> vec:
                 return adj
-        elif k in spec.surface_walls:
+        elif k not in spec.node_walls:
             return after_walls_adj(k + 1)
         else:
             through_others, inside, meet = after_walls_adj(k + 1), wall(spec, k).inside, wall(spec, k).meet

@@ -15,6 +15,7 @@ from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
+from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
 from softmpm.state import Nodal
@@ -31,6 +32,7 @@ class ChunkBuffers:
         words: Status words, see errors.py; shape (world,).
         inputs: Inputs, those of particles in the order of their places.
         contact: Contact of surface points, or None.
+        reflection: Clamps and planes of symmetry, or None.
     """
 
     def __init__(self, model: Model, chunk: Chunk, keep: bool):
@@ -55,9 +57,11 @@ class ChunkBuffers:
         self.mass_array, self.partial_array = view(self.mass, real), view(self.partial, vec)
         self.placed_mass = view(self.inputs.values["mass"], real)
         self.words_array = view(self.words, wp.int64)
-        self.contact = None
+        self.contact = self.reflection = None
         if model.surface is not None:
             self.contact = SurfaceContact(model, self.mass, self.anchor, self.shift)
+        if model.mirror is not None:
+            self.reflection = Reflection(model, self.mass)
 
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
@@ -143,7 +147,10 @@ class ChunkAdjoint:
         self.adj_placed_mass = None
         if "mass" in self.found.tensors:
             self.adj_placed_mass = view(self.found.tensors["mass"], forward.types.real)
-        self.contact = None
+        self.contact = self.reflection = None
+        if forward.reflection is not None:
+            given = shared.wanted, forward.words_array, shared.mass_array
+            self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
             given = shared.wanted, shared.held, shared.anchor, shared.mass_array
             self.contact = SurfaceContactAdj(forward.contact, *given)

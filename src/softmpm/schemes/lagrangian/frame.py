@@ -12,8 +12,10 @@ from softmpm.state import Nodal
 
 
 def quantum(model: Model) -> float:
-    """Of the shift [m]: the power of two from a cell on, so that u changes without rounding."""
-    return 2.0 ** math.ceil(math.log2(model.scene.grid.spacing))
+    """Of the shift [m]: the power of two from a cell on, so that u changes without rounding. Infinite with clamps and planes of
+    symmetry, where u is held or reflected.
+    """
+    return math.inf if model.mirror is not None else 2.0 ** math.ceil(math.log2(model.scene.grid.spacing))
 
 
 def frame_struct(model: Model) -> Any:

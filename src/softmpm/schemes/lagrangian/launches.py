@@ -52,8 +52,12 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     parameters = (model.constants, inputs, buffers.rest, buffers.frame)
     arguments = (*parameters, *sums, shift, *state, p, new_shift, new[0], velocity)
     node_launch(model, launch, nodes(model.spec).advance, *arguments)
+    if buffers.reflection is not None:
+        buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
     if contact is not None:
         contact.advance(launch, inputs, buffers.words_array, now, then, *state, *new)
+        if buffers.reflection is not None:
+            buffers.reflection.advance(launch, buffers.words_array, state[0], new[1], new[0])
 
 
 def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
@@ -78,12 +82,15 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     model, row = forward.model, forward.chunk.row(s)
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(row)
     u, v, p = forward.u_arrays[s], forward.v_arrays[s], forward.p_arrays[s]
+    stored, out = (u, p, forward.v_arrays[s + 1]), (shared.u_array, shared.v_array)
+    if adjoint.reflection is not None:
+        adjoint.reflection.begin(launch, inputs, forward.rest, *stored, *out)
     if adjoint.contact is not None:
-        stored = u, p, forward.v_arrays[s + 1]
-        structs = inputs, adj_inputs, forward.rest
-        adjoint.contact.advance(launch, s, *structs, *stored, shared.u_array, shared.v_array)
+        adjoint.contact.advance(launch, s, inputs, adj_inputs, forward.rest, *stored, *out)
+    if adjoint.reflection is not None:
+        adjoint.reflection.finish(launch, *out)
     parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held)
-    out = (shared.u_array, shared.v_array, shared.f_array, shared.mass_array, adj_inputs)
+    out = (*out, shared.f_array, shared.mass_array, adj_inputs)
     kernel = nodes_adj(model.spec, shared.wanted).advance_adj
     node_launch(model, launch, kernel, *parameters, forward.shift_arrays[s], u, v, p, *out)
 

@@ -1,6 +1,6 @@
 """The two representations of a state in the reference formulation: nodes, and the particles that show them. Differentiable.
 
-Equations: kernels/lagrangian/projection.py.
+Equations: kernels/lagrangian/projection.py. Clamps and planes of symmetry then hold and reflect the nodes by (B1).
 """
 
 from typing import Any
@@ -40,7 +40,9 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     moved = (moved - shift[:, None]).to(model.dtype)
     placed = mass.index_select(1, model.rest_grid.order)
     found: Any = _Project.apply(model, moved, state.v, state.C, state.F, placed)
-    u, v = found
+    of_nodes, u, v = found
+    if model.mirror is not None:
+        u, v = model.mirror.reflected(of_nodes, u, v)
     return Nodal(u, v, _anchors(model, u), shift)
 
 
@@ -137,7 +139,7 @@ class _Project(torch.autograd.Function):
         node_mass, nodal_u, nodal_v = _project(model, moved, v, C, F, mass)
         ctx.model = model
         ctx.save_for_backward(moved, v, C, F, mass, node_mass, nodal_u, nodal_v)
-        return nodal_u, nodal_v
+        return node_mass, nodal_u, nodal_v
 
     @staticmethod
     @once_differentiable
@@ -167,6 +169,7 @@ def _project_adj(
     node_mass: Tensor,
     nodal_u: Tensor,
     nodal_v: Tensor,
+    adj_of_nodes: Tensor,
     adj_u: Tensor,
     adj_v: Tensor,
 ) -> list[Tensor]:
@@ -174,6 +177,7 @@ def _project_adj(
     each, adj_node_mass = [adj_u.clone(), adj_v.clone()], torch.empty_like(node_mass)
     arguments = one.views(node_mass, nodal_u, nodal_v, *each, adj_node_mass)
     node_launch(model, one.launch, one.sums.means_adj, *arguments)
+    adj_node_mass += adj_of_nodes
     found, adj_mass = one.particles(), torch.zeros_like(mass)
     arguments = one.views(mass, moved, v, C, F, *each, *found, adj_mass)
     brick_launch(model, one.launch, one.kernels.project_adj, model.constants, one.rest, *arguments)

@@ -1,0 +1,60 @@
+"""Motion of a viscous block on an incline in the reference formulation: `python bench/incline.py [--device cpu] [--json FILE]`
+
+A block of 10 x 3 cells is put on an incline of the angle of friction plus some degrees. Mean acceleration in the windows of 0.1 s from
+0.2 s on, and speed at 0.6 s; a rigid block has ``exact``, or rests below the angle of friction.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from common import Table, arguments
+
+import softmpm
+
+BLOCKS = [
+    *((degrees, 32, 4e-3, contact) for degrees in (3.0, 0.5, -0.5) for contact in ("surface", "nodes")),
+    *((degrees, 32, 1e-3, contact) for degrees in (3.0, -0.5) for contact in ("surface", "nodes")),
+    (-0.5, 64, 1e-3, "surface"),
+]
+"""Degrees above the angle of friction, cells per metre, relaxation time η/μ [s] and contact."""
+
+
+def incline(degrees: float, cells: int, relaxation: float, contact: str, device: torch.device) -> dict:
+    """Motion of the block along the incline."""
+    h, friction, young = 1 / cells, 0.5, 2e5
+    angle, corner = math.atan(friction) + math.radians(degrees), (math.floor(0.1 * cells) + 0.5) * h
+    shape = softmpm.box((corner, 3.5 * h), (corner + 10 / 32, 3.5 * h + 3 / 32), spacing=h / 2)
+    material = softmpm.NeoHookean(
+        density=1000.0, young=young, poisson=0.3, viscosity=relaxation * young / 2.6
+    )
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(int(0.8 * cells), int(0.2 * cells) + 8), spacing=h),
+        bodies=[softmpm.Body(shape, material)],
+        walls=[softmpm.Wall(normal=(0.0, 1.0), offset=3.5 * h, friction=friction)],
+        gravity=(9.81 * math.sin(angle), -9.81 * math.cos(angle)),
+        dt=1.0,
+    )
+    scene = dataclasses.replace(scene, dt=0.4 * softmpm.stable_dt(scene))
+    settings = dict(device=device, dtype=torch.float64, formulation="reference", contact=contact)
+    model = softmpm.build(scene, **settings)
+    substeps, state, speeds = int(0.1 / scene.dt), model.rest(), []
+    for _ in range(6):
+        state = softmpm.simulate(model, state, None, model.params(), substeps=substeps)
+        speeds.append(state.v[..., 0].mean().item())
+    found = np.diff(speeds)[1:] / (substeps * scene.dt)
+    exact = 9.81 * (math.sin(angle) - friction * math.cos(angle))
+    row = {"degrees": degrees, "cells": cells, "tau ms": 1e3 * relaxation, "contact": contact}
+    return row | {f"a {k / 10} s": a for k, a in enumerate(found, 2)} | {"exact": exact, "speed": speeds[-1]}
+
+
+def main():
+    args = arguments(__doc__)
+    table = Table("Block on an incline, m/s² and m/s, float64", torch.device(args.device), args.json)
+    for block in BLOCKS:
+        table.add(incline(*block, torch.device(args.device)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Problems with exact answers, for bench/accuracy.py and the tests."""

@@ -1,0 +1,240 @@
+"""Clamps and planes of symmetry: every value and gradient against the float64 reference, and what they promise."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
+
+import softmpm
+from softmpm import Inputs, reference_contact, reference_lagrangian
+from softmpm.schemes.lagrangian.nodal import particles_of
+
+NAMES = ("gravity", "damping", "friction", "viscosity", "force")
+STEPS = 3
+
+
+def corner(dim: int, **changes) -> softmpm.Scene:
+    """A block in a clamp on the left, between two planes of symmetry in front, on two rough floors and at a slipping side wall."""
+    lower, upper = (0.2, 0.33, 0.15)[:dim], (0.42, 0.52, 0.45)[:dim]
+    shape = softmpm.box(lower, upper, spacing=0.05)
+    material = softmpm.NeoHookean(density=1.2, young=80.0, poisson=0.3, viscosity=0.02)
+    settings = dict(
+        grid=softmpm.Grid(shape=(9, 10, 8)[:dim], spacing=0.1),
+        bodies=[softmpm.Body(shape, material)],
+        muscles=[softmpm.Muscle(particles=np.arange(6), direction=(1.0, 0.4, 0.2)[:dim], strength=10.0)],
+        walls=[
+            softmpm.Wall(normal=(1.0, 0.0, 0.0)[:dim], offset=0.2, contact="clamp"),
+            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.35, friction=0.4),
+            softmpm.Wall(normal=(-0.4, 1.0, 0.0)[:dim], offset=0.22, friction=0.2),
+            softmpm.Wall(normal=(-1.0, 0.2, 0.0)[:dim], offset=-0.35, contact="slip"),
+            *[
+                softmpm.Wall(normal=(0.0, 0.0, side), offset=side * place, contact="symmetry")
+                for side, place in ((1.0, 0.15), (-1.0, 0.45))[: 2 * (dim - 2)]
+            ],
+        ],
+        gravity=(0.3, -9.8, 0.2)[:dim],
+        damping=0.7,
+        dt=3e-3,
+    )
+    return softmpm.Scene(**(settings | changes))
+
+
+def build(made: softmpm.Scene, **settings) -> softmpm.Model:
+    alarms = softmpm.Alarms(collapse=None)
+    return softmpm.build(
+        made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
+    )
+
+
+def by_reference(model, start, activation, params, substeps, inputs) -> softmpm.State:
+    made, settings = model.scene, {}
+    u, v = reference_lagrangian.project(made, start, params)
+    if model.surface is not None:
+        surface = surface_of(model)
+        settings = dict(surface=surface, anchor=reference_contact.start_anchor(made, surface, u))
+    u, v, *_ = reference_lagrangian.simulate(
+        made, u, v, activation, params, substeps=substeps, inputs=inputs, **settings
+    )
+    return reference_lagrangian.evaluate(made, u, v)
+
+
+@pytest.mark.parametrize("contact", ["nodes", "surface"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_end_and_all_gradients_are_those_of_the_reference(dim, contact, device):
+    """A clamp, planes of symmetry, walls on nodes and at surface points at once, in two worlds."""
+    for dtype, limit in ((torch.float64, 1e-10), (torch.float32, 2e-3)):
+        settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact=contact)
+        model = build(corner(dim), **settings)
+        leaves = busy_inputs(model, control_steps=STEPS) | given(model, NAMES, STEPS)
+        copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
+        found = []
+        for tensors in (leaves, copies):
+            start = softmpm.State(*(tensors[name] for name in "xvCF"))
+            params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
+            inputs, activation = Inputs(**{name: tensors[name] for name in NAMES}), tensors["activation"]
+            if tensors is leaves:
+                end = softmpm.simulate(model, start, activation, params, substeps=2, inputs=inputs)
+            else:
+                end = by_reference(model, start, activation, params, 2, inputs)
+            loss = dot(cotangent(end), end)
+            found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
+        for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
+            assert want.abs().max() > 0, f"the test does not exercise {name}"
+            assert_relative(got.detach().cpu().double(), want.detach(), limit, f"{name} in {dtype}")
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_reference_agrees_with_central_differences(dim):
+    """Through four substeps with both reflections, along one random direction of the nodes and of the density."""
+    made = corner(dim)
+    model = build(made, dtype=torch.float64, contact="surface")
+    surface, params = surface_of(model), model.params()
+    generator = torch.Generator().manual_seed(3)
+    state = model.rest()
+    state = state._replace(v=torch.randn(state.v.shape, generator=generator, dtype=torch.float64))
+    u, v = reference_lagrangian.project(made, state, params)
+    ways = [torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in (v, params.density)]
+    mass = reference_lagrangian.node_mass(
+        made, reference_lagrangian.quadrature(made), params.density * model.volume[None]
+    )
+    ways[0] *= (mass > 0)[..., None]
+
+    def loss(v, density):
+        end = reference_lagrangian.simulate(
+            made, u, v, None, params._replace(density=density), substeps=4, surface=surface
+        )
+        return dot(cotangent(softmpm.State(*end[:2], *end[:2])), softmpm.State(*end[:2], *end[:2]))
+
+    leaves = [v.clone().requires_grad_(), params.density.clone().requires_grad_()]
+    gradient = dot(ways, torch.autograd.grad(loss(*leaves), leaves)).item()
+    h = 1e-6
+    up, down = (
+        loss(*(t + step * way for t, way in zip((v, params.density), ways, strict=True))).item()
+        for step in (h, -h)
+    )
+    assert abs((up - down) / (2 * h) - gradient) <= 1e-7 * abs(gradient)
+
+
+def test_a_reflection_is_a_projection_that_takes_energy(device):
+    """(B1) twice is (B1) once, the field is its own image, and the kinetic energy does not grow."""
+    model = build(corner(3), device=device, dtype=torch.float64)
+    mirror, rest = model.mirror, model.rest_grid
+    assert mirror is not None
+    mass = torch.zeros(1, rest.count, dtype=torch.float64, device=model.device)
+    mass.index_add_(1, rest.stencil.flatten(), (model.mass[:, None] * rest.weights).flatten()[None])
+    v = torch.randn(1, rest.count, 3, dtype=torch.float64).to(model.device)
+    (once,) = mirror.reflected(mass, v)
+    (twice,) = mirror.reflected(mass, once)
+    torch.testing.assert_close(twice, once, rtol=1e-13, atol=1e-14)
+    assert mirror.apart(once) == 0.0 and mirror.apart(v) > 0.1
+    energy, before = ((mass[..., None] * field.square()).sum() for field in (once, v))
+    torch.testing.assert_close(
+        before - energy, (mass[..., None] * (v - once).square()).sum(), rtol=1e-12, atol=0
+    )
+    on = rest.nodes[:, 0] == 2
+    assert on.any() and (once[:, on] == 0).all()  # the clamp at 0.2 m
+    between = rest.nodes[:, 2] == 3  # not near a plane of symmetry, nor the clamp
+    free = between & (rest.nodes[:, 0] > 3)
+    assert free.any() and torch.equal(once[:, free], v[:, free])
+
+
+def test_calls_in_turn_are_one_call(device):
+    """A state with nodes continues to the bit, with its gradient."""
+    model = build(corner(2), device=device, dtype=torch.float64)
+    inputs = busy_inputs(model, control_steps=4)
+    start = softmpm.State(*(inputs[name] for name in "xvCF"))
+    rows = inputs["activation"]
+    whole = softmpm.simulate(model, start, rows, model.params(), substeps=5)
+    first = softmpm.simulate(model, start, rows[:2], model.params(), substeps=5)
+    parts = softmpm.simulate(model, first, rows[2:], model.params(), substeps=5)
+    for got, want in zip(parts[:4], whole[:4], strict=True):
+        assert torch.equal(got, want)
+    found = [
+        torch.autograd.grad(dot(cotangent(end), end), list(inputs.values())[:5]) for end in (whole, parts)
+    ]
+    for name, want, got in zip(inputs, *found, strict=False):
+        assert_relative(got, want, 1e-12, name)
+
+
+def test_nodes_that_are_not_images_are_refused():
+    """A change of state.nodes that a clamp does not allow, shown by the particles too."""
+    model = build(corner(2), dtype=torch.float64)
+    state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=2)
+    assert state.nodes is not None
+    for nodes in (state.nodes._replace(u=state.nodes.u + 1e-3), state.nodes._replace(v=0.5 + state.nodes.v)):
+        with pytest.raises(ValueError, match="must be zero or reflected at clamps"):
+            softmpm.simulate(model, particles_of(model, nodes), None, model.params(), substeps=1)
+
+
+def test_a_slab_between_planes_of_symmetry_is_plane_strain(device):
+    """One cell thick, in 3D, with a clamp at one end: the motion of the plane scene, to rounding."""
+    ends = []
+    for dim in (2, 3):
+        shape = softmpm.box((0.2, 0.3, 0.3)[:dim], (0.6, 0.5, 0.4)[:dim], spacing=0.05)
+        sides = [
+            softmpm.Wall(normal=(0.0, 0.0, side), offset=side * place, contact="symmetry")
+            for side, place in ((1.0, 0.3), (-1.0, 0.4))[: 2 * (dim - 2)]
+        ]
+        clamp = softmpm.Wall(normal=(1.0, 0.0, 0.0)[:dim], offset=0.2, contact="clamp")
+        material = softmpm.NeoHookean(density=1.0, young=200.0, poisson=0.3)
+        made = softmpm.Scene(
+            grid=softmpm.Grid(shape=(9, 9, 7)[:dim], spacing=0.1),
+            bodies=[softmpm.Body(shape, material)],
+            walls=[clamp, *sides],
+            gravity=(0.0, -9.8, 0.0)[:dim],
+            dt=2e-3,
+        )
+        model = build(made, device=device, dtype=torch.float64)
+        end = softmpm.simulate(model, model.rest(), None, model.params(), substeps=50)
+        if dim == 3:
+            torch.testing.assert_close(end.x[..., 2], model.rest().x[..., 2], rtol=0, atol=1e-14)
+            assert end.x.shape[1] == 2 * len(ends[0])
+        ends.append((end.x - model.rest().x)[0, :: dim - 1, :2])
+    assert ends[0].abs().max() > 0.01
+    torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wall", "said"),
+    [
+        (dict(normal=(1.0, 0.1), offset=0.2), "normal along an axis of the grid"),
+        (dict(offset=0.21), "must lie on nodes or midway"),
+        (dict(offset=0.25), "cut the body off there"),
+        (dict(offset=0.1), "nearest particle is 0.1275 m in front"),
+        (dict(friction=0.1), "a clamp wall has no friction"),
+    ],
+)
+def test_clamps_that_cannot_be_are_refused(wall, said):
+    """With the rule, the value and a remedy."""
+
+    def make():
+        return build(corner(2, walls=[softmpm.Wall(**(settings | wall))]))
+
+    settings = dict(normal=(1.0, 0.0), offset=0.2, contact="clamp")
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+def test_walls_that_reflect_leave_room_and_need_the_reference_formulation():
+    """Two that face the same way or are too close, and any of them on a moving grid."""
+    made = corner(2)
+    clamp = made.walls[0]
+    for others, said in (
+        ([dataclasses.replace(clamp, contact="symmetry")], "face the same way"),
+        ([softmpm.Wall(normal=(0.0, 1.0), offset=0.4, contact="symmetry")], "cut the body off there"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            build(dataclasses.replace(made, walls=[clamp, *others]))
+    body = softmpm.Body(softmpm.box((0.2, 0.3), (0.25, 0.5), spacing=0.05), made.bodies[0].material)
+    back = softmpm.Wall(normal=(-1.0, 0.0), offset=-0.25, contact="clamp")
+    thin = dataclasses.replace(made, bodies=[body], walls=[clamp, back], muscles=[])
+    with pytest.raises(ValueError, match=r"face each other at 0\.5 cells"):
+        build(thin)
+    for kind, other in (("clamp", "stick"), ("symmetry", "slip")):
+        walls = [dataclasses.replace(clamp, contact=kind)]
+        with pytest.raises(
+            ValueError, match=f"needs formulation='reference'; take that, or contact='{other}'"
+        ):
+            softmpm.build(dataclasses.replace(made, walls=walls), device="cpu")

@@ -1,0 +1,61 @@
+"""Short problems of bench/accuracy.py with limits; docs/accuracy.md has all of them."""
+
+import math
+
+import pytest
+from bench.problems import contact, exact, statics, waves
+
+
+def test_a_cantilever_bends_as_the_exact_beam():
+    """By a fifth of its length: 0.2 % with 1.2 million particle-substeps, 1 % with 0.4 million."""
+    for size, limit, cost in (((3, 3), 0.2, 1.2), ((2, 3), 1.0, 0.4)):
+        found = statics.beam("reference", *size, sinks=0.2, dim=2)
+        assert abs(found["error %"]) <= limit
+        assert found["cost M"] <= cost
+
+
+def test_a_cantilever_of_two_cells_bends_in_3d():
+    """Within 2 %."""
+    assert abs(statics.beam("reference", 2, 3, sinks=0.2, dim=3)["error %"]) <= 2.0
+
+
+def test_a_column_sinks_under_its_weight():
+    """Within 0.03 % with 32 cells, where a sticking wall has an error of 0.9 %."""
+    assert abs(statics.column("reference", 32, 2)["error %"]) <= 0.03
+
+
+@pytest.mark.parametrize(("clamped", "limit"), [(True, 0.12), (False, 0.4)])
+def test_a_bar_vibrates_with_second_order(clamped, limit):
+    """Lowest frequency with 16 cells, and the order from 8 to 16."""
+    coarse, fine = (waves.bar("reference", n, 2, clamped=clamped)["error %"] for n in (8, 16))
+    assert abs(fine) <= limit
+    assert math.log2(coarse / fine) >= 1.9
+
+
+def test_a_disc_breathes():
+    """Within 0.7 % with 32 cells per unit of length, 8 in its radius."""
+    assert abs(waves.disc("reference", 32, 2)["error %"]) <= 0.7
+
+
+def test_a_disc_rests_as_hertz_says():
+    """Its centre sinks by the exact amount to 1 %, its largest pressure is exact to 3 %, with 1.7 cells in half of the contact."""
+    found = contact.hertz(32, 2)
+    assert abs(found["sinking"]["error %"]) <= 1.0
+    assert abs(found["pressure"]["error %"]) <= 3.0
+
+
+def test_a_block_rests_on_the_floor():
+    """Without a gap: within half a hundredth of a cell."""
+    assert abs(contact.gap(2, 2)["error %"]) <= 0.5
+
+
+def test_the_exact_answers():
+    """Against the literature: roots of the disc, torsion of a square, a small beam, a light column."""
+    assert abs(exact.breathing(0.3) - 2.12575) < 1e-5
+    assert abs(exact.breathing(0.0) - 1.84118) < 1e-5
+    assert abs(exact.twist_of_bar(1.0, 1.0, 1.0, 1.0) * 2 * 0.1406 - 1) < 3e-4
+    of = exact.section(1e5, 0.3, 0.1, None)
+    small = exact.tip_of_beam(1e-3, 0.8, of)
+    assert abs(small / (1e-3 * 0.8**4 / (8 * of.bending) + 1e-3 * 0.8**2 / (2 * of.shear)) - 1) < 1e-6
+    light = exact.column([1.0], 1.0, 1e-6, 1.0, 1.0)[0]
+    assert abs(light / (-1e-6 / 6) - 1) < 1e-5
