@@ -24,12 +24,13 @@ LAYERS = """
     surface_grid
     describe
     model
-    nodal schemes
+    nodal
+    schemes
     schemes.plain schemes.fast schemes.lagrangian recording
     schemes.registry
     kernel_inputs
     building runner rasterization cuda_graph
-    rollout
+    rollout forces
     autograd warp_arrays
     warp_api __main__
 """

@@ -108,7 +108,10 @@ def _simulate(
         return _run(model, horizon, start, values, failures)
     if start.nodes is not None and not is_capturing(model):
         check_shown(start, particles_of(model, start.nodes.detach()))
-    nodes = nodes_of(model, start, values["mass"]) if start.nodes is None else start.nodes
+    nodes = start.nodes
+    if nodes is None:
+        normals = values["normal"][0] if model.spec.moving else None  # at the beginning of the call
+        nodes = nodes_of(model, start, values["mass"], normals)
     return particles_of(model, _run(model, horizon, nodes, values, failures))
 
 
@@ -259,8 +262,7 @@ class _SimulateBackward(_Function):
         call, wanted, *tensors = given
         values, state = call.split(tensors)
         kind: Any = Nodal if call.model.formulation == "reference" else State
-        count = 3 if kind is Nodal else 4
-        pairs = zip(state[-count:], state[:count], strict=True)
+        pairs = zip(state[-4:], state[:4], strict=True)
         adj_end = kind(*(torch.zeros_like(like) if adj is None else adj for adj, like in pairs))
         with explain_out_of_memory(call.model, call.horizon, gradient=True):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)

@@ -75,7 +75,7 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
             "formulation='reference'."
         )
     shape = (model.worlds, model.rest_grid.count, model.dim)
-    for name, wanted in zip(Nodal._fields, (shape, shape, model.anchor_shape), strict=True):
+    for name, wanted in zip(Nodal._fields, (shape, shape, *2 * (model.anchor_shape,)), strict=True):
         _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
 
 

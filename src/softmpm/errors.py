@@ -31,6 +31,7 @@ class Kind(IntEnum):
     STEP = 6
     TORN = 7
     COLLAPSED = 8
+    IN_WALL = 9
 
 
 class UnstableError(RuntimeError):

@@ -38,11 +38,12 @@ def inverse(F: Tensor) -> Tensor:
     return torch.stack(columns, -1) / (a * columns[0]).sum(-1)[..., None, None]
 
 
-def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
+def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = None) -> Nodal:
     """Nodal state from the four fields of the particles (Q6).
 
     Args:
         mass: Mass of the particles in any unit, shape (world, particle).
+        normals: Unit normals of all walls, shape (world, wall, dim); None takes the scene's.
     """
     grid = model.rest_grid
     share = mass[..., None] * grid.weights.to(model.dtype)  # (world, particle, node)
@@ -55,18 +56,29 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     total = _added(grid, share[..., None])
     total = torch.where(total > 0, total, 1.0)  # a node at the very edge of a spline has no mass
     u, v = (_added(grid, share[..., None] * field) / total for field in (u, v))
-    return Nodal(u, v, _anchors(model, u))
+    anchors = _anchors(model, u, normals)
+    return Nodal(u, v, anchors, torch.zeros_like(anchors))
 
 
-def _anchors(model: Model, u: Tensor) -> Tensor:
+def _anchors(model: Model, u: Tensor, normals: Tensor | None) -> Tensor:
     """Anchors of surface points that touch nothing yet: their places across the normal of each separating wall."""
     surface = model.surface
     if surface is None:
         return u.new_zeros(model.anchor_shape)
+    x = surface_places(model, u)
+    if normals is None:
+        n = surface.normals.expand(len(u), -1, -1).to(u.dtype)
+    else:
+        n = normals[:, model.spec.surface_walls].to(u.dtype)
+    return x[:, None] - torch.einsum("wpd,wkd->wkp", x, n)[..., None] * n[:, :, None]
+
+
+def surface_places(model: Model, u: Tensor) -> Tensor:
+    """Places of the surface points [m], shape (world, point, dim), from the displacements of the nodes (K2)."""
+    surface = model.surface
+    assert surface is not None, "the nodes meet the walls here"
     near = u[:, surface.stencil.long()]
-    x = surface.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, surface.weights.to(u.dtype))
-    normals = surface.normals.to(u.dtype)
-    return x[:, None] - torch.einsum("wpd,kd->wkp", x, normals)[..., None] * normals[:, None]
+    return surface.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, surface.weights.to(u.dtype))
 
 
 def _added(grid, terms: Tensor) -> Tensor:

@@ -19,9 +19,9 @@ from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, grid_struct, particle_struct
+from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, elapsed, grid_struct, particle_struct
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
-from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
+from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj, check_start
 from softmpm.state import Nodal, State
 
 
@@ -56,6 +56,8 @@ class LagrangianRun:
         self.model, self.chunk, self.start = model, chunk, start
         self.types, self.stream = types(model.spec.dim, model.spec.dtype), stream_of(model.device)
         self._values = model.fixed | values  # the structs only see their tensors
+        if model.spec.moving:
+            self._values["elapsed"] = elapsed(model, chunk.first, chunk.length, chunk.substeps)
         self._rest = rest_struct(model)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         self.words_array = view(self.words, wp.int64)
@@ -69,18 +71,23 @@ class LagrangianRun:
         stored = chunk.length if keep else 1
         self._u, self._v, self._p = self._nodal(stored + 1), self._nodal(stored + 1), self._nodal(stored)
         self._anchor = self._tensor(stored + 1, *model.anchor_shape)
-        for own, given in zip((self._u, self._v, self._anchor), start, strict=True):
+        for own, given in zip((self._u, self._v, self._anchor), start[:3], strict=True):
             own[0].copy_(given.detach())
+        force = start.force.detach().clone()
         self._partial = self._cells()
         self._contact = None
         if model.surface is not None:
-            self._contact = SurfaceContact(model, self._mass, self._anchor, self._launch)
+            about = (chunk, self._mass, self._anchor, force, self._launch)
+            self._contact = SurfaceContact(model, *about)
         for s in range(chunk.length):
             self._use_inputs(s, s - 1)
             self._advance(s, keep)
         last = chunk.length if keep else chunk.length % 2
         # A result must not keep all states alive:
-        self.end = Nodal(*(tensor[last].clone() for tensor in (self._u, self._v, self._anchor)))
+        u, v, anchor = (tensor[last].clone() for tensor in (self._u, self._v, self._anchor))
+        self.end = Nodal(u, v, anchor, force)
+        if self._contact is not None:
+            self._contact.check_end(self._grid_inputs, self._array(self.end.u), self.words_array)
         arguments = (model.constants, self._rest, chunk.length - 1, self._array(self.end.u))
         kernel, lead = cells(model.spec).check_end, self._partial.shape[:2]
         self._launch(kernel, lead, *arguments, self.words_array)
@@ -105,8 +112,10 @@ class LagrangianRun:
     def _use_inputs(self, s: int, before: int) -> None:
         """Set the structs of substep ``s``, unless those of the substep that ran before it serve."""
         row = self.chunk.row(s)
-        if not (0 <= before < self.chunk.length and row == self.chunk.row(before)):
+        same = 0 <= before < self.chunk.length and row == self.chunk.row(before)
+        if not same:
             self._particle_inputs = particle_struct(self.model, self._values, row, row)
+        if not same or self.model.spec.moving:
             self._grid_inputs = grid_struct(self.model, self._values, row, s)
 
     def _advance(self, s: int, keep: bool) -> None:
@@ -124,7 +133,7 @@ class LagrangianRun:
         velocity = new[1] if self._contact is None else self._contact.free
         self._launch(kernel, self._mass.shape, *parameters, self.words_array, *state, new[0], velocity)
         if self._contact is not None:
-            self._contact.advance(self._grid_inputs, self.words_array, now, then, u, v, *new)
+            self._contact.advance(s, self._grid_inputs, self.words_array, now, then, u, v, *new)
 
     def vjp(self, adj_end: Nodal, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Nodal:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
@@ -140,7 +149,7 @@ class LagrangianRun:
         arrays = [self._array(tensor) for tensor in (*adj[:2], adj_f, self._partial, partial_v)]
         adj_mass_array, contact = view(adj_mass, self.types.real), None
         if self._contact is not None:
-            given = (wanted, self._held, adj.anchor, adj_mass_array)
+            given = (wanted, self._held, adj.anchor, adj.force, adj_mass_array)
             contact = SurfaceContactAdj(self._contact, *given)
         for s in reversed(range(chunk.length)):
             self._use_inputs(s, s + 1)
@@ -204,10 +213,17 @@ class Lagrangian:
         words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
         arguments = (model.constants, rest_struct(model), 0, u, view(words, wp.int64))
-        lead = (model.worlds, model.rest_grid.cell_count)
-        kernel = cells(model.spec).check_end
-        launch(kernel, lead, arguments, device=model.wp_device, stream=stream_of(model.device))
+        self._launch(cells(model.spec).check_end, (model.worlds, model.rest_grid.cell_count), *arguments)
+        if model.surface is not None:
+            known = model.fixed | values
+            if model.spec.moving:
+                known["elapsed"] = elapsed(model, 0, 1, 1)
+            check_start(model, grid_struct(model, known), u, view(words, wp.int64), self._launch)
         return words
+
+    def _launch(self, kernel, dim: Sequence[int], *inputs) -> None:
+        model = self.model
+        launch(kernel, tuple(dim), inputs, device=model.wp_device, stream=stream_of(model.device))
 
     def accept(self, run: LagrangianRun, words: list[int]) -> bool:
         return True
