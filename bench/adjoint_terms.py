@@ -40,7 +40,13 @@ INTEGERS = (
         "node_index",
         "node_coordinates",
     ),
-    *("place_of", "place", "present", "height"),  # in float64, which a factor of the model's precision is not
+    *(
+        "place_of",
+        "place",
+        "present",
+        "exact_vec",
+        "float64",
+    ),  # in float64, which a factor of the model's precision is not
     *("coordinates", "offset", "range", "len", "law_of", "actuator_of"),
 )
 """Calls that return integers, or numbers of another precision."""
@@ -57,6 +63,7 @@ STRUCTS = (
         "placed",
     ),
     *("stress_adj_of", "active_stress_adj_of", "touch", "touch_adj"),
+    *("through_others", "after_all_walls_adj", "meet_adj", "face", "pose", "way_adj"),
 )
 """Calls that return structs, which cannot be multiplied by a factor; their fields are terms where they are used."""
 FIELDS = (
