@@ -1,6 +1,7 @@
 """Scenes and models with contact at surface points, for several tests."""
 
 import numpy as np
+import torch
 
 import softmpm
 from softmpm import reference_contact
@@ -65,3 +66,11 @@ def slab(friction=0.5, gravity=(0.0, -G), width=8, **changes) -> softmpm.Scene:
 def settled(model: softmpm.Model, substeps=2500) -> softmpm.State:
     """The block at rest on the floor."""
     return softmpm.simulate(model, model.rest(), None, model.params(), substeps=substeps)
+
+
+def made(scene: softmpm.Scene, **settings) -> softmpm.Model:
+    return softmpm.build(scene, device="cpu", dtype=torch.float64, formulation="reference", **settings)
+
+
+def velocity(model: softmpm.Model, state: softmpm.State) -> torch.Tensor:
+    return (model.mass[:, None] * state.v[0]).sum(0) / model.mass.sum()

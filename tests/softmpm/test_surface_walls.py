@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from helpers import assert_relative, busy_inputs, cotangent, dot, given
-from surface_scenes import G, block, build, settled, slab, surface_of
+from surface_scenes import G, block, build, made, settled, slab, surface_of, velocity
 
 import softmpm
 from softmpm import Inputs, reference_lagrangian
@@ -134,14 +134,6 @@ def test_a_pose_at_rest_is_the_scenes():
             assert_relative(a, b, 1e-13, name)
 
 
-def made(scene: softmpm.Scene, **settings) -> softmpm.Model:
-    return softmpm.build(scene, device="cpu", dtype=torch.float64, formulation="reference", **settings)
-
-
-def velocity(model: softmpm.Model, state: softmpm.State) -> torch.Tensor:
-    return (model.mass[:, None] * state.v[0]).sum(0) / model.mass.sum()
-
-
 def test_a_conveyor_belt():
     """A block on a belt is accelerated with μ g, within 0.5 %, to the speed of the belt, with which it goes on: ≤ 1e-5."""
     model = made(slab(friction=0.3), inputs=("wall_velocity",))
@@ -202,132 +194,3 @@ def test_a_block_sticks_to_a_floor_that_tilts():
     after, cell = turned(model, state, angle, pivot), model.scene.grid.spacing
     way = (softmpm.contact_forces(model, state).points[0] - before).norm(dim=1)[sole]
     assert way.max() > cell and (after - before)[sole].abs().max() < 0.02 * cell
-
-
-def test_the_force_of_a_floor_is_the_weight():
-    """Of a block at rest to 1e-6, without a part along the floor; each point bears a share, at its place on the floor."""
-    model = made(slab())
-    forces = softmpm.contact_forces(model, settled(model, 5000))
-    weight = (model.mass.sum() * G).item()
-    assert forces.total.shape == (1, 1, 2)
-    assert forces.total[0, 0, 1].item() == pytest.approx(weight, rel=1e-6)
-    assert forces.total[0, 0, 0].abs() <= 1e-6 * weight
-    surface = model.surface
-    assert surface is not None and forces.traction.shape == (1, 1, surface.count, 2)
-    torch.testing.assert_close((forces.traction * surface.areas[:, None]).sum(2), forces.total)
-    sole = surface.points[:, 1] < model.scene.walls[0].offset + 1e-9
-    assert (forces.traction[0, 0, ~sole] == 0).all() and (forces.traction[0, 0, sole, 1] >= 0).all()
-    height = forces.points[0, sole, 1] - model.scene.walls[0].offset
-    assert height.abs().max() <= 1e-4 * model.scene.grid.spacing
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_impulses_are_the_change_of_momentum(dim):
-    """T times the forces of two rough walls that move, and T m g, are what a thrown block gains: ≤ 1e-12; |F_t| ≤ μ F_n."""
-    scene = block(dim, walls=block(dim).walls[:2], muscles=[], damping=0.0)
-    model = build(scene, dtype=torch.float64, inputs=("wall_offset", "wall_velocity"))
-    start = model.rest()
-    start.v[..., 1] = -1.0
-    points = model.surface.points  # pyright: ignore[reportOptionalMemberAccess]
-    normal = torch.tensor([wall.normal for wall in scene.walls], dtype=torch.float64)
-    near = (points @ normal.T).amin(0)[None, None]
-    slide = torch.tensor([0.3, 0.1, -0.2][:dim], dtype=torch.float64)
-    inputs = Inputs(wall_offset=torch.cat([near, near + 0.01]), wall_velocity=slide)
-    end = softmpm.simulate(model, start, None, model.params(), substeps=20, inputs=inputs)
-    forces, mass = softmpm.contact_forces(model, end), model.mass.sum()
-    T, before = 20 * scene.dt, velocity(model, start)
-    gained = mass * (velocity(model, end) - before - T * torch.tensor(scene.gravity, dtype=torch.float64))
-    torch.testing.assert_close(T * forces.total[0].sum(0), gained, rtol=0, atol=1e-12)
-    assert (forces.total.norm(dim=-1) > 1e-3).all()
-    for k, wall in enumerate(scene.walls):
-        traction = forces.traction[0, k]
-        pressure = traction @ normal[k]
-        shear = (traction - pressure[:, None] * normal[k]).norm(dim=-1)
-        assert (pressure >= 0).all() and (shear <= wall.friction * pressure * (1 + 1e-12) + 1e-12).all()
-
-
-def test_the_force_has_a_gradient():
-    """Of a block that rests: the force of a control step is the weight, so its derivative is the mass and does not see E."""
-    model = made(slab(), inputs=("gravity",))
-    gravity = torch.tensor([0.0, -G], dtype=torch.float64, requires_grad=True)
-    params = softmpm.Params(*(p.clone().requires_grad_() for p in model.params()))
-    start = settled(model, 5000).detach()
-    state = softmpm.simulate(model, start, None, params, substeps=4000, inputs=Inputs(gravity=gravity))
-    total = softmpm.contact_forces(model, state).total[0, 0, 1]
-    slopes = torch.autograd.grad(total, [gravity, *params])
-    assert slopes[0][1].item() == pytest.approx(-model.mass.sum().item(), rel=1e-2)
-    assert slopes[3].sum().item() == pytest.approx((model.volume.sum() * G).item(), rel=1e-2)
-    assert (slopes[1] * params.young).sum().abs() < 1e-2 * total
-
-
-def test_what_has_no_contact_forces_is_refused():
-    """A model with contact at nodes, and a state that simulate did not return."""
-    model = made(slab())
-    with pytest.raises(ValueError, match="got one without nodes; simulate from it first"):
-        softmpm.contact_forces(model, model.rest())
-    for other in (made(slab(), contact="nodes"), softmpm.build(slab(), device="cpu")):
-        with pytest.raises(ValueError, match="build it with formulation='reference' and contact='surface'"):
-            softmpm.contact_forces(other, other.rest())
-
-
-def jumped(model: softmpm.Model, cells: float) -> Inputs:
-    """The floor, in the second of two worlds higher by so many cells."""
-    offset = model.scene.walls[0].offset + model.scene.grid.spacing * torch.tensor([0.0, cells]).double()
-    return Inputs(wall_offset=offset[None, :, None])
-
-
-def test_a_wall_that_jumps_into_a_body_is_named():
-    """World, wall, point, depth and limit, at the start of a call; below the limit it runs, and so it does without the alarm."""
-    model = made(slab(), worlds=2, inputs=("wall_offset",))
-    surface, cell = model.surface, model.scene.grid.spacing
-    assert surface is not None
-    most = model.scene.dt * surface.waves[0].item() / cell
-    start = softmpm.simulate(model, model.rest(), None, model.params(), substeps=10)
-    assert start.nodes is not None
-    for state in (start, start._replace(nodes=None)):
-        inputs = jumped(model, 1.0)
-        with pytest.raises(softmpm.UnstableError) as caught:
-            softmpm.simulate(model, state, None, model.params(), substeps=10, inputs=inputs)
-        error = caught.value
-        text = str(error)
-        assert (error.kind, error.world, error.substep) == ("in_wall", 1, 0)
-        assert "cells) inside wall 0 in the start state" in text and "surface point" in text
-        assert f"at most {most * cell:.4g} m are allowed" in text
-        depth = float(text.split(" m (")[1].split(" cells")[0])
-        height = float(text.split("is at (")[1].split(")")[0].split(", ")[1])
-        assert depth == pytest.approx((inputs.wall_offset[0, 1, 0].item() - height) / cell, abs=0.01)
-        assert most < depth <= 1.01
-        place = surface.points[int(text.split("surface point ")[1].split(" ")[0])]
-        assert (model.positions[error.particle] - place).norm() < cell
-    with pytest.raises(softmpm.UnstableError, match="inside wall 0"):
-        softmpm.simulate(model, start, None, model.params(), substeps=1, inputs=jumped(model, 1.05 * most))
-    softmpm.simulate(model, start, None, model.params(), substeps=1, inputs=jumped(model, 0.95 * most))
-    failures = softmpm.Failures("freeze")
-    about = (model, start, None, model.params())
-    end = softmpm.simulate(*about, substeps=10, inputs=jumped(model, 1.0), failures=failures)
-    alone = softmpm.simulate(*about, substeps=10, inputs=jumped(model, 0.0))
-    assert failures.worlds == [1] and torch.equal(end.x[0], alone.x[0]) and torch.equal(end.x[1], start.x[1])
-    loose = made(slab(), worlds=2, inputs=("wall_offset",), alarms=softmpm.Alarms(depth=None, collapse=None))
-    softmpm.simulate(loose, start, None, loose.params(), substeps=1, inputs=jumped(loose, 1.5 * most))
-
-
-def test_a_point_that_is_driven_into_a_wall_is_named_while_running():
-    """Two walls press a body against each other: the substep and the pose are those of the error."""
-    walls = [
-        softmpm.Wall(normal=(0.0, 1.0), offset=4.5 / 32),
-        softmpm.Wall(normal=(0.0, -1.0), offset=-7.5 / 32),
-    ]
-    soft = softmpm.FixedCorotated(density=1000.0, young=2e5, poisson=0.3)
-    scene = slab(walls=walls, bodies=[softmpm.Body(slab().bodies[0].particles, soft)])
-    model = made(scene, inputs=("wall_offset",), alarms=softmpm.Alarms(collapse=None))
-    closing = torch.tensor([[[4.5, -7.5]], [[6.5, -5.7]]], dtype=torch.float64) / 32
-    about = dict(substeps=100, inputs=Inputs(wall_offset=closing))
-    with pytest.raises(softmpm.UnstableError) as caught:
-        softmpm.simulate(model, model.rest(), None, model.params(), **about)
-    error, text = caught.value, str(caught.value)
-    assert error.kind == "in_wall" and error.substep > 0 and error.state is not None
-    wall, share = int(text.split("inside wall ")[1].split(" ")[0]), (error.substep + 1) / 100
-    offset = ((1 - share) * closing[0, 0, wall] + share * closing[1, 0, wall]).item()
-    height = float(text.split("is at (")[1].split(")")[0].split(", ")[1])
-    depth = float(text.split(") m, ")[1].split(" m (")[0])
-    assert depth == pytest.approx(offset - walls[wall].normal[1] * height, rel=0.05)
