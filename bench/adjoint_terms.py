@@ -40,7 +40,13 @@ INTEGERS = (
         "node_index",
         "node_coordinates",
     ),
-    *("place_of", "place", "present", "height"),  # in float64, which a factor of the model's precision is not
+    *(
+        "place_of",
+        "place",
+        "present",
+        "exact_vec",
+        "float64",
+    ),  # in float64, which a factor of the model's precision is not
     *("coordinates", "offset", "range", "len", "law_of", "actuator_of"),
 )
 """Calls that return integers, or numbers of another precision."""
@@ -57,6 +63,7 @@ STRUCTS = (
         "placed",
     ),
     *("stress_adj_of", "active_stress_adj_of", "touch", "touch_adj"),
+    *("through_others", "after_all_walls_adj", "meet_adj", "response_adj", "face", "pose", "way_adj"),
 )
 """Calls that return structs, which cannot be multiplied by a factor; their fields are terms where they are used."""
 FIELDS = (
@@ -64,6 +71,8 @@ FIELDS = (
     *("particles", "first", "members", "stencil", "cell_nodes", "node_cells", "number"),
 )
 """Attributes and arrays of integers."""
+COUNTS = ("count", "arms")
+"""Constants of a factory that are integers."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +263,7 @@ def _is_zero(node: ast.expr) -> bool:
 
 def _is_whole(node: ast.AST, whole: set[str]) -> bool:
     if isinstance(node, ast.Name):
-        return node.id in whole
+        return node.id in whole or node.id in COUNTS
     if isinstance(node, ast.Constant):
         return isinstance(node.value, (int, bool))
     if isinstance(node, ast.Attribute):

@@ -31,6 +31,7 @@ TESTS = (
     "tests/softmpm/test_adjoint_terms.py",
     "tests/softmpm/test_inputs.py",
     "tests/softmpm/test_surface_contact.py",
+    "tests/softmpm/test_surface_walls.py",
     "tests/softmpm/test_lagrangian.py",
     "tests/softmpm/test_mirror.py",
     "tests/softmpm/test_rollout.py",

@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 README = Path(__file__).parents[1] / "README.md"
+FORMULATIONS = README.parent / "docs" / "formulations.md"
 
 
 def test_the_code_of_the_readme_runs():
@@ -16,6 +17,16 @@ def test_the_code_of_the_readme_runs():
     gradient = names["activation"].grad
     assert gradient.shape == (25, 1, 1) and bool(torch.isfinite(gradient).all())
     assert gradient.abs().max() > 1e-4 and bool((gradient != 0).all())
+
+
+def test_the_code_on_contact_forces_runs():
+    """A block on a belt presses with its weight and is pulled by the friction, whose derivative is the weight."""
+    (code,) = re.findall(r"```python\n(.*?)```", FORMULATIONS.read_text(), re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    pull, push = names["forces"].total[0, 0].tolist()
+    assert abs(push / 588 - 1) < 0.1 and abs(pull / push / 0.3 - 1) < 1e-3
+    assert abs(names["friction"].grad.item() / 588 - 1) < 0.15
 
 
 def test_every_file_that_the_readme_names_is_there():

@@ -12,6 +12,7 @@ from softmpm.autograd import rasterize, simulate
 from softmpm.building import build
 from softmpm.cuda_graph import Graph
 from softmpm.errors import UnstableError
+from softmpm.forces import contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
 from softmpm.recording.reader import Recording
@@ -22,7 +23,7 @@ from softmpm.scene.outline import Outline
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
-from softmpm.state import GridField, Low, Nodal, Params, State
+from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State
 from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 
@@ -33,6 +34,7 @@ __all__ = [
     "Alarms",
     "BarrierCorotated",
     "Body",
+    "ContactForces",
     "Failures",
     "FixedCorotated",
     "Graph",
@@ -63,6 +65,7 @@ __all__ = [
     "ball",
     "box",
     "build",
+    "contact_forces",
     "image",
     "mesh",
     "rasterize",

@@ -29,6 +29,11 @@ class Alarms:
     [-], checked at the start of a call and after each chunk, in the reference formulation in every substep. Particles that share
     nodes bear 1.1 to 1.6 of it."""
 
+    depth: float | None = 1.0
+    """Largest depth of a surface point under a separating wall, over the way of a pressure wave of the scene's material in a substep
+    [-], checked in every substep. Contact pushes a point out within one substep, beyond 1 faster than sound. Impacts at half of the
+    wave speed reach 0.3 (docs/math/contact.md)."""
+
     def __post_init__(self):
         for field in fields(self):
             value = getattr(self, field.name)

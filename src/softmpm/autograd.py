@@ -112,14 +112,17 @@ def _simulate(
         check_shown(start, particles_of(model, start.nodes.detach()))
         if model.mirror is not None:
             check_reflected(model.mirror.apart(start.nodes.u.detach(), start.nodes.v.detach()))
-    nodes = nodes_of(model, start, values["mass"]) if start.nodes is None else start.nodes
+    nodes = start.nodes
+    if nodes is None:
+        normals = values["normal"][0] if model.spec.moving else None  # at the beginning of the call
+        nodes = nodes_of(model, start, values["mass"], normals)
     nodes = nodes._replace(shift=shift_of(model, nodes).detach())
     return particles_of(model, _run(model, horizon, nodes, values, failures))
 
 
 def _run(model: Model, horizon: Horizon, start: Any, values: Values, failures: Failures | None) -> Any:
     """The final state, of the type of the initial one."""
-    tensors = (*values.values(), *start[: _count(model)])
+    tensors = (*values.values(), *start[:COUNT])
     needed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     call = _Call(model, horizon, tuple(values), needed, failures)
     if not needed and not _has_transform_or_tangent(tensors):
@@ -175,9 +178,8 @@ def _cast(model: Model, value: Any) -> Any:
     return type(value)(*(_cast(model, part) for part in value))
 
 
-def _count(model: Model) -> int:
-    """Tensors of a state that are differentiable, its first ones."""
-    return 3 if model.formulation == "reference" else 4
+COUNT = 4
+"""Tensors of a state that are differentiable, its first ones, in both formulations."""
 
 
 @dataclass(eq=False)
@@ -240,12 +242,12 @@ class _Simulate(_Function):
         call, *tensors = given
         values, state = call.split(tensors)
         end = call.run(call.state(state), values)
-        return (*end[: _count(call.model)], *call.rounding(end))
+        return (*end[:COUNT], *call.rounding(end))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
         ctx.call, *tensors = inputs
-        ctx.mark_non_differentiable(*(t for t in output[_count(ctx.call.model) :] if t is not None))
+        ctx.mark_non_differentiable(*(t for t in output[COUNT:] if t is not None))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place
 
@@ -254,9 +256,8 @@ class _Simulate(_Function):
         refuse_batches(adj_end)
         needed = dict(zip(ctx.call.names, ctx.needs_input_grad[1:], strict=False))
         found = [one.group for one in differentiable(ctx.call.model.spec) if needed.get(one.name)]
-        count = _count(ctx.call.model)
-        rounding = len(adj_end) - count
-        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:count]
+        rounding = len(adj_end) - COUNT
+        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:COUNT]
         # It may be differentiated once more:
         again = torch.is_grad_enabled() or _has_transform_or_tangent(given[2:])
         backward = _SimulateBackward.apply if again else _SimulateBackward.forward
@@ -271,11 +272,9 @@ class _SimulateBackward(_Function):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
         call, wanted, *tensors = given
         values, state = call.split(tensors)
-        count = _count(call.model)
-        pairs = zip(state[-count:], state[:count], strict=True)
-        filled = [torch.zeros_like(like) if adj is None else adj for adj, like in pairs]
-        kind: Any = Nodal if count == 3 else State
-        adj_end = kind(*filled, *([torch.zeros_like(state[count])] if kind is Nodal else []))
+        kind: Any = Nodal if call.model.formulation == "reference" else State
+        pairs = zip(state[-COUNT:], state[:COUNT], strict=True)
+        adj_end = kind(*(torch.zeros_like(like) if adj is None else adj for adj, like in pairs))
         with explain_out_of_memory(call.model, call.horizon, gradient=True):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
         found = (adj_inputs.tensors.get(name) for name in call.names)
@@ -283,7 +282,7 @@ class _SimulateBackward(_Function):
             adj if adj is None else adj.to(value.dtype)
             for adj, value in zip(found, values.values(), strict=True)
         )
-        return *exact, *adj[:count]
+        return *exact, *adj[:COUNT]
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -91,12 +91,14 @@ def build(
         raise ValueError(f"contact_width must be in [0, 1) cells, got {contact_width!r}.")
     surface = on_surface(scene, formulation, contact, contact_width)
     if formulation == "reference":
-        check_reference(scene, given, scheme)
+        check_reference(scene, scheme)
         scheme, reason = "lagrangian", "formulation='reference'"
         alarms = dataclasses.replace(alarms, gap=None)
     else:
         check_moving(scene)
         scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
+    if not surface:
+        alarms = dataclasses.replace(alarms, depth=None)
     place = device_of(device)
     return Model(
         scene,
@@ -178,15 +180,10 @@ def check_moving(scene: Scene) -> None:
             )
 
 
-def check_reference(scene: Scene, given: tuple[str, ...], scheme: str) -> None:
+def check_reference(scene: Scene, scheme: str) -> None:
     """Raise ValueError for what the reference formulation cannot do."""
     if scheme != "auto":
         raise ValueError(f"formulation='reference' has one scheme, got scheme={scheme!r}; leave scheme out.")
-    moving = [name for name in given if name.startswith("wall_")]
-    if moving:
-        raise ValueError(
-            f"formulation='reference' has walls at rest only, but inputs has {moving[0]!r}; take formulation='moving'."
-        )
     if len(scene.driven):
         raise ValueError(
             "formulation='reference' has no driven particles, but the scene does; take formulation='moving'."

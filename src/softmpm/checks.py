@@ -75,7 +75,8 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
             "formulation='reference'."
         )
     shape = (model.worlds, model.rest_grid.count, model.dim)
-    for name, wanted in {"u": shape, "v": shape, "anchor": model.anchor_shape}.items():
+    wanted_shapes = {"u": shape, "v": shape, "anchor": model.anchor_shape, "force": model.anchor_shape}
+    for name, wanted in wanted_shapes.items():
         _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
     if nodes.shift is not None:
         _check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)

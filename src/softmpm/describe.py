@@ -68,6 +68,7 @@ def _alarms(model) -> str:
         "det F below": alarms.collapse,
         "neighbours at rest farther apart than, in cells,": alarms.gap,
         "dt over its running limit above": alarms.step,
+        "points deeper in walls than, in ways of a pressure wave in a substep,": alarms.depth,
     }
     return "; ".join(f"{what} {limit:g}" for what, limit in texts.items() if limit is not None) or "off"
 

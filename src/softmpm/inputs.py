@@ -149,6 +149,8 @@ class Input:
     """True if all worlds share it."""
     constant: Callable[[Any], bool] = lambda spec: False
     """True if it is passed by value with a launch, as the walls at rest are, so that no kernel waits for memory."""
+    branches: Callable[[Any], bool] = lambda spec: False
+    """True if it only selects branches, and its gradient is zero: nodes are inside a wall or not, surface points have a gap."""
 
     @property
     def sorted(self) -> bool:
@@ -240,6 +242,8 @@ INPUTS = (
         name="offset",
         per="wall",
         present=lambda spec: len(spec.contacts) > 0,
+        group="wall",
+        branches=lambda spec: not spec.surface_walls,
         rows=True,
         stage="grid",
         double=True,
@@ -295,7 +299,7 @@ def stored(spec) -> tuple[Input, ...]:
 
 def differentiable(spec) -> tuple[Input, ...]:
     """Inputs of :func:`present` that have a gradient."""
-    return tuple(one for one in stored(spec) if one.group and not one.shared(spec))
+    return tuple(one for one in stored(spec) if one.group and not one.shared(spec) and not one.branches(spec))
 
 
 def groups(spec) -> tuple[str, ...]:

@@ -172,7 +172,7 @@ def grid_velocity(
     Args:
         inputs: Of one control step, without that axis; one pose of the walls, or those at its two ends.
         time, duration: Since the beginning of the control step, and its length [s].
-        displacement: Of the nodes [m], shape (world, node, dim), where a wall meets them elsewhere; for walls at rest.
+        displacement: Of the nodes [m], shape (world, node, dim), where a wall meets them elsewhere.
         contacts: Kinds of the walls that act on nodes.
     """
     present = (mass > 0)[..., None]
@@ -186,7 +186,7 @@ def grid_velocity(
         if wall.contact not in contacts:
             continue
         where = surface(scene, k, inputs, v, time, duration)
-        u = wall_velocity(scene, where)
+        u = wall_velocity(scene, where, displacement)
         response = u + respond(wall, v - u, friction[:, k, None, None], where.unit[:, None])  # (C5)
         v = torch.where(inside(scene, where, displacement)[..., None] & present, response, v)
     return torch.where(present, v, torch.zeros_like(v))

@@ -1,12 +1,14 @@
 """Contact with friction at surface points in plain float64 PyTorch. Part of :mod:`softmpm.reference_lagrangian`.
 
 The outline of a body at rest has points with an area and constant weights on the nodes. One pass over the separating walls finds an
-impulse per area at each point from the predicted penetration, with an anchored friction, and the nodes gather it. Derivations:
+impulse per area at each point from the predicted penetration, with an anchored friction, and the nodes gather it. A wall that moves
+does so first, from its pose n°, o° at the beginning of the substep to n, o at its end, and takes the anchors along. Derivations:
 docs/math/contact.md.
 
     D_s = Σ_i |w_si| L_i / m_i,   L_i = Σ_r |w_ri| A_r                                       (K1)
     x_s = X_s + Σ w_si u_i,   v_s = Σ w_si v*_i                                              (K2)
-    d = −(y + Δt v_n),   P = H(d) / (Δt D_s),   y = n·x_s − o                                (K3)
+    a° ← R a° + (o° + o) (n° − (n·n°) n) / (1 + n·n°) + Δt w_t                               (K6)
+    d = −(y + Δt (v_n − w_n)),   P = H(d) / (Δt D_s),   y = n·x_s − o                        (K3)
     T = −c e, |T| ≤ μ P,   e = x_t + Δt v_t − a,   c = k Δt / (1 + D_s k Δt²)                (K4)
     v'_i = v*_i + (1/m_i) Σ_s w_si A_s Σ_k J_k,   J_k = P n + T                              (K5)
 """
@@ -19,6 +21,7 @@ from torch import Tensor
 
 from softmpm.inputs import Inputs
 from softmpm.reference import SCENE
+from softmpm.reference_walls import Surface as Wall
 from softmpm.reference_walls import surface as wall_at
 from softmpm.scene.scene import Scene
 
@@ -70,6 +73,8 @@ def contact(
     mass: Tensor,
     inputs: Inputs = SCENE,
     smoothing: float = 0.0,
+    time: float = 0.0,
+    duration: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Response of the separating walls to one substep (K2) to (K5).
 
@@ -78,8 +83,9 @@ def contact(
         v: Their velocity v* after forces and the other walls [m/s].
         anchor: Anchors a [m], shape (world, separating wall, point, dim).
         mass: Of the nodes [kg], shape (world, node).
-        inputs: Of one control step, with walls at rest.
+        inputs: Of one control step, without that axis; one pose of the walls, or those at its two ends.
         smoothing: Width s of the hinge H [m].
+        time, duration: Since the beginning of the control step, and its length [s].
 
     Returns:
         Velocity of the nodes [m/s], anchors, and impulses per area J [N s/m²], shaped like the anchors.
@@ -92,12 +98,13 @@ def contact(
     friction = friction.expand(len(v), len(scene.walls))
     anchors, impulses = [], []
     for number, k in enumerate(separating(scene)):
-        wall = wall_at(scene, k, inputs, v, 0.0, 1.0)
-        n, offset, mu = wall.unit[:, None], wall.offset[:, None, None], friction[:, k, None, None]
-        y, v_n = (x * n).sum(-1, keepdim=True) - offset, (at_points * n).sum(-1, keepdim=True)
+        before, wall = (wall_at(scene, k, inputs, v, at, duration) for at in (time, time + scene.dt))
+        n, mu, slide = wall.unit[:, None], friction[:, k, None, None], wall.slide[:, None]
+        y, v_n = (x * n).sum(-1, keepdim=True) - level(wall), (at_points * n).sum(-1, keepdim=True)
         x_t, v_t = _tangential(x, n), at_points - v_n * n
-        P = hinge(-(y + scene.dt * v_n), smoothing) / (scene.dt * D)
-        T, moved = _friction(surface, scene.dt, D, P, mu, x_t, v_t, anchor[:, number])
+        P = hinge(-(y + scene.dt * (v_n - (slide * n).sum(-1, keepdim=True))), smoothing) / (scene.dt * D)
+        carried = carry(before, wall, anchor[:, number]) + scene.dt * _tangential(slide, n)
+        T, moved = _friction(surface, scene.dt, D, P, mu, x_t, v_t, carried)
         impulses.append(P * n + T)
         anchors.append(moved)
         at_points = at_points + D * impulses[-1]
@@ -107,6 +114,19 @@ def contact(
     share = (surface.w * surface.area[:, None])[..., None] * J.sum(1)[:, :, None]
     sums = torch.zeros_like(v).index_add(1, surface.node.flatten(), share.flatten(1, 2))
     return v + _per_mass(sums, mass[..., None]), torch.stack(anchors, 1), J
+
+
+def level(wall: Wall) -> Tensor:
+    """Offset o of the unit normal [m], shape (world, 1, 1)."""
+    return (wall.offset / torch.linalg.vector_norm(wall.normal, dim=-1))[:, None, None]
+
+
+def carry(before: Wall, after: Wall, anchor: Tensor) -> Tensor:
+    """Anchors (world, point, dim) after the wall turned about the line that both of its planes share (K6)."""
+    old, n = before.unit[:, None], after.unit[:, None]
+    cosine = (old * n).sum(-1, keepdim=True)
+    turned = anchor - (n * anchor).sum(-1, keepdim=True) / (1 + cosine) * (old + n)
+    return turned + (level(before) + level(after)) / (1 + cosine) * (old - cosine * n)
 
 
 def hinge(d: Tensor, smoothing: float) -> Tensor:
@@ -136,7 +156,10 @@ def _tangential(vectors: Tensor, n: Tensor) -> Tensor:
 
 
 def start_anchor(scene: Scene, surface: Surface, u: Tensor, inputs: Inputs = SCENE) -> Tensor:
-    """Anchors x_t of the displacement ``u`` (world, node, dim), shape (world, separating wall, point, dim)."""
+    """Anchors x_t of the displacement ``u`` (world, node, dim), shape (world, separating wall, point, dim).
+
+    ``inputs`` are those of the first control step.
+    """
     x = surface.X + gather(surface, u)
     normals = [wall_at(scene, k, inputs, u, 0.0, 1.0).unit[:, None] for k in separating(scene)]
     return torch.stack([_tangential(x, n) for n in normals], 1) if normals else x[:, None][:, :0]

@@ -116,18 +116,25 @@ def step(
     surface: Surface | None = None,
     anchor: Tensor | None = None,
     smoothing: float = 0.0,
+    time: float = 0.0,
+    duration: float = 1.0,
 ) -> tuple[Tensor, ...]:
-    """One substep (Q1) to (Q4), with a surface also (K2) to (K5); ``mass`` of the nodes. Nodes without mass have the velocity zero."""
+    """One substep (Q1) to (Q4), with a surface also (K2) to (K6); ``mass`` of the nodes. Nodes without mass have the velocity zero.
+
+    Returns:
+        u and v, with a surface also the anchors and the impulses per area J of :func:`softmpm.reference_contact.contact`.
+    """
     impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
     contacts = ("stick", "slip", "separate") if surface is None else ("stick", "slip")
-    v = grid_velocity(scene, mass, mass[..., None] * v + impulse, inputs, displacement=u, contacts=contacts)
+    momentum = mass[..., None] * v + impulse
+    v = grid_velocity(scene, mass, momentum, inputs, time, duration, displacement=u, contacts=contacts)
     v = reflected(scene, mass, v)
     if surface is None:
         return u + scene.dt * v, v
     anchor = start_anchor(scene, surface, u, inputs) if anchor is None else anchor
-    v, anchor, _ = contact(scene, surface, u, v, anchor, mass, inputs, smoothing)
+    v, *rest = contact(scene, surface, u, v, anchor, mass, inputs, smoothing, time, duration)
     v = reflected(scene, mass, v)
-    return u + scene.dt * v, v, anchor
+    return u + scene.dt * v, v, *rest
 
 
 def reflected(scene: Scene, mass: Tensor, field: Tensor) -> Tensor:
@@ -178,31 +185,31 @@ def simulate(
         smoothing: Width of the onset of contact [m].
 
     Returns:
-        u and v after ``control_step * substeps * dt`` seconds, with a surface also the anchors.
+        u and v after ``control_step * substeps * dt`` seconds, with a surface also the anchors and the mean force of each wall on each
+        point in the last control step [N], shape (world, separating wall, point, dim).
     """
-    _need_walls_at_rest(scene, inputs)
+    _need_no_driven(scene, inputs)
     points = quadrature(scene)
     young, poisson, density = (value.expand(len(u), len(points.X)) for value in params)
     mu, lam = lame(young, poisson)
     mass = node_mass(scene, points, density * rest_volume(scene, density.dtype))
+    steps, duration = control_steps(activation, inputs), substeps * scene.dt
     if surface is not None and anchor is None:
-        anchor = start_anchor(scene, surface, u, inputs)
-    steps = control_steps(activation, inputs)
+        anchor = start_anchor(scene, surface, u, of_control_step(inputs, 0, steps))
+    force = torch.zeros(0)
     for c in range(steps):
         row, now = None if activation is None else activation[c], of_control_step(inputs, c, steps)
-        for _ in range(substeps):
-            u, v, *moved = step(scene, points, u, v, row, mu, lam, mass, now, surface, anchor, smoothing)
-            anchor = moved[0] if moved else None
-    return (u, v) if anchor is None else (u, v, anchor)
+        force = torch.zeros_like(u if anchor is None else anchor)
+        for s in range(substeps):
+            about = (row, mu, lam, mass, now, surface, anchor, smoothing, s * scene.dt, duration)
+            u, v, *contacts = step(scene, points, u, v, *about)
+            if surface is not None:
+                anchor, impulse = contacts
+                force = force + surface.area[:, None] * impulse / duration
+    return (u, v) if anchor is None else (u, v, anchor, force)
 
 
-def _need_walls_at_rest(scene: Scene, inputs: Inputs) -> None:
-    poses = ((inputs.wall_offset, 3), (inputs.wall_normal, 4))
-    moving = any(value is not None and value.ndim == axes and len(value) > 1 for value, axes in poses)
-    if moving or inputs.wall_velocity is not None:
-        raise NotImplementedError(
-            "the total Lagrangian reference has walls at rest only; give one pose of each."
-        )
+def _need_no_driven(scene: Scene, inputs: Inputs) -> None:
     if len(scene.driven) or inputs.velocity is not None or inputs.position is not None:
         raise NotImplementedError(
             "the total Lagrangian reference has no driven particles; use a sticking wall."

@@ -88,9 +88,10 @@ def inside(scene: Scene, wall: Surface, displacement: Tensor | None = None) -> T
     return reach <= wall.offset.detach().double()[:, None]
 
 
-def wall_velocity(scene: Scene, wall: Surface) -> Tensor:
-    """Velocity u of a wall at each node [m/s], shape (world, node, dim) (C4)."""
-    approach = wall.offset_rate[:, None] - wall.normal_rate @ nodes(scene).T
+def wall_velocity(scene: Scene, wall: Surface, displacement: Tensor | None = None) -> Tensor:
+    """Velocity u of a wall at each node [m/s], shape (world, node, dim) (C4); ``displacement`` as for :func:`inside`."""
+    x = nodes(scene)[None] if displacement is None else nodes(scene) + displacement
+    approach = wall.offset_rate[:, None] - (x * wall.normal_rate[:, None]).sum(-1)
     return (approach / _length(wall.normal))[..., None] * wall.unit[:, None] + wall.slide[:, None]
 
 

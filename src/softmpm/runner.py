@@ -38,7 +38,8 @@ class Runner:
 
     def check(self, start: Any) -> Report | None:
         """Launch the check of the call's initial state; :meth:`passed` evaluates the report. None if there is nothing to check."""
-        if not armed(self.model) and self.model.alarms.collapse is None:
+        alarms = self.model.alarms
+        if not armed(self.model) and alarms.collapse is None and alarms.depth is None:
             return None
         words = self.scheme.check_start(start, self.values)
         if is_capturing(self.model):
@@ -105,7 +106,9 @@ class Runner:
             if self._failed(reported):
                 world = min(self._failed(reported), key=lambda w: reported[w])
                 values = in_rows(self.values, one.rows)
-                return found(reported, world, shown(single.end), first=one.first, values=values)
+                time = (one.first % one.substeps + 1) * self.model.scene.dt
+                end = shown(single.end)
+                return found(reported, world, end, first=one.first, values=values, time=time)
             state = single.end
         # Sums in another order may have avoided the failure; the report remains true.
         world = min(self._failed(words), key=lambda w: words[w])

@@ -56,6 +56,9 @@ class Nodal(NamedTuple):
     anchor: Tensor
     """Places on the walls where surface points adhere, in addition to the shift [m], shape (world, wall, point, dim), of the separating
     walls; no walls or no points without surface contact."""
+    force: Tensor
+    """Mean force of each of these walls on each surface point in the last control step [N], of the same shape; see
+    :func:`softmpm.contact_forces`. A call does not read it."""
     shift: Tensor | None = None
     """Translation of all nodes of a world [m], shape (world, dim), in float64 in every precision; None is none. It follows the bodies,
     so that u keeps its digits over long ways. A constant of the gradient: that with respect to u is that with respect to the sum."""
@@ -78,7 +81,7 @@ class Nodal(NamedTuple):
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Nodal":
         shift = None if self.shift is None else change(self.shift)
-        return Nodal(change(self.u), change(self.v), change(self.anchor), shift)
+        return Nodal(change(self.u), change(self.v), change(self.anchor), change(self.force), shift)
 
 
 class State(NamedTuple):
@@ -145,6 +148,23 @@ class GridField(NamedTuple):
     """Nodal mass [kg], shape (world, *nodes)."""
     velocity: Tensor
     """Nodal velocity [m/s], shape (world, *nodes, dim); zero on nodes without mass."""
+
+    def __repr__(self) -> str:
+        return _text(self)
+
+
+class ContactForces(NamedTuple):
+    """Forces of the separating walls on the bodies, mean values over the last control step. Differentiable.
+
+    The axis ``wall`` counts the walls of the kind ``separate`` in the order of the scene. In 2D a force is per metre of depth.
+    """
+
+    total: Tensor
+    """Force of each wall [N], shape (world, wall, dim)."""
+    traction: Tensor
+    """Force per area at rest at each surface point [Pa], shape (world, wall, point, dim)."""
+    points: Tensor
+    """Places of the surface points [m], shape (world, point, dim)."""
 
     def __repr__(self) -> str:
         return _text(self)

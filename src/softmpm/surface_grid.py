@@ -27,6 +27,7 @@ class SurfaceGrid:
         points: Rest positions [m], shape (point, dim), float64.
         areas: Area of each point [m²], shape (point,), float64.
         stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
+        waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
         stencil: Nodes of each point, numbers in the grid at rest, shape (point, 3^dim), int32.
         weights: Their weights, 0 for nodes that take no part, shape (point, 3^dim), float64.
         loads: Area that each node carries [m²], L of (K1), shape (node,), float64.
@@ -42,11 +43,7 @@ class SurfaceGrid:
         areas = np.concatenate([outline.areas for outline in outlines])
         counts = [len(outline) for outline in outlines]
         density = np.repeat([body.material.density for body in scene.bodies], counts)
-        stiffness = (
-            np.repeat([longitudinal_modulus(body.material) for body in scene.bodies], counts)
-            * 4.0
-            / grid.spacing
-        )
+        modulus = np.repeat([longitudinal_modulus(body.material) for body in scene.bodies], counts)
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
         base, f, weights = stencils(points / grid.spacing, offsets)
         at = flat(base[:, None] + offsets, grid.shape)
@@ -81,10 +78,20 @@ class SurfaceGrid:
         normals = [wall.normal for wall in scene.walls if wall.contact == "separate"]
         self.normals = tensor(np.array(normals), np.float64)
         self.points, self.areas = tensor(points, np.float64), tensor(areas, np.float64)
-        self.stiffness, self.loads = tensor(stiffness, np.float64), tensor(loads, np.float64)
+        self.stiffness, self.loads = (
+            tensor(4.0 * modulus / grid.spacing, np.float64),
+            tensor(loads, np.float64),
+        )
+        self.waves = tensor(np.sqrt(modulus / density), np.float64)
         self.stencil, self.weights = tensor(numbers, np.int32), tensor(weights, np.float64)
         self.members = tensor(members[order], np.int32)
         self.first = tensor(np.searchsorted(owners[order], np.arange(len(index) + 1)), np.int32)
+
+    def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
+        """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""
+        near = u[:, self.stencil.long()]
+        x = self.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, self.weights.to(u.dtype))
+        return x if shift is None else (x + shift[:, None]).to(u.dtype)
 
 
 def longitudinal_modulus(material: Material) -> float:

@@ -295,18 +295,14 @@ def test_worlds_and_control_steps(dim):
             torch.testing.assert_close(got[part], want, rtol=0, atol=1e-13 * want.abs().max().item())
 
 
-def test_moving_walls_and_driven_particles_are_refused():
-    """They are errors, not walls at rest and free particles."""
+def test_driven_particles_are_refused():
+    """They are errors, not free particles."""
     scene = full(2)
     start, params = rest(scene)
     u, v = reference_lagrangian.project(scene, start, params)
-    for given in (
-        Inputs(wall_offset=torch.zeros(2, 1, 3).double()),
-        Inputs(wall_velocity=torch.zeros(2).double()),
-        Inputs(velocity=torch.zeros(2).double()),
-    ):
-        with pytest.raises(NotImplementedError, match="walls at rest only|no driven particles"):
-            reference_lagrangian.simulate(scene, u, v, None, params, substeps=1, inputs=given)
+    given = Inputs(velocity=torch.zeros(2).double())
+    with pytest.raises(NotImplementedError, match="no driven particles"):
+        reference_lagrangian.simulate(scene, u, v, None, params, substeps=1, inputs=given)
     driven = dataclasses.replace(scene, driven=[1])
     with pytest.raises(NotImplementedError, match="no driven particles"):
         reference_lagrangian.simulate(driven, u, v, None, params, substeps=1)

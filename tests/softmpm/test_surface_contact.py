@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
+from helpers import assert_relative, busy_inputs, cotangent, dot, given
+from surface_scenes import block, build, surface_of
 
 import softmpm
 from softmpm import Inputs, reference_contact, reference_lagrangian
@@ -15,41 +16,13 @@ STEPS = 3
 NAMES = ("gravity", "friction", "viscosity")
 
 
-def block(dim: int, **changes) -> softmpm.Scene:
-    """A block on a rough floor and at a rough side wall, with a muscle; the sides of the block stand off the grid lines."""
-    lower, upper = (0.33, 0.3, 0.34)[:dim], (0.52, 0.49, 0.53)[:dim]
-    shape = softmpm.box(lower, upper, spacing=0.05)
-    material = softmpm.NeoHookean(density=1.2, young=80.0, poisson=0.3, viscosity=0.02)
-    settings = dict(
-        grid=softmpm.Grid(shape=(12, 11, 10)[:dim], spacing=0.1),
-        bodies=[softmpm.Body(shape, material)],
-        muscles=[softmpm.Muscle(particles=np.arange(6), direction=(1.0, 0.4, 0.2)[:dim], strength=10.0)],
-        walls=[
-            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.35, friction=0.4),
-            softmpm.Wall(normal=(1.0, 0.2, 0.0)[:dim], offset=0.4, friction=0.2),
-            softmpm.Wall(normal=(-1.0, 0.0, 0.0)[:dim], offset=-0.5, contact="slip"),
-        ],
-        gravity=(0.3, -9.8, 0.2)[:dim],
-        damping=0.7,
-        dt=1e-3,
-    )
-    return softmpm.Scene(**(settings | changes))
-
-
-def build(made: softmpm.Scene, **settings) -> softmpm.Model:
-    alarms = softmpm.Alarms(collapse=None)
-    return softmpm.build(
-        made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
-    )
-
-
 def by_reference(model, start, activation, params, substeps, inputs) -> softmpm.State:
     surface, made = surface_of(model), model.scene
     width = model.contact_width * made.grid.spacing
     u, v = reference_lagrangian.project(made, start, params)
     anchor = reference_contact.start_anchor(made, surface, u)
     settings = dict(surface=surface, anchor=anchor, smoothing=width)
-    u, v, _ = reference_lagrangian.simulate(
+    u, v, *_ = reference_lagrangian.simulate(
         made, u, v, activation, params, substeps=substeps, inputs=inputs, **settings
     )
     return reference_lagrangian.evaluate(made, u, v)

@@ -7,6 +7,7 @@ from softmpm.errors import FROZEN, NEVER, Kind, UnstableError, decode
 from softmpm.model import Model
 from softmpm.schemes.failure_messages import Case
 from softmpm.schemes.inputs import Values
+from softmpm.schemes.penetration import Penetration
 from softmpm.state import State
 
 
@@ -52,6 +53,7 @@ def failure(
     values: Values | None = None,
     state: State | None = None,
     before: bool = False,
+    time: float = 0.0,
 ) -> UnstableError:
     """The failure of a world as an error.
 
@@ -63,6 +65,7 @@ def failure(
         values: Inputs of the call in one control step, if available.
         state: State that the error carries; ``end`` if None.
         before: True if the initial state itself was checked, before any substep.
+        time: Of ``end`` since the beginning of the control step of ``values`` [s].
     """
     substep, kind, particle = decode(words[world])
     substep += first
@@ -72,12 +75,17 @@ def failure(
             _never_ran(end, start, unmoved),
             None if state is None else _never_ran(state, start, unmoved),
         )
-    name, value, limit, advice = Case(model, kind, world, particle, end, values).explain()
-    where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
-    time = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
+    if kind is Kind.IN_WALL:
+        case = Penetration(model, world, particle, end, values, time)
+        particle, where = case.particle, f"{case.where} of world {world}"
+    else:
+        case = Case(model, kind, world, particle, end, values)
+        where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
+    name, value, limit, advice = case.explain()
+    at = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"
     more = len(failed_worlds(words)) - 1
     others = f" ({more} more world(s) failed too.)" if more else ""
-    when = "in the start state" if kind is Kind.START or before else f"at {time}"
+    when = "in the start state" if kind is Kind.START or before else f"at {at}"
     return UnstableError(
         f"{where} {value} {when}; {limit}. {advice}{others}",
         kind=name,

@@ -5,7 +5,8 @@
     v̄' += Δt ū'                                                                                      (Q4.adj)
     p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
 
-(Q3) and (Q4) are the grid stage (G1), (G2) of the momentum p. The side of a wall on which a node lies is constant in the adjoint.
+(Q3) and (Q4) are the grid stage (G1), (G2) of the momentum p. The side of a wall on which a node lies is constant in the adjoint; the
+speed of a wall that turns depends on the place of the node.
 """
 
 from types import SimpleNamespace
@@ -103,7 +104,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
     gathered, place, exact_vec = gathering(spec.dim, spec.dtype), one.place, types(spec.dim, "float64").vec
-    viscous, surface = spec.viscosity, bool(spec.surface_walls)
+    viscous, surface, moving = spec.viscosity, bool(spec.surface_walls), spec.moving
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -139,6 +140,8 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj = node_velocity_adj(constants, inputs, world, here, p[world, i], m, adj_new, number, adj_inputs)
         adj_f[world, i] = constants.dt * adj.p
         adj_v[world, i] = m * adj.p
+        if wp.static(moving):
+            adj_u[world, i] = adj_u[world, i] + adj.x
         adj_mass[world, i] = adj_mass[world, i] + adj.m + wp.dot(v[world, i], adj.p)
 
     @wp.kernel(module=module, enable_backward=False)

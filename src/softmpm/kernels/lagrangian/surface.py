@@ -2,30 +2,26 @@
 
     D_s = Σ |w_si| L_i / m_i                                                                         (K1)
     x_s = X_s + shift + Σ w_si u_i,  v_s = Σ w_si v*_i                                               (K2)
-    wall by wall: J by (K3), (K4), then v_s += D_s J
+    wall by wall: the anchor goes along by (K6), J by (K3), (K4), then v_s += D_s J
+    f_s += A_s J / T, the mean force of a wall on a point in a control step of T                     (K7)
     v'_i = v*_i + Σ w_si A_s J / m_i,  u'_i = u_i + Δt v'_i                                          (K5)
 
-    J̄_s = A_s Σ w_si v̄'_i / m_i,  m̄_i −= (v'_i − v*_i)·v̄'_i / m_i                                   (K5.adj)
-    from the last wall to the first: J̄ += D v̄_s,  D̄ += J·v̄_s, then (K4.adj), (K3.adj)
-    v̄*_i += Σ w_si v̄_s,  ū_i += Σ w_si x̄_s                                                           (K2.adj)
-    m̄_i −= Σ D̄_s |w_si| L_i / m_i²                                                                   (K1.adj)
-
 Nodes gather what the points give them in a fixed order, as in nodes.py. Only the height over a wall sees the shift; anchors move with
-the frame.
+the frame. The adjoint is in surface_adj.py.
 """
 
 from types import SimpleNamespace
 
 import warp as wp
 
+from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.frame import frame
-from softmpm.kernels.lagrangian.nodes import nodes
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
-from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.physics.wall_face import wall_face
+from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
@@ -37,6 +33,8 @@ def surface_type(dim: int, dtype: str):
 
         points: wp.array(dtype=exact_vec)
         areas: wp.array(dtype=t.real)
+        newtons: wp.array(dtype=t.real)  # areas in the units of force
+        deepest: wp.array(dtype=t.real)
         stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
         loads: wp.array(dtype=t.real)
         stencil: wp.array2d(dtype=wp.int32)
@@ -63,9 +61,10 @@ def surface(spec: Spec) -> SimpleNamespace:
     walls = spec.surface_walls
     number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
     count, each_world, rough, arms = len(walls), "friction" in spec.given, spec.friction, r.count
-    touch, across, running = block.touch, block.across, status.report(dim, spec.dtype).running
-    f = frame(dim, spec.dtype)
+    touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, exact_of = f.Frame, f.recentring, f.exact
+    face, depth = wall_face(spec).face, wall_face(spec).depth
+    running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
@@ -76,21 +75,6 @@ def surface(spec: Spec) -> SimpleNamespace:
             return inputs.friction[k]
         else:
             return real(0.0)
-
-    @wp.func
-    def normal_of(inputs: GridInputs, k: int) -> vec:
-        n = vec()
-        for axis in range(dim):
-            n[axis] = real(inputs.normal[k, axis])
-        return n
-
-    @wp.func
-    def height(inputs: GridInputs, k: int, x: exact_vec) -> real:
-        """y of (K3), in float64 until it is small."""
-        y = -inputs.offset[k]
-        for axis in range(dim):
-            y += inputs.normal[k, axis] * x[axis]
-        return real(y)
 
     @wp.func
     def at_point(body: Surface, nodal: wp.array2d(dtype=vec), world: int, p: int) -> vec:
@@ -134,43 +118,53 @@ def surface(spec: Spec) -> SimpleNamespace:
         body: Surface,
         moving: Frame,
         smoothing: real,
-        words: wp.array(dtype=wp.int64),
         D: wp.array2d(dtype=real),
+        substep: int,
+        rate: wp.array(dtype=real),  # 1/T
+        anew: int,  # 1 at the beginning of a control step
         # In:
         shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
         free: wp.array2d(dtype=vec),
         anchor: wp.array3d(dtype=vec),
+        # In and out:
+        words: wp.array(dtype=wp.int64),
+        force: wp.array3d(dtype=vec),
         # Out:
         impulse: wp.array2d(dtype=vec),
         new_anchor: wp.array3d(dtype=vec),
     ):
-        """(K2) to (K4): impulse A J of each point."""
+        """(K2) to (K4), (K6), (K7): impulse A J of each point."""
         world, p = wp.tid()
         total = vec()
         if running(words, world):
             d = recentring(moving, u, world)
-            exact = present(body, p, at_point(body, u, world, p))
-            x = vec(exact)
-            exact += shift[world]
+            x = present(body, p, at_point(body, u, world, p))
             v = at_point(body, free, world, p)
             for q in range(count):
                 k = number[q]
+                wall = face(constants, inputs, world, k, x + shift[world], anchor[world, q, p])
+                if wall.depth > body.deepest[p]:
+                    report(words, world, wp.max(substep - 1, 0), in_wall, q * body.points.shape[0] + p)
                 found = touch(
-                    normal_of(inputs, k),
-                    height(inputs, k, exact),
-                    x,
+                    wall.n,
+                    wall.y,
+                    vec(x),
                     v,
-                    anchor[world, q, p],
+                    wall.anchor,
                     D[world, p],
                     friction_of(inputs, world, k),
                     body.stiffness[p],
                     constants.dt,
                     smoothing,
                 )
-                new_anchor[world, q, p] = found.anchor - across(normal_of(inputs, k), d)
+                new_anchor[world, q, p] = found.anchor - across(wall.n, d)
                 total += found.J
                 v += D[world, p] * found.J
+                pushed = (rate[0] * body.newtons[p]) * found.J
+                if anew == 0:
+                    pushed += force[world, q, p]
+                force[world, q, p] = pushed
         else:
             for q in range(count):
                 new_anchor[world, q, p] = anchor[world, q, p]
@@ -205,195 +199,35 @@ def surface(spec: Spec) -> SimpleNamespace:
         new_u[world, i] = here
         new_v[world, i] = new
 
+    @wp.kernel(module=module, enable_backward=False)
+    def check_depth(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        body: Surface,
+        later: wp.float64,  # than the inputs [s]
+        substep: int,
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+    ):
+        """Check a state that no contact is computed of: the final one of a chunk, or the initial one of a call."""
+        world, p = wp.tid()
+        x = present(body, p, at_point(body, u, world, p)) + shift[world]
+        for q in range(count):
+            if depth(inputs, world, number[q], later, x) > body.deepest[p]:
+                report(words, world, substep, in_wall, q * body.points.shape[0] + p)
+
     return SimpleNamespace(
         delassus=delassus,
         press=press,
         settle=settle,
+        check_depth=check_depth,
         friction_of=friction_of,
-        normal_of=normal_of,
-        height=height,
         at_point=at_point,
         from_points=from_points,
         present=present,
         number=number,
-    )
-
-
-@kernel_factory
-def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
-    t, r, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), surface(spec)
-    real, vec, Constants, Rest, dim = t.real, t.vec, t.Constants, r.Rest, spec.dim
-    GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    Surface, block, count = (
-        surface_type(dim, spec.dtype),
-        surface_contact(dim, spec.dtype),
-        len(spec.surface_walls),
-    )
-    touch, touch_adj, number = block.touch, block.touch_adj, one.number
-    friction_of, normal_of, height, present = one.friction_of, one.normal_of, one.height, one.present
-    at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
-    arms, place, before_wall = r.count, nodes(spec).place, wp.types.matrix((count, dim), real)
-    exact_vec, mirrored = types(dim, "float64").vec, bool(spec.mirrors)
-    module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
-
-    @wp.kernel(module=module, enable_backward=False)
-    def settle_adj(
-        # Parameters:
-        constants: Constants,
-        inputs: GridInputs,
-        inside: Rest,
-        mass: wp.array2d(dtype=real),
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
-        adj_u: wp.array2d(dtype=vec),
-        # In and out:
-        adj_v: wp.array2d(dtype=vec),
-        # Out, with clamps in:
-        free: wp.array2d(dtype=vec),
-        # Out:
-        shared: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
-    ):
-        """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m."""
-        world, i = wp.tid()
-        m = mass[world, i]
-        x = place(constants, inside, i, shift[world], u[world, i])
-        v = node_velocity(constants, inputs, world, x, p[world, i], m)
-        if wp.static(mirrored):
-            v = free[world, i]  # reflected already
-        adj = adj_v[world, i] + constants.dt * adj_u[world, i]
-        free[world, i] = v
-        adj_v[world, i] = adj
-        each = vec()
-        if m > real(0.0):
-            each = adj / m
-        shared[world, i] = each
-        adj_mass[world, i] = adj_mass[world, i] - wp.dot(new_v[world, i] - v, each)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def press_adj(
-        # Parameters:
-        constants: Constants,
-        inputs: GridInputs,
-        body: Surface,
-        smoothing: real,
-        D: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        anchor: wp.array3d(dtype=vec),
-        shared: wp.array2d(dtype=vec),
-        # In and out:
-        adj_anchor: wp.array3d(dtype=vec),
-        # Out:
-        adj_x: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_D: wp.array2d(dtype=real),
-        adj_inputs: GridInputsAdj,
-    ):
-        world, p = wp.tid()
-        exact = present(body, p, at_point(body, u, world, p))
-        x = vec(exact)
-        exact += shift[world]
-        v = at_point(body, free, world, p)
-        dv = D[world, p]
-        reached = before_wall()
-        for q in range(count):
-            for axis in range(dim):
-                reached[q, axis] = v[axis]
-            k = number[q]
-            found = touch(
-                normal_of(inputs, k),
-                height(inputs, k, exact),
-                x,
-                v,
-                anchor[world, q, p],
-                dv,
-                friction_of(inputs, world, k),
-                body.stiffness[p],
-                constants.dt,
-                smoothing,
-            )
-            v += dv * found.J
-        adj_J = body.areas[p] * at_point(body, shared, world, p)
-        back_x = vec()
-        back_v = vec()
-        total_D = real(0.0)
-        after = v
-        for back in range(count):
-            q = count - 1 - back
-            k = number[q]
-            here = vec()
-            for axis in range(dim):
-                here[axis] = reached[q, axis]
-            n = normal_of(inputs, k)
-            adj = touch_adj(
-                n,
-                height(inputs, k, exact),
-                x,
-                here,
-                anchor[world, q, p],
-                dv,
-                friction_of(inputs, world, k),
-                body.stiffness[p],
-                constants.dt,
-                smoothing,
-                adj_J + dv * back_v,
-                adj_anchor[world, q, p],
-            )
-            total_D += wp.dot(after - here, back_v) / dv + adj.D
-            back_v += adj.v
-            back_x += adj.x
-            adj_anchor[world, q, p] = adj.anchor
-            if wp.static("friction" in wanted):
-                i = world * held + p
-                adj_inputs.friction[k, i] = adj_inputs.friction[k, i] + adj.friction
-            after = here
-        adj_x[world, p] = back_x
-        adj_v[world, p] = back_v
-        adj_D[world, p] = adj_D[world, p] + total_D
-
-    @wp.kernel(module=module, enable_backward=False)
-    def spread_adj(
-        # Parameters:
-        body: Surface,
-        # In:
-        adj_x: wp.array2d(dtype=vec),
-        adj_free: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-    ):
-        """(K2.adj)"""
-        world, i = wp.tid()
-        adj_u[world, i] = adj_u[world, i] + from_points(body, adj_x, world, i)
-        adj_v[world, i] = adj_v[world, i] + from_points(body, adj_free, world, i)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def delassus_adj(
-        body: Surface,
-        mass: wp.array2d(dtype=real),
-        adj_D: wp.array2d(dtype=real),
-        adj_mass: wp.array2d(dtype=real),
-    ):
-        """(K1.adj)"""
-        world, i = wp.tid()
-        total = real(0.0)
-        for m in range(body.first[i], body.first[i + 1]):
-            entry = body.members[m]
-            p = entry / arms
-            total += wp.abs(body.weights[p, entry - p * arms]) * adj_D[world, p]
-        if body.first[i + 1] > body.first[i]:
-            square = mass[world, i] * mass[world, i]
-            adj_mass[world, i] = adj_mass[world, i] - total * body.loads[i] / square
-
-    return SimpleNamespace(
-        settle_adj=settle_adj, press_adj=press_adj, spread_adj=spread_adj, delassus_adj=delassus_adj
     )

@@ -8,8 +8,8 @@ A wall at rest has n·x ≤ o inside. A wall that moves has, t seconds after the
 with the velocity w of its surface. With r̄ and n̄ from the response (contacts/) and ū = v̄' − r̄, r = (ȯ − ṅ·x) / |a|:
 
     v̄ = r̄,   w̄ = ū,   r̄_u = n̂·ū,   ȱ = r̄_u / |a|,   n̄ += r ū,                                     (C5.adj)
-    ā = (n̄ − (n̂·n̄) n̂ − r r̄_u n̂) / |a|,   ṅ̄ = t ā − (r̄_u / |a|) x
-Derivation: docs/math/grid.md.
+    ā = (n̄ − (n̂·n̄) n̂ − r r̄_u n̂) / |a|,   ṅ̄ = t ā − (r̄_u / |a|) x,   x̄ = −(r̄_u / |a|) ṅ
+x̄ counts in the reference formulation, whose nodes move. Derivation: docs/math/grid.md.
 """
 
 from types import SimpleNamespace
@@ -75,14 +75,27 @@ def wall(spec: Spec, k: int) -> SimpleNamespace:
 
 
 @kernel_factory
+def meet_adj_type(dim: int, dtype: str):
+    vec = types(dim, dtype).vec
+
+    @wp.struct
+    class MeetAdj:
+        v: vec
+        x: vec
+
+    return MeetAdj
+
+
+@kernel_factory
 def wall_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
-    """Adjoint of ``meet`` of wall number ``k``: that of v; adds those of the wall's inputs at node ``i`` into ``adj_inputs``."""
+    """Adjoints of ``meet`` of wall number ``k``; adds those of the wall's inputs at node ``i`` into ``adj_inputs``."""
     t, w = types(spec.dim, spec.dtype), wall(spec, k)
     real, vec, GridInputs = t.real, t.vec, input_types(spec).GridInputs
     exact_vec = types(spec.dim, "float64").vec
     GridInputsAdj = input_adj_types(spec, wanted).GridInputsAdj
     normal, velocity, plane = w.normal, w.velocity, w.plane
     respond_adj, moving = response_adj(spec, wanted, k), spec.moving
+    MeetAdj = meet_adj_type(spec.dim, spec.dtype)
 
     @wp.func
     def motion_adj(
@@ -118,15 +131,19 @@ def wall_adj(spec: Spec, wanted: RequestedGrads, k: int) -> wp.Function:
         adj: vec,
         i: int,
         adj_inputs: GridInputsAdj,
-    ) -> vec:
+    ) -> MeetAdj:
+        out = MeetAdj()
+        n = normal(inputs, world)
         if wp.static(moving):
-            u = velocity(inputs, world, x)
-            back = respond_adj(inputs, world, normal(inputs, world), v - u, adj, i, adj_inputs)
+            back = respond_adj(inputs, world, n, v - velocity(inputs, world, x), adj, i, adj_inputs)
             if wp.static("wall" in wanted):
                 motion_adj(inputs, world, x, back.n, adj - back.v, i, adj_inputs)
-            return back.v
+            length = real(wp.length(plane(inputs, world)))
+            out.x = (-wp.dot(n, adj - back.v) / length) * vec(inputs.normal_rate[world, k])
+            out.v = back.v
         else:
-            still = respond_adj(inputs, world, normal(inputs, world), v, adj, i, adj_inputs)
-            return still.v
+            still = respond_adj(inputs, world, n, v, adj, i, adj_inputs)
+            out.v = still.v
+        return out
 
     return meet_adj

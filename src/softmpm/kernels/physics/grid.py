@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.physics.contact import wall, wall_adj
+from softmpm.kernels.physics.contact import meet_adj_type, wall, wall_adj
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
@@ -128,15 +128,16 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     nodes, dim = spline(spec.dim, spec.dtype), spec.dim
     node_coordinates, momentum, pack = nodes.node_coordinates, nodes.momentum, nodes.pack
     gravity, decay, free_velocity = forward.gravity, forward.decay, forward.free_velocity
-    damped = spec.damping
+    damped, MeetAdj = spec.damping, meet_adj_type(spec.dim, spec.dtype)
 
     @wp.struct
     class NodeAdj:
         p: vec
         m: real
+        x: vec  # through the speed of walls that turn
 
     def after_walls_adj(k: int) -> wp.Function:
-        """Adjoint of the velocity before wall ``k``, from that of the velocity after all walls."""
+        """Adjoints of the velocity before wall ``k`` and of the position, from that of the velocity after all walls."""
         if k == len(spec.contacts):
 
             @wp.func
@@ -149,8 +150,10 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 adj: vec,
                 i: int,
                 adj_inputs: GridInputsAdj,
-            ) -> vec:
-                return adj
+            ) -> MeetAdj:
+                out = MeetAdj()
+                out.v = adj
+                return out
         elif k not in spec.node_walls:
             return after_walls_adj(k + 1)
         else:
@@ -167,15 +170,17 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 adj: vec,
                 i: int,
                 adj_inputs: GridInputsAdj,
-            ) -> vec:
+            ) -> MeetAdj:
                 meets = inside(inputs, world, x)
                 w = v
                 if meets:
                     w = meet(inputs, world, x, v)
-                adj_v = through_others(constants, inputs, world, x, w, adj, i, adj_inputs)
+                out = through_others(constants, inputs, world, x, w, adj, i, adj_inputs)
                 if meets:
-                    adj_v = meet_adj(inputs, world, x, v, adj_v, i, adj_inputs)
-                return adj_v
+                    here = meet_adj(inputs, world, x, v, out.v, i, adj_inputs)
+                    out.v = here.v
+                    out.x += here.x
+                return out
 
         return back
 
@@ -198,7 +203,9 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if m > real(0.0):
             u = p / m
             free = free_velocity(constants, inputs, world, u)
-            adj_v = after_all_walls_adj(constants, inputs, world, x, free, adj_velocity, i, adj_inputs)
+            back = after_all_walls_adj(constants, inputs, world, x, free, adj_velocity, i, adj_inputs)
+            adj_v = back.v
+            adj.x = back.x
             adj.p = adj_v / m  # (G1.adj)
             if wp.static(damped):
                 adj.p = decay(constants, inputs, world) * adj.p

@@ -12,9 +12,10 @@ With y the height over the wall, v_n and v_t the velocity along and across its n
     stick:  ā += ā',  ē = −c T̄,  D̄ += c² Δt e·T̄
     both:   x̄_t += ē,  v̄_t += Δt ē,  ā −= ē
     d̄ = P̄ H'(d) / (Δt D),  D̄ −= P̄ P / D,  ȳ −= d̄,  v̄_n −= Δt d̄                                     (K3.adj)
+    n̄ = ȳ x + (v̄_n − n·v̄_t) v − v_n v̄_t − (n·x) x̄_t − (n·x̄_t) x + P J̄
 
-H is max(d, 0), or smooth over 2s: d²/(4s) up to 2s and d − s beyond. P and T are impulses per area; the stick spring k only
-remembers where a point adhered.
+with y = n·x − o. H is max(d, 0), or smooth over 2s: d²/(4s) up to 2s and d − s beyond. P and T are impulses per area; the stick
+spring k only remembers where a point adhered.
 """
 
 from types import SimpleNamespace
@@ -41,6 +42,8 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
         anchor: vec
         D: real
         friction: real
+        n: vec
+        y: real
 
     @wp.func
     def across(n: vec, a: vec) -> vec:
@@ -132,6 +135,9 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
             adj_d = adj_P * hinge_slope(d, s) / (dt * D)  # (K3.adj)
             adj.D -= adj_P * P / D
             adj_y = -adj_d
+        adj.y = adj_y
+        adj.n = adj_y * x + (dt * adj_y - wp.dot(n, adj_v)) * v - wp.dot(n, v) * adj_v
+        adj.n += P * adj_J - wp.dot(n, x) * adj_x - wp.dot(n, adj_x) * x
         adj.x = across(n, adj_x) + adj_y * n
         adj.v = across(n, adj_v) + (dt * adj_y) * n
         return adj

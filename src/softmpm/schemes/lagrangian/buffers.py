@@ -26,6 +26,7 @@ class ChunkBuffers:
 
     Attributes:
         u, v, anchor, shift: Nodal states, one more than substeps if ``keep``, else two in turn.
+        force: Mean forces of the walls on the surface points in the present control step.
         p: Momenta of the nodes, one for each substep if ``keep``, else one.
         mass: Masses of the nodes.
         partial: Sums of the bricks for the nodes of their windows.
@@ -44,7 +45,7 @@ class ChunkBuffers:
         self.p, self.mass = self.tensor(momenta, *nodal), self.tensor(*nodal[:2])
         self.anchor, self.partial = self.tensor(stored, *model.anchor_shape), empty_partial(model)
         self.shift = torch.empty(stored, model.worlds, model.dim, dtype=torch.float64, device=model.device)
-        self.frame = frame_struct(model)
+        self.force, self.frame = self.tensor(*model.anchor_shape), frame_struct(model)
         self.words = torch.empty(model.worlds, dtype=torch.int64, device=model.device)
         self._loaded = False
         order = model.rest_grid.order.expand(model.worlds, -1).contiguous()
@@ -59,7 +60,7 @@ class ChunkBuffers:
         self.words_array = view(self.words, wp.int64)
         self.contact = self.reflection = None
         if model.surface is not None:
-            self.contact = SurfaceContact(model, self.mass, self.anchor, self.shift)
+            self.contact = SurfaceContact(model, chunk, self.mass, self.anchor, self.shift, self.force)
         if model.mirror is not None:
             self.reflection = Reflection(model, self.mass)
 
@@ -88,19 +89,31 @@ class ChunkBuffers:
         given_states = (*start[:3], shift_of(self.model, start))
         for own, given in zip((self.u, self.v, self.anchor, self.shift), given_states, strict=True):
             own[0].copy_(given.detach())
+        if begins(chunk):
+            clear(self.force)
+        else:
+            self.force.copy_(start.force.detach())
+        if self.contact is not None:
+            self.contact.rate.fill_(1.0 / (chunk.substeps * self.model.scene.dt))
         self._loaded = True
 
     def end(self) -> Nodal:
         """Copy of the final state: a result must not keep all states alive."""
         last = self.index(self.chunk.length)
-        return Nodal(*(one[last].clone() for one in (self.u, self.v, self.anchor, self.shift)))
+        u, v, anchor, shift = (one[last].clone() for one in (self.u, self.v, self.anchor, self.shift))
+        return Nodal(u, v, anchor, self.force.clone(), shift)
+
+
+def begins(chunk: Chunk) -> bool:
+    """True if a chunk begins with a control step."""
+    return chunk.first % chunk.substeps == 0
 
 
 class SharedAdjoint:
     """Buffers that a backward pass needs only while it runs; all chunks share them.
 
     Attributes:
-        u, v, anchor: Adjoint of the state.
+        u, v, anchor, force: Adjoint of the state.
         f: Adjoint of the forces on the nodes.
         mass: Adjoint of the masses of the nodes.
         partials: Sums of the bricks for the adjoints of displacements and velocities.
@@ -108,8 +121,8 @@ class SharedAdjoint:
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
         self.model, self.wanted = buffers.model, wanted
-        self.u, self.v, self.anchor = (
-            torch.empty_like(one[0]) for one in (buffers.u, buffers.v, buffers.anchor)
+        self.u, self.v, self.anchor, self.force = (
+            torch.empty_like(one) for one in (buffers.u[0], buffers.v[0], buffers.anchor[0], buffers.force)
         )
         self.f, self.mass = torch.empty_like(self.u), torch.empty_like(buffers.mass)
         viscous = self.model.spec.viscosity
@@ -122,6 +135,11 @@ class SharedAdjoint:
         self.mass_array = view(self.mass, buffers.types.real)
         self.partial_arrays = [view(one, vec) for one in self.partials]
         self._accumulators: dict[int, Accumulators] = {}
+
+    @property
+    def state(self) -> tuple[Tensor, ...]:
+        """Adjoint of the state, in the order of :class:`Nodal`."""
+        return self.u, self.v, self.anchor, self.force
 
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""
@@ -152,7 +170,7 @@ class ChunkAdjoint:
             given = shared.wanted, forward.words_array, shared.mass_array
             self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
-            given = shared.wanted, shared.held, shared.anchor, shared.mass_array
+            given = shared.wanted, shared.held, shared.anchor, shared.force, shared.mass_array
             self.contact = SurfaceContactAdj(forward.contact, *given)
 
     def load(self, adj_end: Nodal) -> None:
@@ -163,11 +181,13 @@ class ChunkAdjoint:
         if self.contact is not None:
             self.contact.clear()
         shared = self.shared
-        for own, given in zip((shared.u, shared.v, shared.anchor), adj_end[:3], strict=True):
+        for own, given in zip(shared.state, adj_end[:4], strict=True):
             own.copy_(given)
 
     def unload(self, stream: wp.Stream | None, chunk: Chunk, adj_inputs: InputsAdj) -> Nodal:
         """Add the adjoints of the inputs into ``adj_inputs``; returns that of the initial state."""
         adj_inputs.add(self.found, chunk.rows)
         add_unsorted(stream, self._unsort, self.found, chunk.rows, adj_inputs)
-        return Nodal(*(one.clone() for one in (self.shared.u, self.shared.v, self.shared.anchor)))
+        if begins(chunk):
+            clear(self.shared.force)
+        return Nodal(*(one.clone() for one in self.shared.state))

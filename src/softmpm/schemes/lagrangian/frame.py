@@ -13,9 +13,13 @@ from softmpm.state import Nodal
 
 def quantum(model: Model) -> float:
     """Of the shift [m]: the power of two from a cell on, so that u changes without rounding. Infinite with clamps and planes of
-    symmetry, where u is held or reflected.
+    symmetry, where u is held or reflected, and with walls that move, whose anchors turn about a place.
     """
-    return math.inf if model.mirror is not None else 2.0 ** math.ceil(math.log2(model.scene.grid.spacing))
+    return (
+        math.inf
+        if model.mirror is not None or model.spec.moving
+        else 2.0 ** math.ceil(math.log2(model.scene.grid.spacing))
+    )
 
 
 def frame_struct(model: Model) -> Any:

@@ -21,6 +21,9 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
         _advance(buffers, s, launch)
     last = buffers.chunk.length
     kernel, u = cells(model.spec, model.rest_grid.bricks).check_end, buffers.u_arrays[buffers.index(last)]
+    if buffers.contact is not None:
+        inputs = buffers.inputs.grid_struct(last - 1)
+        buffers.contact.check_end(launch, inputs, last - 1, buffers.index(last), u, buffers.words_array)
     brick_launch(model, launch, kernel, model.constants, buffers.rest, last - 1, u, buffers.words_array)
 
 
@@ -55,7 +58,7 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     if buffers.reflection is not None:
         buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
     if contact is not None:
-        contact.advance(launch, inputs, buffers.words_array, now, then, *state, *new)
+        contact.advance(launch, s, inputs, buffers.words_array, now, then, *state, *new)
         if buffers.reflection is not None:
             buffers.reflection.advance(launch, buffers.words_array, state[0], new[1], new[0])
 

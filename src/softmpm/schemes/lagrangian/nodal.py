@@ -27,11 +27,12 @@ def particles_of(model: Model, nodes: Nodal) -> State:
     return State(*shown, nodes=nodes)
 
 
-def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
+def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = None) -> Nodal:
     """Nodal state from the four fields of the particles (Q6).
 
     Args:
         mass: Mass of the particles in any unit, shape (world, particle).
+        normals: Unit normals of all walls, shape (world, wall, dim); None takes the scene's.
     """
     moved = state.x.double() - model.positions.double()
     moved = moved if state.low is None else moved + (state.low.x.double() - model.rest_low.double())
@@ -43,7 +44,8 @@ def nodes_of(model: Model, state: State, mass: Tensor) -> Nodal:
     of_nodes, u, v = found
     if model.mirror is not None:
         u, v = model.mirror.reflected(of_nodes, u, v)
-    return Nodal(u, v, _anchors(model, u), shift)
+    anchors = _anchors(model, u, normals)
+    return Nodal(u, v, anchors, torch.zeros_like(anchors), shift)
 
 
 class _Arrays:
@@ -186,12 +188,14 @@ def _project_adj(
     return [*found, adj_mass]
 
 
-def _anchors(model: Model, u: Tensor) -> Tensor:
+def _anchors(model: Model, u: Tensor, normals: Tensor | None) -> Tensor:
     """Anchors of surface points that touch nothing yet: their places across the normal of each separating wall."""
     surface = model.surface
     if surface is None:
         return u.new_zeros(model.anchor_shape)
-    near = u[:, surface.stencil.long()]
-    x = surface.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, surface.weights.to(u.dtype))
-    normals = surface.normals.to(u.dtype)
-    return x[:, None] - torch.einsum("wpd,kd->wkp", x, normals)[..., None] * normals[:, None]
+    x = surface.places(u)
+    if normals is None:
+        n = surface.normals.expand(len(u), -1, -1).to(u.dtype)
+    else:
+        n = normals[:, model.spec.surface_walls].to(u.dtype)
+    return x[:, None] - torch.einsum("wpd,wkd->wkp", x, n)[..., None] * n[:, :, None]

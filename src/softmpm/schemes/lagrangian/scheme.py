@@ -17,12 +17,14 @@ from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.graph_cache import GraphCache, Lease
-from softmpm.schemes.inputs import InputsAdj, Values, particle_struct, stiffest
+from softmpm.schemes.inputs import InputsAdj, Values, elapsed, grid_struct, particle_struct, stiffest
 from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers, SharedAdjoint
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
+from softmpm.schemes.lagrangian.frame import shift_of
 from softmpm.schemes.lagrangian.launches import launch_chunk, launch_chunk_adj
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
+from softmpm.schemes.lagrangian.surface import check_start
 from softmpm.schemes.launch import KernelLauncher, LaunchReplay
 from softmpm.state import Nodal, State
 
@@ -129,7 +131,14 @@ class Lagrangian:
         inputs = particle_struct(model, model.fixed | stiffest(model, values))
         arguments = (model.constants, inputs, rest_struct(model), u, view(words, wp.int64))
         kernel = cells(model.spec, model.rest_grid.bricks).check_start
-        brick_launch(model, KernelLauncher(model, stream_of(model.device)), kernel, *arguments)
+        launch = KernelLauncher(model, stream_of(model.device))
+        brick_launch(model, launch, kernel, *arguments)
+        if model.surface is not None:
+            known = model.fixed | values
+            if model.spec.moving:
+                known["elapsed"] = elapsed(model, 0, 1, 1)
+            shift = view(shift_of(model, start), types(model.spec.dim, "float64").vec)
+            check_start(model, launch, grid_struct(model, known), shift, u, view(words, wp.int64))
         return words
 
     def accept(self, run: LagrangianRun, words: list[int]) -> bool:

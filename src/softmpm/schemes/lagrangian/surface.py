@@ -7,11 +7,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.lagrangian.surface import surface, surface_adj, surface_type
+from softmpm.kernels.lagrangian.surface import surface, surface_type
+from softmpm.kernels.lagrangian.surface_adj import surface_adj
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
+from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.lagrangian.frame import frame_struct
+from softmpm.schemes.penetration import deepest
 
 
 def surface_struct(model: Model):
@@ -23,6 +26,8 @@ def surface_struct(model: Model):
     for name in ("areas", "loads", "weights"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
+    struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)
+    struct.deepest = view(deepest(model).to(model.dtype), t.real)
     for name in ("stencil", "first", "members"):
         setattr(struct, name, view(getattr(points, name), wp.int32))
     return struct
@@ -32,22 +37,36 @@ class SurfaceContact:
     """Contact of the surface points with the separating walls, from the velocity without it to the new state.
 
     Args:
+        chunk: Substeps that it takes part in.
         mass: Masses of the nodes, shape (world, node).
         anchors: Anchors of each stored state, shape (state, world, wall, point, dim).
         shifts: Translation of each stored state, shape (state, world, dim).
+        force: Mean forces in the control step so far [N], shape (world, wall, point, dim); updated in place.
 
     Attributes:
         free: Nodal velocities without contact.
+        rate: 1/T, T being the duration of a control step [1/s], shape (1,): calls whose chunks have one shape may differ in it.
     """
 
-    def __init__(self, model: Model, mass: Tensor, anchors: Tensor, shifts: Tensor):
-        self.model, self.anchors, self.shifts = model, anchors, shifts
-        self._frame = frame_struct(model)
+    def __init__(
+        self,
+        model: Model,
+        chunk: Chunk,
+        mass: Tensor,
+        anchors: Tensor,
+        shifts: Tensor,
+        force: Tensor,
+    ):
+        self.model, self.chunk, self.anchors = model, chunk, anchors
+        self._frame, exact = frame_struct(model), types(model.spec.dim, "float64").vec
+        self.shifts = [view(one, exact) for one in shifts]
+        self.rate = torch.empty(1, dtype=model.dtype, device=model.device)
         self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
         self._vec, self._real = (
             getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
         )
         self._struct, self._mass = surface_struct(model), view(mass, self._real)
+        self._force, self.rate_array = view(force, self._vec), view(self.rate, self._real)
         self._width = model.contact_width * model.scene.grid.spacing
         self.free = self._vectors(self.nodes)
         self._impulse = self._vectors(self.points)
@@ -61,9 +80,14 @@ class SurfaceContact:
         """Launch what depends on the masses only."""
         launch(surface(self.model.spec).delassus, self.points, self._struct, self._mass, self._D)
 
+    def anew(self, s: int) -> int:
+        """1 if a control step begins with substep ``s``, but the first one, where the buffers are cleared."""
+        return int(s in self.chunk.shape[1])
+
     def advance(
         self,
         launch: Callable[..., None],
+        s: int,
         inputs: Any,
         words: wp.array,
         now: int,
@@ -73,18 +97,41 @@ class SurfaceContact:
         new_u: wp.array,
         new_v: wp.array,
     ) -> None:
-        """From :attr:`free` and the state before the substep to that after it; ``now`` and ``then`` count their anchors."""
+        """Substep ``s``, from :attr:`free` and the state before to that after; ``now`` and ``then`` count their anchors."""
         model, kernels = self.model, surface(self.model.spec)
         anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
-        parameters = (model.constants, inputs, self._struct, self._frame, self._width, words, self._D)
-        arguments = (self.shift(now), u, self.free, anchors[0], self._impulse, anchors[1])
+        about = (s, self.rate_array, self.anew(s))
+        parameters = (model.constants, inputs, self._struct, self._frame, self._width, self._D, *about)
+        arguments = (
+            self.shifts[now],
+            u,
+            self.free,
+            anchors[0],
+            words,
+            self._force,
+            self._impulse,
+            anchors[1],
+        )
         launch(kernels.press, self.points, *parameters, *arguments)
         parameters = (model.constants, self._struct, self._frame, self._mass, self._impulse, words)
         launch(kernels.settle, self.nodes, *parameters, u, v, self.free, new_u, new_v)
 
-    def shift(self, s: int) -> wp.array:
-        """Translation of a stored state."""
-        return view(self.shifts[s], types(self.model.spec.dim, "float64").vec)
+    def check_end(
+        self, launch: Callable[..., None], inputs: Any, s: int, end: int, u: wp.array, words: wp.array
+    ) -> None:
+        """Check the depth of the points in state ``end`` after substep ``s``, whose inputs are given."""
+        kernel, about = surface(self.model.spec).check_depth, (self.model.scene.dt, s)
+        parameters = (self.model.constants, inputs, self._struct, *about)
+        launch(kernel, self.points, *parameters, self.shifts[end], u, words)
+
+
+def check_start(
+    model: Model, launch: Callable[..., None], inputs: Any, shift: wp.array, u: wp.array, words: wp.array
+) -> None:
+    """Check the depth of the points in the initial state of a call, with the inputs of its first substep."""
+    points = (model.worlds, model.anchor_shape[2])
+    arguments = (model.constants, inputs, surface_struct(model), 0.0, 0, shift, u, words)
+    launch(surface(model.spec).check_depth, points, *arguments)
 
 
 class SurfaceContactAdj:
@@ -92,7 +139,7 @@ class SurfaceContactAdj:
 
     Args:
         held: Accumulators of one world in the structs of the inputs' adjoints.
-        adj_anchor: Adjoint of the anchors, updated in place.
+        adj_anchor, adj_force: Adjoints of the anchors and of the mean forces, updated in place.
         adj_mass: Adjoint of the masses of the nodes, added into.
     """
 
@@ -102,11 +149,12 @@ class SurfaceContactAdj:
         wanted: RequestedGrads,
         held: int,
         adj_anchor: Tensor,
+        adj_force: Tensor,
         adj_mass: wp.array,
     ):
         self.forward, self.held, self._adj_mass = forward, held, adj_mass
         self._kernels = surface_adj(forward.model.spec, wanted)
-        self._adj_anchor = view(adj_anchor, forward._vec)
+        self._adj_anchor, self._adj_force = view(adj_anchor, forward._vec), view(adj_force, forward._vec)
         self._shared = forward._vectors(forward.nodes)
         self._adj_x, self._adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
         model = forward.model
@@ -131,13 +179,14 @@ class SurfaceContactAdj:
         adj_v: wp.array,
     ) -> None:
         """Adjoint of substep ``s``, from that of the new state to that of the velocity without contact, in ``adj_v``."""
-        one = self.forward
+        one, shift = self.forward, self.forward.shifts[s]
         constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
-        arguments = (one.shift(s), u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
+        arguments = (shift, u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
         launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, one._mass, *arguments)
-        parameters = (constants, inputs, one._struct, one._width, one._D, self.held)
+        about = (self.held, one.rate_array, one.anew(s))
+        parameters = (constants, inputs, one._struct, one._width, one._D, *about)
         anchors = view(one.anchors[s], one._vec)
-        arguments = (one.shift(s), u, one.free, anchors, self._shared, self._adj_anchor)
+        arguments = (shift, u, one.free, anchors, self._shared, self._adj_force, self._adj_anchor)
         out = (*adj_points, self._adj_D, adj_inputs)
         launch(self._kernels.press_adj, one.points, *parameters, *arguments, *out)
         launch(self._kernels.spread_adj, one.nodes, one._struct, *adj_points, adj_u, adj_v)
