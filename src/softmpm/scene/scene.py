@@ -85,6 +85,17 @@ class Particles:
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "volume", read_only(np.broadcast_to(volume, (len(positions),)).copy()))
 
+    def moved(self, by: Sequence[float]) -> "Particles":
+        """The same shape, with its outline, displaced by a vector [m]."""
+        shift, outline = np.asarray(by, dtype=np.float64), self.outline
+        need(
+            shift.shape == self.positions.shape[1:],
+            f"a shape moves by {self.positions.shape[1]} numbers, one per axis, got {by}.",
+        )
+        if outline is not None:
+            outline = Outline(outline.points + shift, outline.normals, outline.areas)
+        return Particles(self.positions + shift, self.volume, outline)
+
     def __len__(self) -> int:
         return len(self.positions)
 
