@@ -52,7 +52,7 @@ class Model:
         derived: Names of the kernels' inputs that a call decides, in their order.
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
-        formulation: "moving" or "reference".
+        formulation, formulation_reason: "moving" or "reference", and why it was chosen.
         surface: Surface points that meet the separating walls, or None if the nodes do.
         contact_width: Width over which surface contact sets in [cells].
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
@@ -71,6 +71,7 @@ class Model:
         alarms: Alarms,
         *,
         formulation: str,
+        formulation_reason: str,
         surface: bool,
         contact_width: float,
         given: tuple[str, ...],
@@ -96,7 +97,7 @@ class Model:
         slots = muscle_slots(scene, self.particle_count)
         self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
         self.deterministic, self.workspace = deterministic, Workspace()
-        self.formulation = formulation
+        self.formulation, self.formulation_reason = formulation, formulation_reason
         self._rest_grid = RestGrid(scene, device) if formulation == "reference" else None
         self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
         self.contact_width = contact_width

@@ -103,7 +103,7 @@ def test_soles_meet_the_floor_on_spline_knots(name, resolution):
         soles = outline.points[:, 1] < lowest + 1e-9
         legs = 4 if name == "elephant" else 2
         width = {"elephant": 0.106 * 0.44, "biped": 0.078}[name]
-        assert outline.areas[soles].sum() == pytest.approx(legs * width, rel=0.05)  # legs are a little oblique
+        assert outline.areas[soles].sum() == pytest.approx(legs * width, rel=0.05)  # of oblique legs
         if resolution is Resolution.draft:
             model = softmpm.build(scene, device="cpu", **task.build)
             assert (model.surface is not None) == (contact != "nodes")
