@@ -44,7 +44,8 @@ class TaskConf:
     viscosity: float = 0.0
     """Viscosity η of the material [Pa s]; co-design starts there if it is > 0."""
     retardation: float = 0.0
-    """Retardation time η/μ of the material [s], instead of ``viscosity``; 1e-3 to 4e-3 for friction that does not flutter."""
+    """Retardation time η/μ of the material [s], instead of ``viscosity``. Good value in the reference formulation: 4e-3, with which its
+    gradients were usable (docs/gait.md)."""
     strength: float = 1.2e4
     """Stress of a muscle at full activation [Pa]."""
     gravity: float = 9.81
@@ -59,8 +60,7 @@ class TaskConf:
     """moving, or reference: as in :func:`softmpm.build`. In the reference formulation limbs pass through each other, and the body
     has cut cells."""
     contact: str = "auto"
-    """reference: what meets the floor, as in :func:`softmpm.build`; auto takes the surface of the robot, as does surface, nodes the
-    nodes."""
+    """reference: what meets the floor. auto and surface: the surface of the robot; nodes: the nodes around it."""
     contact_width: float = 0.0
     """Distance over which surface contact sets in [cells]; 0.01 to learn, 0 to evaluate."""
 
