@@ -1,4 +1,4 @@
-"""Accuracy of a walk: `python bench/gait.py {walk,gradient,precision} --device cpu [--gait NAME] [--json FILE]`
+"""Accuracy of a walk: `python bench/gait.py {walk,gradient,growth,precision} --device cpu [--gait NAME] [--json FILE]`
 
 Two open-loop gaits of the biped, learned at 80 cells per metre on the moving grid in 45 Adam steps, are replayed (``gaits.json``;
 docs/gait.md has the commands): `viscous` was learned with η/μ = 1 ms, `elastic` without viscosity.
@@ -9,6 +9,9 @@ formulation; ``±`` is the uncertainty of that limit: its standard error, and it
 
 **gradient**: cosine between directional derivatives of the displacement after 1 s and central secants, for eight random directions in
 the space of all activations; float64, 80 cells per metre.
+
+**growth**: ratio of the differences, after 1 s and after 0.1 s, of two walks whose activations in the first control step differ by
+1e-7; root mean square over the particles, in the reference formulation at 80 cells per metre.
 
 **precision**: float32 against float64 after 1000 substeps at 80 cells per metre. Largest differences of the state, in units of the
 largest displacement, speed, velocity gradient and deformation, and cosine of the gradients of the displacement with respect to all
@@ -47,6 +50,13 @@ GRADIENTS = [
     *((4e-3, "reference", "surface", width) for width in (0.0, 0.01)),
 ]
 """η/μ [s], formulation, contact and width."""
+GROWTH = [
+    *((1e-3, safety, 0.0, 0.8) for safety in (0.4, 0.2, 0.1)),
+    *((4e-3, safety, 0.0, 0.8) for safety in (0.4, 0.1)),
+    (1e-3, 0.1, 0.0, 0.0),
+    (1e-3, 0.1, 0.03, 0.8),
+]
+"""η/μ [s], share of the stable step, width and friction."""
 
 
 class Walker(BipedConf):
@@ -182,9 +192,29 @@ def precision(table: Table, gaits: dict, device) -> None:
         table.add(row)
 
 
+@torch.no_grad()
+def growth(table: Table, gaits: dict, device) -> None:
+    for (name, gait), (retardation, safety, width, friction) in itertools.product(gaits.items(), GROWTH):
+        settings = dict(formulation="reference", contact_width=width, friction=friction, safety=safety)
+        task = walker(80, retardation=retardation, **settings)
+        model, activation = replayed(task, np.array(gait), 0.0, device)
+        generator = torch.Generator().manual_seed(1)
+        change = torch.randn(activation.shape, generator=generator, dtype=activation.dtype).to(device)
+        change[1:] = 0.0
+        first, last = math.ceil(0.1 * len(gait)), len(gait)
+        ends = {}
+        for sign in (0.0, 1e-7):
+            middle = run(task, model, (activation + sign * change)[:first])
+            ends[sign] = (middle.x, run(task, model, (activation + sign * change)[first:last], middle).x)
+        early, late = ((b - a).norm().item() for a, b in zip(ends[0.0], ends[1e-7], strict=True))
+        row = {"gait": name, "η/μ ms": 1e3 * retardation, "safety": safety}
+        table.add(row | {"width": width, "friction": friction, "growth": late / early})
+
+
 PARTS = {
     "walk": (walks, "Displacement of a walk, float64"),
     "gradient": (gradients, "Gradient of 1 s of walking against secants, float64"),
+    "growth": (growth, "Growth of a small change of the activations from 0.1 s to 1 s, reference, float64"),
     "precision": (precision, "1000 substeps of walking, float32 against float64"),
 }
 
