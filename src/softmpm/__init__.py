@@ -20,8 +20,9 @@ from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.outline import Outline
+from softmpm.scene.polygons import inside
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
-from softmpm.scene.shapes import ball, box, image, mesh
+from softmpm.scene.shapes import ball, box, image, mesh, polygons
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State
 from softmpm.warp_api import step
@@ -67,7 +68,9 @@ __all__ = [
     "build",
     "contact_forces",
     "image",
+    "inside",
     "mesh",
+    "polygons",
     "rasterize",
     "simulate",
     "stable_dt",

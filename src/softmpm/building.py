@@ -44,7 +44,8 @@ def build(
         scheme: "fast", "plain", or "auto": fast in float32 wherever it can hold the scene. Both do the same; see
             docs/performance.md.
         formulation: "moving": material point method, whose grid is reset in each substep. "reference": total Lagrangian, with weights
-            taken once at rest; see docs/formulations.md.
+            taken once at rest; see docs/formulations.md. "auto": the reference formulation if the scene states ``body_contact=False``
+            and it has all that is asked for; ``describe`` gives the reason.
         contact: What meets the separating walls in the reference formulation: "nodes", "surface" (the points of the outlines,
             :class:`softmpm.Outline`), or "auto": the surface if every body has an outline. The moving formulation has nodes.
         contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
@@ -75,9 +76,8 @@ def build(
         memory_budget = int(memory_budget)
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
-    if formulation not in ("moving", "reference"):
-        raise ValueError(f"formulation must be 'moving' or 'reference', got {formulation!r}.")
     given = check_given(scene, inputs)
+    formulation, why = choose_formulation(scene, scheme, formulation)
     if not isinstance(deterministic, (bool, np.bool_)):
         raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
     alarms = Alarms() if alarms is None else alarms
@@ -109,6 +109,7 @@ def build(
         SCHEMES[scheme].footprint,
         alarms,
         formulation=formulation,
+        formulation_reason=why,
         surface=surface,
         contact_width=float(contact_width),
         given=given,
@@ -118,6 +119,25 @@ def build(
         memory_budget=memory_budget,
         calls=int(calls),
     )
+
+
+def choose_formulation(scene: Scene, scheme: str, wanted: str) -> tuple[str, str]:
+    """Formulation for ``wanted``, which may be "auto", and the reason.
+
+    Raises:
+        ValueError: There is no such formulation.
+    """
+    if wanted not in ("auto", "moving", "reference"):
+        raise ValueError(f"formulation must be 'auto', 'moving' or 'reference', got {wanted!r}.")
+    if wanted != "auto":
+        return wanted, "as asked for"
+    if scene.body_contact:
+        return "moving", "the scene does not state body_contact=False"
+    try:
+        check_reference(scene, scheme)
+    except ValueError as obstacle:
+        return "moving", str(obstacle).partition(";")[0]
+    return "reference", "bodies meet walls only"
 
 
 def on_surface(scene: Scene, formulation: str, contact: str, width: float) -> bool:

@@ -35,7 +35,7 @@ def describe(model, substeps: int) -> str:
         f"  gradients  of the start always; of {', '.join(groups(spec))} only in a backward pass that asks for them",
         f"  alarms     {_alarms(model)}",
         f"  dt         {model.scene.dt:.3g} s, stable up to {limit.dt:.3g} s; set by {limit.limit}",
-        f"  form       {model.formulation} formulation",
+        f"  form       {model.formulation} formulation: {model.formulation_reason}",
         f"  scheme     {model.scheme}: {model.scheme_reason}; {model.held_nodes} nodes of each world in memory",
         f"  sums       {_sums(model)}",
         f"  memory     {_memory(model, substeps)}",

@@ -53,7 +53,7 @@ class Model:
         derived: Names of the kernels' inputs that a call decides, in their order.
         spec: What the kernels are specialised for.
         deterministic: Whether results are the same bits from run to run.
-        formulation: "moving" or "reference".
+        formulation, formulation_reason: "moving" or "reference", and why it was chosen.
         surface: Surface points that meet the separating walls, or None if the nodes do.
         mirror: Nodes that clamps and planes of symmetry hold or reflect, or None if the scene has neither.
         contact_width: Width over which surface contact sets in [cells].
@@ -73,6 +73,7 @@ class Model:
         alarms: Alarms,
         *,
         formulation: str,
+        formulation_reason: str,
         surface: bool,
         contact_width: float,
         given: tuple[str, ...],
@@ -98,7 +99,7 @@ class Model:
         slots = muscle_slots(scene, self.particle_count)
         self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
         self.deterministic, self.workspace = deterministic, Workspace()
-        self.formulation = formulation
+        self.formulation, self.formulation_reason = formulation, formulation_reason
         self._rest_grid = None
         if formulation == "reference":
             self._rest_grid = RestGrid(scene, device, dtype, worlds, "force" in given)

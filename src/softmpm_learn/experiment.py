@@ -107,6 +107,7 @@ def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
         memory_budget=None if memory is None else round(1e6 * memory),
         inputs=declared_inputs(conf.design),
         calls=task.control_steps,
+        **task.build,
     )
 
 

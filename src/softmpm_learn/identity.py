@@ -22,11 +22,11 @@ def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object
     """Settings, task and scene by name; arrays by a short digest."""
     flat = identity_of_settings(settings)
     for field in dataclasses.fields(task):
-        if field.name != "scene":
+        if field.name not in ("scene", "build"):
             flat |= dict(_described(f"task.{field.name}", getattr(task, field.name)))
     flat["dtype"] = str(model.dtype)
     flat["scene"] = _digest(model)
-    return flat
+    return flat | _formulation(model)
 
 
 def identity_of_settings(settings: Settings) -> dict[str, object]:
@@ -61,6 +61,19 @@ def _described(name: str, value: object) -> Iterator[tuple[str, object]]:
         raise TypeError(
             f"{name} must be made of numbers, texts, arrays and dataclasses, got {type(value).__name__}."
         )
+
+
+def _formulation(model: Model) -> dict[str, object]:
+    """Formulation and contact; nothing for the moving formulation, like checkpoints from before there was another one."""
+    if model.formulation == "moving":
+        return {}
+    found = {"formulation": model.formulation, "contact": "nodes", "contact_width": model.contact_width}
+    if model.surface is not None:
+        surface = np.concatenate(
+            [part.cpu().numpy().ravel() for part in (model.surface.points, model.surface.areas)]
+        )
+        found["contact"] = hashlib.sha256(surface.tobytes()).hexdigest()[:16]
+    return found
 
 
 def _digest(model: Model) -> str:

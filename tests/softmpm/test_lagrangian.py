@@ -217,8 +217,32 @@ def test_what_the_formulation_lacks_is_refused():
     for make in (softmpm.warp_state, softmpm.warp_solid):
         with pytest.raises(ValueError, match="and softmpm.step need formulation='moving'"):
             make(model)
-    with pytest.raises(ValueError, match="formulation must be 'moving' or 'reference'"):
+    with pytest.raises(ValueError, match="formulation must be 'auto', 'moving' or 'reference'"):
         softmpm.build(busy_scene(2), formulation="lagrangian")
+
+
+def test_auto_takes_the_reference_formulation_where_it_serves():
+    """Only if the scene says that bodies meet walls only, and nothing is asked for that the formulation lacks; the summary says why."""
+    alone = {"driven": (), "body_contact": False}
+    for changes, settings, formulation, why in (
+        (alone, {}, "reference", "bodies meet walls only"),
+        ({"driven": ()}, {}, "moving", "the scene does not state body_contact=False"),
+        ({"body_contact": False}, {}, "moving", "has no driven particles"),
+        (
+            alone,
+            {"inputs": ("wall_offset",)},
+            "moving",
+            "has walls at rest only, but inputs has 'wall_offset'",
+        ),
+        (alone, {"scheme": "plain"}, "moving", "has one scheme, got scheme='plain'"),
+    ):
+        model = softmpm.build(full_scene(2, **changes), device="cpu", formulation="auto", **settings)
+        assert model.formulation == formulation and why in model.formulation_reason
+        assert f"{formulation} formulation: {model.formulation_reason}" in model.describe(substeps=10)
+    model = softmpm.build(full_scene(2, **alone), device="cpu")
+    assert model.formulation == "moving" and "moving formulation: as asked for" in model.describe(substeps=10)
+    with pytest.raises(TypeError, match="body_contact must be True or False, got 'no'"):
+        full_scene(2, body_contact="no")
 
 
 def test_a_particle_that_collapses_is_named():

@@ -203,12 +203,13 @@ def test_legal_runs_are_not_stopped(device):
     made = dataclasses.replace(made, dt=0.2 * softmpm.stable_dt(made))
     rows = torch.tensor([[[0.3, 0.8]], [[0.9, -0.2]]], dtype=torch.float64)
     quiet = softmpm.build(
-        made, device="cpu", dtype=torch.float64, formulation="reference", alarms=softmpm.Alarms(step=None)
+        made, device=device, dtype=torch.float64, formulation="reference", alarms=softmpm.Alarms(step=None)
     )
     state, states = inward(quiet, 25.0), []
     for s in range(40):
-        states.append(state.F[0])
-        state = softmpm.simulate(quiet, state, rows[s // 20][None], quiet.params(), substeps=1)
+        states.append(state.F[0].cpu())
+        row = rows[s // 20][None].to(quiet.device)
+        state = softmpm.simulate(quiet, state, row, quiet.params(), substeps=1)
     assert torch.linalg.svdvals(torch.stack(states)).min() < 0.6
     low, high = made.dt / 5, 10 * made.dt
     while high / low > 1.001:

@@ -8,7 +8,7 @@ import torch
 
 import softmpm
 from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
-from softmpm_learn.tasks.outline import Limb, fill, inside, smooth, smooth_line
+from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
 from softmpm_learn.tasks.task import Resolution, TaskConf
 
 SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
@@ -70,6 +70,50 @@ def test_legs_stand_on_the_floor():
                 gap = (positions[leg, 1].min() - floor) / scene.grid.spacing
                 assert 0.5 < gap < 1.0
             assert positions[:, 1].min() == min(positions[leg, 1].min() for leg in legs)
+
+
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("resolution", Resolution)
+def test_outlines_fit_their_robots(name, resolution):
+    """The outline closes around the volume of the particles: to half a spacing of the lattice, to 5e-4 with cut cells."""
+    conf, build = TASKS[name]
+    for formulation, tolerance in (("moving", 0.01), ("reference", 5e-4)):
+        task = build(conf(resolution=resolution, formulation=formulation))
+        particles, spacing = task.scene.bodies[0].particles, task.scene.grid.spacing / 2
+        outline = particles.outline
+        assert np.linalg.norm(outline.areas @ outline.normals) < 1e-12
+        assert outline.enclosed_volume == pytest.approx(particles.volume.sum(), rel=tolerance)
+        whole = bool(np.allclose(particles.volume, spacing**2, rtol=1e-9))
+        assert whole == (formulation == "moving")
+        assert particles.volume.min() > 0.35 * spacing**2
+
+
+@pytest.mark.parametrize("name", ["elephant", "biped"])
+@pytest.mark.parametrize("resolution", Resolution)
+def test_soles_meet_the_floor_on_spline_knots(name, resolution):
+    """With surface contact, soles and floor are at one height, in the middle between two rows of nodes, and are exactly level; nodes
+    meet a floor that is half a cell lower."""
+    conf, build = TASKS[name]
+    for contact, gap in (("auto", 0.0), ("surface", 0.0), ("nodes", 0.5)):
+        task = build(conf(resolution=resolution, formulation="reference", contact=contact))
+        scene, outline = task.scene, task.scene.bodies[0].particles.outline
+        lowest = outline.points[:, 1].min()
+        assert (lowest / scene.grid.spacing) % 1 == pytest.approx(0.5, abs=1e-9)
+        assert (lowest - scene.walls[0].offset) / scene.grid.spacing == pytest.approx(gap, abs=1e-9)
+        soles = outline.points[:, 1] < lowest + 1e-9
+        legs = 4 if name == "elephant" else 2
+        width = {"elephant": 0.106 * 0.44, "biped": 0.078}[name]
+        assert outline.areas[soles].sum() == pytest.approx(legs * width, rel=0.05)  # of oblique legs
+        if resolution is Resolution.draft:
+            model = softmpm.build(scene, device="cpu", **task.build)
+            assert (model.surface is not None) == (contact != "nodes")
+
+
+def test_retardation_is_viscosity_over_shear_modulus():
+    """η = τ μ, and the step is smaller."""
+    scene = biped(BipedConf(retardation=1e-3, young=5e4, poisson=0.25)).scene
+    assert scene.bodies[0].material.viscosity == pytest.approx(20.0)
+    assert scene.dt < biped(BipedConf(young=5e4, poisson=0.25)).scene.dt
 
 
 def test_the_step_is_stable_with_room_for_co_design(task):
@@ -148,6 +192,14 @@ def test_settings_reach_the_scene():
         (ElephantConf, {"seconds": 0.0}, "task.seconds must be > 0"),
         (ElephantConf, {"young": float("nan")}, "task.young must be > 0"),
         (ElephantConf, {"viscosity": -1.0}, "task.viscosity must be ≥ 0"),
+        (ElephantConf, {"retardation": -1.0}, "task.retardation must be ≥ 0"),
+        (ElephantConf, {"retardation": 1e-3, "viscosity": 1.0}, "two names for one thing"),
+        (ArmConf, {"formulation": "auto"}, "task.formulation must be one of moving, reference; got 'auto'"),
+        (
+            ArmConf,
+            {"contact": "surfaces"},
+            "task.contact must be one of auto, nodes, surface; got 'surfaces'",
+        ),
         (ElephantConf, {"gravity": -1.0}, "task.gravity must be ≥ 0"),
         (ElephantConf, {"friction": -0.1}, "task.friction must be ≥ 0"),
         (BipedConf, {"upright": -1.0}, "task.upright must be ≥ 0"),
@@ -176,15 +228,6 @@ def test_make_task_knows_its_tasks():
         make_task(Other())
 
 
-def test_inside_and_fill():
-    """Points inside a square and no others; a filled square has the square's area, overlapping parts count once."""
-    points = np.array([(0.5, 0.5), (1.5, 0.5), (-0.1, 0.2), (0.99, 0.01)])
-    assert inside(points, SQUARE).tolist() == [True, False, False, True]
-    particles = fill([SQUARE, SQUARE + (0.5, 0.0)], 0.05)
-    assert particles.volume.sum() == pytest.approx(1.5)
-    assert len(np.unique(particles.positions.round(6), axis=0)) == len(particles)
-
-
 def test_smooth_curves_pass_through_their_points():
     """Every step-th point of a curve is one that was given; a closed curve has no double point where it closes."""
     assert smooth(SQUARE, 4)[::4] == pytest.approx(SQUARE)
@@ -199,7 +242,7 @@ def test_a_limb_knows_along_and_across():
     along, left = limb.locate(np.array([(0.05, -0.5), (0.5, -0.95), (0.5, -1.05)]))
     assert along == pytest.approx([0.25, 0.75, 0.75]) and left == pytest.approx([0.05, 0.05, -0.05])
     assert limb.direction(0.0, 0.5) == pytest.approx([0.0, -1.0])
-    points = fill([limb.outline()], 0.02).positions
+    points = softmpm.polygons([limb.outline()], 0.02).positions
     halves = [limb.part(points, 0.0, 1.01, side) for side in (1, -1)]
     assert len(np.intersect1d(*halves)) == 0
     assert len(limb.part(points, 0.0, 1.01)) == pytest.approx(sum(map(len, halves)), abs=60)

@@ -49,10 +49,11 @@ def ball_outline(center: np.ndarray, radii: np.ndarray, spacing: float) -> Outli
     return Outline(center + radii * on_sphere, across / length[:, None], length * areas)
 
 
-def polygon_outline(polygons: Sequence[np.ndarray], spacing: float) -> Outline | None:
+def polygon_outline(polygons: Sequence[np.ndarray], spacing: float, corner: float = np.pi) -> Outline | None:
     """Closed polygons, the inside to the left, resampled in chords of about one spacing; None if there are none.
 
-    Islets and holes of less than a tenth of a lattice cell are left out.
+    Corners that turn by more than ``corner`` [rad] stay where they are; the default rounds all of them at the spacing, as suits the
+    steps of a picture. Islets and holes of less than a tenth of a lattice cell are left out.
 
     Points are the chords' middles, so that lengths, normals and the enclosed area are exactly those of the resampled polygons.
     """
@@ -61,9 +62,17 @@ def polygon_outline(polygons: Sequence[np.ndarray], spacing: float) -> Outline |
         x, y = polygon.T
         if abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2 < 0.1 * spacing**2:
             continue
+        sharp = np.flatnonzero(np.abs(_turns(polygon)) > corner)
+        polygon = np.roll(polygon, -sharp[0], axis=0) if len(sharp) else polygon
         closed = np.concatenate([polygon, polygon[:1]])
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-        places = np.linspace(0.0, arc[-1], max(4, round(arc[-1] / spacing)) + 1)
+        fixed = [*arc[sharp - sharp[0]], arc[-1]] if len(sharp) else [0.0, arc[-1]]
+        least = 1 if len(sharp) > 2 else 4
+        parts = [
+            np.linspace(a, b, max(least, round((b - a) / spacing)), endpoint=False)
+            for a, b in pairwise(fixed)
+        ]
+        places = np.concatenate([*parts, arc[-1:]])
         corners = np.stack([np.interp(places, arc, closed[:, axis]) for axis in (0, 1)], axis=-1)
         starts.append(corners[:-1])
         ends.append(corners[1:])
@@ -74,6 +83,13 @@ def polygon_outline(polygons: Sequence[np.ndarray], spacing: float) -> Outline |
     start, end, length = (values[length > 1e-6 * spacing] for values in (start, end, length))
     right = np.stack([(end - start)[:, 1], -(end - start)[:, 0]], axis=-1)
     return Outline((start + end) / 2, right / length[:, None], length)
+
+
+def _turns(polygon: np.ndarray) -> np.ndarray:
+    """Angle by which a closed polygon turns at each vertex [rad], in [−π, π]."""
+    after = np.roll(polygon, -1, axis=0) - polygon
+    angle = np.arctan2(after[:, 1], after[:, 0])
+    return (angle - np.roll(angle, 1) + np.pi) % (2 * np.pi) - np.pi
 
 
 def split_triangles(triangles: np.ndarray, spacing: float) -> np.ndarray:

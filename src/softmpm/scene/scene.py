@@ -87,6 +87,17 @@ class Particles:
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "volume", read_only(np.broadcast_to(volume, (len(positions),)).copy()))
 
+    def moved(self, by: Sequence[float]) -> "Particles":
+        """The same shape, with its outline, displaced by a vector [m]."""
+        shift, outline = np.asarray(by, dtype=np.float64), self.outline
+        need(
+            shift.shape == self.positions.shape[1:],
+            f"a shape moves by {self.positions.shape[1]} numbers, one per axis, got {by}.",
+        )
+        if outline is not None:
+            outline = Outline(outline.points + shift, outline.normals, outline.areas)
+        return Particles(self.positions + shift, self.volume, outline)
+
     def __len__(self) -> int:
         return len(self.positions)
 
@@ -234,6 +245,9 @@ class Scene:
     Indices into the model's particles, in any order; copied, read-only."""
     gravity: Sequence[float] | None = None
     """Gravity g [m/s²], one number per axis, such as (0.0, -9.8) in 2D, where axis 1 points up; None is weightless."""
+    body_contact: bool = True
+    """Bodies may touch themselves or each other. False states that they meet walls only, which allows ``formulation="auto"`` of
+    ``build`` to take the reference formulation, where they would pass through each other; nothing checks the statement."""
     damping: float = 0.0
     """Rate at which grid velocity decays [1/s]; the same for every dt. 0 for free motion; an arm that should come to rest takes 6."""
     dt: float
@@ -262,6 +276,8 @@ class Scene:
         gravity = (0.0,) * dim if self.gravity is None else numbers("gravity", self.gravity)
         need(len(gravity) == dim, f"gravity needs {dim} numbers, one per axis, got {self.gravity}.")
         object.__setattr__(self, "gravity", gravity)
+        if not isinstance(self.body_contact, (bool, np.bool_)):
+            raise TypeError(f"scene body_contact must be True or False, got {self.body_contact!r}.")
         store_numbers(self, "scene", "damping", "dt")
         need(self.damping >= 0, f"damping must be ≥ 0 1/s, got {self.damping}.")
         need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")

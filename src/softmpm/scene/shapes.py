@@ -1,4 +1,4 @@
-"""Shapes to particles: a box, a ball, a picture's silhouette or a closed mesh, on a regular lattice.
+"""Shapes to particles: a box, a ball, polygons, a picture's silhouette or a closed mesh, on a regular lattice.
 
 Every particle sits in the middle of its lattice cell and has the cell's volume; the last axis runs fastest.
 A box is filled exactly: its mass is its density times its own volume. The other shapes keep the cells whose
@@ -17,6 +17,7 @@ from softmpm.scene.boundary import ball_outline, box_outline, polygon_outline
 from softmpm.scene.cut_cells import SAMPLES, inner_parts, merge_slivers, sample_points, share_inside
 from softmpm.scene.image import Inside, coverage, mask_contours, silhouette
 from softmpm.scene.mesh import closed_surface, mesh_coverage, mesh_outline, near_surface, winding_inside
+from softmpm.scene.polygons import boundary_distance, inside_any, union_boundary
 from softmpm.scene.scene import Particles
 from softmpm.validate import need
 
@@ -82,6 +83,55 @@ def _cut_ball(radii: np.ndarray, middles: np.ndarray, spacing: float) -> tuple[n
     level = np.linalg.norm(samples, axis=2)
     distance = (level - 1.0) * level / np.linalg.norm(samples / radii, axis=2)  # to first order
     weights = share_inside(distance, spacing / SAMPLES)
+    share[cut], centroid[cut] = inner_parts(middles[cut], weights, spacing)
+    return share, centroid
+
+
+def polygons(
+    parts: Sequence[Sequence[Sequence[float]] | np.ndarray], spacing: float, *, cut_cells: bool = False
+) -> Particles:
+    """Fill the union of closed polygons with 2D particles; its outline keeps corners that turn by more than 20°.
+
+    Lattice cells begin at multiples of the spacing from the origin, so sides that lie there are exact.
+
+    Args:
+        parts: Vertices [m] of each polygon, shape (vertex, 2), either way round. They may overlap, share sides and cross themselves;
+            the inside of one that does follows the even-odd rule.
+        spacing: Distance of neighbouring particles [m].
+        cut_cells: Take every cell that the union crosses, with the volume and the centroid of the part inside.
+    """
+    spacing, drawn = _spacing(spacing), [np.asarray(part, dtype=np.float64) for part in parts]
+    need(len(drawn) > 0, "polygons needs at least one polygon.")
+    for k, part in enumerate(drawn):
+        need(
+            part.ndim == 2 and part.shape[1:] == (2,) and len(part) >= 3 and bool(np.isfinite(part).all()),
+            f"each polygon needs at least three finite vertices, shape (vertex, 2), but polygon {k} has shape {part.shape}.",
+        )
+    every = np.concatenate(drawn)
+    lower = np.floor(every.min(axis=0) / spacing)
+    count = _whole(np.maximum(np.ceil(every.max(axis=0) / spacing) - lower, 1))
+    middles = spacing * _lattice(lower + count / 2, count, 1.0)
+    boundary = union_boundary(drawn)
+    _not_empty(np.concatenate([middles[:0], *boundary]), spacing)
+    if cut_cells:
+        positions, volume = merge_slivers(*_cut_polygons(drawn, boundary, middles, spacing), count, spacing)
+    else:
+        positions, volume = middles[inside_any(middles, drawn)], spacing**2
+    return Particles(
+        _not_empty(positions, spacing), volume, polygon_outline(boundary, spacing, math.radians(20.0))
+    )
+
+
+def _cut_polygons(
+    drawn: list[np.ndarray], boundary: list[np.ndarray], middles: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each cell that is inside, and centroid of that part."""
+    share, centroid = inside_any(middles, drawn).astype(float), middles.copy()
+    cut = boundary_distance(middles, boundary) < spacing * math.sqrt(0.5)
+    samples = sample_points(middles[cut], spacing)
+    flat = samples.reshape(-1, 2)
+    distance = boundary_distance(flat, boundary) * np.where(inside_any(flat, drawn), -1.0, 1.0)
+    weights = share_inside(distance, spacing / SAMPLES).reshape(len(samples), -1)
     share[cut], centroid[cut] = inner_parts(middles[cut], weights, spacing)
     return share, centroid
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softmpm import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm import Body, Grid, Muscle, Scene, Wall
 from softmpm_learn.objective import Effort, Reach
-from softmpm_learn.tasks.outline import Limb, fill
-from softmpm_learn.tasks.task import Task, TaskConf, clock, neo_hookean
+from softmpm_learn.tasks.outline import Limb
+from softmpm_learn.tasks.task import Task, TaskConf, clock, filled, neo_hookean
 
 BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
@@ -56,7 +56,8 @@ def arm(conf: ArmConf) -> Task:
     line = np.array(BASE) + way[:, None] * np.array([0.0, LENGTH])
     limb = Limb(line[1:], np.array(WIDTH), round_tip=True)
     clamped = Limb(line[:2], np.array([WIDTH[0], WIDTH[0]]))
-    rest = fill([limb.outline(), clamped.outline()], conf.spacing / 2).positions
+    shape = filled(conf, [limb.outline(), clamped.outline()])
+    rest = shape.positions
     regions = {name: limb.part(rest, start, end) for name, (start, end) in SEGMENTS.items()}
     muscles = [
         Muscle(
@@ -67,10 +68,10 @@ def arm(conf: ArmConf) -> Task:
         for start, end in SEGMENTS.values()
         for side in (1, -1)
     ]
-    nodes = conf.resolution.value
+    nodes = conf.cells
     scene = Scene(
         grid=Grid(shape=(round(0.9 * nodes), round(0.7 * nodes)), spacing=conf.spacing),
-        bodies=[Body(Particles(rest, (conf.spacing / 2) ** 2), neo_hookean(conf))],
+        bodies=[Body(shape, neo_hookean(conf))],
         muscles=muscles,
         walls=[Wall(normal=(0.0, 1.0), offset=BASE[1], contact="stick")],
         gravity=(0.0, -conf.gravity),
@@ -88,4 +89,5 @@ def arm(conf: ArmConf) -> Task:
         objective=Reach(limb.part(rest, TIP, 1.01), goal, terms=(Effort(conf.effort),)),
         body_length=LENGTH,
         goal=goal,
+        build=conf.build,
     )

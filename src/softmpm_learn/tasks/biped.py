@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Body, Muscle, Particles, Scene
+from softmpm import Body, Muscle, Scene
 from softmpm_learn.objective import Effort, Progress
-from softmpm_learn.tasks.outline import Limb, fill, smooth
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, level, neo_hookean, track
+from softmpm_learn.tasks.outline import Limb, smooth
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, level, neo_hookean, track
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -35,7 +35,8 @@ def biped(conf: BipedConf) -> Task:
         for name, (hip, sole) in LEGS.items()
     }
     soles = [np.maximum(limb.outline(), (-np.inf, 0.0)) for limb in limbs.values()]
-    rest = fill([smooth(TORSO), *soles], conf.spacing / 2).positions
+    shape = filled(conf, [smooth(TORSO), *soles])
+    rest = shape.positions
     regions = {name: limb.part(rest, *LEG_MUSCLE) for name, limb in limbs.items()}
     muscles = [
         Muscle(
@@ -47,11 +48,10 @@ def biped(conf: BipedConf) -> Task:
         for side in (1, -1)
     ]
     regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
-    grid, walls = track(conf, conf.friction)
-    feet = np.array([0.2, walls[0].offset + 0.5 * conf.spacing])  # half a cell over the floor's nodes
+    grid, walls, height = track(conf, conf.friction)
     scene = Scene(
         grid=grid,
-        bodies=[Body(Particles(rest + feet, (conf.spacing / 2) ** 2), neo_hookean(conf))],
+        bodies=[Body(shape.moved((0.2, height)), neo_hookean(conf))],
         muscles=muscles,
         walls=walls,
         gravity=(0.0, -conf.gravity),
@@ -67,4 +67,5 @@ def biped(conf: BipedConf) -> Task:
         regions=regions,
         objective=Progress(terms=(Effort(conf.effort), level(conf.upright, rest, regions["body"]))),
         body_length=float(np.ptp(rest[:, 0])),
+        build=conf.build,
     )

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Body, Muscle, Particles, Scene
+from softmpm import Body, Muscle, Scene
 from softmpm_learn.objective import Effort, Progress
-from softmpm_learn.tasks.outline import Limb, fill, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, level, neo_hookean, track
+from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, level, neo_hookean, track
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -72,13 +72,13 @@ class ElephantConf(WalkerConf):
 def elephant(conf: ElephantConf) -> Task:
     """Build the elephant: about 2,000 particles as a draft, 5,200 at the standard resolution."""
     limbs, outlines = limbs_and_outlines()
-    rest = fill([LENGTH * outline for outline in outlines], conf.spacing / 2).positions
+    shape = filled(conf, [LENGTH * outline for outline in outlines])
+    rest = shape.positions
     regions, muscles = actuate(rest, limbs, conf.strength)
-    grid, walls = track(conf, conf.friction)
-    feet = np.array([0.22, walls[0].offset + 0.5 * conf.spacing])  # half a cell over the floor's nodes
+    grid, walls, height = track(conf, conf.friction)
     scene = Scene(
         grid=grid,
-        bodies=[Body(Particles(rest + feet, (conf.spacing / 2) ** 2), neo_hookean(conf))],
+        bodies=[Body(shape.moved((0.22, height)), neo_hookean(conf))],
         muscles=muscles,
         walls=walls,
         gravity=(0.0, -conf.gravity),
@@ -94,6 +94,7 @@ def elephant(conf: ElephantConf) -> Task:
         regions=regions,
         objective=Progress(terms=(Effort(conf.effort), level(conf.upright, rest, regions["body"]))),
         body_length=float(np.ptp(rest[:, 0])),
+        build=conf.build,
     )
 
 

@@ -1,4 +1,4 @@
-"""Drawing robots by code: smooth outlines and tapered limbs, filled with particles, split for muscles.
+"""Drawing robots by code: smooth outlines and tapered limbs, which ``softmpm.polygons`` fills; limbs are split for muscles.
 
 All lengths are in metres unless a robot says otherwise; points are (x, y), y up.
 """
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Particles
+from softmpm import inside
 
 
 def smooth(points: Sequence, steps: int = 12) -> np.ndarray:
@@ -83,25 +83,3 @@ class Limb:
         along, left = self.locate(points)
         chosen = inside(points, self.outline()) & (along >= start) & (along < end)
         return np.flatnonzero(chosen if side == 0 else chosen & (np.sign(left) == side))
-
-
-def inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """True for each point that lies in a closed polygon (even-odd rule), shape (point,)."""
-    a, b = polygon, np.roll(polygon, -1, axis=0)
-    x, y = points[:, 0, None], points[:, 1, None]
-    crosses = (a[:, 1] > y) != (b[:, 1] > y)
-    rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])  # a level edge never crosses
-    at = a[:, 0] + (y - a[:, 1]) * (b[:, 0] - a[:, 0]) / rise
-    return ((crosses & (x < at)).sum(axis=1) % 2) == 1
-
-
-def fill(polygons: Sequence[np.ndarray], spacing: float) -> Particles:
-    """Particles on a square lattice in the union of polygons, each for an area of ``spacing²`` [m²].
-
-    The lattice hangs on the origin, half a spacing off, whatever the polygons.
-    """
-    low = np.floor(np.min([p.min(axis=0) for p in polygons], axis=0) / spacing).astype(int)
-    high = np.ceil(np.max([p.max(axis=0) for p in polygons], axis=0) / spacing).astype(int)
-    axes = [(np.arange(a, b) + 0.5) * spacing for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    return Particles(points[np.any([inside(points, p) for p in polygons], axis=0)], spacing**2)

@@ -2,13 +2,18 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
 import softmpm
 from softmpm_learn.objective import Objective, Upright
+
+FORMULATIONS = ("moving", "reference")
+CONTACTS = ("auto", "nodes", "surface")
 
 
 class Resolution(Enum):
@@ -38,6 +43,9 @@ class TaskConf:
     """Rest density ρ₀ [kg/m³]; where co-design starts."""
     viscosity: float = 0.0
     """Viscosity η of the material [Pa s]; co-design starts there if it is > 0."""
+    retardation: float = 0.0
+    """Retardation time η/μ of the material [s], instead of ``viscosity``. Good value in the reference formulation: 4e-3, with which its
+    gradients were usable (docs/gait.md)."""
     strength: float = 1.2e4
     """Stress of a muscle at full activation [Pa]."""
     gravity: float = 9.81
@@ -48,14 +56,31 @@ class TaskConf:
     """Substep over the largest stable one at rest; leaves room for stretch and co-design."""
     effort: float = 1e-3
     """Weight of the mean squared activation in the loss; decides between motions that are equally good."""
+    formulation: str = "moving"
+    """moving, or reference: as in :func:`softmpm.build`. In the reference formulation limbs pass through each other, and the body
+    has cut cells."""
+    contact: str = "auto"
+    """reference: what meets the floor. auto and surface: the surface of the robot; nodes: the nodes around it."""
+    contact_width: float = 0.0
+    """Distance over which surface contact sets in [cells]; 0.01 to learn, 0 to evaluate."""
 
     def __post_init__(self):
+        for name, known in (("formulation", FORMULATIONS), ("contact", CONTACTS)):
+            if getattr(self, name) not in known:
+                raise ValueError(
+                    f"task.{name} must be one of {', '.join(known)}; got {getattr(self, name)!r}."
+                )
+        if self.viscosity > 0 and self.retardation > 0:
+            raise ValueError(
+                f"task.viscosity = {self.viscosity} and task.retardation = {self.retardation} are two names for one thing; "
+                "set one of them to 0."
+            )
         positive = ("seconds", "control_period", "young", "density", "strength", "safety")
         for name in positive:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"task.{name} must be > 0, got {value}.")
-        self.need_not_negative("viscosity", "gravity", "damping", "effort")
+        self.need_not_negative("viscosity", "retardation", "gravity", "damping", "effort")
         if self.control_period > self.seconds:
             raise ValueError(
                 f"task.control_period must be at most task.seconds = {self.seconds}, got {self.control_period}."
@@ -69,9 +94,19 @@ class TaskConf:
                 raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
 
     @property
+    def cells(self) -> int:
+        """Cells per metre."""
+        return self.resolution.value
+
+    @property
     def spacing(self) -> float:
         """Distance of neighbouring grid nodes [m]."""
-        return 1.0 / self.resolution.value
+        return 1.0 / self.cells
+
+    @property
+    def build(self) -> dict[str, Any]:
+        """Arguments of :func:`softmpm.build`."""
+        return {name: getattr(self, name) for name in ("formulation", "contact", "contact_width")}
 
 
 @dataclass(kw_only=True)
@@ -109,6 +144,8 @@ class Task:
     """Extent of the robot at rest along x, or its reach [m]."""
     goal: np.ndarray | None = None
     """Goal position [m], shape (dim,), if the task has one."""
+    build: dict[str, Any] = field(default_factory=dict)
+    """Arguments of :func:`softmpm.build` that the task decides: formulation and contact."""
 
     @property
     def seconds(self) -> float:
@@ -130,9 +167,16 @@ def clock(conf: TaskConf, scene: softmpm.Scene) -> tuple[softmpm.Scene, int, int
 
 def neo_hookean(conf: TaskConf) -> softmpm.NeoHookean:
     """The material that the settings describe."""
+    shear = conf.young / (2 * (1 + conf.poisson))
+    viscosity = conf.viscosity or conf.retardation * shear
     return softmpm.NeoHookean(
-        density=conf.density, young=conf.young, poisson=conf.poisson, viscosity=conf.viscosity
+        density=conf.density, young=conf.young, poisson=conf.poisson, viscosity=viscosity
     )
+
+
+def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:
+    """Particles half a cell apart in the union of polygons; with cut cells in the reference formulation."""
+    return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=conf.formulation == "reference")
 
 
 def level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
@@ -141,14 +185,21 @@ def level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
     return Upright(weight, torso[rest[torso, 0] > high], torso[rest[torso, 0] < low], rest)
 
 
-def track(conf: TaskConf, friction: float) -> tuple[softmpm.Grid, list[softmpm.Wall]]:
-    """Grid and walls of a walker: 1.5 m long, 0.5 m high, a floor with friction first, smooth ends."""
-    length, height, floor, margin = 1.5, 0.5, 0.0625, 0.05
-    nodes = conf.resolution.value
-    grid = softmpm.Grid(shape=(round(length * nodes), round(height * nodes)), spacing=conf.spacing)
+def track(conf: TaskConf, friction: float) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
+    """Grid and walls of a walker, 1.5 m long, 0.5 m high, a floor with friction first, smooth ends; and the height of the soles [m].
+
+    The soles lie on spline knots, half a cell above a row of nodes. The floor is at the soles if surface points meet it, and at the
+    nodes otherwise.
+    """
+    length, height, margin, nodes, spacing = 1.5, 0.5, 0.05, conf.cells, conf.spacing
+    floor = math.floor(0.0625 * nodes) * spacing
+    soles = floor + 0.5 * spacing
+    if conf.formulation == "reference" and conf.contact != "nodes":
+        floor = soles
+    grid = softmpm.Grid(shape=(round(length * nodes), round(height * nodes)), spacing=spacing)
     walls = [
         softmpm.Wall(normal=(0.0, 1.0), offset=floor, friction=friction),
         softmpm.Wall(normal=(1.0, 0.0), offset=margin),
         softmpm.Wall(normal=(-1.0, 0.0), offset=margin - length),
     ]
-    return grid, walls
+    return grid, walls, soles
