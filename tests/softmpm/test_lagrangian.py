@@ -228,12 +228,7 @@ def test_auto_takes_the_reference_formulation_where_it_serves():
         (alone, {}, "reference", "bodies meet walls only"),
         ({"driven": ()}, {}, "moving", "the scene does not state body_contact=False"),
         ({"body_contact": False}, {}, "moving", "has no driven particles"),
-        (
-            alone,
-            {"inputs": ("wall_offset",)},
-            "moving",
-            "has walls at rest only, but inputs has 'wall_offset'",
-        ),
+        (alone, {"inputs": ("wall_offset",)}, "reference", "bodies meet walls only"),
         (alone, {"scheme": "plain"}, "moving", "has one scheme, got scheme='plain'"),
     ):
         model = softmpm.build(full_scene(2, **changes), device="cpu", formulation="auto", **settings)

@@ -1,4 +1,4 @@
-"""The step limit of the reference formulation: the bound (Q8), and the alarm that compares dt with it in every substep."""
+"""The step limit of the reference formulation: the bound (Q8), and the alarm that compares dt with it."""
 
 import dataclasses
 import math
@@ -177,14 +177,14 @@ def above(made, F, activation, dt: float) -> torch.Tensor:
 def test_it_fires_at_the_substep_and_particle_of_the_reference(device):
     """In a body that shrinks under its muscles: named is the first particle above its limit, in the substep that begins so."""
     made = squeezed()
-    made = dataclasses.replace(made, dt=0.9 * softmpm.stable_dt(made))
+    made = dataclasses.replace(made, dt=0.95 * softmpm.stable_dt(made))
     model = softmpm.build(made, device=device, dtype=torch.float64, formulation="reference")
-    start, params = inward(model, 16.0), model.params()
+    start, params = inward(model, 20.0), model.params()
     rows = torch.tensor([[[0.1, 0.2]], [[0.3, -0.2]]], dtype=torch.float64, device=model.device)
     with pytest.raises(softmpm.UnstableError, match="times its running stable step") as caught:
         softmpm.simulate(model, start, rows, params, substeps=4)
     error = caught.value
-    assert error.kind == "step" and 2 <= error.substep < 8, error
+    assert error.kind == "step" and 1 <= error.substep < 8, error
     own, given = (softmpm.Params(*(t.cpu() for t in params)), softmpm.State(*(t.cpu() for t in start[:4])))
     u, v = reference_lagrangian.project(made, given, own)
     for s in range(error.substep + 1):

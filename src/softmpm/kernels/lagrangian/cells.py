@@ -142,7 +142,6 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
                     if substep > 0:
                         check(constants, words, world, inside.order[p], substep - 1, H)
-                    check_step(constants, inputs, words, world, p, inside.order[p], substep, H)
                     A = constants.rate * forced(inputs, world, p, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
@@ -178,12 +177,14 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
+        substep: int,
+        placed: bool,  # whether the inputs are in the order of the places, or in the user's
         # In:
         u: wp.array2d(dtype=vec),
         # Out:
         words: wp.array(dtype=wp.int64),
     ):
-        """Check the initial state of a call; ``inputs`` are in the user's order."""
+        """Check the state at the beginning of a substep, with the step limit."""
         world, brick, lane = wp.tid()
         stage_u(u, inside, world, brick, lane)
         meet()
@@ -194,8 +195,11 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     p = inside.order[place]
                     corner = inside.corners[brick, slot % count]
                     H = gradient_u(u, inside, world, brick, corner, inside.fraction[place], constants.rate)
-                    check(constants, words, world, p, 0, H)
-                    check_step(constants, inputs, words, world, p, p, 0, H)
+                    check(constants, words, world, p, substep, H)
+                    at = p
+                    if placed:
+                        at = place
+                    check_step(constants, inputs, words, world, at, p, substep, H)
 
     return SimpleNamespace(forces=forces, check_end=check_end, check_start=check_start)
 
@@ -206,7 +210,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     vec, Constants, dim = t.vec, t.Constants, spec.dim
     ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
-    check, check_step = one.check, one.check_step
+    check = one.check
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
     layer_of, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
@@ -262,7 +266,6 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         Hn = constants.rate * taken(H, n)
                         if substep > 0:
                             check(constants, words, world, inside.order[p], substep - 1, Hn)
-                        check_step(constants, inputs, words, world, p, inside.order[p], substep, Hn)
                         A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
                         A = put(A, n, constants.rate * A_n)
             add(A, partial, world, brick, corner, layer, lane, lattice)

@@ -8,6 +8,11 @@ from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
 from softmpm.schemes.lagrangian.nodal import launch_masses
 from softmpm.schemes.launch import KernelLauncher
 
+CHECKED = 8
+"""Substeps from one check of the step limit to the next: an instability takes several substeps to grow. A chunk that failed is run
+again substep by substep, with a check at the beginning of each.
+"""
+
 
 def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     """Advance the first state by all substeps of the chunk, then check the last one."""
@@ -17,14 +22,26 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     if buffers.contact is not None:
         buffers.contact.begin(launch)
     for s in range(buffers.chunk.length):
+        if s % CHECKED == 0 and model.alarms.step is not None:
+            _check_step(buffers, s, buffers.index(s), launch)
         _forces(buffers, s, launch)
         _advance(buffers, s, launch)
     last = buffers.chunk.length
+    if model.alarms.step is not None and last > 1:  # else the next substep is checked
+        _check_step(buffers, last - 1, buffers.index(last), launch)
     kernel, u = cells(model.spec, model.rest_grid.bricks).check_end, buffers.u_arrays[buffers.index(last)]
     if buffers.contact is not None:
         inputs = buffers.inputs.grid_struct(last - 1)
         buffers.contact.check_end(launch, inputs, last - 1, buffers.index(last), u, buffers.words_array)
     brick_launch(model, launch, kernel, model.constants, buffers.rest, last - 1, u, buffers.words_array)
+
+
+def _check_step(buffers: ChunkBuffers, s: int, state: int, launch: KernelLauncher) -> None:
+    """Compare Δt with the limit of each particle in a stored state, with the inputs of substep ``s``."""
+    model, inputs = buffers.model, buffers.inputs.particle_struct(s, s)
+    arguments = (s, True, buffers.u_arrays[state], buffers.words_array)
+    kernel = cells(model.spec, model.rest_grid.bricks).check_start
+    brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
 
 
 def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:

@@ -129,7 +129,7 @@ class Lagrangian:
         words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
         inputs = particle_struct(model, model.fixed | stiffest(model, values))
-        arguments = (model.constants, inputs, rest_struct(model), u, view(words, wp.int64))
+        arguments = (model.constants, inputs, rest_struct(model), 0, False, u, view(words, wp.int64))
         kernel = cells(model.spec, model.rest_grid.bricks).check_start
         launch = KernelLauncher(model, stream_of(model.device))
         brick_launch(model, launch, kernel, *arguments)
