@@ -17,8 +17,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, field, meet, sums
+from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
 from softmpm.kernels.lagrangian.frame import frame
+from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.nodes import gathering
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics.kinematics import kinematics

@@ -1,6 +1,7 @@
 """Launches of a chunk of the reference formulation, forward and adjoint, in their order."""
 
-from softmpm.kernels.lagrangian.cells import cells, cells_adj, lattice_cells, lattice_cells_adj
+from softmpm.kernels.lagrangian.cells import cells, cells_adj
+from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.projection import masses
 from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node_launch

@@ -1,0 +1,295 @@
+"""Interpolation from nodes to particles, and sums over particles for nodes, in bricks of cells.
+
+With r = o − f the distance of a particle from node o of its cell, in cells, and ``rate`` = 4/dx, the sums
+
+    Σ N_i a_i,  Σ a_i ⊗ g_i,  g_i = rate N_i r                                                       (Q1)
+    Σ_p N_i b + A g_i                                                                                (Q1.adj)
+
+are taken axis by axis. On a GPU the thread of a particle gives A and b to those threads that have one component of the sums of a cell
+each.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.bricks import Bricks, meet
+from softmpm.kernels.lagrangian.rest import rest
+from softmpm.kernels.structs import types
+
+
+@kernel_factory
+def field(dim: int, dtype: str, bricks: Bricks, number: int, layered: bool = False) -> SimpleNamespace:
+    """Nodal field ``number`` of those that a kernel holds; ``layered`` says whether its threads have layers."""
+    t, r = types(dim, dtype), rest(dim, dtype)
+    real, vec, mat, Rest, weights, lean = t.real, t.vec, t.mat, r.Rest, r.weights, r.lean
+    nodes, across, along = bricks.nodes, bricks.window[-2], bricks.window[-1]
+    threads = bricks.layer_threads if layered else bricks.threads
+
+    @wp.func_native(f"softmpm::stage<{number}, {nodes}, {threads}>(values, window, world, brick, lane);")
+    def copy_window(
+        values: wp.array2d(dtype=vec), window: wp.array2d(dtype=wp.int32), world: int, brick: int, lane: int
+    ): ...
+
+    @wp.func_native(f"return softmpm::fetch<{number}, {nodes}>(values, window, world, brick, k);")
+    def fetch(
+        values: wp.array2d(dtype=vec), window: wp.array2d(dtype=wp.int32), world: int, brick: int, k: int
+    ) -> vec: ...
+
+    @wp.func
+    def stage(values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, lane: int):
+        """Make a field ready, after :func:`meet`."""
+        if wp.static(not bricks.serial):
+            copy_window(values, inside.window, world, brick, lane)
+
+    @wp.func
+    def node(values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, k: int) -> vec:
+        return fetch(values, inside.window, world, brick, k)
+
+    if dim == 2:
+
+        @wp.func
+        def gradient(
+            values: wp.array2d(dtype=vec),
+            inside: Rest,
+            world: int,
+            brick: int,
+            corner: int,
+            fx: vec,
+            rate: real,
+        ) -> mat:
+            """Σ a ⊗ g"""
+            w = weights(fx)
+            e = lean(w, fx)
+            out = mat()
+            for i in range(3):
+                plain = vec()
+                sloped = vec()
+                for j in range(3):
+                    a = node(values, inside, world, brick, corner + along * i + j)
+                    plain += w[j, 1] * a
+                    sloped += e[j, 1] * a
+                for axis in range(2):
+                    out[axis, 0] = out[axis, 0] + e[i, 0] * plain[axis]
+                    out[axis, 1] = out[axis, 1] + w[i, 0] * sloped[axis]
+            return rate * out
+
+        @wp.func
+        def value(
+            values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, corner: int, fx: vec
+        ) -> vec:
+            """Σ N a"""
+            w = weights(fx)
+            out = vec()
+            for i in range(3):
+                for j in range(3):
+                    a = node(values, inside, world, brick, corner + along * i + j)
+                    out += (w[i, 0] * w[j, 1]) * a
+            return out
+    else:
+
+        @wp.func
+        def gradient(
+            values: wp.array2d(dtype=vec),
+            inside: Rest,
+            world: int,
+            brick: int,
+            corner: int,
+            fx: vec,
+            rate: real,
+        ) -> mat:
+            """Σ a ⊗ g"""
+            w = weights(fx)
+            e = lean(w, fx)
+            out = mat()
+            for i in range(3):
+                plain = vec()
+                y_sloped = vec()
+                z_sloped = vec()
+                for j in range(3):
+                    line = vec()
+                    sloped = vec()
+                    for k in range(3):
+                        at = corner + along * (across * i + j) + k
+                        a = node(values, inside, world, brick, at)
+                        line += w[k, 2] * a
+                        sloped += e[k, 2] * a
+                    plain += w[j, 1] * line
+                    y_sloped += e[j, 1] * line
+                    z_sloped += w[j, 1] * sloped
+                for axis in range(3):
+                    out[axis, 0] = out[axis, 0] + e[i, 0] * plain[axis]
+                    out[axis, 1] = out[axis, 1] + w[i, 0] * y_sloped[axis]
+                    out[axis, 2] = out[axis, 2] + w[i, 0] * z_sloped[axis]
+            return rate * out
+
+        @wp.func
+        def value(
+            values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, corner: int, fx: vec
+        ) -> vec:
+            """Σ N a"""
+            w = weights(fx)
+            out = vec()
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        at = corner + along * (across * i + j) + k
+                        a = node(values, inside, world, brick, at)
+                        out += (w[i, 0] * w[j, 1] * w[k, 2]) * a
+            return out
+
+    return SimpleNamespace(stage=stage, gradient=gradient, value=value)
+
+
+@kernel_factory
+def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
+    """Sums Σ A g or, if ``loaded``, Σ N b + A g over the particles of a brick, for the nodes of its window.
+
+    A kernel calls ``clear``, for each row ``add``, and ``write``.
+    """
+    t, r = types(dim, dtype), rest(dim, dtype)
+    real, vec, mat, Rest, weights, lean = t.real, t.vec, t.mat, r.Rest, r.weights, r.lean
+    nodes, threads, count, cells = bricks.nodes, bricks.threads, r.count, bricks.cell_count
+    parts, slots, serial = bricks.parts, bricks.slots, bricks.serial
+    across, along, kinds = bricks.window[-2], bricks.window[-1], dim + (2 if loaded else 1)
+    line = wp.types.vector(count, real)
+    terms = f"{kinds * dim * slots}, {slots}"
+    sizes = f"{nodes}, {threads}, {count}, {across}, {along}"
+
+    @wp.func_native(f"softmpm::give<{terms}>(number, lane, value);")
+    def give(number: int, lane: int, value: vec): ...
+
+    @wp.func_native(f"return softmpm::given<{terms}, {t.c_name}, {dim}>(number, lane);")
+    def given(number: int, lane: int) -> vec: ...
+
+    @wp.func_native(f"softmpm::write_sums<{sizes}>(total, partial, world, brick, corner, axis, lane);")
+    def write_shared(
+        total: line,
+        partial: wp.array2d(dtype=vec),
+        world: int,
+        brick: int,
+        corner: int,
+        axis: int,
+        lane: int,
+    ): ...
+
+    if dim == 2:
+
+        @wp.func
+        def with_term(total: line, fx: vec, A: vec, b: real) -> line:
+            """Add A·g/rate + N b of one particle, with one row of A and component of b."""
+            w = weights(fx)
+            e = lean(w, fx)
+            new = total
+            for i in range(3):
+                plain = e[i, 0] * A[0]
+                if wp.static(loaded):
+                    plain += w[i, 0] * b
+                sloped = w[i, 0] * A[1]
+                for j in range(3):
+                    new[3 * i + j] = new[3 * i + j] + (w[j, 1] * plain + e[j, 1] * sloped)
+            return new
+    else:
+
+        @wp.func
+        def with_term(total: line, fx: vec, A: vec, b: real) -> line:
+            """Add A·g/rate + N b of one particle, with one row of A and component of b."""
+            w = weights(fx)
+            e = lean(w, fx)
+            new = total
+            for i in range(3):
+                x = e[i, 0] * A[0]
+                if wp.static(loaded):
+                    x += w[i, 0] * b
+                y = w[i, 0] * A[1]
+                z = w[i, 0] * A[2]
+                for j in range(3):
+                    plain = w[j, 1] * x + e[j, 1] * y
+                    sloped = w[j, 1] * z
+                    for k in range(3):
+                        new[9 * i + 3 * j + k] = new[9 * i + 3 * j + k] + (w[k, 2] * plain + e[k, 2] * sloped)
+            return new
+
+    @wp.func
+    def row_of(A: mat, axis: int) -> vec:
+        out = vec()
+        for k in range(dim):
+            out[k] = A[axis, k]
+        return out
+
+    @wp.func
+    def place(n: int) -> int:
+        """Node n of a cell in the window, from the cell's corner on."""
+        if wp.static(dim == 2):
+            return n / 3 * along + n % 3
+        else:
+            return (n / 9 * across + (n / 3) % 3) * along + n % 3
+
+    @wp.func_native(f"softmpm::clear_sums<{nodes}>(partial, world, brick);")
+    def clear(partial: wp.array2d(dtype=vec), world: int, brick: int): ...
+
+    @wp.func
+    def place_of(inside: Rest, row: int, slot: int) -> int:
+        """Place of the particle in a slot of a row, or -1."""
+        place = int(-1)
+        if slot < slots:
+            place = inside.places[row, slot]
+        return place
+
+    @wp.func
+    def add(
+        total: line,
+        partial: wp.array2d(dtype=vec),
+        world: int,
+        brick: int,
+        slot: int,
+        corner: int,
+        fx: vec,
+        A: mat,
+        b: vec,
+    ) -> line:
+        """Add what the particles of a row give; A and b are zero where there is none. All threads of a block call this together."""
+        if wp.static(serial):
+            x = with_term(line(), fx, row_of(A, 0), b[0])
+            y = with_term(line(), fx, row_of(A, 1), b[1])
+            z = line()
+            if wp.static(dim == 3):
+                z = with_term(line(), fx, row_of(A, 2), b[dim - 1])
+            for n in range(count):
+                at = brick * nodes + corner + place(n)
+                if wp.static(dim == 2):
+                    partial[world, at] = partial[world, at] + vec(x[n], y[n])
+                else:
+                    partial[world, at] = partial[world, at] + vec(x[n], y[n], z[n])
+            return total
+        else:
+            if slot < slots:
+                give(0, slot, fx)
+                for axis in range(dim):
+                    give(1 + axis, slot, row_of(A, axis))
+                if wp.static(loaded):
+                    give(1 + dim, slot, b)
+            meet()
+            new = total
+            if slot < cells * dim:
+                component = slot / cells
+                for part in range(parts):
+                    other = part * cells + slot % cells
+                    load = real(0.0)
+                    if wp.static(loaded):
+                        load = given(1 + dim, other)[component]
+                    new = with_term(new, given(0, other), given(1 + component, other), load)
+            meet()
+            return new
+
+    @wp.func
+    def write(total: line, partial: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, lane: int):
+        """Write the sums that ``add`` returned last."""
+        if wp.static(not serial):
+            corner = int(-1)
+            if lane < cells * dim:
+                corner = inside.corners[brick, lane % cells]
+            write_shared(total, partial, world, brick, corner, lane / cells, lane)
+
+    return SimpleNamespace(line=line, clear=clear, place_of=place_of, add=add, write=write)

@@ -1,0 +1,247 @@
+"""Forces on the nodes, brick by brick, of particles on a lattice: as cells.py, but particles of a layer share their weights."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
+from softmpm.kernels.lagrangian.interpolation import field, sums
+from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
+from softmpm.kernels.lagrangian.rest import rest
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+
+
+@kernel_factory
+def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
+    """Interpolation and sums of the layers of a lattice."""
+    t, K, points = types(dim, dtype), bricks.parts, bricks.layer
+    real, vec, mat = t.real, t.vec, t.mat
+    table, block = wp.types.matrix((K * dim, 3), real), wp.types.matrix((points * dim, dim), real)
+    across, along = bricks.window[-2], bricks.window[-1]
+    where = f"{bricks.nodes}, {{}}{across}, {along}, {K}"
+    gathers = f"{where.format('')}>(values, window, world, brick, corner, layer, lattice.w, lattice.e);"
+    adds = f"{where.format(f'{bricks.cell_count}, ')}>(A, partial, world, brick, corner, layer, lane, lattice.w, lattice.e);"
+
+    class Lattice:
+        w: table  # [axis and place, node]
+        e: table  # w (o − f)
+
+    Lattice = wp.struct(Lattice, module=f"softmpm.types.d{dim}.{dtype}.lattice{K}")
+
+    def gradients(number: int):
+        """Σ a ⊗ g / rate of nodal field ``number``, ``dim`` rows for each particle."""
+
+        @wp.func_native(f"return softmpm::layer_gradients<{number}, {gathers}")
+        def gathered(
+            values: wp.array2d(dtype=vec),
+            window: wp.array2d(dtype=wp.int32),
+            world: int,
+            brick: int,
+            corner: int,
+            layer: int,
+            lattice: Lattice,
+        ) -> block: ...
+
+        return gathered
+
+    def adding(number: int):
+        """Add A g / rate of each particle to sums ``number``, and write them."""
+
+        @wp.func_native(f"softmpm::add_layer<{number}, {adds}")
+        def add(
+            A: block,
+            partial: wp.array2d(dtype=vec),
+            world: int,
+            brick: int,
+            corner: int,
+            layer: int,
+            lane: int,
+            lattice: Lattice,
+        ): ...
+
+        return add
+
+    @wp.func
+    def taken(rows: block, n: int) -> mat:
+        out = mat()
+        for i in range(dim):
+            for j in range(dim):
+                out[i, j] = rows[dim * n + i, j]
+        return out
+
+    @wp.func
+    def put(rows: block, n: int, A: mat) -> block:
+        new = rows
+        for i in range(dim):
+            for j in range(dim):
+                new[dim * n + i, j] = A[i, j]
+        return new
+
+    return SimpleNamespace(
+        Lattice=Lattice,
+        block=block,
+        gradients=(gradients(0), gradients(1), gradients(2)),
+        add=(adding(0), adding(1)),
+        taken=taken,
+        put=put,
+    )
+
+
+@kernel_factory
+def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
+    """As :func:`cells`, for particles on a lattice without external forces of their own."""
+    t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
+    vec, Constants, dim = t.vec, t.Constants, spec.dim
+    ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
+    check = one.check
+    of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
+    stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
+    layer_of, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
+    Lattice, block, taken, put, add = (
+        layer_of.Lattice,
+        layer_of.block,
+        layer_of.taken,
+        layer_of.put,
+        layer_of.add[0],
+    )
+    gradients_u, gradients_v, points = layer_of.gradients[0], layer_of.gradients[1], bricks.layer
+    count, slots, threads, settings = (
+        bricks.cell_count,
+        bricks.slots,
+        bricks.layer_threads,
+        bricks.layer_settings,
+    )
+    module = brick_module(f"{spec.module}.lagrangian.{bricks.name}.layers")
+
+    @wp.kernel(module=module, **settings)
+    def forces(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        partial: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+        clear(partial, world, brick)
+        meet()
+        for slot in range(lane, slots, threads):
+            layer = slot / count
+            corner = inside.corners[brick, slot % count]
+            A = block()
+            if corner >= 0:
+                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
+                rate = block()
+                if wp.static(viscous):
+                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+                for n in range(points):
+                    p = inside.places[brick * points + n, slot]
+                    if p >= 0:
+                        Hn = constants.rate * taken(H, n)
+                        if substep > 0:
+                            check(constants, words, world, inside.order[p], substep - 1, Hn)
+                        A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
+                        A = put(A, n, constants.rate * A_n)
+            add(A, partial, world, brick, corner, layer, lane, lattice)
+
+    return SimpleNamespace(forces=forces)
+
+
+@kernel_factory
+def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNamespace:
+    """As :func:`cells_adj`, for particles on a lattice without external forces of their own."""
+    t, Rest, one = (
+        types(spec.dim, spec.dtype),
+        rest(spec.dim, spec.dtype).Rest,
+        particle_forces_adj(spec, wanted),
+    )
+    vec, Constants, dim = t.vec, t.Constants, spec.dim
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
+    forced_adj, check_adj, layer_of = one.forced_adj, one.check_adj, layers(dim, spec.dtype, bricks)
+    of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(3))
+    stage_u, stage_f, stage_v = of_u.stage, of_f.stage, of_v.stage
+    clear, viscous = sums(dim, spec.dtype, bricks, False).clear, spec.viscosity
+    Lattice, block, taken, put, points = (
+        layer_of.Lattice,
+        layer_of.block,
+        layer_of.taken,
+        layer_of.put,
+        bricks.layer,
+    )
+    gradients_u, gradients_f, gradients_v = layer_of.gradients
+    add_u, add_v = layer_of.add
+    count, slots, threads, settings = (
+        bricks.cell_count,
+        bricks.slots,
+        bricks.layer_threads,
+        bricks.layer_settings,
+    )
+    module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
+
+    @wp.kernel(module=module, **settings)
+    def forces_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        # Out, added into:
+        adj_inputs: ParticleInputsAdj,
+        # Out:
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        stage_u(u, inside, world, brick, lane)
+        stage_f(adj_f, inside, world, brick, lane)
+        clear(partial_u, world, brick)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+            clear(partial_v, world, brick)
+        meet()
+        for slot in range(lane, slots, threads):
+            layer = slot / count
+            corner = inside.corners[brick, slot % count]
+            A = block()
+            B = block()
+            if corner >= 0:
+                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
+                G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
+                rate = block()
+                if wp.static(viscous):
+                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+                for n in range(points):
+                    p = inside.places[brick * points + n, slot]
+                    if p >= 0:
+                        Hn = constants.rate * taken(H, n)
+                        Gn = constants.rate * taken(G, n)
+                        adj = forced_adj(
+                            inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs
+                        )
+                        check_adj(words, world, inside.order[p], substep, adj)
+                        A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
+                        if wp.static(viscous):
+                            B = put(B, n, constants.rate * adj.rate)
+            add_u(A, partial_u, world, brick, corner, layer, lane, lattice)
+            if wp.static(viscous):
+                add_v(B, partial_v, world, brick, corner, layer, lane, lattice)
+
+    return SimpleNamespace(forces_adj=forces_adj)

@@ -1,0 +1,141 @@
+"""Force of one particle on its nodes, and its adjoint. Derivation: docs/math/lagrangian.md.
+
+P = τ F⁻ᵀ,  the force is −V P g_i                                                                (Q2)
+P̄ = −V Σ f̄_i ⊗ g_i,  τ̄ = P̄ F⁻¹,  F̄ −= F⁻ᵀ P̄ᵀ P                                                  (Q2.adj)
+with viscosity, L = Ḟ F⁻¹:  Ḟ̄ = L̄ F⁻ᵀ,  F̄ −= Lᵀ L̄ F⁻ᵀ
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.errors import Kind
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.physics import status
+from softmpm.kernels.physics.kinematics import kinematics
+from softmpm.kernels.physics.rest_step import rest_step
+from softmpm.kernels.physics.stress import total_stress, total_stress_adj
+from softmpm.kernels.physics.viscosity import viscosity
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
+
+
+@kernel_factory
+def particle_forces(spec: Spec) -> SimpleNamespace:
+    """Functions of one particle."""
+    t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
+    real, mat, Constants, dim = t.real, t.mat, t.Constants, spec.dim
+    ParticleInputs, total_of = input_types(spec).ParticleInputs, total_stress(spec)
+    rotation, stress, identity, volume_change = (
+        total_of.rotation,
+        total_of.stress,
+        k.identity,
+        k.volume_change,
+    )
+    viscous_stress, viscous = viscosity(dim, spec.dtype).viscous_stress, spec.viscosity
+    report, largest = status.report(dim, spec.dtype).report, 1.0e12
+    collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
+    step_is_stable = rest_step(spec).step_is_stable
+
+    @wp.func
+    def piola(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat, L: mat, inverse: mat) -> mat:
+        """P of (Q2) [Pa]."""
+        tau = stress(inputs, world, p, H, Q)
+        if wp.static(viscous):
+            tau += viscous_stress(identity() + H, L, inputs.viscosity[world, p])
+        return tau * wp.transpose(inverse)
+
+    @wp.func
+    def forced(inputs: ParticleInputs, world: int, p: int, H: mat, rate: mat) -> mat:
+        """−V P of a particle; ``rate`` is Ḟ."""
+        inverse = wp.inverse(identity() + H)
+        L = mat()
+        if wp.static(viscous):
+            L = rate * inverse
+        return -inputs.volume[world, p] * piola(
+            inputs, world, p, H, rotation(inputs, world, p, H), L, inverse
+        )
+
+    @wp.func
+    def check(
+        constants: Constants, words: wp.array(dtype=wp.int64), world: int, p: int, substep: int, H: mat
+    ):
+        """Report a particle that collapsed or is not finite. A comparison with NaN is false."""
+        j = volume_change(H)
+        if not (j > constants.collapse and j < real(largest)):
+            kind = collapsed
+            if not wp.isfinite(wp.ddot(H, H)) or not j < real(largest):
+                kind = not_finite
+            report(words, world, substep, kind, p)
+
+    @wp.func
+    def check_step(
+        constants: Constants,
+        inputs: ParticleInputs,
+        words: wp.array(dtype=wp.int64),
+        world: int,
+        place: int,
+        p: int,
+        substep: int,
+        H: mat,
+    ):
+        """Report a particle for which Δt is too long in the substep that begins with this H."""
+        if wp.isfinite(constants.step):  # else the alarm is off
+            if not step_is_stable(constants, inputs, world, place, H):
+                report(words, world, substep, too_long, p)
+
+    return SimpleNamespace(piola=piola, forced=forced, check=check, check_step=check_step)
+
+
+@kernel_factory
+def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
+    """Adjoint of the functions of one particle."""
+    t, identity = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype).identity
+    mat, rotation, piola = t.mat, total_stress(spec).rotation, particle_forces(spec).piola
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
+    stress_adj, viscous = total_stress_adj(spec, wanted).stress_adj, spec.viscosity
+    viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
+    report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
+
+    @wp.struct
+    class ForceAdj:
+        F: mat
+        rate: mat
+
+    @wp.func
+    def forced_adj(
+        inputs: ParticleInputs,
+        world: int,
+        p: int,
+        H: mat,
+        rate: mat,
+        G: mat,  # Σ f̄_i ⊗ g_i
+        adj_inputs: ParticleInputsAdj,
+    ) -> ForceAdj:
+        """(Q2.adj)"""
+        inverse = wp.inverse(identity() + H)
+        Q = rotation(inputs, world, p, H)
+        L = mat()
+        if wp.static(viscous):
+            L = rate * inverse
+        P = piola(inputs, world, p, H, Q, L, inverse)
+        adj_P = -inputs.volume[world, p] * G
+        adj_tau = adj_P * inverse
+        adj = ForceAdj()
+        adj.F = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
+        adj.F -= wp.transpose(inverse) * wp.transpose(adj_P) * P
+        if wp.static(viscous):
+            found = viscous_stress_adj(identity() + H, L, inputs.viscosity[world, p], adj_tau)
+            adj.rate = found.C * wp.transpose(inverse)
+            adj.F += found.F - wp.transpose(L) * adj.rate
+            if wp.static("viscosity" in wanted):
+                adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + found.eta
+        return adj
+
+    @wp.func
+    def check_adj(words: wp.array(dtype=wp.int64), world: int, p: int, substep: int, adj: ForceAdj):
+        """Report a gradient that is not finite."""
+        if not wp.isfinite(wp.ddot(adj.F, adj.F) + wp.ddot(adj.rate, adj.rate)):
+            report(words, world, substep, bad_gradient, p)
+
+    return SimpleNamespace(forced_adj=forced_adj, check_adj=check_adj, ForceAdj=ForceAdj)
