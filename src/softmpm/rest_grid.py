@@ -27,8 +27,8 @@ class RestGrid:
         order: Particle at each place, shape (place,), int32.
         fraction: Distance of each particle from its base node in cells, place by place, shape (place, dim).
         rows: First row of each brick in ``places``, and their count, shape (brick + 1,), int32.
-        places: Place of the particle in each slot of a row, or -1, shape (row, slot), int32. Of each cell of the brick in turn the
-            first particles, then the next ones; on a lattice the slots are layers, and the rows their particles.
+        places: Place of the particle in each slot of a row, or -1, shape (row, slot), int32. Slots count the
+            cells of the brick first, then the particles of a cell; on a lattice these are layers, and rows are their particles.
         lattice: Places of the particles along each axis in every cell, shape (axis, place), or None.
         corners: First node of each of these cells in the window of its brick, or -1, shape (brick, cell), int32.
         window: Nodes of each brick, or -1 where there is none, shape (brick, node of the window), int32.
@@ -50,7 +50,7 @@ class RestGrid:
         boxes, brick = np.unique(box, axis=0, return_inverse=True)
         cell = np.ravel_multi_index(tuple(inside.T), bricks.cells)
 
-        # Cells of each brick in turn, and the particles of each cell in turn
+        # Cells, brick by brick, and particles, cell by cell
         cells, of = np.unique(brick.reshape(-1) * size.prod() + cell, return_inverse=True)
         of = of.reshape(-1)
         brick_of_cell = cells // size.prod()

@@ -176,7 +176,7 @@ CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradi
 
 // Add A g / rate of the particles of a layer to the sums of the brick. All threads of a block come here together, those without a cell
 // with a negative corner. Each layer has planes of its own, for every first offset.
-template <int SUM, int NODES, int CELLS, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
+template <int NODES, int CELLS, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
 CUDA_CALLABLE inline void add_layer(
     const wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T>& A, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick,
     int corner, int layer, int lane, const wp::mat_t<K * DIM, 3, T>& w, const wp::mat_t<K * DIM, 3, T>& e)
@@ -185,7 +185,8 @@ CUDA_CALLABLE inline void add_layer(
     wp::vec_t<DIM, T>* out = partial.data + size_t(world) * partial.shape[1] + brick * NODES;
 #if defined(__CUDA_ARCH__)
     constexpr int THREADS = CELLS * K;
-    Node<T, DIM>* planes = shared_nodes<-1 - SUM, 3 * K * NODES, T, DIM>();
+    Node<T, DIM>* planes = shared_nodes<-1, 3 * K * NODES, T, DIM>();
+    meet();  // sums that were added before may still be read
     for (int k = lane; k < 3 * K * NODES; k += THREADS)
         planes[k] = {};
     meet();

@@ -45,22 +45,18 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
 
         return gathered
 
-    def adding(number: int):
-        """Add A g / rate of each particle to sums ``number``, and write them."""
-
-        @wp.func_native(f"softmpm::add_layer<{number}, {adds}")
-        def add(
-            A: block,
-            partial: wp.array2d(dtype=vec),
-            world: int,
-            brick: int,
-            corner: int,
-            layer: int,
-            lane: int,
-            lattice: Lattice,
-        ): ...
-
-        return add
+    @wp.func_native(f"softmpm::add_layer<{adds}")
+    def add(
+        A: block,
+        partial: wp.array2d(dtype=vec),
+        world: int,
+        brick: int,
+        corner: int,
+        layer: int,
+        lane: int,
+        lattice: Lattice,
+    ):
+        """Add A g / rate of each particle, and write the sums."""
 
     @wp.func
     def taken(rows: block, n: int) -> mat:
@@ -82,7 +78,7 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         Lattice=Lattice,
         block=block,
         gradients=(gradients(0), gradients(1), gradients(2)),
-        add=(adding(0), adding(1)),
+        add=add,
         taken=taken,
         put=put,
     )
@@ -103,7 +99,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         layer_of.block,
         layer_of.taken,
         layer_of.put,
-        layer_of.add[0],
+        layer_of.add,
     )
     gradients_u, gradients_v, points = layer_of.gradients[0], layer_of.gradients[1], bricks.layer
     count, slots, threads, settings = (
@@ -180,7 +176,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         bricks.layer,
     )
     gradients_u, gradients_f, gradients_v = layer_of.gradients
-    add_u, add_v = layer_of.add
+    add = layer_of.add
     count, slots, threads, settings = (
         bricks.cell_count,
         bricks.slots,
@@ -240,8 +236,8 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
                         A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
                         if wp.static(viscous):
                             B = put(B, n, constants.rate * adj.rate)
-            add_u(A, partial_u, world, brick, corner, layer, lane, lattice)
+            add(A, partial_u, world, brick, corner, layer, lane, lattice)
             if wp.static(viscous):
-                add_v(B, partial_v, world, brick, corner, layer, lane, lattice)
+                add(B, partial_v, world, brick, corner, layer, lane, lattice)
 
     return SimpleNamespace(forces_adj=forces_adj)

@@ -25,7 +25,7 @@ class ChunkBuffers:
     """Everything that the launches of a chunk read and write.
 
     Attributes:
-        u, v, anchor, shift: Nodal states, one more than substeps if ``keep``, else two in turn.
+        u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns.
         force: Mean forces of the walls on the surface points in the present control step.
         p: Momenta of the nodes, one for each substep if ``keep``, else one.
         mass: Masses of the nodes.
