@@ -1,11 +1,16 @@
 """Both formulations on one body: `python bench/formulations.py [--device cuda] [--json bench/results/formulations.h200.json]`
 
 Microseconds of a substep in calls without gradient, in calls that store their states, and of the backward pass; medians after a
-warm-up, the two formulations in turn. ``kept``: bytes that a gradient keeps for each substep. A cube on a lattice, without walls;
-``ratio`` is the moving formulation's time over that of the reference formulation.
+warm-up, the two formulations in turn. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving formulation's
+figure over that of the reference formulation.
+
+``cube``: particles on a lattice, without walls, in one world or several. ``block`` has an outline; ``on a floor`` it also meets a wall
+with friction, at nodes in the moving and at surface points in the reference formulation, where the last row gives the times with the
+floor over those without.
 """
 
 import time
+from collections.abc import Callable, Iterator
 
 import torch
 from common import Table, arguments, cube, sync
@@ -13,8 +18,39 @@ from gradient import measure, substeps_of
 
 import softmpm
 
-CASES = [(3, 8_000, 32), (3, 64_000, 48), (3, 1_000_000, 96)]
-ON_A_CPU = [(2, 3_000, 96), (2, 20_000, 192), (3, 8_000, 32)]
+CASES = [
+    (3, 8_000, 32, 1),
+    (3, 64_000, 48, 1),
+    (3, 8_000, 32, 64),
+    (3, 1_000_000, 96, 1),
+    (3, 8_000_000, 192, 1),
+]
+ON_A_CPU = [(2, 3_000, 96, 1), (2, 20_000, 192, 1), (3, 8_000, 32, 1)]
+"""Dimension, particles of a world, nodes along an axis, worlds."""
+FIGURES = "forward", "stored", "backward", "kept"
+
+
+def block(dim: int, cells: int, floor: bool) -> softmpm.Scene:
+    """A box with an outline in the middle of the grid, ``cells`` wide; gravity presses it onto the floor if there is one."""
+    dx = 0.5 / cells
+    low, high, up = (0.25,) * dim, (0.75,) * dim, (0.0, 1.0) + (0.0,) * (dim - 2)
+    rubber = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
+    scene = dict(
+        grid=softmpm.Grid(shape=(2 * cells,) * dim, spacing=dx),
+        bodies=[softmpm.Body(softmpm.box(low, high, spacing=dx / 2), rubber)],
+        walls=[softmpm.Wall(normal=up, offset=0.25, friction=0.5)] if floor else [],
+        gravity=tuple(-0.5 * u for u in up),
+    )
+    return softmpm.Scene(**scene, dt=0.3 * softmpm.stable_dt(softmpm.Scene(**scene, dt=1.0)))
+
+
+def cases(on_a_cpu: bool) -> Iterator[tuple[str, int, int, int, Callable[[], softmpm.Scene]]]:
+    """Name, dimension, worlds, particles of a world, and the scene."""
+    for dim, particles, nodes, worlds in ON_A_CPU if on_a_cpu else CASES:
+        yield "cube", dim, worlds, particles, lambda d=dim, p=particles, n=nodes: cube(d, p, n)
+    for dim, cells in [(2, 32)] if on_a_cpu else [(2, 32), (3, 24)]:
+        for name, floor in (("block", False), ("block on a floor", True)):
+            yield name, dim, 1, (2 * cells) ** dim, lambda d=dim, c=cells, f=floor: block(d, c, f)
 
 
 def forward(model: softmpm.Model, substeps: int, repeats: int) -> float:
@@ -30,27 +66,39 @@ def forward(model: softmpm.Model, substeps: int, repeats: int) -> float:
     return sorted(times[1:])[repeats // 2] / substeps * 1e6
 
 
+def figures(scene: softmpm.Scene, formulation: str, worlds: int, substeps: int, args) -> tuple[float, ...]:
+    """In the order of :data:`FIGURES`."""
+    model = softmpm.build(
+        scene, device=args.device, worlds=worlds, formulation=formulation, memory_budget=2**62
+    )
+    ahead, back = measure(model, substeps, args.repeats)
+    sizes = model.sizes()
+    return forward(model, substeps, args.repeats), ahead, back, sizes.inside + sizes.nodes
+
+
 def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
-    table = Table("Two formulations [us/substep], float32", device, args.json)
-    for dim, particles, nodes in ON_A_CPU if device.type == "cpu" else CASES:
-        if particles > (args.largest or particles):
+    table, before = Table("Two formulations [us/substep], float32", device, args.json), (1.0,) * 4
+    for name, dim, worlds, particles, scene in cases(device.type == "cpu"):
+        if particles * worlds > (args.largest or particles * worlds):
             continue
-        substeps, found = substeps_of(particles, device)["kept"], {}
+        case = {"scene": name, "dim": dim, "worlds": worlds, "particles": particles}
+        substeps, found = substeps_of(particles * worlds, device)["kept"], {}
         for formulation in ("moving", "reference"):
-            scene = cube(dim, particles, nodes)
-            model = softmpm.build(scene, device=device, formulation=formulation, memory_budget=2**62)
-            ahead, back = measure(model, substeps, args.repeats)
-            sizes = model.sizes()
-            kept = sizes.inside + sizes.nodes
-            found[formulation] = forward(model, substeps, args.repeats), ahead, back, kept
-            row = dict(zip(("forward", "stored", "backward", "kept"), found[formulation], strict=True))
-            row["kept"] = int(kept)
-            table.add(dict(dim=dim, particles=particles, formulation=formulation) | row)
-        ratios = [one / other for one, other in zip(*found.values(), strict=True)]
-        row = dict(zip(("forward", "stored", "backward", "kept"), ratios, strict=True))
-        table.add(dict(dim=dim, particles=particles, formulation="ratio") | row)
+            found[formulation] = figures(scene(), formulation, worlds, substeps, args)
+            table.add(
+                case | {"formulation": formulation} | dict(zip(FIGURES, found[formulation], strict=True))
+            )
+            if device.type == "cuda":
+                torch.cuda.empty_cache()
+        rows = {"ratio": (found["moving"], found["reference"])}
+        if name == "block on a floor":
+            rows["with over without"] = found["reference"], before
+        for label, (one, other) in rows.items():
+            ratios = [a / b for a, b in zip(one, other, strict=True)]
+            table.add(case | {"formulation": label} | dict(zip(FIGURES, ratios, strict=True)))
+        before = found["reference"]
 
 
 if __name__ == "__main__":
