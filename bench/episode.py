@@ -2,9 +2,10 @@
 
     python bench/episode.py [--device cuda] [--json bench/results/episode.json]
 
-The biped observes, acts and moves; the loss is differentiated with respect to policy and materials. ``iteration`` is the time of one
+A robot observes, acts and moves; the loss is differentiated with respect to policy and materials. ``iteration`` is the time of one
 such iteration as in training; ``physics`` that of its calls of `simulate`, forward and backward, captured as a CUDA graph as well;
-``eager`` that of the iteration without the graph. Medians after a warm-up.
+``eager`` that of the iteration without the graph. Medians after a warm-up. The rows with a viscous material compare both formulations:
+the reference formulation with contact at surface points.
 """
 
 import enum
@@ -18,16 +19,30 @@ import softmpm
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
 from softmpm_learn.tasks.biped import BipedConf, biped
+from softmpm_learn.tasks.elephant import ElephantConf, elephant
+from softmpm_learn.tasks.task import Task
 
-CASES = [(128, 0.0125, 2000), (264, 0.0125, 2000), (264, 0.004, 2000)]
-"""Cells per metre, seconds between two decisions, substeps of an episode."""
+ROBOTS = {"biped": (BipedConf, biped), "elephant": (ElephantConf, elephant)}
+VISCOUS = dict(retardation=4e-3)
+CASES = [
+    ("biped", 128, 0.0125, 2000, {}),
+    ("biped", 264, 0.0125, 2000, {}),
+    ("biped", 264, 0.004, 2000, {}),
+    ("biped", 128, 0.0125, 2000, VISCOUS),
+    ("biped", 128, 0.0125, 2000, VISCOUS | dict(formulation="reference", contact_width=0.01)),
+    ("elephant", 128, 0.0125, 2000, VISCOUS),
+    ("elephant", 128, 0.0125, 2000, VISCOUS | dict(formulation="reference", contact_width=0.01)),
+]
+"""Robot, cells per metre, seconds between two decisions, substeps of an episode, settings."""
+ON_A_CPU = [("biped", 80, 0.0125, 100, VISCOUS), ("biped", 80, 0.0125, 100, CASES[4][-1])]
 
 
-def task_of(cells: int, period: float, substeps: int):
+def task_of(robot: str, cells: int, period: float, substeps: int, settings: dict) -> Task:
+    make_conf, make = ROBOTS[robot]
     resolution = enum.Enum("Cells", {"bench": cells}).bench
-    conf = BipedConf(resolution=resolution, control_period=period, seconds=period)
-    steps = round(substeps / biped(conf).substeps)
-    return biped(BipedConf(resolution=resolution, control_period=period, seconds=steps * period))
+    settings = settings | dict(resolution=resolution, control_period=period)
+    steps = round(substeps / make(make_conf(seconds=period, **settings)).substeps)
+    return make(make_conf(seconds=steps * period, **settings))
 
 
 def physics(run: Run):
@@ -52,9 +67,9 @@ def main():
     args = arguments(__doc__)
     device = torch.device(args.device)
     table = Table("An iteration of learning in closed loop, float32", device, args.json)
-    for cells, period, substeps in CASES if device.type == "cuda" else [(80, 0.0125, 100)]:
-        task = task_of(cells, period, substeps)
-        model = softmpm.build(task.scene, device=device, calls=task.control_steps)
+    for case in CASES if device.type == "cuda" else ON_A_CPU:
+        task = task_of(*case)
+        model = softmpm.build(task.scene, device=device, calls=task.control_steps, **task.build)
         with tempfile.TemporaryDirectory() as folder:
             run = Run(task, model, Settings(), Path(folder))
             whole = median_seconds(lambda run=run: run.loop(None), device, args.repeats + 1)
@@ -62,6 +77,9 @@ def main():
             eager = median_seconds(run.loop._work, device, 2)
         table.add(
             {
+                "robot": task.name,
+                "formulation": model.formulation,
+                "viscous": model.spec.viscosity,
                 "particles": model.particle_count,
                 "control steps": task.control_steps,
                 "substeps": task.control_steps * task.substeps,
