@@ -54,8 +54,8 @@ class RestGrid:
         cells, of = np.unique(brick.reshape(-1) * size.prod() + cell, return_inverse=True)
         of = of.reshape(-1)
         brick_of_cell = cells // size.prod()
-        turn = np.arange(len(cells)) - np.searchsorted(brick_of_cell, np.arange(len(boxes)))[brick_of_cell]
-        corner = np.stack(np.unravel_index(cells % size.prod(), bricks.cells), axis=-1)
+        turn = cells % size.prod()
+        corner = np.stack(np.unravel_index(turn, bricks.cells), axis=-1)
         corners = np.full((len(boxes), size.prod()), -1)
         corners[brick_of_cell, turn] = flat(corner, bricks.window)
         order = np.argsort(of, kind="stable")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from softmpm.rest_grid import RestGrid, flat, stencils
 from softmpm.scene.materials import Material
-from softmpm.scene.scene import Scene
+from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.validate import need
 
 LEAST = 1e-3
@@ -32,8 +32,10 @@ class SurfaceGrid:
         weights: Their weights, 0 for nodes that take no part, shape (point, 3^dim), float64.
         loads: Area that each node carries [m²], L of (K1), shape (node,), float64.
         normals: Unit normals of the separating walls, shape (wall, dim), float64.
-        first: First entry of each node in ``members``, and their count, shape (node + 1,), int32.
-        members: Entries of ``stencil``, flat, node by node, shape (entry,), int32.
+        nodes: Nodes that the points act on, with planes of symmetry or clamps all nodes, shape (touched,), int32.
+        first: First entry of each of ``nodes`` in ``members``, and their count, shape (touched + 1,), int32.
+        members: Points that act on a node, node by node, shape (entry,), int32.
+        shares: Their weights, shape (entry,), float64.
     """
 
     def __init__(self, scene: Scene, rest: RestGrid, device: torch.device):
@@ -84,8 +86,13 @@ class SurfaceGrid:
         )
         self.waves = tensor(np.sqrt(modulus / density), np.float64)
         self.stencil, self.weights = tensor(numbers, np.int32), tensor(weights, np.float64)
-        self.members = tensor(members[order], np.int32)
-        self.first = tensor(np.searchsorted(owners[order], np.arange(len(index) + 1)), np.int32)
+        members, owners = members[order], owners[order]
+        mirrored = any(wall.contact in MIRRORS for wall in scene.walls)
+        touched = np.arange(len(index)) if mirrored else np.unique(owners)
+        self.nodes = tensor(touched, np.int32)
+        self.members = tensor(members // len(offsets), np.int32)
+        self.shares = tensor(weights.reshape(-1)[members], np.float64)
+        self.first = tensor(np.append(np.searchsorted(owners, touched), len(owners)), np.int32)
 
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""

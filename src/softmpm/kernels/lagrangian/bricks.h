@@ -31,19 +31,37 @@ CUDA_CALLABLE inline void meet()
 #endif
 }
 
+// Wait for the threads of cells with the same first coordinate, of which a window has ACROSS x ALONG nodes: they are in one warp.
+template <int ACROSS, int ALONG, unsigned DIM> CUDA_CALLABLE inline void meet_slice()
+{
+    static_assert(32 % (DIM == 2 ? ALONG - 2 : (ACROSS - 2) * (ALONG - 2)) == 0, "a slice of cells has to lie in one warp");
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+}
+
 // Copy a nodal field of the window; complete after meet().
 template <int FIELD, int NODES, int THREADS, typename T, unsigned DIM>
 CUDA_CALLABLE inline void stage(
     const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int lane)
 {
+    constexpr int EACH = (NODES + THREADS - 1) / THREADS;
     Node<T, DIM>* nodes = shared_nodes<FIELD, NODES, T, DIM>();
     const int* node = window.data + brick * NODES;
     const wp::vec_t<DIM, T>* first = values.data + size_t(world) * values.shape[1];
-    for (int k = lane; k < NODES; k += THREADS) {
-        int i = node[k];
-        for (unsigned axis = 0; axis < DIM; ++axis)
-            nodes[k].at[axis] = i >= 0 ? first[i].c[axis] : T(0);
-    }
+    int at[EACH];
+    wp::vec_t<DIM, T> value[EACH];
+#pragma unroll
+    for (int n = 0; n < EACH; ++n)
+        at[n] = node[lane + n * THREADS < NODES ? lane + n * THREADS : 0];
+#pragma unroll
+    for (int n = 0; n < EACH; ++n)
+        value[n] = first[at[n] > 0 ? at[n] : 0];
+#pragma unroll
+    for (int n = 0; n < EACH; ++n)
+        if (lane + n * THREADS < NODES)
+            for (unsigned axis = 0; axis < DIM; ++axis)
+                nodes[lane + n * THREADS].at[axis] = at[n] >= 0 ? value[n].c[axis] : T(0);
 }
 
 // Node k of the window
@@ -91,26 +109,33 @@ CUDA_CALLABLE inline void clear_sums(const wp::array_t<wp::vec_t<DIM, T>>& parti
 }
 
 // Write the sums that each thread has for one component of the COUNT nodes of a cell, of which `corner` is the first in the window, or -1.
-// The threads of a component are apart from those of the others, and all cells add to the same node of theirs at a time.
+// Each component has planes of its own, for every first offset, so that only the cells of a slice add to the same node, in turns.
 template <int NODES, int THREADS, int COUNT, int ACROSS, int ALONG, typename T, unsigned DIM>
 CUDA_CALLABLE inline void write_sums(
     const wp::vec_t<COUNT, T>& total, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick, int corner, int axis,
     int lane)
 {
-    T* sums = shared_terms<NODES * int(DIM), T>();
-    for (int k = lane; k < NODES * int(DIM); k += THREADS)
+    constexpr int TURNS = COUNT / 3;
+    T* sums = shared_terms<3 * NODES * int(DIM), T>();
+    for (int k = lane; k < 3 * NODES * int(DIM); k += THREADS)
         sums[k] = T(0);
     meet();
-    T* own = sums + axis * NODES + corner;
 #pragma unroll
-    for (int n = 0; n < COUNT; ++n) {
+    for (int turn = 0; turn < TURNS; ++turn) {
         if (corner >= 0)
-            own[DIM == 2 ? n / 3 * ALONG + n % 3 : (n / 9 * ACROSS + n / 3 % 3) * ALONG + n % 3] += total.c[n];
-        meet();
+#pragma unroll
+            for (int i = 0; i < 3; ++i) {
+                int node = corner + (DIM == 2 ? i * ALONG + turn : (i * ACROSS + turn / 3) * ALONG + turn % 3);
+                sums[(axis * 3 + i) * NODES + node] += total.c[i * TURNS + turn];
+            }
+        meet_slice<ACROSS, ALONG, DIM>();
     }
+    meet();
     T* out = reinterpret_cast<T*>(partial.data + size_t(world) * partial.shape[1] + brick * NODES);
-    for (int k = lane; k < NODES * int(DIM); k += THREADS)
-        out[k] = sums[k % DIM * NODES + k / DIM];
+    for (int k = lane; k < NODES * int(DIM); k += THREADS) {
+        const T* own = sums + k % DIM * 3 * NODES + k / DIM;
+        out[k] = own[0] + own[NODES] + own[2 * NODES];
+    }
     meet();  // the sums may be used again
 }
 
@@ -224,7 +249,8 @@ CUDA_CALLABLE inline void add_layer(
                     T p = T(0), s = T(0);
 #pragma unroll
                     for (int q = 0; q < Q; ++q) {
-                        p += w.data[K + q][j] * x[i][q][c] + e.data[K + q][j] * y[i][q][c];
+                        p += w.data[K + q][j] * x[i][q][c];
+                        p += e.data[K + q][j] * y[i][q][c];
                         s += w.data[K + q][j] * z[i][q][c];
                     }
                     plain[i][c] = p, sloped[i][c] = s;
@@ -239,11 +265,13 @@ CUDA_CALLABLE inline void add_layer(
                 for (int i = 0; i < 3; ++i) {
                     Node<T, DIM>* node = planes + (layer * 3 + i) * NODES + corner + (DIM == 2 ? i : i * ACROSS + j) * ALONG + k;
                     Node<T, DIM> sum = *node;
-                    for (unsigned c = 0; c < DIM; ++c)
-                        sum.at[c] += wl * plain[i][c] + el * sloped[i][c];
+                    for (unsigned c = 0; c < DIM; ++c) {
+                        sum.at[c] += wl * plain[i][c];
+                        sum.at[c] += el * sloped[i][c];
+                    }
                     *node = sum;
                 }
-            meet();
+            meet_slice<ACROSS, ALONG, DIM>();
 #else
             for (int i = 0; i < 3; ++i)
                 for (unsigned c = 0; c < DIM; ++c)
@@ -252,6 +280,7 @@ CUDA_CALLABLE inline void add_layer(
         }
     }
 #if defined(__CUDA_ARCH__)
+    meet();
     for (int k = lane; k < NODES; k += THREADS) {
         wp::vec_t<DIM, T> sum = {};
 #pragma unroll

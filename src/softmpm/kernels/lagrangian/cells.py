@@ -31,7 +31,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     viscous, loaded, settings = spec.viscosity, "force" in spec.given, bricks.settings
     of_f = sums(dim, spec.dtype, bricks, loaded)
     line, clear, add, write, place_of = of_f.line, of_f.clear, of_f.add, of_f.write, of_f.place_of
-    count, turns, threads = bricks.cell_count, bricks.turns, bricks.threads
+    count, turns, threads, serial = bricks.cell_count, bricks.turns, bricks.threads, bricks.serial
     module = brick_module(f"{spec.module}.lagrangian.{bricks.name}")
 
     @wp.kernel(module=module, **settings)
@@ -49,16 +49,21 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         partial: wp.array2d(dtype=vec),
     ):
         world, brick, lane = wp.tid()
+        first = inside.rows[brick]  # loaded while the nodes are awaited
+        last = inside.rows[brick + 1]
+        corner = inside.corners[brick, lane % count]
+        p = place_of(inside, first, lane)
         stage_u(u, inside, world, brick, lane)
         if wp.static(viscous):
             stage_v(v, inside, world, brick, lane)
         clear(partial, world, brick)
         meet()
         total = line()
-        for row in range(inside.rows[brick], inside.rows[brick + 1]):
+        for row in range(first, last):
             for slot in range(lane, turns, threads):
-                p = place_of(inside, row, slot)
-                corner = inside.corners[brick, slot % count]
+                if wp.static(serial):
+                    corner = inside.corners[brick, slot % count]
+                    p = place_of(inside, row, slot)
                 fx = vec()
                 A = mat()
                 b = vec()
@@ -68,11 +73,14 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     rate = mat()
                     if wp.static(viscous):
                         rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
-                    if substep > 0:
-                        check(constants, words, world, inside.order[p], substep - 1, H)
                     A = constants.rate * forced(inputs, world, p, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
+                    if substep > 0:  # last, so that nothing waits for it
+                        check(constants, words, world, inside.order[p], substep - 1, H)
+                if wp.static(not serial):
+                    if row + 1 < last:
+                        p = place_of(inside, row + 1, lane)
                 total = add(total, partial, world, brick, slot, corner, fx, A, b)
         write(total, partial, inside, world, brick, lane)
 
@@ -155,6 +163,7 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         total_of.place_of,
     )
     count, turns, threads, settings = bricks.cell_count, bricks.turns, bricks.threads, bricks.settings
+    serial = bricks.serial
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}")
 
     @wp.kernel(module=module, **settings)
@@ -177,6 +186,10 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         partial_v: wp.array2d(dtype=vec),
     ):
         world, brick, lane = wp.tid()
+        first = inside.rows[brick]  # loaded while the nodes are awaited
+        last = inside.rows[brick + 1]
+        corner = inside.corners[brick, lane % count]
+        p = place_of(inside, first, lane)
         stage_u(u, inside, world, brick, lane)
         stage_f(adj_f, inside, world, brick, lane)
         clear(partial_u, world, brick)
@@ -186,10 +199,11 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         meet()
         total_u = line()
         total_v = line()
-        for row in range(inside.rows[brick], inside.rows[brick + 1]):
+        for row in range(first, last):
             for slot in range(lane, turns, threads):
-                p = place_of(inside, row, slot)
-                corner = inside.corners[brick, slot % count]
+                if wp.static(serial):
+                    corner = inside.corners[brick, slot % count]
+                    p = place_of(inside, row, slot)
                 fx = vec()
                 A = mat()
                 B = mat()
@@ -207,6 +221,9 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
                     if wp.static(loaded):
                         share = value_f(adj_f, inside, world, brick, corner, fx)
                         adj_inputs.force[world, p] = adj_inputs.force[world, p] + share
+                if wp.static(not serial):
+                    if row + 1 < last:
+                        p = place_of(inside, row + 1, lane)
                 total_u = add(total_u, partial_u, world, brick, slot, corner, fx, A, vec())
                 if wp.static(viscous):
                     total_v = add(total_v, partial_v, world, brick, slot, corner, fx, B, vec())

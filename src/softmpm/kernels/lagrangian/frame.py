@@ -26,10 +26,9 @@ def frame(dim: int, dtype: str) -> SimpleNamespace:
     Frame = wp.struct(Frame, module=f"softmpm.types.d{dim}.{dtype}")
 
     @wp.func
-    def recentring(body: Frame, u: wp.array2d(dtype=vec), world: int) -> vec:
-        """d of (Q9)."""
+    def recentring(body: Frame, here: vec) -> vec:
+        """d of (Q9) from u_m."""
         d = vec()
-        here = u[world, body.middle]
         for axis in range(dim):
             if wp.abs(here[axis]) > body.quantum:
                 d[axis] = body.quantum * wp.round(here[axis] / body.quantum)

@@ -18,6 +18,7 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     t, K, points = types(dim, dtype), bricks.parts, bricks.layer
     real, vec, mat = t.real, t.vec, t.mat
     table, block = wp.types.matrix((K * dim, 3), real), wp.types.matrix((points * dim, dim), real)
+    Rest, places = rest(dim, dtype).Rest, wp.types.vector(points, wp.int32)
     across, along = bricks.window[-2], bricks.window[-1]
     where = f"{bricks.nodes}, {{}}{across}, {along}, {K}"
     gathers = f"{where.format('')}>(values, window, world, brick, corner, layer, lattice.w, lattice.e);"
@@ -59,6 +60,14 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         """Add A g / rate of each particle, and write the sums."""
 
     @wp.func
+    def places_of(inside: Rest, brick: int, slot: int) -> places:
+        """Places of the particles of a layer, or -1."""
+        out = places()
+        for n in range(points):
+            out[n] = inside.places[brick * points + n, slot]
+        return out
+
+    @wp.func
     def taken(rows: block, n: int) -> mat:
         out = mat()
         for i in range(dim):
@@ -79,6 +88,8 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         block=block,
         gradients=(gradients(0), gradients(1), gradients(2)),
         add=add,
+        places=places,
+        places_of=places_of,
         taken=taken,
         put=put,
     )
@@ -93,24 +104,52 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     check = one.check
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
-    layer_of, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
-    Lattice, block, taken, put, add = (
-        layer_of.Lattice,
-        layer_of.block,
-        layer_of.taken,
-        layer_of.put,
-        layer_of.add,
+    one_layer, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
+    Lattice, block, places, places_of = (
+        one_layer.Lattice,
+        one_layer.block,
+        one_layer.places,
+        one_layer.places_of,
     )
-    gradients_u, gradients_v, points = layer_of.gradients[0], layer_of.gradients[1], bricks.layer
-    count, slots, threads, settings = (
-        bricks.cell_count,
-        bricks.slots,
-        bricks.layer_threads,
-        bricks.layer_settings,
-    )
+    taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
+    gradients_u, gradients_v = one_layer.gradients[0], one_layer.gradients[1]
+    count, slots, serial = bricks.cell_count, bricks.slots, bricks.serial
     module = brick_module(f"{spec.module}.lagrangian.{bricks.name}.layers")
 
-    @wp.kernel(module=module, **settings)
+    @wp.func
+    def layer_forces(
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        words: wp.array(dtype=wp.int64),
+        world: int,
+        brick: int,
+        corner: int,
+        layer: int,
+        at: places,
+    ) -> block:
+        """−V P / rate of each particle of a layer."""
+        A = block()
+        if corner >= 0:
+            H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
+            rate = block()
+            if wp.static(viscous):
+                rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+            for n in range(points):
+                p = at[n]
+                if p >= 0:
+                    Hn = constants.rate * taken(H, n)
+                    A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
+                    A = put(A, n, constants.rate * A_n)
+                    if substep > 0:  # last, so that nothing waits for it
+                        check(constants, words, world, inside.order[p], substep - 1, Hn)
+        return A
+
+    @wp.kernel(module=module, **bricks.layer_settings)
     def forces(
         # Parameters:
         constants: Constants,
@@ -126,28 +165,27 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         partial: wp.array2d(dtype=vec),
     ):
         world, brick, lane = wp.tid()
-        stage_u(u, inside, world, brick, lane)
-        if wp.static(viscous):
-            stage_v(v, inside, world, brick, lane)
-        clear(partial, world, brick)
-        meet()
-        for slot in range(lane, slots, threads):
-            layer = slot / count
-            corner = inside.corners[brick, slot % count]
-            A = block()
-            if corner >= 0:
-                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
-                rate = block()
-                if wp.static(viscous):
-                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
-                for n in range(points):
-                    p = inside.places[brick * points + n, slot]
-                    if p >= 0:
-                        Hn = constants.rate * taken(H, n)
-                        if substep > 0:
-                            check(constants, words, world, inside.order[p], substep - 1, Hn)
-                        A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
-                        A = put(A, n, constants.rate * A_n)
+        if wp.static(serial):
+            clear(partial, world, brick)
+            for slot in range(slots):
+                corner = inside.corners[brick, slot % count]
+                layer = slot / count
+                at = places_of(inside, brick, slot)
+                A = layer_forces(
+                    constants, inputs, inside, lattice, substep, u, v, words, world, brick, corner, layer, at
+                )
+                add(A, partial, world, brick, corner, layer, lane, lattice)
+        else:
+            corner = inside.corners[brick, lane % count]
+            layer = lane / count
+            at = places_of(inside, brick, lane)
+            stage_u(u, inside, world, brick, lane)
+            if wp.static(viscous):
+                stage_v(v, inside, world, brick, lane)
+            meet()
+            A = layer_forces(
+                constants, inputs, inside, lattice, substep, u, v, words, world, brick, corner, layer, at
+            )
             add(A, partial, world, brick, corner, layer, lane, lattice)
 
     return SimpleNamespace(forces=forces)
@@ -164,28 +202,65 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     vec, Constants, dim = t.vec, t.Constants, spec.dim
     ParticleInputs = input_types(spec).ParticleInputs
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
-    forced_adj, check_adj, layer_of = one.forced_adj, one.check_adj, layers(dim, spec.dtype, bricks)
+    forced_adj, check_adj, one_layer = one.forced_adj, one.check_adj, layers(dim, spec.dtype, bricks)
     of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(3))
     stage_u, stage_f, stage_v = of_u.stage, of_f.stage, of_v.stage
     clear, viscous = sums(dim, spec.dtype, bricks, False).clear, spec.viscosity
-    Lattice, block, taken, put, points = (
-        layer_of.Lattice,
-        layer_of.block,
-        layer_of.taken,
-        layer_of.put,
-        bricks.layer,
+    Lattice, block, places, places_of = (
+        one_layer.Lattice,
+        one_layer.block,
+        one_layer.places,
+        one_layer.places_of,
     )
-    gradients_u, gradients_f, gradients_v = layer_of.gradients
-    add = layer_of.add
-    count, slots, threads, settings = (
-        bricks.cell_count,
-        bricks.slots,
-        bricks.layer_threads,
-        bricks.layer_settings,
-    )
+    taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
+    gradients_u, gradients_f, gradients_v = one_layer.gradients
+    count, slots, serial = bricks.cell_count, bricks.slots, bricks.serial
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
 
-    @wp.kernel(module=module, **settings)
+    @wp.struct
+    class LayerAdj:
+        F: block
+        rate: block
+
+    @wp.func
+    def layer_forces_adj(
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
+        words: wp.array(dtype=wp.int64),
+        adj_inputs: ParticleInputsAdj,
+        world: int,
+        brick: int,
+        corner: int,
+        layer: int,
+        at: places,
+    ) -> LayerAdj:
+        """F̄ / rate and Ḟ̄ / rate of each particle of a layer."""
+        out = LayerAdj()
+        if corner >= 0:
+            H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
+            G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
+            rate = block()
+            if wp.static(viscous):
+                rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+            for n in range(points):
+                p = at[n]
+                if p >= 0:
+                    Hn = constants.rate * taken(H, n)
+                    Gn = constants.rate * taken(G, n)
+                    adj = forced_adj(inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs)
+                    check_adj(words, world, inside.order[p], substep, adj)
+                    out.F = put(out.F, n, constants.rate * adj.F)  # (Q1.adj)
+                    if wp.static(viscous):
+                        out.rate = put(out.rate, n, constants.rate * adj.rate)
+        return out
+
+    @wp.kernel(module=module, **bricks.layer_settings)
     def forces_adj(
         # Parameters:
         constants: Constants,
@@ -206,38 +281,62 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         partial_v: wp.array2d(dtype=vec),
     ):
         world, brick, lane = wp.tid()
-        stage_u(u, inside, world, brick, lane)
-        stage_f(adj_f, inside, world, brick, lane)
-        clear(partial_u, world, brick)
-        if wp.static(viscous):
-            stage_v(v, inside, world, brick, lane)
-            clear(partial_v, world, brick)
-        meet()
-        for slot in range(lane, slots, threads):
-            layer = slot / count
-            corner = inside.corners[brick, slot % count]
-            A = block()
-            B = block()
-            if corner >= 0:
-                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
-                G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
-                rate = block()
-                if wp.static(viscous):
-                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
-                for n in range(points):
-                    p = inside.places[brick * points + n, slot]
-                    if p >= 0:
-                        Hn = constants.rate * taken(H, n)
-                        Gn = constants.rate * taken(G, n)
-                        adj = forced_adj(
-                            inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs
-                        )
-                        check_adj(words, world, inside.order[p], substep, adj)
-                        A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
-                        if wp.static(viscous):
-                            B = put(B, n, constants.rate * adj.rate)
-            add(A, partial_u, world, brick, corner, layer, lane, lattice)
+        if wp.static(serial):
+            clear(partial_u, world, brick)
             if wp.static(viscous):
-                add(B, partial_v, world, brick, corner, layer, lane, lattice)
+                clear(partial_v, world, brick)
+            for slot in range(slots):
+                corner = inside.corners[brick, slot % count]
+                layer = slot / count
+                at = places_of(inside, brick, slot)
+                adj = layer_forces_adj(
+                    constants,
+                    inputs,
+                    inside,
+                    lattice,
+                    substep,
+                    u,
+                    v,
+                    adj_f,
+                    words,
+                    adj_inputs,
+                    world,
+                    brick,
+                    corner,
+                    layer,
+                    at,
+                )
+                add(adj.F, partial_u, world, brick, corner, layer, lane, lattice)
+                if wp.static(viscous):
+                    add(adj.rate, partial_v, world, brick, corner, layer, lane, lattice)
+        else:
+            corner = inside.corners[brick, lane % count]
+            layer = lane / count
+            at = places_of(inside, brick, lane)
+            stage_u(u, inside, world, brick, lane)
+            stage_f(adj_f, inside, world, brick, lane)
+            if wp.static(viscous):
+                stage_v(v, inside, world, brick, lane)
+            meet()
+            adj = layer_forces_adj(
+                constants,
+                inputs,
+                inside,
+                lattice,
+                substep,
+                u,
+                v,
+                adj_f,
+                words,
+                adj_inputs,
+                world,
+                brick,
+                corner,
+                layer,
+                at,
+            )
+            add(adj.F, partial_u, world, brick, corner, layer, lane, lattice)
+            if wp.static(viscous):
+                add(adj.rate, partial_v, world, brick, corner, layer, lane, lattice)
 
     return SimpleNamespace(forces_adj=forces_adj)

@@ -25,35 +25,29 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
     real, mat, Constants, dim = t.real, t.mat, t.Constants, spec.dim
     ParticleInputs, total_of = input_types(spec).ParticleInputs, total_stress(spec)
-    rotation, stress, identity, volume_change = (
-        total_of.rotation,
-        total_of.stress,
-        k.identity,
-        k.volume_change,
-    )
+    rotation, stress, identity = total_of.rotation, total_of.stress, k.identity
+    volume_change, inverse_transpose = k.volume_change, k.inverse_transpose
     viscous_stress, viscous = viscosity(dim, spec.dtype).viscous_stress, spec.viscosity
     report, largest = status.report(dim, spec.dtype).report, 1.0e12
     collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
     step_is_stable = rest_step(spec).step_is_stable
 
     @wp.func
-    def piola(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat, L: mat, inverse: mat) -> mat:
-        """P of (Q2) [Pa]."""
+    def piola(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat, L: mat, R: mat) -> mat:
+        """P of (Q2) [Pa]; R is F⁻ᵀ."""
         tau = stress(inputs, world, p, H, Q)
         if wp.static(viscous):
             tau += viscous_stress(identity() + H, L, inputs.viscosity[world, p])
-        return tau * wp.transpose(inverse)
+        return tau * R
 
     @wp.func
     def forced(inputs: ParticleInputs, world: int, p: int, H: mat, rate: mat) -> mat:
         """−V P of a particle; ``rate`` is Ḟ."""
-        inverse = wp.inverse(identity() + H)
+        R = inverse_transpose(H)
         L = mat()
         if wp.static(viscous):
-            L = rate * inverse
-        return -inputs.volume[world, p] * piola(
-            inputs, world, p, H, rotation(inputs, world, p, H), L, inverse
-        )
+            L = rate * wp.transpose(R)
+        return -inputs.volume[world, p] * piola(inputs, world, p, H, rotation(inputs, world, p, H), L, R)
 
     @wp.func
     def check(
@@ -89,8 +83,9 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
 @kernel_factory
 def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     """Adjoint of the functions of one particle."""
-    t, identity = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype).identity
-    mat, rotation, piola = t.mat, total_stress(spec).rotation, particle_forces(spec).piola
+    mat, k = types(spec.dim, spec.dtype).mat, kinematics(spec.dim, spec.dtype)
+    identity, inverse_transpose = k.identity, k.inverse_transpose
+    rotation, piola = total_stress(spec).rotation, particle_forces(spec).piola
     ParticleInputs = input_types(spec).ParticleInputs
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     stress_adj, viscous = total_stress_adj(spec, wanted).stress_adj, spec.viscosity
@@ -113,20 +108,20 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: ParticleInputsAdj,
     ) -> ForceAdj:
         """(Q2.adj)"""
-        inverse = wp.inverse(identity() + H)
+        R = inverse_transpose(H)
         Q = rotation(inputs, world, p, H)
         L = mat()
         if wp.static(viscous):
-            L = rate * inverse
-        P = piola(inputs, world, p, H, Q, L, inverse)
+            L = rate * wp.transpose(R)
+        P = piola(inputs, world, p, H, Q, L, R)
         adj_P = -inputs.volume[world, p] * G
-        adj_tau = adj_P * inverse
+        adj_tau = adj_P * wp.transpose(R)
         adj = ForceAdj()
         adj.F = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
-        adj.F -= wp.transpose(inverse) * wp.transpose(adj_P) * P
+        adj.F -= R * (wp.transpose(adj_P) * P)
         if wp.static(viscous):
             found = viscous_stress_adj(identity() + H, L, inputs.viscosity[world, p], adj_tau)
-            adj.rate = found.C * wp.transpose(inverse)
+            adj.rate = found.C * R
             adj.F += found.F - wp.transpose(L) * adj.rate
             if wp.static("viscosity" in wanted):
                 adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + found.eta

@@ -32,6 +32,7 @@ def rest(dim: int, dtype: str) -> SimpleNamespace:
         places: wp.array2d(dtype=wp.int32)
         corners: wp.array2d(dtype=wp.int32)
         order: wp.array(dtype=wp.int32)
+        touched: wp.array(dtype=wp.int32)  # 1 for nodes that surface points act on
         fraction: wp.array(dtype=t.vec)
 
     real, vec = t.real, t.vec

@@ -6,8 +6,8 @@
     f_s += A_s J / T, the mean force of a wall on a point in a control step of T                     (K7)
     v'_i = v*_i + Σ w_si A_s J / m_i,  u'_i = u_i + Δt v'_i                                          (K5)
 
-Nodes gather what the points give them in a fixed order, as in nodes.py. Only the height over a wall sees the shift; anchors move with
-the frame. The adjoint is in surface_adj.py.
+Nodes gather what the points give them in a fixed order; on a GPU the threads of a node share this work. Only the height over a wall
+sees the shift; anchors move with the frame. The adjoint is in surface_adj.py.
 """
 
 from types import SimpleNamespace
@@ -22,6 +22,20 @@ from softmpm.kernels.physics import status
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face
 from softmpm.kernels.structs import Spec, input_types, types
+
+LANES = 32
+"""Threads of a node on a GPU; the CPU has one."""
+BATCH = 4
+"""Entries that a thread reads at once."""
+TOGETHER = """
+    auto total = value;
+#if defined(__CUDA_ARCH__)
+    for (int other = {lanes} / 2; other > 0; other /= 2)
+        for (unsigned axis = 0; axis < {dim}; ++axis)
+            total.c[axis] += __shfl_xor_sync(0xffffffffu, total.c[axis], other);
+#endif
+    return total;
+"""
 
 
 @kernel_factory
@@ -39,8 +53,10 @@ def surface_type(dim: int, dtype: str):
         loads: wp.array(dtype=t.real)
         stencil: wp.array2d(dtype=wp.int32)
         weights: wp.array2d(dtype=t.real)
+        nodes: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
         members: wp.array(dtype=wp.int32)
+        shares: wp.array(dtype=t.real)
 
     return wp.struct(Surface, module=f"softmpm.types.d{dim}.{dtype}")
 
@@ -60,12 +76,21 @@ def surface(spec: Spec) -> SimpleNamespace:
     )
     walls = spec.surface_walls
     number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
-    count, each_world, rough, arms = len(walls), "friction" in spec.given, spec.friction, r.count
+    count, each_world, rough = len(walls), "friction" in spec.given, spec.friction
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, exact_of = f.Frame, f.recentring, f.exact
     face, depth = wall_face(spec).face, wall_face(spec).depth
     running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
+    vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
     module = lagrangian_module(spec.module + ".lagrangian")
+
+    @wp.struct
+    class Faces:
+        n: vecs
+        y: reals
+        depth: reals
+        anchor: vecs
+        friction: reals
 
     @wp.func
     def friction_of(inputs: GridInputs, world: int, k: int) -> real:
@@ -77,6 +102,27 @@ def surface(spec: Spec) -> SimpleNamespace:
             return real(0.0)
 
     @wp.func
+    def faces_of(
+        constants: Constants,
+        inputs: GridInputs,
+        anchor: wp.array3d(dtype=vec),
+        world: int,
+        p: int,
+        x: exact_vec,
+    ) -> Faces:
+        """The walls as a point meets them. All are read before the first acts, so that they wait for memory together."""
+        out = Faces()
+        for q in range(count):
+            k = number[q]
+            wall = face(constants, inputs, world, k, x, anchor[world, q, p])
+            out.n[q] = wall.n
+            out.y[q] = wall.y
+            out.depth[q] = wall.depth
+            out.anchor[q] = wall.anchor
+            out.friction[q] = friction_of(inputs, world, k)
+        return out
+
+    @wp.func
     def at_point(body: Surface, nodal: wp.array2d(dtype=vec), world: int, p: int) -> vec:
         """Σ w a of a nodal field."""
         total = vec()
@@ -84,15 +130,24 @@ def surface(spec: Spec) -> SimpleNamespace:
             total += body.weights[p, n] * nodal[world, body.stencil[p, n]]
         return total
 
+    @wp.func_native(TOGETHER.format(lanes=LANES, dim=dim))
+    def together(value: vec) -> vec:
+        """Sum over the threads of a node, for all of them."""
+
     @wp.func
-    def from_points(body: Surface, values: wp.array2d(dtype=vec), world: int, i: int) -> vec:
-        """Σ w a of a field of the surface points, at a node, in a fixed order."""
+    def from_points(
+        body: Surface, values: wp.array2d(dtype=vec), world: int, n: int, lane: int, step: int
+    ) -> vec:
+        """Σ w a of a field of the surface points, at node ``n`` of those they act on, in a fixed order."""
+        last = body.first[n + 1]
         total = vec()
-        for m in range(body.first[i], body.first[i + 1]):
-            entry = body.members[m]
-            p = entry / arms
-            total += body.weights[p, entry - p * arms] * values[world, p]
-        return total
+        for m in range(body.first[n] + lane, last, BATCH * step):
+            for k in range(BATCH):  # several that wait for memory together
+                at = wp.min(m + k * step, last - 1)
+                share = body.shares[at] * values[world, body.members[at]]
+                if m + k * step < last:
+                    total += share
+        return together(total)
 
     @wp.func
     def present(body: Surface, p: int, u: vec) -> exact_vec:
@@ -136,39 +191,51 @@ def surface(spec: Spec) -> SimpleNamespace:
     ):
         """(K2) to (K4), (K6), (K7): impulse A J of each point."""
         world, p = wp.tid()
+        middle = u[world, moving.middle]  # all of it loaded while the status is awaited
+        x = present(body, p, at_point(body, u, world, p))
+        v = at_point(body, free, world, p)
+        dv = D[world, p]
+        stiffness = body.stiffness[p]
+        per_force = rate[0] * body.newtons[p]
+        wall = faces_of(constants, inputs, anchor, world, p, x + shift[world])
+        after = vecs()
+        pushed = vecs()
+        for q in range(count):
+            after[q] = anchor[world, q, p]
+            if anew == 0:
+                pushed[q] = force[world, q, p]
+        deepest = body.deepest[p]
+        area = body.areas[p]
         total = vec()
+        deep = int(-1)
         if running(words, world):
-            d = recentring(moving, u, world)
-            x = present(body, p, at_point(body, u, world, p))
-            v = at_point(body, free, world, p)
+            d = recentring(moving, middle)
             for q in range(count):
-                k = number[q]
-                wall = face(constants, inputs, world, k, x + shift[world], anchor[world, q, p])
-                if wall.depth > body.deepest[p]:
-                    report(words, world, wp.max(substep - 1, 0), in_wall, q * body.points.shape[0] + p)
+                if wall.depth[q] > deepest:
+                    deep = q
                 found = touch(
-                    wall.n,
-                    wall.y,
+                    wall.n[q],
+                    wall.y[q],
                     vec(x),
                     v,
-                    wall.anchor,
-                    D[world, p],
-                    friction_of(inputs, world, k),
-                    body.stiffness[p],
+                    wall.anchor[q],
+                    dv,
+                    wall.friction[q],
+                    stiffness,
                     constants.dt,
                     smoothing,
                 )
-                new_anchor[world, q, p] = found.anchor - across(wall.n, d)
+                after[q] = found.anchor - across(wall.n[q], d)
                 total += found.J
-                v += D[world, p] * found.J
-                pushed = (rate[0] * body.newtons[p]) * found.J
-                if anew == 0:
-                    pushed += force[world, q, p]
-                force[world, q, p] = pushed
-        else:
+                v += dv * found.J
+                pushed[q] = pushed[q] + per_force * found.J
             for q in range(count):
-                new_anchor[world, q, p] = anchor[world, q, p]
-        impulse[world, p] = body.areas[p] * total
+                force[world, q, p] = pushed[q]
+        for q in range(count):
+            new_anchor[world, q, p] = after[q]
+        impulse[world, p] = area * total
+        if deep >= 0:
+            report(words, world, wp.max(substep - 1, 0), in_wall, deep * body.points.shape[0] + p)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(
@@ -177,6 +244,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         body: Surface,
         moving: Frame,
         mass: wp.array2d(dtype=real),
+        step: int,  # threads of a node
         impulse: wp.array2d(dtype=vec),
         words: wp.array(dtype=wp.int64),
         # In:
@@ -187,17 +255,22 @@ def surface(spec: Spec) -> SimpleNamespace:
         new_u: wp.array2d(dtype=vec),
         new_v: wp.array2d(dtype=vec),
     ):
-        """(K5)"""
-        world, i = wp.tid()
+        """(K5), at the nodes that surface points act on."""
+        world, n, lane = wp.tid()
+        i = body.nodes[n]
         here = u[world, i]
-        new = v[world, i]
+        new = free[world, i]  # loaded while the status is awaited
+        middle = u[world, moving.middle]
+        push = from_points(body, impulse, world, n, lane, step)
         if running(words, world):
-            new = free[world, i]
-            if body.first[i + 1] > body.first[i]:
-                new += from_points(body, impulse, world, i) / mass[world, i]
-            here = (here - recentring(moving, u, world)) + constants.dt * new
-        new_u[world, i] = here
-        new_v[world, i] = new
+            if body.first[n + 1] > body.first[n]:
+                new += push / mass[world, i]
+            here = (here - recentring(moving, middle)) + constants.dt * new
+        else:
+            new = v[world, i]
+        if lane == 0:
+            new_u[world, i] = here
+            new_v[world, i] = new
 
     @wp.kernel(module=module, enable_backward=False)
     def check_depth(
@@ -225,7 +298,8 @@ def surface(spec: Spec) -> SimpleNamespace:
         press=press,
         settle=settle,
         check_depth=check_depth,
-        friction_of=friction_of,
+        faces_of=faces_of,
+        vecs=vecs,
         at_point=at_point,
         from_points=from_points,
         present=present,

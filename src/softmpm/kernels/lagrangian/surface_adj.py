@@ -14,12 +14,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.nodes import nodes
+from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.lagrangian.surface import surface, surface_type
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.physics.wall_face import wall_face, wall_face_adj
+from softmpm.kernels.physics.wall_face import wall_face_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
@@ -34,11 +34,11 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         len(spec.surface_walls),
     )
     touch, touch_adj, number = block.touch, block.touch_adj, one.number
-    face, face_adj = wall_face(spec).face, wall_face_adj(spec, wanted)
-    friction_of, present = one.friction_of, one.present
+    faces_of, face_adj, present = one.faces_of, wall_face_adj(spec, wanted), one.present
     at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
     exact_vec, mirrored = types(dim, "float64").vec, bool(spec.mirrors)
-    arms, place, before_wall = r.count, nodes(spec).place, wp.types.matrix((count, dim), real)
+    place, vecs, back = nodes(spec).place, one.vecs, nodes_adj(spec, wanted)
+    gather, moved_adj = back.gather, back.moved_adj
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -48,36 +48,66 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         inputs: GridInputs,
         inside: Rest,
         mass: wp.array2d(dtype=real),
+        held: int,  # accumulators of one world
         # In:
         shift: wp.array(dtype=exact_vec),
         u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
         p: wp.array2d(dtype=vec),
         new_v: wp.array2d(dtype=vec),
-        adj_u: wp.array2d(dtype=vec),
+        pending: bool,  # whether the partial sums of the substep after are still to be added
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
         # In and out:
+        adj_u: wp.array2d(dtype=vec),
         adj_v: wp.array2d(dtype=vec),
         # Out, with clamps in:
         free: wp.array2d(dtype=vec),
         # Out:
         shared: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
         # Out, added into:
         adj_mass: wp.array2d(dtype=real),
+        adj_inputs: GridInputsAdj,
     ):
-        """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m."""
+        """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m. Nodes that no surface points act on are done here."""
         world, i = wp.tid()
-        m = mass[world, i]
-        x = place(constants, inside, i, shift[world], u[world, i])
-        v = node_velocity(constants, inputs, world, x, p[world, i], m)
-        if wp.static(mirrored):
-            v = free[world, i]  # reflected already
+        if pending:
+            gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
         adj = adj_v[world, i] + constants.dt * adj_u[world, i]
-        free[world, i] = v
-        adj_v[world, i] = adj
-        each = vec()
-        if m > real(0.0):
-            each = adj / m
-        shared[world, i] = each
-        adj_mass[world, i] = adj_mass[world, i] - wp.dot(new_v[world, i] - v, each)
+        if inside.touched[i] == 1:
+            m = mass[world, i]
+            x = place(constants, inside, i, shift[world], u[world, i])
+            free_v = node_velocity(constants, inputs, world, x, p[world, i], m)
+            if wp.static(mirrored):
+                free_v = free[world, i]  # reflected already
+            free[world, i] = free_v
+            adj_v[world, i] = adj
+            each = vec()
+            if m > real(0.0):
+                each = adj / m
+            shared[world, i] = each
+            adj_mass[world, i] = adj_mass[world, i] - wp.dot(new_v[world, i] - free_v, each)
+        else:
+            moved_adj(
+                constants,
+                inputs,
+                inside,
+                mass,
+                held,
+                shift,
+                u,
+                v,
+                p,
+                world,
+                i,
+                adj,
+                adj_u,
+                adj_v,
+                adj_f,
+                adj_mass,
+                adj_inputs,
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def press_adj(
@@ -110,26 +140,33 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         x = present(body, p, at_point(body, u, world, p))
         v = at_point(body, free, world, p)
         dv = D[world, p]
-        reached = before_wall()
+        stiffness = body.stiffness[p]
+        per_force = rate[0] * body.newtons[p]
+        wall = faces_of(constants, inputs, anchor, world, p, x + shift[world])
+        before = vecs()
+        adj_after = vecs()
+        pushed = vecs()
         for q in range(count):
-            for axis in range(dim):
-                reached[q, axis] = v[axis]
-            k = number[q]
-            wall = face(constants, inputs, world, k, x + shift[world], anchor[world, q, p])
+            before[q] = anchor[world, q, p]
+            adj_after[q] = adj_anchor[world, q, p]
+            pushed[q] = adj_force[world, q, p]
+        adj_J = body.areas[p] * at_point(body, shared, world, p)
+        reached = vecs()
+        for q in range(count):
+            reached[q] = v
             found = touch(
-                wall.n,
-                wall.y,
+                wall.n[q],
+                wall.y[q],
                 vec(x),
                 v,
-                wall.anchor,
+                wall.anchor[q],
                 dv,
-                friction_of(inputs, world, k),
-                body.stiffness[p],
+                wall.friction[q],
+                stiffness,
                 constants.dt,
                 smoothing,
             )
             v += dv * found.J
-        adj_J = body.areas[p] * at_point(body, shared, world, p)
         back_x = vec()
         back_v = vec()
         total_D = real(0.0)
@@ -138,29 +175,26 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         for back in range(count):
             q = count - 1 - back
             k = number[q]
-            here = vec()
-            for axis in range(dim):
-                here[axis] = reached[q, axis]
-            wall = face(constants, inputs, world, k, x + shift[world], anchor[world, q, p])
+            here = reached[q]
             adj = touch_adj(
-                wall.n,
-                wall.y,
+                wall.n[q],
+                wall.y[q],
                 vec(x),
                 here,
-                wall.anchor,
+                wall.anchor[q],
                 dv,
-                friction_of(inputs, world, k),
-                body.stiffness[p],
+                wall.friction[q],
+                stiffness,
                 constants.dt,
                 smoothing,
-                adj_J + dv * back_v + (rate[0] * body.newtons[p]) * adj_force[world, q, p],
-                adj_anchor[world, q, p],
+                adj_J + dv * back_v + per_force * pushed[q],
+                adj_after[q],
             )
             total_D += wp.dot(after - here, back_v) / dv + adj.D
             back_v += adj.v
             back_x += adj.x
             adj_anchor[world, q, p] = face_adj(
-                constants, inputs, world, k, anchor[world, q, p], adj.n, adj.y, adj.anchor, i, adj_inputs
+                constants, inputs, world, k, before[q], adj.n, adj.y, adj.anchor, i, adj_inputs
             )
             if anew == 1:  # the mean before is dropped
                 adj_force[world, q, p] = vec()
@@ -174,18 +208,59 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def spread_adj(
         # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        inside: Rest,
         body: Surface,
+        mass: wp.array2d(dtype=real),
+        held: int,  # accumulators of one world
+        step: int,  # threads of a node
         # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        p: wp.array2d(dtype=vec),
         adj_x: wp.array2d(dtype=vec),
         adj_free: wp.array2d(dtype=vec),
-        # Out, added into:
+        # In and out:
         adj_u: wp.array2d(dtype=vec),
         adj_v: wp.array2d(dtype=vec),
+        # Out:
+        adj_f: wp.array2d(dtype=vec),
+        # Out, added into:
+        adj_mass: wp.array2d(dtype=real),
+        adj_inputs: GridInputsAdj,
     ):
-        """(K2.adj)"""
-        world, i = wp.tid()
-        adj_u[world, i] = adj_u[world, i] + from_points(body, adj_x, world, i)
-        adj_v[world, i] = adj_v[world, i] + from_points(body, adj_free, world, i)
+        """(K2.adj), then (Q3.adj), at the nodes that surface points act on; with clamps their adjoint comes between."""
+        world, n, lane = wp.tid()
+        i = body.nodes[n]
+        more_u = from_points(body, adj_x, world, n, lane, step)
+        more_v = from_points(body, adj_free, world, n, lane, step)
+        if lane == 0:
+            adj_u[world, i] = adj_u[world, i] + more_u
+            adj_new = adj_v[world, i] + more_v
+            if wp.static(mirrored):
+                adj_v[world, i] = adj_new
+            else:
+                moved_adj(
+                    constants,
+                    inputs,
+                    inside,
+                    mass,
+                    held,
+                    shift,
+                    u,
+                    v,
+                    p,
+                    world,
+                    i,
+                    adj_new,
+                    adj_u,
+                    adj_v,
+                    adj_f,
+                    adj_mass,
+                    adj_inputs,
+                )
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus_adj(
@@ -195,13 +270,12 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_mass: wp.array2d(dtype=real),
     ):
         """(K1.adj)"""
-        world, i = wp.tid()
+        world, n = wp.tid()
+        i = body.nodes[n]
         total = real(0.0)
-        for m in range(body.first[i], body.first[i + 1]):
-            entry = body.members[m]
-            p = entry / arms
-            total += wp.abs(body.weights[p, entry - p * arms]) * adj_D[world, p]
-        if body.first[i + 1] > body.first[i]:
+        for m in range(body.first[n], body.first[n + 1]):
+            total += wp.abs(body.shares[m]) * adj_D[world, body.members[m]]
+        if body.first[n + 1] > body.first[n]:
             square = mass[world, i] * mass[world, i]
             adj_mass[world, i] = adj_mass[world, i] - total * body.loads[i] / square
 

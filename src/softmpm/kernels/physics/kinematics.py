@@ -30,6 +30,12 @@ def kinematics(dim: int, dtype: str) -> SimpleNamespace:
         def volume_change(H: mat) -> real:
             """j = det(I + H) − 1."""
             return H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+
+        @wp.func
+        def inverse_transpose(H: mat) -> mat:
+            """F⁻ᵀ."""
+            scale = real(1.0) / (real(1.0) + volume_change(H))
+            return scale * (cofactor(H) + identity())
     else:
 
         @wp.func
@@ -47,10 +53,26 @@ def kinematics(dim: int, dtype: str) -> SimpleNamespace:
             G = cofactor(H)
             return wp.trace(H) + wp.trace(G) + (H[0, 0] * G[0, 0] + H[0, 1] * G[0, 1] + H[0, 2] * G[0, 2])
 
+        @wp.func
+        def inverse_transpose(H: mat) -> mat:
+            """F⁻ᵀ, with cof F = (1 + tr H) I − Hᵀ + cof H."""
+            scale = real(1.0) / (real(1.0) + volume_change(H))
+            C = cofactor(H) - wp.transpose(H)
+            t = real(1.0) + wp.trace(H)
+            for i in range(3):
+                C[i, i] = C[i, i] + t
+            return scale * C
+
     @wp.func
     def log1p(j: real) -> real:
         """log(1 + j) to the last digit also for small j (Kahan)."""
         u = real(1.0) + j
         return wp.where(u == real(1.0), j, wp.log(u) * divide(j, u - real(1.0)))
 
-    return SimpleNamespace(identity=identity, cofactor=cofactor, volume_change=volume_change, log1p=log1p)
+    return SimpleNamespace(
+        identity=identity,
+        cofactor=cofactor,
+        volume_change=volume_change,
+        inverse_transpose=inverse_transpose,
+        log1p=log1p,
+    )

@@ -23,6 +23,10 @@ def rest_struct(model: Model) -> Any:
         struct.nodes, struct.fraction = view(grid.nodes, t.ivec), view(grid.fraction, t.vec)
         for name in ("shares", "window", "rows", "places", "corners", "order"):
             setattr(struct, name, view(getattr(grid, name), wp.int32))
+        touched = torch.zeros(grid.count, dtype=torch.int32, device=model.device)
+        if model.surface is not None:
+            touched[model.surface.nodes.long()] = 1
+        struct.touched = view(touched, wp.int32)
         return struct
 
     return model.workspace.get(rest_struct, make)

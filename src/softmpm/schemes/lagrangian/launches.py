@@ -71,7 +71,7 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     sums = buffers.mass_array, buffers.partial_array, buffers.words_array
     shift, new_shift = buffers.shift_arrays[now], buffers.shift_arrays[then]
     parameters = (model.constants, inputs, buffers.rest, buffers.frame)
-    arguments = (*parameters, *sums, shift, *state, p, new_shift, new[0], velocity)
+    arguments = (*parameters, *sums, shift, *state, p, velocity, new_shift, *new)
     node_launch(model, launch, nodes(model.spec).advance, *arguments)
     if buffers.reflection is not None:
         buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
@@ -102,18 +102,25 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     model, row = forward.model, forward.chunk.row(s)
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(row)
-    u, v, p = forward.u_arrays[s], forward.v_arrays[s], forward.p_arrays[s]
-    stored, out = (u, p, forward.v_arrays[s + 1]), (shared.u_array, shared.v_array)
-    if adjoint.reflection is not None:
-        adjoint.reflection.begin(launch, inputs, forward.rest, *stored, *out)
+    stored, new_v = (forward.u_arrays[s], forward.v_arrays[s], forward.p_arrays[s]), forward.v_arrays[s + 1]
+    shift, out, sums = (
+        forward.shift_arrays[s],
+        (shared.u_array, shared.v_array),
+        (shared.f_array, shared.mass_array),
+    )
+    last, reflection = s == forward.chunk.length - 1, adjoint.reflection
+    pending = (not last and reflection is None, shared.partial_arrays[0], shared.partial_arrays[1])
+    if reflection is not None:
+        reflection.begin(launch, inputs, forward.rest, stored[0], stored[2], new_v, *out)
     if adjoint.contact is not None:
-        adjoint.contact.advance(launch, s, inputs, adj_inputs, forward.rest, *stored, *out)
-    if adjoint.reflection is not None:
-        adjoint.reflection.finish(launch, *out)
-    parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held)
-    out = (*out, shared.f_array, shared.mass_array, adj_inputs)
-    kernel = nodes_adj(model.spec, shared.wanted).advance_adj
-    node_launch(model, launch, kernel, *parameters, forward.shift_arrays[s], u, v, p, *out)
+        given = inputs, adj_inputs, forward.rest, stored, new_v, pending
+        adjoint.contact.advance(launch, s, *given, *out, shared.f_array)
+    if reflection is not None:
+        reflection.finish(launch, *out)
+    if adjoint.contact is None or reflection is not None:
+        parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held, shift)
+        kernel = nodes_adj(model.spec, shared.wanted).advance_adj
+        node_launch(model, launch, kernel, *parameters, *stored, *pending, *out, *sums, adj_inputs)
 
 
 def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
@@ -139,5 +146,6 @@ def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     else:
         kernel = cells_adj(model.spec, shared.wanted, bricks).forces_adj
         brick_launch(model, launch, kernel, *parameters, *arguments)
-    kernel = nodes_adj(model.spec, shared.wanted).gather_adj
-    node_launch(model, launch, kernel, forward.rest, *shared.partial_arrays, shared.u_array, shared.v_array)
+    if s == 0 or adjoint.reflection is not None:  # else the substep before adds the sums
+        kernel, out = nodes_adj(model.spec, shared.wanted).gather_adj, (shared.u_array, shared.v_array)
+        node_launch(model, launch, kernel, forward.rest, *shared.partial_arrays, *out)

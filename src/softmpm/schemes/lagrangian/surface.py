@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.lagrangian.surface import surface, surface_type
+from softmpm.kernels.lagrangian.surface import LANES, surface, surface_type
 from softmpm.kernels.lagrangian.surface_adj import surface_adj
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
@@ -23,12 +23,12 @@ def surface_struct(model: Model):
     assert points is not None
     struct = surface_type(model.spec.dim, model.spec.dtype)()
     struct.points = view(points.points, types(model.spec.dim, "float64").vec)
-    for name in ("areas", "loads", "weights"):
+    for name in ("areas", "loads", "weights", "shares"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
     struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)
     struct.deepest = view(deepest(model).to(model.dtype), t.real)
-    for name in ("stencil", "first", "members"):
+    for name in ("stencil", "nodes", "first", "members"):
         setattr(struct, name, view(getattr(points, name), wp.int32))
     return struct
 
@@ -62,6 +62,9 @@ class SurfaceContact:
         self.shifts = [view(one, exact) for one in shifts]
         self.rate = torch.empty(1, dtype=model.dtype, device=model.device)
         self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
+        assert model.surface is not None
+        self.lanes = LANES if model.device.type == "cuda" else 1
+        self.touched = (model.worlds, len(model.surface.nodes), self.lanes)
         self._vec, self._real = (
             getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
         )
@@ -113,8 +116,16 @@ class SurfaceContact:
             anchors[1],
         )
         launch(kernels.press, self.points, *parameters, *arguments)
-        parameters = (model.constants, self._struct, self._frame, self._mass, self._impulse, words)
-        launch(kernels.settle, self.nodes, *parameters, u, v, self.free, new_u, new_v)
+        parameters = (
+            model.constants,
+            self._struct,
+            self._frame,
+            self._mass,
+            self.lanes,
+            self._impulse,
+            words,
+        )
+        launch(kernels.settle, self.touched, *parameters, u, v, self.free, new_u, new_v)
 
     def check_end(
         self, launch: Callable[..., None], inputs: Any, s: int, end: int, u: wp.array, words: wp.array
@@ -172,27 +183,50 @@ class SurfaceContactAdj:
         inputs: Any,
         adj_inputs: Any,
         rest: Any,
-        u: wp.array,
-        p: wp.array,
+        stored: tuple[wp.array, ...],
         new_v: wp.array,
+        pending: tuple[bool, wp.array, wp.array],
         adj_u: wp.array,
         adj_v: wp.array,
+        adj_f: wp.array,
     ) -> None:
-        """Adjoint of substep ``s``, from that of the new state to that of the velocity without contact, in ``adj_v``."""
+        """Adjoint of substep ``s``, from that of the new state to those of the forces and of the state before; with clamps to that
+        of the velocity without contact, in ``adj_v``.
+
+        Args:
+            stored: Displacements, velocities and momenta of the nodes.
+            pending: See :mod:`softmpm.kernels.lagrangian.nodes`.
+        """
         one, shift = self.forward, self.forward.shifts[s]
-        constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
-        arguments = (shift, u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
-        launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, one._mass, *arguments)
+        constants, adj_points, out = (
+            one.model.constants,
+            (self._adj_x, self._adj_free),
+            (self._adj_mass, adj_inputs),
+        )
+        parameters = (constants, inputs, rest, one._mass, self.held, shift, *stored, new_v, *pending)
+        launch(
+            self._kernels.settle_adj,
+            one.nodes,
+            *parameters,
+            adj_u,
+            adj_v,
+            one.free,
+            self._shared,
+            adj_f,
+            *out,
+        )
         about = (self.held, one.rate_array, one.anew(s))
         parameters = (constants, inputs, one._struct, one._width, one._D, *about)
         anchors = view(one.anchors[s], one._vec)
-        arguments = (shift, u, one.free, anchors, self._shared, self._adj_force, self._adj_anchor)
-        out = (*adj_points, self._adj_D, adj_inputs)
-        launch(self._kernels.press_adj, one.points, *parameters, *arguments, *out)
-        launch(self._kernels.spread_adj, one.nodes, one._struct, *adj_points, adj_u, adj_v)
+        arguments = (shift, stored[0], one.free, anchors, self._shared, self._adj_force, self._adj_anchor)
+        launch(
+            self._kernels.press_adj, one.points, *parameters, *arguments, *adj_points, self._adj_D, adj_inputs
+        )
+        parameters = (constants, inputs, rest, one._struct, one._mass, self.held, one.lanes, shift, *stored)
+        launch(self._kernels.spread_adj, one.touched, *parameters, *adj_points, adj_u, adj_v, adj_f, *out)
 
     def finish(self, launch: Callable[..., None]) -> None:
         """Add what the mobility D of all substeps gives to the masses."""
         one = self.forward
         arguments = (one._struct, one._mass, self._adj_D, self._adj_mass)
-        launch(self._kernels.delassus_adj, one.nodes, *arguments)
+        launch(self._kernels.delassus_adj, one.touched[:2], *arguments)
