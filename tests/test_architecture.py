@@ -30,7 +30,7 @@ LAYERS = """
     schemes.registry
     kernel_inputs
     building runner rasterization cuda_graph
-    rollout forces
+    rollout forces warp_nodal
     autograd warp_arrays
     warp_api __main__
 """
