@@ -87,6 +87,10 @@ class SurfaceGrid:
         self.members = tensor(members[order], np.int32)
         self.first = tensor(np.searchsorted(owners[order], np.arange(len(index) + 1)), np.int32)
 
+    def carried(self, nodes: Tensor) -> Tensor:
+        """True for points with a weight on any of these nodes, shape (point,), from shape (node,)."""
+        return (nodes[self.stencil.long()] & (self.weights != 0)).any(1)
+
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""
         near = u[:, self.stencil.long()]

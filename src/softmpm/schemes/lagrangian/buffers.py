@@ -171,7 +171,7 @@ class ChunkAdjoint:
             self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
             given = shared.wanted, shared.held, shared.anchor, shared.force, shared.mass_array
-            self.contact = SurfaceContactAdj(forward.contact, *given)
+            self.contact = SurfaceContactAdj(forward.contact, *given, forward.words_array)
 
     def load(self, adj_end: Nodal) -> None:
         """Copy the adjoint of the final state into the buffers, and clear all sums."""

@@ -6,6 +6,7 @@ from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.projection import masses
 from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node_launch
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
+from softmpm.schemes.lagrangian.driven import drive, drive_adj
 from softmpm.schemes.lagrangian.nodal import launch_masses
 from softmpm.schemes.launch import KernelLauncher
 
@@ -75,10 +76,12 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     node_launch(model, launch, nodes(model.spec).advance, *arguments)
     if buffers.reflection is not None:
         buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
+    drive(model, launch, inputs, buffers.words_array, state[0], new[0], velocity)
     if contact is not None:
         contact.advance(launch, s, inputs, buffers.words_array, now, then, *state, *new)
         if buffers.reflection is not None:
             buffers.reflection.advance(launch, buffers.words_array, state[0], new[1], new[0])
+        drive(model, launch, inputs, buffers.words_array, state[0], *new)
 
 
 def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
@@ -104,10 +107,12 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(row)
     u, v, p = forward.u_arrays[s], forward.v_arrays[s], forward.p_arrays[s]
     stored, out = (u, p, forward.v_arrays[s + 1]), (shared.u_array, shared.v_array)
+    drive_adj(model, launch, shared.wanted, model.scene.dt, *out, adj_inputs)
     if adjoint.reflection is not None:
         adjoint.reflection.begin(launch, inputs, forward.rest, *stored, *out)
     if adjoint.contact is not None:
         adjoint.contact.advance(launch, s, inputs, adj_inputs, forward.rest, *stored, *out)
+        drive_adj(model, launch, shared.wanted, 0.0, *out, adj_inputs)
     if adjoint.reflection is not None:
         adjoint.reflection.finish(launch, *out)
     parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held)

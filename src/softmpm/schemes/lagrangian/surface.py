@@ -13,6 +13,7 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.lagrangian.driven import drive
 from softmpm.schemes.lagrangian.frame import frame_struct
 from softmpm.schemes.penetration import deepest
 
@@ -23,11 +24,16 @@ def surface_struct(model: Model):
     assert points is not None
     struct = surface_type(model.spec.dim, model.spec.dtype)()
     struct.points = view(points.points, types(model.spec.dim, "float64").vec)
-    for name in ("areas", "loads", "weights"):
+    areas, limit = points.areas, deepest(model)
+    if model.driven_grid is not None:  # points of driven nodes only get no force, whatever their depth
+        free = points.carried(~model.driven_grid.held)
+        areas, limit = areas * free, torch.where(free, limit, torch.inf)
+    struct.areas = view(areas.to(model.dtype), t.real)
+    for name in ("loads", "weights"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
-    struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)
-    struct.deepest = view(deepest(model).to(model.dtype), t.real)
+    struct.newtons = view(areas.to(model.dtype) * model.mass_unit, t.real)
+    struct.deepest = view(limit.to(model.dtype), t.real)
     for name in ("stencil", "first", "members"):
         setattr(struct, name, view(getattr(points, name), wp.int32))
     return struct
@@ -141,6 +147,7 @@ class SurfaceContactAdj:
         held: Accumulators of one world in the structs of the inputs' adjoints.
         adj_anchor, adj_force: Adjoints of the anchors and of the mean forces, updated in place.
         adj_mass: Adjoint of the masses of the nodes, added into.
+        words: Status words, all of them of worlds that run.
     """
 
     def __init__(
@@ -151,11 +158,13 @@ class SurfaceContactAdj:
         adj_anchor: Tensor,
         adj_force: Tensor,
         adj_mass: wp.array,
+        words: wp.array,
     ):
         self.forward, self.held, self._adj_mass = forward, held, adj_mass
         self._kernels = surface_adj(forward.model.spec, wanted)
         self._adj_anchor, self._adj_force = view(adj_anchor, forward._vec), view(adj_force, forward._vec)
-        self._shared = forward._vectors(forward.nodes)
+        self._shared, self._words = forward._vectors(forward.nodes), words
+        self._scratch = forward._vectors(forward.nodes) if forward.model.driven_grid else self._shared
         self._adj_x, self._adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
         model = forward.model
         self._total_D = torch.empty(forward.points, dtype=model.dtype, device=model.device)
@@ -183,6 +192,7 @@ class SurfaceContactAdj:
         constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
         arguments = (shift, u, p, new_v, adj_u, adj_v, one.free, self._shared, self._adj_mass)
         launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, one._mass, *arguments)
+        drive(one.model, launch, inputs, self._words, u, self._scratch, one.free)
         about = (self.held, one.rate_array, one.anew(s))
         parameters = (constants, inputs, one._struct, one._width, one._D, *about)
         anchors = view(one.anchors[s], one._vec)
