@@ -80,8 +80,8 @@ class DrivenGrid:
         both = 0 if mirror is None else int((mirror.group[self.nodes.long()] >= 0).sum())
         need(
             both == 0,
-            f"driven particles must be two cells or more from clamps and planes of symmetry, but {both} nodes are held or reflected by "
-            "both; drive other particles, or take a wall of the kind 'stick' or 'slip'.",
+            f"driven particles must be three cells or more from clamps and planes of symmetry, but {both} nodes belong to both; drive "
+            "other particles, or take a wall of the kind 'stick' or 'slip'.",
         )
 
 
