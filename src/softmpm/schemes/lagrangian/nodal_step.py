@@ -25,6 +25,8 @@ ONE = Chunk(0, 1, 1)
 class NodalStep:
     """A chunk of one substep, on buffers of its own that are made when first used.
 
+    Inputs are given in new tensors each time: the buffers do not copy a tensor again, whatever Warp has written into its memory.
+
     Attributes:
         words: Status words of all steps so far, see errors.py; shape (world,).
         last: Number of the substep that was launched last.
@@ -75,8 +77,7 @@ class NodalStep:
         """The graph after its run from ``now``, with all intermediate states."""
         if self._graph is None:
             self._graph = ChunkGraph(self.model, ONE, keep=True)
-        fresh = {name: value.detach() for name, value in values.items()}  # Warp may have written into them
-        self._graph.buffers.load(self.stream, ONE, now, fresh, ())
+        self._graph.buffers.load(self.stream, ONE, now, values, ())
         if failed is not None:
             self._graph.buffers.words.masked_fill_(failed, FROZEN)
         self._graph.run(self.stream)
