@@ -46,7 +46,7 @@ def step(
     Raises:
         TypeError, ValueError: A state or ``solid`` is of another model or has other arrays; the two states are the same; a tape is
             given and an array carries no gradient.
-        RuntimeError: The model is deterministic, and a CUDA graph is being captured.
+        RuntimeError: A CUDA graph is being captured, and the model is deterministic or of the reference formulation.
     """
     check_own(model, "step", solid=solid, state_in=state_in, state_out=state_out)
     if state_in.v.ptr == state_out.v.ptr:

@@ -10,6 +10,7 @@ from surface_scenes import block, build
 
 import softmpm
 from softmpm.kernels.structs import types
+from softmpm.schemes.lagrangian import nodal_step
 from softmpm.schemes.lagrangian.nodal import particles_of
 
 STEPS = 4
@@ -116,8 +117,10 @@ def test_a_failure_names_its_substep():
     assert torch.equal(states[0].nodal().u[1], stopped.u[1])
 
 
-def test_states_of_the_other_formulation_are_refused():
-    """With what makes the right one, and a step that needs two states."""
+def test_what_a_step_cannot_do_is_refused(monkeypatch):
+    """States of the other formulation, one state twice, arrays of another shape, and a capture: its replays would write into memory
+    that others use by then.
+    """
     moving = softmpm.build(block(2), device="cpu")
     model = build(block(2))
     solid, state = softmpm.warp_solid(model), softmpm.warp_state(model)
@@ -127,5 +130,8 @@ def test_states_of_the_other_formulation_are_refused():
         softmpm.torch_state(moving, state)
     with pytest.raises(ValueError, match="two different states"):
         softmpm.step(model, state, state, solid)
+    monkeypatch.setattr(nodal_step, "is_capturing", lambda model: True)
+    with pytest.raises(RuntimeError, match="cannot be captured in a CUDA graph"):
+        softmpm.step(model, state, softmpm.warp_state(model), solid)
     with pytest.raises(ValueError, match=r"u must be .* got \(1, 4, 2\) of float32"):
         dataclasses.replace(state, u=state.v[:, :4])

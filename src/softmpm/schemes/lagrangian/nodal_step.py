@@ -10,6 +10,7 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import view
+from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import InputsAdj, Values, particle_struct
 from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
@@ -77,6 +78,11 @@ class NodalStep:
 
     def _launch(self, now: Nodal, values: Values, failed: Tensor | None = None) -> ChunkGraph:
         """The graph after its run from ``now``, with all intermediate states."""
+        if is_capturing(self.model):
+            raise RuntimeError(
+                "softmpm.step in the reference formulation cannot be captured in a CUDA graph; capture softmpm.simulate with "
+                "softmpm.Graph."
+            )
         if self._graph is None:
             self._graph = ChunkGraph(self.model, ONE, keep=True)
         self._graph.buffers.load(self.stream, ONE, now, values, ())
