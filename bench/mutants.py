@@ -34,6 +34,7 @@ TESTS = (
     "tests/softmpm/test_surface_walls.py",
     "tests/softmpm/test_lagrangian.py",
     "tests/softmpm/test_mirror.py",
+    "tests/softmpm/test_driven.py",
     "tests/softmpm/test_rollout.py",
     "tests/softmpm/test_autograd.py",
     "tests/softmpm/test_warp_api.py",

@@ -18,11 +18,12 @@ LAYERS = """
     checks
     reference_stress reference_walls
     reference reference_step kernels.physics
-    reference_contact
+    reference_contact reference_driven
     stability kernels.convert reference_lagrangian
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     rest_grid
     surface_grid mirror_grid
+    driven_grid
     describe
     model
     schemes
@@ -30,7 +31,7 @@ LAYERS = """
     schemes.registry
     kernel_inputs
     building runner rasterization cuda_graph
-    rollout forces
+    rollout forces warp_nodal
     autograd warp_arrays
     warp_api __main__
 """
@@ -113,7 +114,14 @@ def test_one_module_per_outside_world():
         roots = {imported.split(".")[0] for imported in imports(path)}
         for library, allowed in OUTSIDE.items():
             assert library not in roots or name in allowed, f"{name} imports {library}"
-        own = ("autograd", "schemes.lagrangian.nodal", "reference", "reference_step", "reference_stress")
+        own = (
+            "autograd",
+            "schemes.lagrangian.nodal",
+            "schemes.lagrangian.driven",
+            "reference",
+            "reference_step",
+            "reference_stress",
+        )
         if name not in own:
             assert "torch.autograd" not in path.read_text(), name
 

@@ -27,6 +27,7 @@ from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State
 from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
+from softmpm.warp_nodal import WarpNodal
 
 __version__ = "0.1.0"
 
@@ -61,6 +62,7 @@ __all__ = [
     "State",
     "UnstableError",
     "Wall",
+    "WarpNodal",
     "WarpSolid",
     "WarpState",
     "ball",

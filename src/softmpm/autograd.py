@@ -16,8 +16,6 @@ from softmpm.checks import (
     check_horizon,
     check_inputs,
     check_inputs_bounds,
-    check_reflected,
-    check_shown,
     check_state,
     control_steps,
 )
@@ -31,8 +29,7 @@ from softmpm.rasterization import rasterize_nodes, rasterize_nodes_adj
 from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
-from softmpm.schemes.lagrangian.frame import shift_of
-from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
+from softmpm.schemes.lagrangian.nodal import particles_of, start_of
 from softmpm.state import GridField, Low, Nodal, Params, State
 
 _SECOND = (
@@ -108,15 +105,8 @@ def _simulate(
     values = derive(model, start, activation, params, given, horizon)
     if model.formulation == "moving":
         return _run(model, horizon, start, values, failures)
-    if start.nodes is not None and not is_capturing(model):
-        check_shown(start, particles_of(model, start.nodes.detach()))
-        if model.mirror is not None:
-            check_reflected(model.mirror.apart(start.nodes.u.detach(), start.nodes.v.detach()))
-    nodes = start.nodes
-    if nodes is None:
-        normals = values["normal"][0] if model.spec.moving else None  # at the beginning of the call
-        nodes = nodes_of(model, start, values["mass"], normals)
-    nodes = nodes._replace(shift=shift_of(model, nodes).detach())
+    normals = values["normal"][0] if model.spec.moving else None  # at the beginning of the call
+    nodes = start_of(model, start, values["mass"], normals)
     return particles_of(model, _run(model, horizon, nodes, values, failures))
 
 

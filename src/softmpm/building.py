@@ -204,10 +204,6 @@ def check_reference(scene: Scene, scheme: str) -> None:
     """Raise ValueError for what the reference formulation cannot do."""
     if scheme != "auto":
         raise ValueError(f"formulation='reference' has one scheme, got scheme={scheme!r}; leave scheme out.")
-    if len(scene.driven):
-        raise ValueError(
-            "formulation='reference' has no driven particles, but the scene does; take formulation='moving'."
-        )
 
 
 def check_given(scene: Scene, inputs: Iterable[str]) -> tuple[str, ...]:

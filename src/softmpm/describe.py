@@ -24,7 +24,7 @@ def describe(model, substeps: int) -> str:
         f"{model.particle_count} particles on {' x '.join(map(str, model.scene.grid.shape))} nodes",
         f"  laws       {', '.join(spec.laws)}{'' if len(spec.laws) > 1 else '; others left out'}",
         f"  muscles    {muscles if spec.muscle_slots else 'left out'}",
-        f"  driven     {f'{model.driven_count} particles' if spec.driven else 'left out'}",
+        f"  driven     {_driven(model)}",
         f"  walls      {contacts or 'left out'}",
         f"  contact    {_contact(model)}",
         f"  friction   {has(spec.friction)}",
@@ -41,6 +41,13 @@ def describe(model, substeps: int) -> str:
         f"  memory     {_memory(model, substeps)}",
     ]
     return "\n".join(lines)
+
+
+def _driven(model) -> str:
+    if not model.driven_count:
+        return "left out"
+    nodes = "" if model.driven_grid is None else f", which hold {model.driven_grid.count} nodes"
+    return f"{model.driven_count} particles{nodes}"
 
 
 def _contact(model) -> str:

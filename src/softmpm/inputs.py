@@ -113,7 +113,7 @@ QUANTITIES = {
     "velocity": Quantity(
         axes=("control_step", "world", "driven", "dim"),
         default=lambda scene: [0.0] * scene.grid.dim,
-        needed=lambda spec: spec.driven,
+        needed=lambda spec: spec.driven or spec.driven_nodes,
     ),
     "position": Quantity(axes=("control_step", "world", "driven", "dim")),
     "force": Quantity(
@@ -133,7 +133,7 @@ class Input:
     """Input of the kernels: its count and type, the scenes that have it, and the group of gradients that it belongs to."""
 
     name: str
-    per: Literal["particle", "slot", "muscle", "driven", "world", "wall", "substep"]
+    per: Literal["particle", "slot", "muscle", "driven", "driven_node", "world", "wall", "substep"]
     kind: Literal["scalar", "vector", "index"] = "scalar"
     present: Callable[[Any], bool] = lambda spec: True
     """True if the kernels of a :class:`softmpm.kernels.structs.Spec` take it."""
@@ -215,6 +215,15 @@ INPUTS = (
         group="velocity",
         rows=True,
         stage="g2p",
+    ),
+    Input(  # of the nodes that driven particles hold in the reference formulation [m/s]
+        name="driven_velocity",
+        per="driven_node",
+        kind="vector",
+        present=lambda spec: spec.driven_nodes,
+        group="velocity",
+        rows=True,
+        stage="grid",
     ),
     Input(  # g [m/s²]
         name="gravity",

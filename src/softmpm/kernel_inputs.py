@@ -8,6 +8,7 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
+from softmpm.schemes.lagrangian.driven import of_nodes
 from softmpm.state import Params, State
 
 
@@ -56,6 +57,8 @@ def derive(
             found["surface_velocity"] = value
         elif name not in ("strength", "wall_offset", "wall_normal"):
             found[name] = value
+    if model.driven_grid is not None:
+        found["driven_velocity"] = of_nodes(model, found["velocity"])
     if model.spec.moving:
         found |= _poses(model, full["wall_offset"], full["wall_normal"], horizon)
     return {name: found[name] for name in model.derived}

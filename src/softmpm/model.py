@@ -14,6 +14,7 @@ from torch import Tensor
 
 from softmpm.alarms import Alarms
 from softmpm.describe import describe
+from softmpm.driven_grid import DrivenGrid
 from softmpm.inputs import QUANTITIES, direction_of, stored
 from softmpm.kernels import physics
 from softmpm.kernels.structs import Spec, types
@@ -55,6 +56,7 @@ class Model:
         deterministic: Whether results are the same bits from run to run.
         formulation, formulation_reason: "moving" or "reference", and why it was chosen.
         surface: Surface points that meet the separating walls, or None if the nodes do.
+        driven_grid: Nodes that driven particles hold in the reference formulation, or None.
         mirror: Nodes that clamps and planes of symmetry hold or reflect, or None if the scene has neither.
         contact_width: Width over which surface contact sets in [cells].
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
@@ -105,8 +107,11 @@ class Model:
             self._rest_grid = RestGrid(scene, device, dtype, worlds, "force" in given)
         self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
         self.contact_width = contact_width
-        self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface)
+        self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface, formulation)
         self.mirror = MirrorGrid(scene, self.rest_grid, device) if self.spec.mirrors else None
+        self.driven_grid = (
+            DrivenGrid(scene, self.rest_grid, self.mirror, device) if self.spec.driven_nodes else None
+        )
         self.strength = self._tensor([m.strength for m in scene.muscles])
         self.stiffening = self._tensor(stiffening_signs(scene))
         # Computed now, not on first use: that may be during a capture, which runs nothing.
@@ -323,7 +328,13 @@ def kernel_of(part: object, package: str) -> str:
 
 
 def _spec(
-    scene: Scene, dtype: torch.dtype, slots: int, given: tuple[str, ...], fixed_point: bool, surface: bool
+    scene: Scene,
+    dtype: torch.dtype,
+    slots: int,
+    given: tuple[str, ...],
+    fixed_point: bool,
+    surface: bool,
+    formulation: str,
 ) -> Spec:
 
     def has(name: str) -> bool:
@@ -343,7 +354,8 @@ def _spec(
         actuators=tuple(sorted({kernel_of(muscle, ACTUATORS) for muscle in scene.muscles})),
         fibres=any(hasattr(muscle, "direction") for muscle in scene.muscles),
         viscosity=has("viscosity"),
-        driven=len(scene.driven) > 0,
+        driven=len(scene.driven) > 0 and formulation == "moving",
+        driven_nodes=len(scene.driven) > 0 and formulation == "reference",
         given=given,
         deterministic=fixed_point,
         surface=surface,

@@ -39,6 +39,8 @@ class Surface(NamedTuple):
     """Area of each point A [m²], in 2D [m] of unit depth, shape (point,)."""
     stiffness: Tensor
     """Tangential stiffness k = 4 (λ + 2μ) / dx of the body of each point [Pa/m], shape (point,). A constant."""
+    free: Tensor | float = 1.0
+    """0 for points that get no force because driven particles hold all of their nodes, else 1, shape (point,)."""
 
 
 def separating(scene: Scene) -> list[int]:
@@ -110,7 +112,7 @@ def contact(
         at_points = at_points + D * impulses[-1]
     if not impulses:
         return v, anchor, torch.zeros_like(anchor)
-    J = torch.stack(impulses, 1)
+    J = torch.stack(impulses, 1) * torch.as_tensor(surface.free, dtype=v.dtype)[..., None]
     share = (surface.w * surface.area[:, None])[..., None] * J.sum(1)[:, :, None]
     sums = torch.zeros_like(v).index_add(1, surface.node.flatten(), share.flatten(1, 2))
     return v + _per_mass(sums, mass[..., None]), torch.stack(anchors, 1), J

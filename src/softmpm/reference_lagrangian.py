@@ -10,6 +10,7 @@ deformations". Stress and walls are those of :mod:`softmpm.reference`, and so is
     v*_i = exp(−γ Δt) (v_i + Δt (f_i/m_i + g))                                       (Q3)
     v'_i = W(v*_i) by the walls at X_i + u_i,   u'_i = u_i + Δt v'_i                 (Q4)
     v'_i from Σ m_j s_j v'_j over the images of a node in clamps and symmetries      (B1)
+    v'_i = V_i on the nodes of driven particles                                      (Q10)
     x = X + Σ N u,   v = Σ N v,   C = L                                              (Q5)
     u_i = Σ m_p N_i [x_p − X_p + (F_p − I)(X_i − X_p)] / m_i
     v_i = Σ m_p N_i [v_p + C_p F_p (X_i − X_p)] / m_i                                (Q6)
@@ -33,6 +34,7 @@ from softmpm.reference import (
     stress,
 )
 from softmpm.reference_contact import Surface, contact, start_anchor
+from softmpm.reference_driven import fit, held
 from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
@@ -118,8 +120,11 @@ def step(
     smoothing: float = 0.0,
     time: float = 0.0,
     duration: float = 1.0,
+    drive: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, ...]:
     """One substep (Q1) to (Q4), with a surface also (K2) to (K6); ``mass`` of the nodes. Nodes without mass have the velocity zero.
+
+    ``drive`` are the nodes of driven particles and their velocities (Q10), shape (world, node, dim).
 
     Returns:
         u and v, with a surface also the anchors and the impulses per area J of :func:`softmpm.reference_contact.contact`.
@@ -128,13 +133,18 @@ def step(
     contacts = ("stick", "slip", "separate") if surface is None else ("stick", "slip")
     momentum = mass[..., None] * v + impulse
     v = grid_velocity(scene, mass, momentum, inputs, time, duration, displacement=u, contacts=contacts)
-    v = reflected(scene, mass, v)
+    v = driven(reflected(scene, mass, v), drive)
     if surface is None:
         return u + scene.dt * v, v
     anchor = start_anchor(scene, surface, u, inputs) if anchor is None else anchor
     v, *rest = contact(scene, surface, u, v, anchor, mass, inputs, smoothing, time, duration)
-    v = reflected(scene, mass, v)
+    v = driven(reflected(scene, mass, v), drive)
     return u + scene.dt * v, v, *rest
+
+
+def driven(v: Tensor, drive: tuple[Tensor, Tensor] | None) -> Tensor:
+    """(Q10)"""
+    return v if drive is None else v.index_copy(1, *drive)
 
 
 def reflected(scene: Scene, mass: Tensor, field: Tensor) -> Tensor:
@@ -188,7 +198,10 @@ def simulate(
         u and v after ``control_step * substeps * dt`` seconds, with a surface also the anchors and the mean force of each wall on each
         point in the last control step [N], shape (world, separating wall, point, dim).
     """
-    _need_no_driven(scene, inputs)
+    if inputs.position is not None:
+        raise NotImplementedError(
+            "the total Lagrangian reference takes velocities of driven particles, no positions."
+        )
     points = quadrature(scene)
     young, poisson, density = (value.expand(len(u), len(points.X)) for value in params)
     mu, lam = lame(young, poisson)
@@ -196,24 +209,26 @@ def simulate(
     steps, duration = control_steps(activation, inputs), substeps * scene.dt
     if surface is not None and anchor is None:
         anchor = start_anchor(scene, surface, u, of_control_step(inputs, 0, steps))
-    force = torch.zeros(0)
+    force, drive, spread = torch.zeros(0), None, torch.zeros(0)
+    if len(scene.driven):
+        nodes = held(scene, points.node, points.N)
+        spread = fit(scene, points.X, nodes)
+        if surface is not None:
+            free = ~torch.isin(surface.node, nodes) & (surface.w != 0)
+            surface = surface._replace(free=free.any(1).to(u.dtype))
     for c in range(steps):
         row, now = None if activation is None else activation[c], of_control_step(inputs, c, steps)
         force = torch.zeros_like(u if anchor is None else anchor)
+        if len(scene.driven):
+            V = torch.zeros(1, dtype=u.dtype) if now.velocity is None else now.velocity
+            drive = nodes, spread @ V.expand(len(u), len(scene.driven), u.shape[-1])
         for s in range(substeps):
-            about = (row, mu, lam, mass, now, surface, anchor, smoothing, s * scene.dt, duration)
+            about = (row, mu, lam, mass, now, surface, anchor, smoothing, s * scene.dt, duration, drive)
             u, v, *contacts = step(scene, points, u, v, *about)
             if surface is not None:
                 anchor, impulse = contacts
                 force = force + surface.area[:, None] * impulse / duration
     return (u, v) if anchor is None else (u, v, anchor, force)
-
-
-def _need_no_driven(scene: Scene, inputs: Inputs) -> None:
-    if len(scene.driven) or inputs.velocity is not None or inputs.position is not None:
-        raise NotImplementedError(
-            "the total Lagrangian reference has no driven particles; use a sticking wall."
-        )
 
 
 def evaluate(scene: Scene, u: Tensor, v: Tensor) -> State:

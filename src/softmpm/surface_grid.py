@@ -28,11 +28,12 @@ class SurfaceGrid:
         areas: Area of each point [m²], shape (point,), float64.
         stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
         waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
-        stencil: Nodes of each point, numbers in the grid at rest, shape (point, 3^dim), int32.
+        stencil: Nodes of each point, numbers in the grid at rest, one of them repeated for those that take no part, shape (point, 3^dim),
+            int32.
         weights: Their weights, 0 for nodes that take no part, shape (point, 3^dim), float64.
         loads: Area that each node carries [m²], L of (K1), shape (node,), float64.
         normals: Unit normals of the separating walls, shape (wall, dim), float64.
-        nodes: Nodes that the points act on, with planes of symmetry or clamps all nodes, shape (touched,), int32.
+        nodes: Nodes that the points act on, or all nodes if some are constrained, shape (touched,), int32.
         first: First entry of each of ``nodes`` in ``members``, and their count, shape (touched + 1,), int32.
         members: Points that act on a node, node by node, shape (entry,), int32.
         shares: Their weights, shape (entry,), float64.
@@ -60,7 +61,10 @@ class SurfaceGrid:
             np.add.at(mass, np.searchsorted(index, flat(near[:, None] + offsets, grid.shape)), share)
         held = (index[numbers] == at) & (mass[numbers] > LEAST * density[:, None] * grid.spacing**dim)
         weights = consistent(np.where(held, weights, 0.0), offsets - f[:, None])
-        numbers = sorting[numbers]
+        main = np.take_along_axis(numbers, np.abs(weights).argmax(axis=1)[:, None], axis=1)
+        numbers = sorting[
+            np.where(weights != 0.0, numbers, main)
+        ]  # no point reads a node that it does not act on
         far = np.abs(weights.sum(axis=1) - 1.0) > 1e-6
         need(
             not far.any(),
@@ -87,12 +91,16 @@ class SurfaceGrid:
         self.waves = tensor(np.sqrt(modulus / density), np.float64)
         self.stencil, self.weights = tensor(numbers, np.int32), tensor(weights, np.float64)
         members, owners = members[order], owners[order]
-        mirrored = any(wall.contact in MIRRORS for wall in scene.walls)
-        touched = np.arange(len(index)) if mirrored else np.unique(owners)
+        constrained = len(scene.driven) > 0 or any(wall.contact in MIRRORS for wall in scene.walls)
+        touched = np.arange(len(index)) if constrained else np.unique(owners)
         self.nodes = tensor(touched, np.int32)
         self.members = tensor(members // len(offsets), np.int32)
         self.shares = tensor(weights.reshape(-1)[members], np.float64)
         self.first = tensor(np.append(np.searchsorted(owners, touched), len(owners)), np.int32)
+
+    def carried(self, nodes: Tensor) -> Tensor:
+        """True for points with a weight on any of these nodes, shape (point,), from shape (node,)."""
+        return (nodes[self.stencil.long()] & (self.weights != 0)).any(1)
 
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""

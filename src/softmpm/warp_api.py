@@ -5,9 +5,11 @@ states = [softmpm.warp_state(model, start, requires_grad=True), softmpm.warp_sta
 tape = wp.Tape()
 softmpm.step(model, states[0], states[1], solid, tape=tape)
 tape.backward(grads={states[1].v: ...})             # fills states[0].v.grad, solid.mu.grad, ...
+
+States hold the particles in the moving formulation and the nodes in the reference formulation.
 """
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -18,19 +20,21 @@ from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.inputs import Accumulators, InputsAdj
+from softmpm.schemes.lagrangian.nodal_step import NodalStep
 from softmpm.warp_arrays import WarpSolid, WarpState, check_own
+from softmpm.warp_nodal import WarpNodal
 
 
 def step(
     model: Model,
-    state_in: WarpState,
-    state_out: WarpState,
+    state_in: WarpState | WarpNodal,
+    state_out: WarpState | WarpNodal,
     solid: WarpSolid,
     *,
     substep: int = 0,
     tape: wp.Tape | None = None,
 ) -> None:
-    """Advance by one substep of ``model.scene.dt``, on PyTorch's current stream.
+    """Advance by one substep of ``model.scene.dt``, a control step of its own, on PyTorch's current stream.
 
     Args:
         state_in, state_out: From :func:`warp_state`; two different ones. With a tape both need ``requires_grad=True``,
@@ -42,7 +46,7 @@ def step(
     Raises:
         TypeError, ValueError: A state or ``solid`` is of another model or has other arrays; the two states are the same; a tape is
             given and an array carries no gradient.
-        RuntimeError: The model is deterministic, and a CUDA graph is being captured.
+        RuntimeError: A CUDA graph is being captured, and the model is deterministic or of the reference formulation.
     """
     check_own(model, "step", solid=solid, state_in=state_in, state_out=state_out)
     if state_in.v.ptr == state_out.v.ptr:
@@ -64,26 +68,42 @@ def step(
 
 
 @on_its_gpu
-def _advance(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
-    solid.work.stream = stream_of(model.device)
-    solid.work.advance(state_in.struct(model), state_out.struct(model), substep)
+def _advance(model: Model, state_in: Any, state_out: Any, solid: WarpSolid, substep: int) -> None:
+    work = solid.work
+    work.stream = stream_of(model.device)
+    if isinstance(work, NodalStep):
+        work.advance(state_in.nodal(), state_out.nodal(), solid.values(), substep)
+    else:
+        work.advance(state_in.struct(model), state_out.struct(model), substep)
 
 
 @on_its_gpu
-def _adjoint(model: Model, state_in: WarpState, state_out: WarpState, solid: WarpSolid, substep: int) -> None:
-    solid.work.stream = stream_of(model.device)
-    wanted = RequestedGrads(groups(model.spec))
-    found, adj_inputs = Accumulators(model, wanted, 1, model.node_count), InputsAdj(model, wanted, 1)
-    now, then = state_in.struct(model), state_out.struct(model)
-    structs = found.particle_struct(), found.grid_struct()
-    solid.work.adjoint(
-        wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), structs, substep
-    )
-    found.collect(0, model.fixed, solid.work.launch)
-    adj_inputs.add(found, slice(0, 1))
-    adj_inputs.add_particles(found, slice(0, 1))
+def _adjoint(model: Model, state_in: Any, state_out: Any, solid: WarpSolid, substep: int) -> None:
+    work, wanted = solid.work, RequestedGrads(groups(model.spec))
+    work.stream = stream_of(model.device)
+    if isinstance(work, NodalStep):
+        now, adj_then = state_in.nodal(), state_out.adj()
+        adj, adj_inputs = work.adjoint(now, adj_then, solid.values(), wanted, substep)
+        for grad, found in zip(state_in.adj()[:4], adj[:4], strict=True):
+            grad += found
+    else:
+        adj_inputs = _adjoint_of_particles(model, work, state_in, state_out, wanted, substep)
     arrays = solid.arrays()
     for one in adj_inputs.inputs:
         adj = adj_inputs.tensors[one.name]
         grad = wp.to_torch(cast(wp.array, arrays[one.name].grad))
         grad += adj[0] if one.rows else adj
+
+
+def _adjoint_of_particles(
+    model: Model, work: Any, state_in: Any, state_out: Any, wanted: RequestedGrads, substep: int
+) -> InputsAdj:
+    """Adjoint of a substep of the moving formulation, added to that of ``state_in``; returns that of the inputs."""
+    found, adj_inputs = Accumulators(model, wanted, 1, model.node_count), InputsAdj(model, wanted, 1)
+    now, then = state_in.struct(model), state_out.struct(model)
+    structs = found.particle_struct(), found.grid_struct()
+    work.adjoint(wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), structs, substep)
+    found.collect(0, model.fixed, work.launch)
+    adj_inputs.add(found, slice(0, 1))
+    adj_inputs.add_particles(found, slice(0, 1))
+    return adj_inputs

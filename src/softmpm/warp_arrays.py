@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 import warp as wp
@@ -23,13 +22,16 @@ from softmpm.kernels.structs import element_type, types
 from softmpm.model import Model, check_model
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.alarm_check import armed, check_end
-from softmpm.schemes.buffers import Motion, view
+from softmpm.schemes.buffers import Motion
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.failure_report import raise_failure
 from softmpm.schemes.inputs import Values, grid_struct, particle_struct, shape_of
+from softmpm.schemes.lagrangian.nodal import particles_of, start_of
+from softmpm.schemes.lagrangian.nodal_step import NodalStep
 from softmpm.schemes.plain.substep import Substep
 from softmpm.state import Params, State
+from softmpm.warp_nodal import WarpNodal, check_array, owned, warp_nodal
 
 
 @dataclass(eq=False, frozen=True, kw_only=True)
@@ -59,7 +61,7 @@ class WarpState:
         t = types(self.model.spec.dim, self.model.spec.dtype)
         kinds = {"base": t.ivec, "fx": t.vec, "v": t.vec, "C": t.mat, "H": t.mat, "fx_low": t.vec}
         for name, array in self.arrays().items():
-            _check_array(self.model, name, array, (self.model.worlds, self.model.particle_count), kinds[name])
+            check_array(self.model, name, array, (self.model.worlds, self.model.particle_count), kinds[name])
 
     def differentiable(self) -> list[wp.array]:
         return [self.fx, self.v, self.C, self.H]
@@ -101,21 +103,19 @@ class WarpSolid:
     """Activation times strength [Pa], (world, muscle); None without muscles."""
     others: Mapping[str, wp.array] = field(default_factory=dict)
     """The other inputs that the kernels take, by their names in softmpm/inputs.py."""
-    work: Substep = field(init=False)
+    work: Substep | NodalStep = field(init=False)
 
     def __post_init__(self):
-        model, work = self.model, Substep(self.model)
-        work.particle_inputs, work.grid_inputs = particle_struct(model, model.fixed), grid_struct(model, {})
-        arrays = self.arrays()
+        model, arrays, given = self.model, self.arrays(), {}
         for one in stored(model.spec):
-            if one.per == "substep":
-                work.grid_inputs.elapsed = wp.zeros(1, dtype=wp.float64, device=model.wp_device)
-            elif one.name not in model.fixed:
-                shape = _lead(model, one)
-                array = _check_array(
-                    model, one.name, arrays.get(one.name), shape, element_type(model.spec, one)
-                )
-                setattr(work.grid_inputs if one.stage == "grid" else work.particle_inputs, one.name, array)
+            if one.name in model.derived:
+                kind = element_type(model.spec, one)
+                given[one] = check_array(model, one.name, arrays.get(one.name), _lead(model, one), kind)
+        if model.formulation == "reference":
+            work = NodalStep(model)
+        else:
+            work = Substep(model)
+            _bind(work, given)
         object.__setattr__(self, "work", work)
 
     @property
@@ -136,49 +136,52 @@ class WarpSolid:
     def values(self) -> Values:
         """As the schemes take them: one row of what has rows."""
         rows = {one.name for one in INPUTS if one.rows}
-        tensors = {name: wp.to_torch(array) for name, array in self.arrays().items()}
+        tensors = {name: wp.to_torch(array, requires_grad=False) for name, array in self.arrays().items()}
         return {name: tensor[None] if name in rows else tensor for name, tensor in tensors.items()}
 
-    def raise_failure(self, model: Model, state: WarpState) -> None:
+    def raise_failure(self, model: Model, state: WarpState | WarpNodal) -> None:
         """Raise :class:`softmpm.UnstableError` if a step so far failed. Waits for the device.
 
         Checks ``state``, which the last step gave, for torn bodies and the running step limit as well.
         """
         check_own(model, "raise_failure", solid=self, state=state)
+        self.work.stream = stream_of(model.device)
         _raise_failure(model, state, self.work, self.values())
 
 
+def _bind(work: Substep, given: Mapping[Input, wp.array]) -> None:
+    """Set the structs of the inputs of a substep of the moving formulation."""
+    model = work.model
+    work.particle_inputs, work.grid_inputs = particle_struct(model, model.fixed), grid_struct(model, {})
+    if model.spec.moving:
+        work.grid_inputs.elapsed = wp.zeros(1, dtype=wp.float64, device=model.wp_device)
+    for one, array in given.items():
+        setattr(work.grid_inputs if one.stage == "grid" else work.particle_inputs, one.name, array)
+
+
 @on_its_gpu
-def _raise_failure(model: Model, state: WarpState, work: Substep, values: Values) -> None:
-    work.stream = stream_of(model.device)
+def _raise_failure(
+    model: Model, state: WarpState | WarpNodal, work: Substep | NodalStep, values: Values
+) -> None:
+    if isinstance(work, NodalStep):
+        assert isinstance(state, WarpNodal)
+        nodes = state.nodal()
+        words, end = work.checked(nodes, values), particles_of(model, nodes)
+        raise_failure(model, words.tolist(), end, values=values, time=model.scene.dt)
+        return
+    assert isinstance(state, WarpState)
     end = work.leave(state.struct(model))
     if armed(model):
         check_end(model, work.particle_inputs, end, work.words_array, work.last)
     raise_failure(model, work.words.tolist(), end, values=values)
 
 
-def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
-    """A Warp array on a tensor of its own, with a gradient of its own."""
-    array = view(tensor.clone(memory_format=torch.contiguous_format), dtype)
-    array.requires_grad = requires_grad
-    return array
-
-
-def _check_moving(model: Model, wants: str) -> None:
-    """Raise unless this is a model of the moving formulation."""
-    check_model(model, wants)
-    if model.formulation != "moving":
-        raise ValueError(
-            f"{wants} and softmpm.step need formulation='moving', got a model with formulation={model.formulation!r}; take "
-            "softmpm.simulate."
-        )
-
-
-def check_own(model: Model, wants: str, **given: WarpState | WarpSolid) -> None:
+def check_own(model: Model, wants: str, **given: WarpState | WarpNodal | WarpSolid) -> None:
     """Raise unless these are the model's own: the kernels trust shapes and types."""
     check_model(model, wants)
+    of_states = WarpNodal if model.formulation == "reference" else WarpState
     for name, held in given.items():
-        kind, make = (WarpSolid, "warp_solid") if name == "solid" else (WarpState, "warp_state")
+        kind, make = (WarpSolid, "warp_solid") if name == "solid" else (of_states, "warp_state")
         if not isinstance(held, kind):
             raise TypeError(
                 f"{name} must be a softmpm.{kind.__name__}, as softmpm.{make} gives it, got {type(held).__name__}."
@@ -187,43 +190,45 @@ def check_own(model: Model, wants: str, **given: WarpState | WarpSolid) -> None:
             raise ValueError(f"{name} belongs to another model; make one with softmpm.{make}(model).")
 
 
-def _check_array(model: Model, name: str, array: object, shape: tuple[int, ...], dtype: type) -> wp.array:
-    """The array; raises unless it has this shape and type and is on the model's device."""
-    if not isinstance(array, wp.array):
-        raise TypeError(f"{name} must be a warp.array, got {type(array).__name__}.")
-    if array.shape != shape or array.dtype is not dtype or array.device != model.wp_device:
-        raise ValueError(
-            f"{name} must be {_kind(shape, dtype)} on {model.wp_device}, got {_kind(array.shape, array.dtype)} on {array.device}; "
-            "softmpm.warp_state and softmpm.warp_solid make such arrays."
-        )
-    return array
-
-
 def _lead(model: Model, one: Input) -> tuple[int, ...]:
     """Axes of an input in a step, without that of a vector."""
     shape = shape_of(model, one, 1)[1 if one.rows else 0 :]
     return shape[:-1] if one.kind == "vector" else shape
 
 
-def _kind(shape: tuple[int, ...], dtype: Any) -> str:
-    """As PyTorch would see it: the axes of vectors and matrices last."""
-    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    return f"{(*shape, *getattr(dtype, '_shape_', ()))} of {scalar.__name__}"
+def warp_state(
+    model: Model, state: State | None = None, solid: WarpSolid | None = None, *, requires_grad: bool = False
+) -> WarpState | WarpNodal:
+    """A :class:`WarpState` that holds ``state``, or the rest state if None; in the reference formulation a :class:`WarpNodal`.
 
-
-def warp_state(model: Model, state: State | None = None, *, requires_grad: bool = False) -> WarpState:
-    """A :class:`WarpState` that holds ``state``, or the rest state if None.
+    Args:
+        solid: In the reference formulation the masses and walls by which nodes are computed from a state without any; None takes the
+            scene's. The moving formulation does not need them.
 
     Raises:
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model and the state.
         UnstableError: A particle is off the grid.
     """
-    _check_moving(model, "warp_state")
+    check_model(model, "warp_state")
     if state is not None:
         check_state(model, state)
         if not is_capturing(model):
             check_finite(state, None)
-    return _warp_state(model, model.rest() if state is None else state, requires_grad)
+    if solid is not None:
+        check_own(model, "warp_state", solid=solid)
+    start = model.rest() if state is None else state
+    if model.formulation == "reference":
+        return _warp_nodal(model, start, solid, requires_grad)
+    return _warp_state(model, start, requires_grad)
+
+
+@torch.no_grad()
+def _warp_nodal(model: Model, state: State, solid: WarpSolid | None, requires_grad: bool) -> WarpNodal:
+    mass, normals = model.mass.expand(model.worlds, -1), None
+    if solid is not None:
+        values = solid.values()
+        mass, normals = values["mass"], values["normal"][0] if model.spec.moving else None
+    return warp_nodal(model, start_of(model, state, mass, normals), requires_grad)
 
 
 @on_its_gpu
@@ -234,18 +239,20 @@ def _warp_state(model: Model, state: State, requires_grad: bool) -> WarpState:
     raise_failure(model, work.words.tolist(), state)
     return WarpState(
         model=model,
-        base=_owned(motion.base, t.ivec, False),
-        fx=_owned(motion.fx, t.vec, requires_grad),
-        v=_owned(motion.v, t.vec, requires_grad),
-        C=_owned(motion.C, t.mat, requires_grad),
-        H=_owned(motion.H, t.mat, requires_grad),
-        fx_low=None if motion.fx_low is None else _owned(motion.fx_low, t.vec, False),
+        base=owned(motion.base, t.ivec, False),
+        fx=owned(motion.fx, t.vec, requires_grad),
+        v=owned(motion.v, t.vec, requires_grad),
+        C=owned(motion.C, t.mat, requires_grad),
+        H=owned(motion.H, t.mat, requires_grad),
+        fx_low=None if motion.fx_low is None else owned(motion.fx_low, t.vec, False),
     )
 
 
-def torch_state(model: Model, state: WarpState) -> State:
-    """The :class:`softmpm.State` that a :class:`WarpState` of this model holds, in new tensors."""
+def torch_state(model: Model, state: WarpState | WarpNodal) -> State:
+    """The :class:`softmpm.State` that a state of this model in Warp arrays holds, in new tensors."""
     check_own(model, "torch_state", state=state)
+    if isinstance(state, WarpNodal):
+        return particles_of(model, state.nodal().clone())
     return _torch_state(model, state)
 
 
@@ -272,7 +279,7 @@ def warp_solid(
     Raises:
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model, the material, the activation and the inputs.
     """
-    _check_moving(model, "warp_solid")
+    check_model(model, "warp_solid")
     params = model.params() if params is None else params
     check_params(model, params)
     check_row(model, activation)
@@ -300,6 +307,6 @@ def _warp_solid(model: Model, values: Values, requires_grad: bool) -> WarpSolid:
         if one.name in values:
             value = values[one.name][0] if one.rows else values[one.name]
             needs = requires_grad and bool(one.group)
-            arrays[one.name] = _owned(value.detach(), element_type(model.spec, one), needs)
+            arrays[one.name] = owned(value.detach(), element_type(model.spec, one), needs)
     own = {name: arrays.pop(name) for name in ("mass", "mu", "lam", "active_stress") if name in arrays}
     return WarpSolid(model=model, others=arrays, **own)

@@ -295,17 +295,31 @@ def test_worlds_and_control_steps(dim):
             torch.testing.assert_close(got[part], want, rtol=0, atol=1e-13 * want.abs().max().item())
 
 
-def test_driven_particles_are_refused():
-    """They are errors, not free particles."""
-    scene = full(2)
+@DIMS
+def test_driven_particles_have_their_velocities(dim):
+    """Exactly where these are affine in X, whatever forces act; the gradient of a loss on the others is a central difference."""
+    scene = dataclasses.replace(full(dim), walls=[], driven=[4, 1, 0, 2, 3, 5, *range(6, 6 * (dim - 1))])
     start, params = rest(scene)
     u, v = reference_lagrangian.project(scene, start, params)
-    given = Inputs(velocity=torch.zeros(2).double())
-    with pytest.raises(NotImplementedError, match="no driven particles"):
-        reference_lagrangian.simulate(scene, u, v, None, params, substeps=1, inputs=given)
-    driven = dataclasses.replace(scene, driven=[1])
-    with pytest.raises(NotImplementedError, match="no driven particles"):
-        reference_lagrangian.simulate(driven, u, v, None, params, substeps=1)
+    places = start.x[0, list(scene.driven)]
+    V = f64([0.3, -0.2, 0.1][:dim]) + places @ randn(dim, dim, seed=3)
+
+    def end(velocity):
+        given = Inputs(velocity=velocity)
+        return reference_lagrangian.simulate(scene, u, v, None, params, substeps=6, inputs=given)
+
+    shown = reference_lagrangian.evaluate(scene, *end(V))
+    torch.testing.assert_close(shown.v[0, list(scene.driven)], V, rtol=0, atol=1e-12)
+    torch.testing.assert_close(shown.x[0, list(scene.driven)], places + 6 * scene.dt * V, rtol=0, atol=1e-13)
+    weights = [randn(*u.shape, seed=k) for k in (4, 5)]
+
+    def loss(velocity):
+        return sum((w * t).sum() for w, t in zip(weights, end(velocity), strict=True))
+
+    leaf, d = V.clone().requires_grad_(), randn(*V.shape, seed=6)
+    parts = torch.autograd.grad(loss(leaf), leaf)[0] * d
+    want = difference(loss, V, d, 1e-3)
+    assert parts.norm() > 0 and abs(parts.sum() - want) <= 1e-9 * parts.norm()
 
 
 @DIMS

@@ -36,7 +36,8 @@ class Spec:
     actuators: tuple[str, ...] = ()  # files of kernels/physics/actuators
     fibres: bool = False  # whether an actuator has a direction
     viscosity: bool = False
-    driven: bool = False
+    driven: bool = False  # particles, in the moving formulation
+    driven_nodes: bool = False  # nodes that driven particles hold, in the reference formulation
     given: tuple[str, ...] = ()  # fields of softmpm.Inputs that calls give
     deterministic: bool = False  # sums over particles in fixed point
     surface: bool = False  # separating walls act on surface points, not on nodes
@@ -59,9 +60,23 @@ class Spec:
         return tuple(k for k in range(len(self.contacts)) if k not in others)
 
     @property
+    def constrained(self) -> bool:
+        """Whether some nodes of the reference formulation are held or mirrored after the walls acted on them."""
+        return bool(self.mirrors) or self.driven_nodes
+
+    @property
     def module(self) -> str:
         """Name of the Warp module that holds every kernel of this specialisation."""
-        names = ("friction", "gravity", "damping", "viscosity", "driven", "deterministic", "surface")
+        names = (
+            "friction",
+            "gravity",
+            "damping",
+            "viscosity",
+            "driven",
+            "driven_nodes",
+            "deterministic",
+            "surface",
+        )
         features = [name for name in names if getattr(self, name)]
         actuators = [f"{name}s" for name in self.actuators if name != "muscle"]
         muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
@@ -207,11 +222,21 @@ def constant_type(spec: Spec, one: Input):
     return wp.types.matrix((count, spec.dim), real) if one.kind == "vector" else wp.types.vector(count, real)
 
 
-AXES = {"particle": 2, "slot": 3, "muscle": 2, "driven": 2, "world": 1, "wall": 2, "substep": 1}
-"""Of an input: (world, particle), (world, particle, slot), (world, muscle), (world, driven), (world,), (world, wall), (1,)."""
-ACCUMULATOR_AXES = {"particle": 2, "muscle": 3, "driven": 2, "world": 1, "wall": 2}
-"""Of its adjoint: (world, particle), (world, particle, slot), (world, driven), (node,), (wall, node), so that no two threads of a
-launch add to the same number; nodes of all worlds count on."""
+AXES = {
+    "particle": 2,
+    "slot": 3,
+    "muscle": 2,
+    "driven": 2,
+    "driven_node": 2,
+    "world": 1,
+    "wall": 2,
+    "substep": 1,
+}
+"""Of an input: (world, particle), (world, particle, slot), (world, muscle), (world, driven), (world, driven node), (world,),
+(world, wall), (1,)."""
+ACCUMULATOR_AXES = {"particle": 2, "muscle": 3, "driven": 2, "driven_node": 2, "world": 1, "wall": 2}
+"""Of its adjoint: (world, particle), (world, particle, slot), (world, driven), (world, driven node), (node,), (wall, node), so that no
+two threads of a launch add to the same number; nodes of all worlds count on."""
 
 
 @kernel_factory

@@ -14,7 +14,7 @@ from softmpm.schemes.buffers import clear, view
 
 Values = dict[str, Tensor]
 """Inputs by name. Those with ``rows`` have a first axis of control steps; then (world, particle), (world, particle, slot),
-(world, muscle), (world, driven), (world,) or (world, wall), then the axis of a vector."""
+(world, muscle), (world, driven), (world, driven node), (world,) or (world, wall), then the axis of a vector."""
 
 
 def particle_struct(model: Model, values: Mapping[str, Tensor], p2g: int = 0, g2p: int = 0):
@@ -47,6 +47,7 @@ def elapsed(model: Model, first: int, length: int, substeps: int) -> Tensor:
     return number.double() * model.scene.dt
 
 
+DRIVEN = ("driven", "driven_node")
 _ROWS = {one.name for one in INPUTS if one.rows}
 
 
@@ -120,6 +121,7 @@ def shape_of(model: Model, one: Input, rows: int) -> tuple[int, ...]:
         "particle": model.particle_count,
         "muscle": model.muscle_count,
         "driven": model.driven_count,
+        "driven_node": 0 if model.driven_grid is None else model.driven_grid.count,
         "wall": model.wall_count,
     }
     own = (sizes[one.per],) if one.per in sizes else ()
@@ -137,7 +139,8 @@ class Accumulators:
     Attributes:
         inputs: Inputs for which gradients are requested.
         tensors: By name: (row, world, particle, dim) for vectors of particles, (world, particle, slot) for actuators,
-            (row, world, driven, dim), ([row, wall,] node of all worlds) for walls and worlds, each with the axis of a vector.
+            (row, world, driven particle or node, dim), ([row, wall,] node of all worlds) for walls and worlds, each with the axis of
+            a vector.
         scalars: See :class:`InputsAdj`.
     """
 
@@ -148,7 +151,7 @@ class Accumulators:
         self.tensors: Values = {}
         self.collected: Values = {}
         for one in self.inputs:
-            if one.per == "particle" or one.per == "driven":
+            if one.per in ("particle", *DRIVEN):
                 self.tensors[one.name] = whole.tensors[one.name]
             else:
                 self.tensors[one.name] = self._zeros(one)
@@ -227,7 +230,7 @@ class Accumulators:
         if one.per == "muscle":
             return self.collected[one.name]
         tensor = self.tensors[one.name]
-        if one.per == "driven":
+        if one.per in DRIVEN:
             return tensor
         tensor = tensor if one.rows else tensor[None]
         axis = 2 if one.per == "wall" else 1  # of the nodes

@@ -49,7 +49,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
     position, node_velocity = g.position, g.node_velocity
     gathered, surface = gathering(spec.dim, spec.dtype), bool(spec.surface_walls)
-    apart = surface and not spec.mirrors  # nodes that no surface points act on are done here
+    apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact = f.Frame, f.recentring, f.exact
     module = lagrangian_module(spec.module + ".lagrangian")

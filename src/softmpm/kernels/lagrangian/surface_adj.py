@@ -36,7 +36,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     touch, touch_adj, number = block.touch, block.touch_adj, one.number
     faces_of, face_adj, present = one.faces_of, wall_face_adj(spec, wanted), one.present
     at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
-    exact_vec, mirrored = types(dim, "float64").vec, bool(spec.mirrors)
+    exact_vec, mirrored, constrained = types(dim, "float64").vec, bool(spec.mirrors), spec.constrained
     place, vecs, back = nodes(spec).place, one.vecs, nodes_adj(spec, wanted)
     gather, moved_adj = back.gather, back.moved_adj
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
@@ -231,7 +231,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_mass: wp.array2d(dtype=real),
         adj_inputs: GridInputsAdj,
     ):
-        """(K2.adj), then (Q3.adj), at the nodes that surface points act on; with clamps their adjoint comes between."""
+        """(K2.adj), then (Q3.adj), at the nodes that surface points act on; the adjoint of constraints comes between."""
         world, n, lane = wp.tid()
         i = body.nodes[n]
         more_u = from_points(body, adj_x, world, n, lane, step)
@@ -239,7 +239,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if lane == 0:
             adj_u[world, i] = adj_u[world, i] + more_u
             adj_new = adj_v[world, i] + more_v
-            if wp.static(mirrored):
+            if wp.static(constrained):
                 adj_v[world, i] = adj_new
             else:
                 moved_adj(

@@ -15,6 +15,7 @@ from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
+from softmpm.schemes.lagrangian.kernels import define_adj
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
@@ -121,6 +122,7 @@ class SharedAdjoint:
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
         self.model, self.wanted = buffers.model, wanted
+        define_adj(self.model.spec, wanted)
         self.u, self.v, self.anchor, self.force = (
             torch.empty_like(one) for one in (buffers.u[0], buffers.v[0], buffers.anchor[0], buffers.force)
         )
@@ -171,7 +173,7 @@ class ChunkAdjoint:
             self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
             given = shared.wanted, shared.held, shared.anchor, shared.force, shared.mass_array
-            self.contact = SurfaceContactAdj(forward.contact, *given)
+            self.contact = SurfaceContactAdj(forward.contact, *given, forward.words_array)
 
     def load(self, adj_end: Nodal) -> None:
         """Copy the adjoint of the final state into the buffers, and clear all sums."""

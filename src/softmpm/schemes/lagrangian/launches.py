@@ -6,6 +6,7 @@ from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.projection import masses
 from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node_launch
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
+from softmpm.schemes.lagrangian.driven import drive, drive_adj
 from softmpm.schemes.lagrangian.nodal import launch_masses
 from softmpm.schemes.launch import KernelLauncher
 
@@ -75,10 +76,12 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     node_launch(model, launch, nodes(model.spec).advance, *arguments)
     if buffers.reflection is not None:
         buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
+    drive(model, launch, inputs, buffers.words_array, state[0], new[0], velocity)
     if contact is not None:
         contact.advance(launch, s, inputs, buffers.words_array, now, then, *state, *new)
         if buffers.reflection is not None:
             buffers.reflection.advance(launch, buffers.words_array, state[0], new[1], new[0])
+        drive(model, launch, inputs, buffers.words_array, state[0], *new)
 
 
 def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
@@ -108,16 +111,18 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         (shared.u_array, shared.v_array),
         (shared.f_array, shared.mass_array),
     )
-    last, reflection = s == forward.chunk.length - 1, adjoint.reflection
-    pending = (not last and reflection is None, shared.partial_arrays[0], shared.partial_arrays[1])
+    last, reflection, constrained = s == forward.chunk.length - 1, adjoint.reflection, model.spec.constrained
+    pending = (not last and not constrained, shared.partial_arrays[0], shared.partial_arrays[1])
+    drive_adj(model, launch, shared.wanted, model.scene.dt, *out, adj_inputs)
     if reflection is not None:
         reflection.begin(launch, inputs, forward.rest, stored[0], stored[2], new_v, *out)
     if adjoint.contact is not None:
         given = inputs, adj_inputs, forward.rest, stored, new_v, pending
         adjoint.contact.advance(launch, s, *given, *out, shared.f_array)
+        drive_adj(model, launch, shared.wanted, 0.0, *out, adj_inputs)
     if reflection is not None:
         reflection.finish(launch, *out)
-    if adjoint.contact is None or reflection is not None:
+    if adjoint.contact is None or constrained:
         parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held, shift)
         kernel = nodes_adj(model.spec, shared.wanted).advance_adj
         node_launch(model, launch, kernel, *parameters, *stored, *pending, *out, *sums, adj_inputs)
@@ -146,6 +151,6 @@ def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     else:
         kernel = cells_adj(model.spec, shared.wanted, bricks).forces_adj
         brick_launch(model, launch, kernel, *parameters, *arguments)
-    if s == 0 or adjoint.reflection is not None:  # else the substep before adds the sums
+    if s == 0 or model.spec.constrained:  # else the substep before adds the sums
         kernel, out = nodes_adj(model.spec, shared.wanted).gather_adj, (shared.u_array, shared.v_array)
         node_launch(model, launch, kernel, forward.rest, *shared.partial_arrays, *out)

@@ -10,10 +10,12 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from softmpm.checks import check_reflected, check_shown
 from softmpm.kernels.lagrangian.projection import masses, node_sums, projection
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import view
+from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
 from softmpm.schemes.lagrangian.frame import quantum, shift_of
@@ -46,6 +48,22 @@ def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
         u, v = model.mirror.reflected(of_nodes, u, v)
     anchors = _anchors(model, u, normals)
     return Nodal(u, v, anchors, torch.zeros_like(anchors), shift)
+
+
+def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = None) -> Nodal:
+    """Nodal state with a shift that a call starts from: that of the state, or :func:`nodes_of` its particles if it has none.
+
+    Raises:
+        ValueError: The particles do not show the nodes of the state, or clamps do not allow them; not checked during a capture.
+    """
+    nodes = state.nodes
+    if nodes is None:
+        nodes = nodes_of(model, state, mass, normals)
+    elif not is_capturing(model):
+        check_shown(state, particles_of(model, nodes.detach()))
+        if model.mirror is not None:
+            check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
+    return nodes._replace(shift=shift_of(model, nodes).detach())
 
 
 class _Arrays:

@@ -13,6 +13,7 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.lagrangian.driven import drive
 from softmpm.schemes.lagrangian.frame import frame_struct
 from softmpm.schemes.penetration import deepest
 
@@ -23,11 +24,16 @@ def surface_struct(model: Model):
     assert points is not None
     struct = surface_type(model.spec.dim, model.spec.dtype)()
     struct.points = view(points.points, types(model.spec.dim, "float64").vec)
-    for name in ("areas", "loads", "weights", "shares"):
+    areas, limit = points.areas, deepest(model)
+    if model.driven_grid is not None:  # points of driven nodes only get no force, whatever their depth
+        free = points.carried(~model.driven_grid.held)
+        areas, limit = areas * free, torch.where(free, limit, torch.inf)
+    struct.areas = view(areas.to(model.dtype), t.real)
+    for name in ("loads", "weights", "shares"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
-    struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)
-    struct.deepest = view(deepest(model).to(model.dtype), t.real)
+    struct.newtons = view(areas.to(model.dtype) * model.mass_unit, t.real)
+    struct.deepest = view(limit.to(model.dtype), t.real)
     for name in ("stencil", "nodes", "first", "members"):
         setattr(struct, name, view(getattr(points, name), wp.int32))
     return struct
@@ -152,6 +158,7 @@ class SurfaceContactAdj:
         held: Accumulators of one world in the structs of the inputs' adjoints.
         adj_anchor, adj_force: Adjoints of the anchors and of the mean forces, updated in place.
         adj_mass: Adjoint of the masses of the nodes, added into.
+        words: Status words, all of them of worlds that run.
     """
 
     def __init__(
@@ -162,11 +169,13 @@ class SurfaceContactAdj:
         adj_anchor: Tensor,
         adj_force: Tensor,
         adj_mass: wp.array,
+        words: wp.array,
     ):
         self.forward, self.held, self._adj_mass = forward, held, adj_mass
         self._kernels = surface_adj(forward.model.spec, wanted)
         self._adj_anchor, self._adj_force = view(adj_anchor, forward._vec), view(adj_force, forward._vec)
-        self._shared = forward._vectors(forward.nodes)
+        self._shared, self._words = forward._vectors(forward.nodes), words
+        self._scratch = forward._vectors(forward.nodes) if forward.model.driven_grid else self._shared
         self._adj_x, self._adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
         model = forward.model
         self._total_D = torch.empty(forward.points, dtype=model.dtype, device=model.device)
@@ -190,8 +199,8 @@ class SurfaceContactAdj:
         adj_v: wp.array,
         adj_f: wp.array,
     ) -> None:
-        """Adjoint of substep ``s``, from that of the new state to those of the forces and of the state before; with clamps to that
-        of the velocity without contact, in ``adj_v``.
+        """Adjoint of substep ``s``, from that of the new state to those of the forces and of the state before; with constraints of
+        nodes to that of the velocity without contact, in ``adj_v``.
 
         Args:
             stored: Displacements, velocities and momenta of the nodes.
@@ -215,6 +224,7 @@ class SurfaceContactAdj:
             adj_f,
             *out,
         )
+        drive(one.model, launch, inputs, self._words, stored[0], self._scratch, one.free)
         about = (self.held, one.rate_array, one.anew(s))
         parameters = (constants, inputs, one._struct, one._width, one._D, *about)
         anchors = view(one.anchors[s], one._vec)
