@@ -29,24 +29,24 @@ class Sparse:
     """A matrix by rows.
 
     Attributes:
-        rows, columns: Its size.
+        rows: Their number.
         first: First entry of each row, and their count, shape (row + 1,), int32.
         column, value: Column and value of each entry, shape (entry,), int32 and float64.
     """
 
-    def __init__(self, row: np.ndarray, column: np.ndarray, value: np.ndarray, rows: int, columns: int):
+    def __init__(
+        self,
+        row: np.ndarray,
+        column: np.ndarray,
+        value: np.ndarray,
+        rows: int,
+        device: torch.device,
+    ):
         order = np.lexsort((column, row))
-        self.rows, self.columns = rows, columns
-        self.first = torch.from_numpy(np.searchsorted(row[order], np.arange(rows + 1)).astype(np.int32))
-        self.column = torch.from_numpy(column[order].astype(np.int32))
-        self.value = torch.from_numpy(value[order])
-
-    def to(self, device: torch.device) -> "Sparse":
-        """This matrix, moved to a device."""
-        self.first, self.column, self.value = (
-            one.to(device) for one in (self.first, self.column, self.value)
-        )
-        return self
+        self.rows, first = rows, np.searchsorted(row[order], np.arange(rows + 1))
+        self.first = torch.from_numpy(first.astype(np.int32)).to(device)
+        self.column = torch.from_numpy(column[order].astype(np.int32)).to(device)
+        self.value = torch.from_numpy(value[order]).to(device)
 
 
 class DrivenGrid:
@@ -68,9 +68,8 @@ class DrivenGrid:
         base, _, share = stencils(places, offsets)
         held = np.unique(flat(base[:, None] + offsets, grid.shape)[share > LEAST])
         node, particle, value = _entries(places, held, grid.shape)
-        spread = node, particle, value, len(held), len(places)
-        transposed = particle, node, value, len(places), len(held)
-        self.spread, self.transposed = Sparse(*spread).to(device), Sparse(*transposed).to(device)
+        self.spread = Sparse(node, particle, value, len(held), device)
+        self.transposed = Sparse(particle, node, value, len(places), device)
         index = rest.index.cpu().numpy()
         sorting = np.argsort(index)
         nodes = sorting[np.searchsorted(index[sorting], held)]

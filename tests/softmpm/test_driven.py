@@ -16,12 +16,12 @@ from softmpm.schemes.lagrangian.driven import of_nodes
 STEPS = 3
 
 
-def gripped(dim: int, **changes) -> softmpm.Scene:
+def gripped(dim: int) -> softmpm.Scene:
     """The block on two rough walls, driven at one corner by a few particles in no order."""
     made = block(dim)
     x = made.bodies[0].particles.positions
     handle = np.flatnonzero((x[:, 0] > 0.45) & (x[:, 1] < 0.4))[::-1]
-    return dataclasses.replace(made, driven=handle, **changes)
+    return dataclasses.replace(made, driven=handle)
 
 
 @pytest.mark.parametrize(("dim", "contact"), [(2, "nodes"), (2, "surface"), (3, "surface")])
