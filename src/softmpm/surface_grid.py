@@ -28,8 +28,8 @@ class SurfaceGrid:
         areas: Area of each point [m²], shape (point,), float64.
         stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
         waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
-        stencil: Nodes of each point, numbers in the grid at rest, one of them repeated for those that take no part, shape (point, 3^dim),
-            int32.
+        stencil: Nodes of each point, numbers in the grid at rest, shape (point, 3^dim), int32. One of them is repeated for those that
+            take no part.
         weights: Their weights, 0 for nodes that take no part, shape (point, 3^dim), float64.
         loads: Area that each node carries [m²], L of (K1), shape (node,), float64.
         normals: Unit normals of the separating walls, shape (wall, dim), float64.

@@ -161,7 +161,9 @@ class Accumulators:
                 self.collected[one.name] = self._tensor(first, model.worlds, model.muscle_count, *vector)
         own = [self.tensors[one.name] for one in self.inputs if not is_particle_scalar(one)]
         self._cleared = [*([self.scalars] if len(self.scalars) else []), *own, *self.collected.values()]
-        if model.deterministic and self.collected:
+        on_gpu = model.device.type == "cuda"  # a CPU adds in one order anyway
+        self._in_order = model.deterministic or (on_gpu and model.formulation == "reference")
+        if self._in_order and self.collected:
             self._parts = view(
                 self._tensor(model.worlds, model.muscle_count, PARTS), types(model.dim, model.spec.dtype).real
             )
@@ -218,7 +220,7 @@ class Accumulators:
                 pairs = [(slots[..., axis], target[..., axis]) for axis in range(slots.shape[3])]
             for slot, total in pairs:
                 given = view(values["muscle"], wp.int32), view(slot, real)
-                if self.model.deterministic:
+                if self._in_order:
                     in_order = collect_slots_in_order(spec)
                     launch(in_order.parts, self._parts.shape, *given, self._parts)
                     launch(in_order.total, total.shape, self._parts, view(total, real))
