@@ -43,7 +43,7 @@ LAME = YOUNG / 2.6, 0.3 * YOUNG / (1.3 * 0.4)
 def main():
     args = arguments(__doc__)
     table = Table("Measured over reported step limit", torch.device(args.device), args.json)
-    how = How(args.device, torch.float64, alarms=False)
+    how = How(args.device, dtype=torch.float64, alarms=False)
     for law in LAWS:
         for dim in (2, 3):
             for stretch in STRETCHES:

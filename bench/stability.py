@@ -43,7 +43,7 @@ def main():
             IMAGES,
         )
         return
-    how = How(args.device, longest=int(args.longest))
+    how = How(args.device, args.formulation, longest=int(args.longest))
     print(f"Maps of the extremes ({machine(torch.device(args.device))})")
     rows = [row.name for rows in PAGES.values() for row in rows if args.row in (None, row.name)]
     parts = [Part(row, law.__name__, args.short, args.needless, how) for row in rows for law in LAWS]
@@ -68,6 +68,7 @@ def arguments() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--formulation", default="moving", choices=["moving", "reference"])
     parser.add_argument("--short", action="store_true", help="a few cells of each row")
     parser.add_argument("--row", choices=list(ROWS), help="one row only")
     parser.add_argument("--processes", type=int, default=1, help="number of processes")

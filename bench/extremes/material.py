@@ -29,7 +29,7 @@ def dropped(law: type, dim: int, mach: float, young: float = YOUNG, poisson: flo
 @functools.cache
 def bounce(law: type, dim: int, device: str) -> np.ndarray:
     """Final positions of the bounce of a block of 1e5 Pa in float64 [m]."""
-    *_, end = states(dropped(law, dim, 0.1), How(device, torch.float64))
+    *_, end = states(dropped(law, dim, 0.1), How(device, dtype=torch.float64))
     return exact(end).x
 
 
