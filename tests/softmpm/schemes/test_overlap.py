@@ -164,8 +164,8 @@ def test_balls_that_collide_are_named_at_their_substep(dim, device):
         assert end.v[0, moving.body == 1, 0].mean() > 0.5
 
 
-def test_a_leg_that_passes_the_other_is_named():
-    """An arch whose feet fly towards each other; one whose feet meet no more than face to face is left alone."""
+def test_a_leg_that_passes_the_other_is_named(tmp_path):
+    """An arch whose feet fly towards each other, recorded until then; one whose feet stay apart is left alone."""
     arch = [
         slab((10.0, 4.0), (12.0, 14.0)),
         slab((18.0, 4.0), (20.0, 14.0)),
@@ -176,9 +176,20 @@ def test_a_leg_that_passes_the_other_is_named():
     assert model.surface is None  # without an outline
     X, state = model.positions, model.rest()
     state.v[0, :, 0] = 0.4 * (12.0 - X[:, 1] / H).clamp(min=0.0) * torch.sign(15 * H - X[:, 0])
+    times = []
+
+    def recorded(end: softmpm.State) -> None:
+        with softmpm.Recorder(tmp_path / "run.h5", model) as recorder, recorder.episode(0) as episode:
+            for k in range(8):
+                episode.frame(float(k), end)
+                times.append(k)
+                end = run(model, end, 50)
+
     with pytest.raises(softmpm.UnstableError) as caught:
-        run(model, state, 400)
+        recorded(state)
     assert caught.value.kind == "overlap" and X[caught.value.particle, 1] < 8 * H
+    with softmpm.Recording(tmp_path / "run.h5") as recording:
+        assert list(recording.frames(0)["time"]) == times and 1 < len(times) < 8
     state.v.mul_(0.1)
     run(model, state, 400)
 
