@@ -74,3 +74,21 @@ def made(scene: softmpm.Scene, **settings) -> softmpm.Model:
 
 def velocity(model: softmpm.Model, state: softmpm.State) -> torch.Tensor:
     return (model.mass[:, None] * state.v[0]).sum(0) / model.mass.sum()
+
+
+def forces_of(model: softmpm.Model, seed: int, worlds=1) -> softmpm.ContactForces:
+    """Random tractions at every third point, the forces that they give, and places near those at rest."""
+    surface, generator = model.surface, torch.Generator().manual_seed(seed)
+    shape = (worlds, len(model.spec.surface_walls), surface.count, model.dim)
+    traction = torch.randn(shape, generator=generator, dtype=torch.float64)
+    traction[:, :, torch.arange(surface.count) % 3 > 0] = 0.0
+    places = surface.points + 0.01 * torch.randn(worlds, *surface.points.shape, generator=generator)
+    return softmpm.ContactForces((traction * surface.areas[:, None]).sum(2), traction, places)
+
+
+def record_forces(recorder: softmpm.Recorder, model: softmpm.Model, iteration: int) -> None:
+    """Three frames, the first without forces."""
+    with recorder.episode(iteration) as episode:
+        for k in range(3):
+            forces = forces_of(model, 10 * iteration + k, worlds=2) if k else None
+            episode.frame(0.1 * k, model.rest(), forces=forces)

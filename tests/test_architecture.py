@@ -18,11 +18,11 @@ LAYERS = """
     checks
     reference_stress reference_walls
     reference reference_step kernels.physics
-    reference_contact reference_driven
+    reference_contact reference_driven reference_overlap
     stability kernels.convert reference_lagrangian
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     rest_grid
-    surface_grid mirror_grid
+    surface_grid mirror_grid overlap_grid
     driven_grid
     describe
     model

@@ -33,6 +33,10 @@ class Alarms:
     """Largest depth of a surface point under a separating wall, over the way of a pressure wave of the scene's material in a substep
     [-], checked in every substep. Contact pushes a point out within one substep, beyond 1 faster than sound. Impacts at half of the
     wave speed reach 0.3 (docs/math/contact.md)."""
+    overlap: float | None = 1.0
+    """Size of the volume around each particle in which no other may be that is more than three cells away from it at rest, over its own
+    volume along each axis [-]; checked after each chunk in the reference formulation, in which bodies pass through themselves and each
+    other. With 1 two flat faces may overlap by half the distance of the particles (docs/limits.md)."""
 
     def __post_init__(self):
         for field in fields(self):

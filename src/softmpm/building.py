@@ -99,6 +99,8 @@ def build(
         scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
     if not surface:
         alarms = dataclasses.replace(alarms, depth=None)
+    if formulation != "reference":
+        alarms = dataclasses.replace(alarms, overlap=None)
     place = device_of(device)
     return Model(
         scene,

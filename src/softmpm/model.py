@@ -19,6 +19,7 @@ from softmpm.inputs import QUANTITIES, direction_of, stored
 from softmpm.kernels import physics
 from softmpm.kernels.structs import Spec, types
 from softmpm.mirror_grid import MirrorGrid
+from softmpm.overlap_grid import overlap_grid
 from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
 from softmpm.rest_grid import RestGrid
 from softmpm.scene.neighbours import rest_neighbours
@@ -58,6 +59,7 @@ class Model:
         surface: Surface points that meet the separating walls, or None if the nodes do.
         driven_grid: Nodes that driven particles hold in the reference formulation, or None.
         mirror: Nodes that clamps and planes of symmetry hold or reflect, or None if the scene has neither.
+        overlap: Volumes of the particles, to find bodies that pass through each other, or None if nothing has to be found.
         contact_width: Width over which surface contact sets in [cells].
         scheme, scheme_reason: Name of the scheme, and why it was chosen.
         footprint: Memory of that scheme.
@@ -102,9 +104,10 @@ class Model:
         self.scheme, self.scheme_reason, self.footprint = scheme, scheme_reason, footprint
         self.deterministic, self.workspace = deterministic, Workspace()
         self.formulation, self.formulation_reason = formulation, formulation_reason
-        self._rest_grid = None
+        self._rest_grid, self.overlap = None, None
         if formulation == "reference":
             self._rest_grid = RestGrid(scene, device, dtype, worlds, "force" in given)
+            self.overlap = overlap_grid(scene, self.rest_grid, alarms.overlap, device)
         self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
         self.contact_width = contact_width
         self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface, formulation)

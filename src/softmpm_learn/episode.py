@@ -105,6 +105,8 @@ def run_episode(
             )
         except softmpm.UnstableError as error:
             when = f"which began at {step * period:.4g} s"
+            if error.kind == "overlap":
+                error.add_note("To train a robot that passes through itself, set task.overlap=true.")
             error.add_note(f"In control step {step} of {task.control_steps}, {when}.")
             raise
         made.features.append(features)

@@ -124,9 +124,12 @@ class RunLogger:
         with self._recorder.episode(iteration, task=self.run.task.name, **about) as episode:
 
             def on_frame(frame: Frame) -> None:
+                model, state = self.run.model, frame.state
                 with torch.no_grad():
-                    velocity = softmpm.rasterize(self.run.model, frame.state).velocity
-                    episode.frame(frame.time, frame.state, frame.activation, velocity, frame.features)
+                    velocity, forces = softmpm.rasterize(model, state).velocity, None
+                    if model.surface is not None and state.nodes is not None:  # the state at rest has none
+                        forces = softmpm.contact_forces(model, state)
+                    episode.frame(frame.time, state, frame.activation, velocity, frame.features, forces)
 
             yield on_frame
 

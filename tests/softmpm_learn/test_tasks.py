@@ -116,6 +116,13 @@ def test_retardation_is_viscosity_over_shear_modulus():
     assert scene.dt < biped(BipedConf(young=5e4, poisson=0.25)).scene.dt
 
 
+def test_limbs_may_pass_each_other_if_they_are_told_to():
+    """The alarm is off with task.overlap alone."""
+    for overlap in (False, True):
+        task = biped(BipedConf(formulation="reference", overlap=overlap))
+        assert (softmpm.build(task.scene, device="cpu", **task.build).overlap is None) == overlap
+
+
 def test_the_step_is_stable_with_room_for_co_design(task):
     """dt is at most 0.4 of the limit, whole substeps fill a control period, and the episode lasts as long as asked."""
     assert task.scene.dt <= 0.4 * softmpm.stable_dt(task.scene) * (1 + 1e-12)

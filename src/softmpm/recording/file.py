@@ -15,7 +15,18 @@ import numpy as np
 
 from softmpm.model import Model
 from softmpm.recording.digest import Content
-from softmpm.recording.format import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, create, put, tables
+from softmpm.recording.format import (
+    EPISODE,
+    FRAME,
+    PARTS,
+    PER_FRAME,
+    SCALAR,
+    STATIC,
+    create,
+    put,
+    stored,
+    tables,
+)
 from softmpm.recording.reader import Recording
 
 _OPEN = {"libver": ("v110", "v110"), "locking": "best-effort"}  # the oldest format that has the mode
@@ -52,8 +63,8 @@ def _copy(
     old: Recording, file: h5py.File, static: dict[str, np.ndarray], before: int, content: Content
 ) -> None:
     """Copy everything of the iterations before ``before``."""
-    for name, values in static.items():
-        if not np.array_equal(values, old.static[name]):
+    for name in stored(STATIC, old.version):
+        if not np.array_equal(static[name], old.static[name]):
             raise ValueError(f"{old.path} records another scene ({name} differs); record to another path.")
 
     new = tables(file)
@@ -74,9 +85,7 @@ def _copy(
             for name, rows in parts.items():
                 extend(PARTS[name], rows)
             when = old.read("time", [row])[1][0]
-            extend(
-                "frame/index", np.array([(len(new["episode"]) - 1, when, at["field"], at["latent"])], FRAME)
-            )
+            extend("frame/index", np.array([(len(new["episode"]) - 1, when, *at.values())], FRAME))
             Content.frame(episode, when, values | parts)
     for name, (iterations, values) in old.scalars.items():
         kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]

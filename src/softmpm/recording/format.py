@@ -2,16 +2,20 @@
 
     episode           {iteration, attributes}       one row per recorded simulation
     scalar            {iteration, name, value}      one row per number, such as a loss
-    frame/index       {episode, time, field, latent}  one row per frame; its rows of the last two, or -1
+    frame/index       {episode, time, field, latent, force, traction, places}
+                                                    one row per frame; its rows of the last five tables, or -1
     frame/x, frame/v  (frame, particle, dim)        [m], [m/s]
     frame/strain      (frame, particle)             size of the Green strain [-], see writer.py
     frame/activation  (frame, muscle)               [-], NaN where none was given
     field/velocity    (row, *nodes, dim)            grid velocity [m/s]
     latent/value      (row, size)                   what an observer saw
-    static/*                                        rest shape, muscles, walls
+    force/total       (row, wall, dim)              force of each separating wall [N]
+    force/traction    (row, wall, point, dim)       force per area at rest at surface points [Pa]
+    force/places      (row, point, dim)             where these points are [m]
+    static/*                                        rest shape, muscles, walls, surface points
 
 A row of a table with names is complete when its first number is not negative; HDF5 shows the fill value -1
-until then.
+until then. Version 1 has no forces and no surface points.
 """
 
 from typing import cast
@@ -22,13 +26,18 @@ import numpy as np
 from softmpm.model import Model
 from softmpm.scene.scene import CONTACTS
 
-FORMAT, VERSION = "softmpm recording", 1
+FORMAT, VERSION = "softmpm recording", 2
 EPISODE = np.dtype([("iteration", "<i8"), ("attributes", "S4096")])
 SCALAR = np.dtype([("iteration", "<i8"), ("name", "S64"), ("value", "<f8")])
-FRAME = np.dtype([("episode", "<i8"), ("time", "<f8"), ("field", "<i8"), ("latent", "<i8")])
+_FIRST_FRAME = [("episode", "<i8"), ("time", "<f8"), ("field", "<i8"), ("latent", "<i8")]
+FRAME = np.dtype([*_FIRST_FRAME, ("force", "<i8"), ("traction", "<i8"), ("places", "<i8")])
+FRAMES = {1: np.dtype(_FIRST_FRAME), 2: FRAME}
+"""Rows of ``frame/index`` by version."""
 REAL, INDEX = np.dtype("<f4"), np.dtype("<i8")
+Layout = tuple[np.dtype, str]
+"""Type of the numbers, and the axes."""
 
-STATIC = {  # name: type, axes. p particles, d dim, m muscles, w walls
+STATIC = {  # name: type, axes. p particles, d dim, m muscles, w walls, k separating walls, s surface points
     "positions": (REAL, "pd"),
     "volume": (REAL, "p"),
     "body": (INDEX, "p"),
@@ -42,6 +51,9 @@ STATIC = {  # name: type, axes. p particles, d dim, m muscles, w walls
     "wall_friction": (REAL, "w"),
     "wall_contact": (np.dtype(f"S{max(map(len, CONTACTS))}"), "w"),
     "grid_shape": (INDEX, "d"),
+    "surface_wall": (INDEX, "k"),
+    "surface_point": (INDEX, "s"),
+    "surface_area": (REAL, "s"),
 }
 TABLES = {  # as above; r rows, n the nodes of the grid (dim axes), l the size of the latent
     "episode": (EPISODE, "r"),
@@ -53,18 +65,42 @@ TABLES = {  # as above; r rows, n the nodes of the grid (dim axes), l the size o
     "frame/activation": (REAL, "rm"),
     "field/velocity": (REAL, "rnd"),
     "latent/value": (REAL, "rl"),
+    "force/total": (REAL, "rkd"),
+    "force/traction": (REAL, "rksd"),
+    "force/places": (REAL, "rsd"),
 }
+SINCE_2 = ("surface_wall", "surface_point", "surface_area", "force/total", "force/traction", "force/places")
+"""Names that version 1 does not have."""
 PER_FRAME = ("x", "v", "strain", "activation")
-PARTS = {"field": "field/velocity", "latent": "latent/value"}
+PARTS = {
+    "field": "field/velocity",
+    "latent": "latent/value",
+    "force": "force/total",
+    "traction": "force/traction",
+    "places": "force/places",
+}
+"""Tables with a row only for the frames that have one."""
 _LATENT_CHUNK, _LATENT_MOST = 64, 65536
 
 
-def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarray]:
-    """Constant data of the recorded particles."""
-    scene, n = model.scene, model.particle_count
-    particle = np.arange(n)
-    if max_particles is not None and max_particles < n:
-        particle = np.sort(np.random.default_rng(0).choice(n, max_particles, replace=False))
+def stored(names: dict[str, Layout], version: int) -> dict[str, Layout]:
+    """Those of :data:`STATIC` or :data:`TABLES` that files of a version have."""
+    found = {name: layout for name, layout in names.items() if version > 1 or name not in SINCE_2}
+    return found | ({"frame/index": (FRAMES[version], "r")} if "frame/index" in found else {})
+
+
+def chosen(count: int, most: int | None) -> np.ndarray:
+    """At most so many of ``count`` things, evenly at random, the same ones every time; in ascending order."""
+    if most is None or most >= count:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
+
+
+def static_values(model: Model, max_particles: int | None, max_points: int | None) -> dict[str, np.ndarray]:
+    """Constant data of the recorded particles and surface points."""
+    scene, n, surface = model.scene, model.particle_count, model.surface
+    particle = chosen(n, max_particles)
+    point = chosen(0 if surface is None else surface.count, max_points)
     member = np.zeros((len(scene.muscles), n))
     for row, muscle in zip(member, scene.muscles, strict=True):
         row[muscle.particles] = 1
@@ -84,6 +120,9 @@ def static_values(model: Model, max_particles: int | None) -> dict[str, np.ndarr
         "wall_friction": [w.friction for w in scene.walls],
         "wall_contact": [w.contact for w in scene.walls],
         "grid_shape": scene.grid.shape,
+        "surface_wall": model.spec.surface_walls,
+        "surface_point": point,
+        "surface_area": np.zeros(0) if surface is None else surface.areas.cpu().numpy()[point],
     }
     return {name: np.asarray(values[name]).astype(dtype) for name, (dtype, _) in STATIC.items()}
 
@@ -102,6 +141,8 @@ def create(file: h5py.File, model: Model, static: dict[str, np.ndarray]) -> None
         "d": (grid.dim,),
         "m": (len(model.scene.muscles),),
         "n": tuple(grid.shape),
+        "k": static["surface_wall"].shape,
+        "s": static["surface_point"].shape,
     }
     for name, (dtype, axes) in TABLES.items():
         if axes == "rl":

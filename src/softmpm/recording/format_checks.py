@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from softmpm.recording.format import FRAME, PARTS, PER_FRAME, SCALAR, STATIC, TABLES
+from softmpm.recording.format import FRAMES, PARTS, PER_FRAME, SCALAR, STATIC, TABLES
 
 _CHECKSUM = {h5py.h5z.FILTER_FLETCHER32}
 _PACKED = _CHECKSUM | {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
@@ -31,7 +31,7 @@ def plain_dataset(path: Path, file: h5py.File, name: str, dtype: np.dtype) -> h5
         raise ValueError(f"{path}: {name} must have type {dtype}, got {node.dtype}.")
     created = node.id.get_create_plist()
     filters = {created.get_filter(i)[0] for i in range(created.get_nfilters())}
-    known = _CHECKSUM if name.startswith("static/") or dtype in (SCALAR, FRAME) else _PACKED
+    known = _CHECKSUM if name.startswith("static/") or dtype in (SCALAR, *FRAMES.values()) else _PACKED
     if not filters <= known:
         raise ValueError(f"{path}: {name} uses HDF5 filters {filters - known}; refused.")
     _check_storage(path, node, name, _BEST_COMPRESSION if filters - _CHECKSUM else 1)
@@ -56,8 +56,9 @@ def check_shapes(path: Path, static: dict[str, np.ndarray], tables: dict[str, h5
     size |= {"n": tuple(int(n) for n in static["grid_shape"].ravel())}
     size |= {"m": static["muscle"].shape[:1], "w": static["wall_offset"].shape[:1]}
     size |= {"l": tables["latent/value"].shape[1:]}
+    size |= {"k": static["surface_wall"].shape[:1], "s": static["surface_point"].shape[:1]}
     found = {f"static/{name}": (static[name].shape, axes) for name, (_, axes) in STATIC.items()}
-    found |= {name: (tables[name].shape[1:], axes[1:]) for name, (_, axes) in TABLES.items()}
+    found |= {name: (table.shape[1:], TABLES[name][1][1:]) for name, table in tables.items()}
     for name, (got, axes) in found.items():
         want = sum((size[axis] for axis in axes), ())
         if got != want:
@@ -65,10 +66,13 @@ def check_shapes(path: Path, static: dict[str, np.ndarray], tables: dict[str, h5
 
 
 def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
-    """Check that all numbers are finite and that the grid has cells."""
+    """Check that all numbers are finite, that the grid has cells, and that the walls exist."""
     for name, values in static.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise ValueError(f"{path}: static/{name} must be finite.")
+    walls, known = static["surface_wall"], len(static["wall_offset"])
+    if len(walls) and not 0 <= walls.min() <= walls.max() < known:
+        raise ValueError(f"{path}: static/surface_wall names a wall beyond the {known} that there are.")
     if static["grid_shape"].min() < 2:
         raise ValueError(f"{path}: static/grid_shape must be at least 2, got {static['grid_shape']}.")
 
@@ -76,7 +80,7 @@ def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
 def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset]) -> None:
     """Check that the rows that each frame refers to exist; frames of episodes that began after the index was read belong to none."""
     for name, table in PARTS.items():
-        count = len(tables[table])
+        count = len(tables[table]) if table in tables else 0
         if len(index) and not -1 <= index[name].min() <= index[name].max() < count:
             raise ValueError(f"{path}: frame/index names rows of {name} beyond the {count} that there are.")
     for name in PER_FRAME:

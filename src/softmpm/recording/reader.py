@@ -16,7 +16,17 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softmpm.recording.format import FORMAT, PARTS, PER_FRAME, STATIC, TABLES, VERSION, complete
+from softmpm.recording.format import (
+    FORMAT,
+    FRAME,
+    PARTS,
+    PER_FRAME,
+    STATIC,
+    TABLES,
+    VERSION,
+    complete,
+    stored,
+)
 from softmpm.recording.format_checks import check_frames, check_shapes, check_values, plain_dataset
 from softmpm.recording.superblock import readable
 from softmpm.summary import table
@@ -36,7 +46,9 @@ class Recording:
     Attributes:
         static: What does not change, by name: ``positions`` (particle, dim) [m], ``volume``, ``body``,
             ``particle`` (the model's index of each recorded particle), ``muscle`` (muscle, particle) 0 or 1,
-            ``wall_normal``, ``grid_shape``, ...
+            ``wall_normal``, ``grid_shape``, ``surface_wall`` (number of each separating wall in the scene),
+            ``surface_point`` (the model's index of each recorded surface point), ``surface_area`` [m²], ...
+        version: Of the format: 2, or 1, which has no forces.
         dt, spacing: Substep [s] and grid spacing [m].
         share: Part of the model's particles that was recorded, 1 for all.
         episodes: Iterations of the recorded simulations, in the order of the run.
@@ -104,19 +116,30 @@ class Recording:
         attributes = self._file.attrs
         if attributes.get("format") != FORMAT.encode():
             raise ValueError(f"{self.path} is an HDF5 file, but no softmpm recording.")
-        if (version := self._number("version")) != VERSION:
-            raise ValueError(f"{self.path} has format version {version:g}; this softmpm reads {VERSION}.")
+        if (version := self._number("version")) not in range(1, VERSION + 1):
+            raise ValueError(
+                f"{self.path} has format version {version:g}; this softmpm reads 1 to {VERSION}."
+            )
+        self.version = int(version)
         self.dt, self.spacing, self.share = (self._number(name) for name in ("dt", "spacing", "share"))
-        self.static = {
-            name: self._dataset(f"static/{name}", dtype)[()] for name, (dtype, _) in STATIC.items()
+        found = {
+            name: self._dataset(f"static/{name}", dtype)[()]
+            for name, (dtype, _) in stored(STATIC, self.version).items()
         }
-        self._tables = {name: self._dataset(name, dtype) for name, (dtype, _) in TABLES.items()}
+        self.static: dict[str, np.ndarray] = {
+            name: np.zeros(0, dtype) for name, (dtype, _) in STATIC.items()
+        } | found
+        tables = stored(TABLES, self.version).items()
+        self._tables = {name: self._dataset(name, dtype) for name, (dtype, _) in tables}
         check_shapes(self.path, self.static, self._tables)
         check_values(self.path, self.static)
         episodes = complete(self._tables["episode"].fields(["iteration"])[()])
         self._newest = {int(iteration): row for row, iteration in enumerate(episodes["iteration"])}
         self.episodes = tuple(self._newest)
-        self._frame = complete(self._tables["frame/index"][()])
+        index = complete(self._tables["frame/index"][()])
+        self._frame = np.full(len(index), -1, FRAME)
+        for name in index.dtype.names or ():
+            self._frame[name] = index[name]
         check_frames(self.path, self._frame, self._tables)
         self.scalars = self._by_name(complete(self._tables["scalar"][()]))
 
@@ -174,7 +197,7 @@ class Recording:
         return rows[self._frame[name][rows] >= 0] if name in PARTS else rows
 
     def read(self, name: str, rows: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """One quantity, ``time x v strain activation field latent``, at some frames.
+        """One quantity, ``time x v strain activation field latent force traction places``, at some frames.
 
         Returns:
             Those of ``rows`` at which it was recorded, and its values there, with a first axis of rows.
@@ -188,6 +211,8 @@ class Recording:
         return rows, self._take(PARTS[name], self._frame[name][rows])
 
     def _take(self, table: str, rows: np.ndarray) -> np.ndarray:
+        if table not in self._tables:
+            return np.zeros(0, TABLES[table][0])
         data = self._tables[table]
         out = np.zeros((len(rows), *data.shape[1:]), data.dtype)
         for k, row in enumerate(rows if out.size else ()):
@@ -208,9 +233,10 @@ class Recording:
 
         Returns:
             ``time`` (frame,) [s], ``x`` and ``v`` (frame, particle, dim), ``strain`` (frame, particle),
-            ``activation`` (frame, muscle); and where they were recorded ``field`` (row, *nodes, dim) and
-            ``latent`` (row, size), with ``field_frame`` and ``latent_frame`` (row,), the frame that each row
-            belongs to.
+            ``activation`` (frame, muscle); and where they were recorded ``field`` (row, *nodes, dim),
+            ``latent`` (row, size), and of the separating walls ``force`` (row, wall, dim) [N], ``traction``
+            (row, wall, point, dim) [Pa] and ``places`` of the surface points (row, point, dim) [m], each with
+            ``field_frame`` and so on (row,), the frame that each row belongs to.
         """
         rows = self.rows(iteration)
         out = {name: self.read(name, rows)[1] for name in ("time", *PER_FRAME)}

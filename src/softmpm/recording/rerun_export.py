@@ -91,6 +91,14 @@ def _log_static(stream, source: Recording, show: Show) -> None:
     muscles = [f"muscle {k}" for k in range(len(source.static["muscle"]))]
     if muscles:
         stream.log("activation", rr.SeriesLines(names=muscles), static=True)
+    if show.has["force"]:
+        names = [f"wall {k} {axis}" for k in source.static["surface_wall"] for axis in "xyz"[: source.dim]]
+        stream.log("force", rr.SeriesLines(names=names), static=True)
+    if show.has["traction"]:
+        look: dict = dict(colors=[style.TRACTION], radii=0.1 * source.spacing)
+        if source.dim == 2:
+            look["draw_order"] = 40.0  # before the particles, which have 30
+        stream.log("scene/traction", _arrows(source).from_fields(**look), static=True)
 
 
 def _log_walls(stream, source: Recording) -> None:
@@ -151,6 +159,7 @@ def _log_simulation(stream, source: Recording, show: Show, simulation: Simulatio
         if show.has["activation"]:
             _send_series(stream, "activation", _times(simulation, at), activation)
         _log_fields(stream, source, show, simulation, at)
+        _log_forces(stream, source, show, simulation, at)
         have, latent = source.read("latent", rows[at])
         if len(have):
             _send_series(stream, "latent", _times(simulation, np.searchsorted(rows, have)), latent)
@@ -166,9 +175,6 @@ def _send_series(stream, name: str, times: list, values: np.ndarray) -> None:
 
 
 def _log_fields(stream, source: Recording, show: Show, simulation: Simulation, at: np.ndarray) -> None:
-    import rerun as rr
-
-    kind = rr.Arrows2D if source.dim == 2 else rr.Arrows3D
     for k in at:
         have, field = source.read("field", simulation.rows[[k]])
         if len(have) == 0:
@@ -176,10 +182,36 @@ def _log_fields(stream, source: Recording, show: Show, simulation: Simulation, a
                 continue
             field = np.zeros((1, *(2,) * source.dim, source.dim))  # no arrows of the simulation before
         origins, vectors, colours = style.arrows(field[0], source.spacing, show.speed)
-        columns = kind.columns(origins=origins, vectors=vectors, colors=colours)
+        columns = _arrows(source).columns(origins=origins, vectors=vectors, colors=colours)
         stream.send_columns(
             "scene/grid/velocity", _times(simulation, np.array([k])), columns.partition([len(origins)])
         )
+
+
+def _log_forces(stream, source: Recording, show: Show, simulation: Simulation, at: np.ndarray) -> None:
+    """Forces of the walls as curves, tractions as arrows; no arrows in frames without them."""
+    rows = simulation.rows
+    have, force = source.read("force", rows[at])
+    if len(have):
+        when = _times(simulation, np.searchsorted(rows, have))
+        _send_series(stream, "force", when, force.reshape(len(have), -1))
+    if show.has["traction"]:
+        arrows = [(np.zeros((0, source.dim)),) * 2] * len(at)
+        have, traction = source.read("traction", rows[at])
+        places = source.read("places", have)[1]
+        for k, where, one in zip(np.searchsorted(rows[at], have), places, traction, strict=True):
+            arrows[k] = style.traction_arrows(where, one, source.spacing, show.traction)
+        origins, vectors = (np.concatenate(parts) for parts in zip(*arrows, strict=True))
+        columns = _arrows(source).columns(origins=origins, vectors=vectors)
+        lengths = [len(origins) for origins, _ in arrows]
+        stream.send_columns("scene/traction", _times(simulation, at), columns.partition(lengths))
+
+
+def _arrows(source: Recording):
+    """Kind of arrows in this dimension."""
+    import rerun as rr
+
+    return rr.Arrows2D if source.dim == 2 else rr.Arrows3D
 
 
 def _log_caption(stream, source: Recording, simulation: Simulation) -> None:
@@ -224,6 +256,9 @@ def _blueprint(source: Recording, show: Show):
     if show.has["field"]:
         name = f"grid velocity, up to {show.speed:.2g} m/s"
         rest.append(_space(source, show, name, ["/scene/grid/velocity", walls]))
+    if show.has["traction"]:
+        name = f"traction of the walls, up to {show.traction:.2g} Pa"
+        rest.append(_space(source, show, name, [f"{robot}/activation", "/scene/traction", walls]))
     side: list = [rrb.TextDocumentView(origin="/caption", name="now playing")]
     quiet = rrb.PlotLegend(visible=False)
     curves = [
@@ -231,9 +266,10 @@ def _blueprint(source: Recording, show: Show):
     ]
     if curves:
         side.append(rrb.Tabs(*curves, active_tab=0))
-    for name in ("activation", "latent"):
+    for name in ("activation", "latent", "force"):
         if show.has[name]:
-            side.append(rrb.TimeSeriesView(origin=f"/{name}", name=name, plot_legend=quiet))
+            title = "force of the walls [N]" if name == "force" else name
+            side.append(rrb.TimeSeriesView(origin=f"/{name}", name=title, plot_legend=quiet))
     left = rrb.Vertical(main, rrb.Horizontal(*rest), row_shares=[3, 2])
     return rrb.Blueprint(
         rrb.Horizontal(

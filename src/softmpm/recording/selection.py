@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm.recording import style
+from softmpm.recording.format import PARTS, chosen
 from softmpm.recording.reader import Recording
 
 _SAMPLE = 64  # frames that decide the scales and the framing
@@ -34,31 +35,36 @@ class Show:
     """Strain at the top of its colour scale [-]."""
     speed: float
     """Speed of the longest arrow [m/s]."""
+    traction: float
+    """Traction of the longest arrow [Pa]."""
     low: np.ndarray
     """Lower corner of the box to frame [m], shape (dim,)."""
     high: np.ndarray
     """Upper corner of that box [m]."""
     has: dict[str, bool]
-    """True for each of ``activation``, ``field`` and ``latent`` that was recorded."""
+    """True for ``activation`` and each quantity of only some frames, such as ``field``, that was recorded."""
 
 
 def plan(source: Recording, every: int, max_particles: int | None) -> Show:
     """Select each ``every``-th frame and at most ``max_particles`` particles, and choose the scales."""
-    particle = np.arange(source.particle_count)
-    if max_particles is not None and max_particles < len(particle):
-        particle = np.sort(np.random.default_rng(0).choice(particle, max_particles, replace=False))
+    particle = chosen(source.particle_count, max_particles)
     simulations = _in_sequence(source, every)
     rows = np.concatenate([np.zeros(0, np.int64), *(simulation.rows for simulation in simulations)])
     some = _spread(rows)
     x = np.concatenate([source.static["positions"], source.read("x", some)[1].reshape(-1, source.dim)])
     x = x[np.isfinite(x).all(-1)]
     low, high = style.frame_box(x.min(0), x.max(0), (source.static["grid_shape"] - 1) * source.spacing)
-    has = {name: len(source.recorded(name, rows)) > 0 for name in ("field", "latent")}
+    has = {name: len(source.recorded(name, rows)) > 0 for name in PARTS}
     has["activation"] = bool(np.isfinite(source.read("activation", some)[1]).any())
-    fields = source.recorded("field", rows)
-    tops = [_top(np.linalg.norm(source.read("field", row)[1], axis=-1)) for row in _spread(fields)[:, None]]
-    strain, speed = _top(source.read("strain", some)[1]), max(tops, default=0.0)
-    return Show(simulations, particle, strain or 1.0, speed or 1.0, low, high, has)
+    speed, traction = (_longest(source, name, rows) for name in ("field", "traction"))
+    strain = _top(source.read("strain", some)[1])
+    return Show(simulations, particle, strain or 1.0, speed or 1.0, traction or 1.0, low, high, has)
+
+
+def _longest(source: Recording, name: str, rows: np.ndarray) -> float:
+    """Top of the scale of a field of vectors."""
+    some = _spread(source.recorded(name, rows))[:, None]
+    return max((_top(np.linalg.norm(source.read(name, row)[1], axis=-1)) for row in some), default=0.0)
 
 
 def _in_sequence(source: Recording, every: int) -> list[Simulation]:

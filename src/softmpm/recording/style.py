@@ -14,6 +14,8 @@ WALL = {
     b"symmetry": (150, 180, 205),
 }
 MOST_ARROWS = 3000
+LEAST_ARROW = 0.01  # of the longest
+TRACTION = (20, 110, 50)
 
 
 def pack(rgb: np.ndarray) -> np.ndarray:
@@ -107,12 +109,35 @@ def arrows(velocity: np.ndarray, spacing: float, top: float) -> tuple[np.ndarray
         origins [m] and vectors [m], (arrow, dim), and packed colours (arrow,).
     """
     speed = np.linalg.norm(velocity, axis=-1)
-    nodes = np.argwhere(speed > 0.01 * top)
+    nodes = np.argwhere(speed > LEAST_ARROW * top)
     nodes = nodes[:: -(-len(nodes) // MOST_ARROWS) or 1]
     vectors = velocity[tuple(nodes.T)] / top
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    vectors *= 3 * spacing / np.maximum(length, 1)
-    return nodes * spacing, vectors, strain_colours(length.T, 1.0)[0]
+    return nodes * spacing, _drawn(vectors, spacing), strain_colours(length.T, 1.0)[0]
+
+
+def traction_arrows(
+    places: np.ndarray, traction: np.ndarray, spacing: float, top: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Arrows at the surface points that a wall touches, the greatest about three cells long.
+
+    Args:
+        places: Of the points [m], shape (point, dim).
+        traction: Of all walls [Pa], shape (wall, point, dim).
+        top: Traction [Pa] drawn at full length.
+
+    Returns:
+        origins [m] and vectors [m], (arrow, dim).
+    """
+    total = traction.sum(0)
+    touched = np.linalg.norm(total, axis=-1) > LEAST_ARROW * top
+    return places[touched], _drawn(total[touched] / top, spacing)
+
+
+def _drawn(vectors: np.ndarray, spacing: float) -> np.ndarray:
+    """Arrows of three cells for vectors of length one and more."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors * (3 * spacing / np.maximum(length, 1))
 
 
 def frame_box(low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from softmpm.model import Model
 from softmpm.recording.digest import Content, Hash
 from softmpm.recording.file import begin, open_to_append, put_in_place, room
 from softmpm.recording.format import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
-from softmpm.state import GridField, State
+from softmpm.state import ContactForces, GridField, State
 
 
 class Recorder:
@@ -31,7 +31,7 @@ class Recorder:
             recorder.scalars(0, {"loss": 0.3})
 
     A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity
-    comes on top.
+    comes on top, and forces of w walls on s surface points with 8 (w + 1) s bytes in 2D and 12 (w + 1) s in 3D.
 
     Args:
         path: The file to write. It must not exist, unless ``resume_before`` is given.
@@ -41,6 +41,7 @@ class Recorder:
         resume_digest: What :attr:`digest` was when these iterations had been recorded; None does not ask.
         every: Record each ``every``-th frame of a simulation only.
         max_particles: Record this many particles, chosen evenly at random, the same in every run; None: all.
+        max_points: Record the tractions at this many surface points, likewise; 0 for the forces of the walls only.
 
     Raises:
         FileExistsError: The file exists, and ``resume_before`` was not given.
@@ -57,18 +58,26 @@ class Recorder:
         resume_digest: str | None = None,
         every: int = 1,
         max_particles: int | None = None,
+        max_points: int | None = None,
     ):
-        for name, value in (("every", every), ("max_particles", max_particles)):
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
+        for name, value, least in (
+            ("every", every, 1),
+            ("max_particles", max_particles, 1),
+            ("max_points", max_points, 0),
+        ):
+            if value is not None and value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}.")
         self.path, self.every = Path(path), every
         if resume_before is None and self.path.exists():
             raise FileExistsError(
                 f"{self.path} exists; choose another path, or go on with resume_before=<iteration>."
             )
-        static = static_values(model, max_particles)
-        self._particles = torch.from_numpy(static["particle"])
+        static = static_values(model, max_particles, max_points)
+        self._particles, self._points = (
+            torch.from_numpy(static[name]) for name in ("particle", "surface_point")
+        )
         self._shape = (model.particle_count, model.scene.grid.dim)
+        self._point_count = None if model.surface is None else model.surface.count
         self._content = Content()
         draft = self.path.with_name(f"{self.path.name}.new")
         draft.unlink(missing_ok=True)  # of a killed process, or a link
@@ -118,10 +127,28 @@ class Recorder:
         with room(self._file, sum(one.nbytes for _, one in rows.values())):
             for table, (counted, one) in rows.items():
                 put(self._tables[table], self._count[counted], one[None])
-        field, latent = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
-        self._write("frame/index", np.array([(episode, time, field, latent)], FRAME))
+        at = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
+        self._write("frame/index", np.array([(episode, time, *at)], FRAME))
         for name in parts:
             self._count[PARTS[name]] += 1
+
+    def _contact(self, forces: ContactForces, world: int) -> dict[str, np.ndarray]:
+        """Forces of the walls, and tractions and places of the recorded points, of one world."""
+        if self._point_count is None:
+            raise ValueError(
+                "forces need contact at surface points, which the model of this recorder has not; leave them out."
+            )
+        walls, dim = self._tables["force/total"].shape[1:]
+        shapes = ((walls, dim), (walls, self._point_count, dim), (self._point_count, dim))
+        for name, tensor, shape in zip(forces._fields, forces, shapes, strict=True):
+            if tuple(tensor.shape[1:]) != shape:
+                raise ValueError(
+                    f"forces.{name} must have shape (world, *{shape}), got {tuple(tensor.shape)}."
+                )
+        points = self._points.to(forces.total.device)
+        total, traction, places = (tensor.detach()[world] for tensor in forces)
+        found = {"force": total, "traction": traction[:, points], "places": places[points]}
+        return {name: _numpy(tensor) for name, tensor in found.items() if tensor.numel()}
 
     def _write(self, name: str, rows: np.ndarray) -> None:
         self._need_open()
@@ -156,6 +183,7 @@ class Episode:
         activation: Tensor | None = None,
         field: GridField | Tensor | None = None,
         latent: Tensor | None = None,
+        forces: ContactForces | None = None,
         *,
         world: int = 0,
     ) -> None:
@@ -168,6 +196,7 @@ class Episode:
             field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize``
                 returns.
             latent: What an observer saw, shape (world, size) or (size,).
+            forces: What :func:`softmpm.contact_forces` returns for this state.
             world: The world to record.
         """
         recorder, self._calls = self._recorder, self._calls + 1
@@ -192,6 +221,8 @@ class Episode:
         if latent is not None:  # the first one decides the size
             size = row["latent/value"] if row["latent/value"] != (0,) else tuple(latent.shape[-1:])
             parts["latent"] = _one_world("latent", latent, world, size)
+        if forces is not None:
+            parts |= recorder._contact(forces, world)
         recorder._frame(self._row, float(time), values, parts)
         Content.frame(self._content, float(time), values | parts)
 

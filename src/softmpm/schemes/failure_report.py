@@ -7,6 +7,7 @@ from softmpm.errors import FROZEN, NEVER, Kind, UnstableError, decode
 from softmpm.model import Model
 from softmpm.schemes.failure_messages import Case
 from softmpm.schemes.inputs import Values
+from softmpm.schemes.overlap import Overlap
 from softmpm.schemes.penetration import Penetration
 from softmpm.state import State
 
@@ -79,7 +80,8 @@ def failure(
         case = Penetration(model, world, particle, end, values, time)
         particle, where = case.particle, f"{case.where} of world {world}"
     else:
-        case = Case(model, kind, world, particle, end, values)
+        about = model, world, particle, end
+        case = Overlap(*about) if kind is Kind.OVERLAP else Case(model, kind, world, particle, end, values)
         where = f"particle {particle} (body {int(model.body[particle])}) of world {world}"
     name, value, limit, advice = case.explain()
     at = f"substep {substep} (t = {(substep + 1) * model.scene.dt:.6g} s after the start of the call)"

@@ -57,8 +57,10 @@ class TaskConf:
     effort: float = 1e-3
     """Weight of the mean squared activation in the loss; decides between motions that are equally good."""
     formulation: str = "moving"
-    """moving, or reference: as in :func:`softmpm.build`. In the reference formulation limbs pass through each other, and the body
-    has cut cells."""
+    """moving, or reference: as in :func:`softmpm.build`. In the reference formulation nothing keeps limbs from passing through each
+    other, and the body has cut cells."""
+    overlap: bool = False
+    """reference: whether limbs may pass through each other; else the simulation stops by name where they do."""
     contact: str = "auto"
     """reference: what meets the floor. auto and surface: the surface of the robot; nodes: the nodes around it."""
     contact_width: float = 0.0
@@ -106,7 +108,8 @@ class TaskConf:
     @property
     def build(self) -> dict[str, Any]:
         """Arguments of :func:`softmpm.build`."""
-        return {name: getattr(self, name) for name in ("formulation", "contact", "contact_width")}
+        found = {name: getattr(self, name) for name in ("formulation", "contact", "contact_width")}
+        return found | ({"alarms": softmpm.Alarms(overlap=None)} if self.overlap else {})
 
 
 @dataclass(kw_only=True)

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from surface_scenes import block, forces_of, made, record_forces
 
 import softmpm
 from softmpm.__main__ import main
@@ -175,3 +176,35 @@ def test_a_failed_conversion_keeps_the_old_file(tmp_path):
     with pytest.raises(OSError, match="is damaged: row 5 of frame/x"):
         softmpm.to_rerun(source)
     assert rrd.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["run.h5", "run.rrd"]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_forces_are_drawn(tmp_path, dim):
+    """Arrows at the points that a wall touches, none in the frame without forces; a curve for each wall and axis."""
+    model = made(block(dim))
+    with softmpm.Recorder(tmp_path / "run.h5", model) as recorder:
+        record_forces(recorder, model, 3)
+    rrd = softmpm.to_rerun(tmp_path / "run.h5")
+    kind, wanted = f"Arrows{dim}D", [forces_of(model, 30 + k, worlds=2) for k in (1, 2)]
+    (part,) = read(rrd, "/scene/traction")
+    per_frame = [[len(one) for one in part[f"{kind}:{name}"]] for name in ("origins", "vectors")]
+    touched = [(one.traction[0].sum(0).norm(dim=-1) > 0).sum().item() for one in wanted]
+    assert per_frame[0] == per_frame[1] and per_frame[0][0] == 0
+    assert all(0.9 * most <= count <= most for count, most in zip(per_frame[0][1:], touched, strict=True))
+    vectors = flat(part[f"{kind}:vectors"]).reshape(-1, dim)
+    assert np.linalg.norm(vectors, axis=-1).max() == pytest.approx(3 * model.scene.grid.spacing, rel=1e-5)
+    first, origins = wanted[0], flat(part[f"{kind}:origins"]).reshape(-1, dim)
+    at = [np.abs(first.points[0].numpy() - origin).sum(-1).argmin() for origin in origins[: per_frame[0][1]]]
+    pulled = first.traction[0].sum(0).numpy()[at]
+    along = (pulled * vectors[: len(at)]).sum(-1)
+    lengths = np.linalg.norm(pulled, axis=-1) * np.linalg.norm(vectors[: len(at)], axis=-1)
+    np.testing.assert_allclose(along, lengths, rtol=1e-5)
+    curves = column(rrd, "/force", "Scalars:scalars").reshape(2, -1)
+    np.testing.assert_allclose(curves, [one.total[0].flatten() for one in wanted], rtol=1e-6)
+    assert column(rrd, "/force", "frame").tolist() == [1, 2]
+    names = [
+        flat(batch.column("SeriesLines:names")).tolist()
+        for one in chunk.RrdReader(rrd).stream().filter(content="/force")
+        if "SeriesLines:names" in (batch := one.to_record_batch()).schema.names
+    ]
+    assert names == [[f"wall {k} {axis}" for k in (0, 1) for axis in "xyz"[:dim]]]

@@ -93,3 +93,11 @@ def test_dots_grow_when_fewer_are_shown():
     for dim in (2, 3):
         full, part = (style.radii(np.ones(1), shown, dim) for shown in (1.0, 0.5**dim))
         assert part == pytest.approx(2 * full)
+
+
+def test_arrows_of_tractions():
+    """The walls' tractions add up; those below a hundredth of the scale are left out, those above it are cut."""
+    traction = np.array([[(0.0, 1.0), (0.001, 0.0), (3.0, 0.0)], [(0.0, 1.0), (0.0, 0.0), (0.0, 4.0)]])
+    origins, vectors = style.traction_arrows(np.arange(6.0).reshape(3, 2), traction, 0.1, 4.0)
+    np.testing.assert_allclose(origins, [(0, 1), (4, 5)])
+    np.testing.assert_allclose(vectors, [(0, 0.15), (0.18, 0.24)])

@@ -17,6 +17,7 @@ from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
 from softmpm.schemes.lagrangian.kernels import define_adj
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
+from softmpm.schemes.lagrangian.overlap import OverlapCheck
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
 from softmpm.state import Nodal
@@ -35,6 +36,7 @@ class ChunkBuffers:
         inputs: Inputs, those of particles in the order of their places.
         contact: Contact of surface points, or None.
         reflection: Clamps and planes of symmetry, or None.
+        overlap: Check for bodies that pass through each other, or None.
     """
 
     def __init__(self, model: Model, chunk: Chunk, keep: bool):
@@ -64,6 +66,7 @@ class ChunkBuffers:
             self.contact = SurfaceContact(model, chunk, self.mass, self.anchor, self.shift, self.force)
         if model.mirror is not None:
             self.reflection = Reflection(model, self.mass)
+        self.overlap = None if model.overlap is None else OverlapCheck(model)
 
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
@@ -71,7 +74,8 @@ class ChunkBuffers:
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        return sum(one.nbytes for one in (self.u, self.v, self.p, self.mass, self.anchor, self.partial))
+        states = sum(one.nbytes for one in (self.u, self.v, self.p, self.mass, self.anchor, self.partial))
+        return states + (0 if self.overlap is None else self.overlap.bytes)
 
     def index(self, s: int) -> int:
         """Number of the state before substep ``s``."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from softmpm.planning.memory import Buffers, Plan, Sizes, input_bytes, sizes_of
+from softmpm.schemes.lagrangian.overlap import overlap_bytes
 
 
 class LagrangianFootprint:
@@ -26,6 +27,6 @@ class LagrangianFootprint:
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         real, nodal = model.dtype.itemsize, model.sizes().inside
         sums = model.worlds * model.rest_grid.window.numel() * model.dim * real
-        forward = 2 * nodal + sums + input_bytes(model, 1)
+        forward = 2 * nodal + sums + input_bytes(model, 1) + overlap_bytes(model)
         kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
         return Buffers(forward, kept, 2 * nodal + 2 * sums)

@@ -36,6 +36,8 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
         inputs = buffers.inputs.grid_struct(last - 1)
         buffers.contact.check_end(launch, inputs, last - 1, buffers.index(last), u, buffers.words_array)
     brick_launch(model, launch, kernel, model.constants, buffers.rest, last - 1, u, buffers.words_array)
+    if buffers.overlap is not None:
+        buffers.overlap.check(launch, last - 1, u, buffers.words_array)
 
 
 def _check_step(buffers: ChunkBuffers, s: int, state: int, launch: KernelLauncher) -> None:
