@@ -15,6 +15,7 @@ import torch
 import warp as wp
 
 from softmpm.kernels.lagrangian.rest import UNROLLED
+from softmpm.kernels.parts import in_parts
 
 HEADER = Path(__file__).with_name("bricks.h")
 
@@ -119,10 +120,8 @@ def bricks_for(dim: int, particles: int, device: torch.device, dtype: torch.dtyp
 
 def brick_module(name: str) -> str:
     """Set the compile options of the Warp module of this name, as native functions need them; returns the name."""
-    source = HEADER.read_text()
-    build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)
     options = {
-        "extra_build_options": build,
+        "extra_build_options": in_parts(HEADER.read_text()),
         "max_unroll": UNROLLED,
         "cuda_output": "cubin",
         "enable_backward": False,

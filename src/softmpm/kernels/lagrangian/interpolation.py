@@ -256,12 +256,13 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
             z = line()
             if wp.static(dim == 3):
                 z = with_term(line(), fx, row_of(A, 2), b[dim - 1])
-            for n in range(count):
-                at = brick * nodes + corner + place(n)
-                if wp.static(dim == 2):
-                    partial[world, at] = partial[world, at] + vec(x[n], y[n])
-                else:
-                    partial[world, at] = partial[world, at] + vec(x[n], y[n], z[n])
+            if corner >= 0:  # else no cell
+                for n in range(count):
+                    at = brick * nodes + corner + place(n)
+                    if wp.static(dim == 2):
+                        partial[world, at] = partial[world, at] + vec(x[n], y[n])
+                    else:
+                        partial[world, at] = partial[world, at] + vec(x[n], y[n], z[n])
             return total
         else:
             if slot < slots:
