@@ -64,7 +64,9 @@ def surface(spec: Spec) -> SimpleNamespace:
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, exact_of = f.Frame, f.recentring, f.exact
     face, depth = wall_face(spec).face, wall_face(spec).depth
-    running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
+    running, was_running, report = (
+        getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
+    )
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
@@ -137,7 +139,8 @@ def surface(spec: Spec) -> SimpleNamespace:
         """(K2) to (K4), (K6), (K7): impulse A J of each point."""
         world, p = wp.tid()
         total = vec()
-        if running(words, world):
+        last = wp.max(substep - 1, 0)
+        if was_running(words, world, last, in_wall):
             d = recentring(moving, u, world)
             x = present(body, p, at_point(body, u, world, p))
             v = at_point(body, free, world, p)
@@ -145,7 +148,7 @@ def surface(spec: Spec) -> SimpleNamespace:
                 k = number[q]
                 wall = face(constants, inputs, world, k, x + shift[world], anchor[world, q, p])
                 if wall.depth > body.deepest[p]:
-                    report(words, world, wp.max(substep - 1, 0), in_wall, q * body.points.shape[0] + p)
+                    report(words, world, last, in_wall, q * body.points.shape[0] + p)
                 found = touch(
                     wall.n,
                     wall.y,
