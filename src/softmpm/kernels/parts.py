@@ -15,13 +15,21 @@ COUNT_BYTES = 64
 """Bytes of the counters of a launch: a cache line."""
 
 
-def in_parts(source: str = "") -> wp.ModuleBuildOptions:
+def in_parts(source: str = "", before: str = "") -> wp.ModuleBuildOptions:
     """Build options of modules whose kernels of two or three dimensions may be launched in parts.
 
     Args:
         source: Native code of the module on every device.
+        before: Further code on the CPU, before the other.
     """
-    return wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=HEADER.read_text() + source)
+    on_cpu = HEADER.read_text() + before + source
+    return wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=on_cpu)
+
+
+def may_be_divided(kernel: wp.Kernel) -> bool:
+    """True if the kernel's module has these options."""
+    build = kernel.module.options.get("extra_build_options")
+    return build is not None and build.extra_cpu_preamble.startswith(HEADER.read_text())
 
 
 @kernel_factory

@@ -1,4 +1,4 @@
-"""Repeated kernel launches: single launches that are rebound to new arrays, and lists on fixed arrays, captured as CUDA graphs."""
+"""Repeated kernel launches: single ones that are rebound to new arrays, and lists on fixed arrays, as CUDA graphs or CPU programs."""
 
 import functools
 import math
@@ -69,8 +69,8 @@ class LaunchReplay:
 
     The function is passed at each use and not stored, since its owner holds this object.
 
-    While PyTorch captures a CUDA graph, the launches become part of that graph. Warp's CPU graphs would be faster still, but they
-    also capture what other threads launch meanwhile.
+    While PyTorch captures a CUDA graph, the launches become part of that graph. Warp's CPU graphs would also capture what other
+    threads launch meanwhile.
     """
 
     def __init__(self, model: Model):

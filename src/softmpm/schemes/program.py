@@ -15,7 +15,7 @@ import torch
 import warp as wp
 
 from softmpm.kernels.compile import launch
-from softmpm.kernels.parts import COUNT_BYTES, runner
+from softmpm.kernels.parts import COUNT_BYTES, may_be_divided, runner
 
 MOST_PARTS = 256
 """Parts of a launch at most: threads take them one by one from a counter that they share."""
@@ -55,6 +55,10 @@ class Program:
         self._launches = [made for made, _ in launches]  # with what they refer to
         self._arguments = [_arguments(made) for made in self._launches]
         self._bounds = [_parts(made.bounds, size) for made, size in launches]
+        divided = {
+            made.kernel for made, bounds in zip(self._launches, self._bounds, strict=True) if len(bounds) > 1
+        }
+        assert all(map(may_be_divided, divided)), "the modules of divided kernels need in_parts()"
         self._rows = (_Row * len(launches))(*map(_row, self._launches, self._arguments, self._bounds))
         self._counts = (ctypes.c_char * (COUNT_BYTES * len(launches)))()
         self._stop = ctypes.c_int32()
