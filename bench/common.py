@@ -86,7 +86,9 @@ def median_seconds(work, device: torch.device, repeats: int) -> float:
     return statistics.median(seconds)
 
 
-def arguments(description: str, schemes: bool = False, formulations: bool = False) -> argparse.Namespace:
+def arguments(
+    description: str, schemes: bool = False, formulations: bool = False, threads: bool = False
+) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--repeats", type=int, default=5)
@@ -95,6 +97,9 @@ def arguments(description: str, schemes: bool = False, formulations: bool = Fals
         parser.add_argument("--scheme", default="auto", choices=["auto", "fast", "plain"])
     if formulations:
         parser.add_argument("--formulation", default="moving", choices=["moving", "reference"])
+    if threads:
+        help = "numbers of threads on a CPU"
+        parser.add_argument("--threads", type=int, nargs="+", default=[torch.get_num_threads()], help=help)
     parser.add_argument("--json", type=Path, default=None, help="also write the table to this file")
     return parser.parse_args()
 

@@ -1,4 +1,4 @@
-"""Both formulations on one body: `python bench/formulations.py [--device cuda] [--json bench/results/formulations.h200.json]`
+"""Both formulations on one body: `python bench/formulations.py [--device cpu --threads 1 2] [--json FILE]`
 
 Microseconds of a substep in calls without gradient, in calls that store their states, and of the backward pass; medians after a
 warm-up, the two formulations in turn. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving formulation's
@@ -7,6 +7,10 @@ figure over that of the reference formulation.
 ``cube``: particles on a lattice, without walls, in one world or several. ``block`` has an outline; ``on a floor`` it also meets a wall
 with friction, at nodes in the moving and at surface points in the reference formulation, where the last row gives the times with the
 floor over those without.
+
+On a CPU the reference formulation runs with each number of threads; ``gain`` is its time with the first over that with this number,
+and ``cores`` the processor time of a call without gradient over its duration: below ``threads`` if other processes had a part of the
+cores.
 """
 
 import time
@@ -53,52 +57,64 @@ def cases(on_a_cpu: bool) -> Iterator[tuple[str, int, int, int, Callable[[], sof
             yield name, dim, 1, (2 * cells) ** dim, lambda d=dim, c=cells, f=floor: block(d, c, f)
 
 
-def forward(model: softmpm.Model, substeps: int, repeats: int) -> float:
-    """Median microseconds of a substep without gradient."""
+def forward(model: softmpm.Model, substeps: int, repeats: int) -> tuple[float, float]:
+    """Median microseconds of a substep without gradient, and the cores that were used."""
     start, params, times = model.rest(), model.params(), []
     for _ in range(repeats + 1):
         sync(model.device)
-        begin = time.perf_counter()
+        begin, used = time.perf_counter(), time.process_time()
         with torch.no_grad():
             softmpm.simulate(model, start, None, params, substeps=substeps)
         sync(model.device)
-        times.append(time.perf_counter() - begin)
-    return sorted(times[1:])[repeats // 2] / substeps * 1e6
+        times.append((time.perf_counter() - begin, time.process_time() - used))
+    median, used = sorted(times[1:])[repeats // 2]
+    return median / substeps * 1e6, used / median
 
 
-def figures(scene: softmpm.Scene, formulation: str, worlds: int, substeps: int, args) -> tuple[float, ...]:
-    """In the order of :data:`FIGURES`."""
+def figures(
+    scene: softmpm.Scene, formulation: str, worlds: int, substeps: int, args
+) -> tuple[tuple[float, ...], float]:
+    """In the order of :data:`FIGURES`, and the cores that were used."""
     model = softmpm.build(
         scene, device=args.device, worlds=worlds, formulation=formulation, memory_budget=2**62
     )
     ahead, back = measure(model, substeps, args.repeats)
-    sizes = model.sizes()
-    return forward(model, substeps, args.repeats), ahead, back, sizes.inside + sizes.nodes
+    sizes, (alone, cores) = model.sizes(), forward(model, substeps, args.repeats)
+    return (alone, ahead, back, sizes.inside + sizes.nodes), cores
 
 
 def main():
-    args = arguments(__doc__)
+    args = arguments(__doc__, threads=True)
     device = torch.device(args.device)
     table, before = Table("Two formulations [us/substep], float32", device, args.json), (1.0,) * 4
+    runs = [("moving", args.threads[0]), *(("reference", count) for count in args.threads)]
     for name, dim, worlds, particles, scene in cases(device.type == "cpu"):
         if particles * worlds > (args.largest or particles * worlds):
             continue
-        case = {"scene": name, "dim": dim, "worlds": worlds, "particles": particles}
-        substeps, found = substeps_of(particles * worlds, device)["kept"], {}
-        for formulation in ("moving", "reference"):
-            found[formulation] = figures(scene(), formulation, worlds, substeps, args)
-            table.add(
-                case | {"formulation": formulation} | dict(zip(FIGURES, found[formulation], strict=True))
-            )
+        case, found = {"scene": name, "dim": dim, "worlds": worlds, "particles": particles}, []
+        substeps = substeps_of(particles * worlds, device)["kept"]
+
+        def add(kind: str, threads: int, values: tuple[float, ...], cores: float = 0.0, case=case) -> None:
+            row = case | {"formulation": kind, "threads": threads}
+            table.add(row | dict(zip(FIGURES, values, strict=True)) | {"cores": cores})
+
+        for formulation, threads in runs:
+            torch.set_num_threads(threads)
+            values, cores = figures(scene(), formulation, worlds, substeps, args)
+            found.append(values)
+            add(formulation, threads, values, cores)
             if device.type == "cuda":
                 torch.cuda.empty_cache()
-        rows = {"ratio": (found["moving"], found["reference"])}
+        add("ratio", runs[1][1], quotients(found[0], found[1]))
+        for (_, threads), values in zip(runs[2:], found[2:], strict=True):
+            add("gain", threads, quotients(found[1], values))
         if name == "block on a floor":
-            rows["with over without"] = found["reference"], before
-        for label, (one, other) in rows.items():
-            ratios = [a / b for a, b in zip(one, other, strict=True)]
-            table.add(case | {"formulation": label} | dict(zip(FIGURES, ratios, strict=True)))
-        before = found["reference"]
+            add("with over without", runs[1][1], quotients(found[1], before))
+        before = found[1]
+
+
+def quotients(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(a / b for a, b in zip(one, other, strict=True))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Repeated kernel launches: single launches that are rebound to new arrays, and lists on fixed arrays, captured as CUDA graphs."""
+"""Repeated kernel launches: single ones that are rebound to new arrays, and lists on fixed arrays, as CUDA graphs or CPU programs."""
 
 import functools
+import math
 import threading
 from collections.abc import Callable, Sequence
 
@@ -10,6 +11,7 @@ import warp as wp
 from softmpm.kernels.compile import launch
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
+from softmpm.schemes.program import Program
 
 
 class KernelLauncher:
@@ -18,12 +20,21 @@ class KernelLauncher:
     def __init__(self, model: Model, stream: wp.Stream | None, collected: list | None = None):
         self.device, self.stream, self.collected = model.wp_device, stream, collected
 
-    def __call__(self, kernel, dim, *inputs, block_dim: int = 256) -> None:
-        collect = self.collected is not None
+    def __call__(self, kernel, dim, *inputs, block_dim: int = 256, part: int | None = None) -> None:
+        """Launch a kernel.
+
+        Args:
+            part: Threads in each of the parts into which a CPU divides the launch; None if it must not be divided. The module of the
+                kernel needs the build options :func:`softmpm.kernels.parts.in_parts`.
+        """
+        divided = self.collected is None and self.device.is_cpu and part is not None and math.prod(dim) > part
+        collect = self.collected is not None or divided
         settings = dict(stream=self.stream, block_dim=block_dim, record_cmd=collect)
         made = launch(kernel, dim, inputs, self.device, **settings)
-        if self.collected is not None:
-            self.collected.append(made)
+        if divided:
+            Program([(made, part)]).run()
+        elif self.collected is not None:
+            self.collected.append((made, part))
 
 
 class RebindableLaunch:
@@ -54,22 +65,22 @@ class RebindableLaunch:
 
 
 class LaunchReplay:
-    """Captures ``launches(launcher)`` on first use, as a CUDA graph or, on the CPU, as a list of launches, and replays it.
+    """Captures ``launches(launcher)`` on first use, as a CUDA graph or, on the CPU, as a program, and replays it.
 
     The function is passed at each use and not stored, since its owner holds this object.
 
-    While PyTorch captures a CUDA graph, the launches become part of that graph. Warp's CPU graphs would be faster still, but they
-    also capture what other threads launch meanwhile.
+    While PyTorch captures a CUDA graph, the launches become part of that graph. Warp's CPU graphs would also capture what other
+    threads launch meanwhile.
     """
 
     def __init__(self, model: Model):
         self.model = model
         self._graph: wp.Graph | None = None
-        self._list: list | None = None
+        self._program: Program | None = None
 
     def run(self, stream: wp.Stream | None, launches: Callable[[KernelLauncher], None]) -> None:
         if stream is None:
-            self._run_list(launches)
+            self._run_program(launches)
         elif is_capturing(self.model):
             launches(KernelLauncher(self.model, stream))
         else:
@@ -80,15 +91,12 @@ class LaunchReplay:
             else:
                 wp.capture_launch(self._graph, stream=stream)
 
-    def _run_list(self, launches: Callable[[KernelLauncher], None]) -> None:
-        if self._list is None:
+    def _run_program(self, launches: Callable[[KernelLauncher], None]) -> None:
+        if self._program is None:
             collected = []
             launches(KernelLauncher(self.model, None, collected))
-            self._list = (
-                collected  # only now: an interruption during compilation would leave an incomplete list
-            )
-        for collected_launch in self._list:
-            collected_launch.launch()
+            self._program = Program(collected)
+        self._program.run()
 
     def _capture(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
         """The captured graph; None if another thread is capturing: waiting for it could deadlock."""

@@ -148,6 +148,9 @@ CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradi
     const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int corner, int layer,
     const wp::mat_t<K * DIM, 3, T>& w, const wp::mat_t<K * DIM, 3, T>& e)
 {
+#if !defined(__CUDA_ARCH__)
+    return cpu_gradients<NODES, ACROSS, ALONG, K>(values, window, world, brick, corner, layer, w, e);
+#else
     constexpr int LAST = (DIM - 1) * K, Q = DIM == 2 ? 1 : K;  // places along the middle axis
     wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> out(T(0));
     T wl[3], el[3];
@@ -197,6 +200,7 @@ CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradi
                 }
     }
     return out;
+#endif
 }
 
 // Add A g / rate of the particles of a layer to the sums of the brick. All threads of a block come here together, those without a cell
@@ -206,19 +210,18 @@ CUDA_CALLABLE inline void add_layer(
     const wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T>& A, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick,
     int corner, int layer, int lane, const wp::mat_t<K * DIM, 3, T>& w, const wp::mat_t<K * DIM, 3, T>& e)
 {
+#if !defined(__CUDA_ARCH__)
+    if (corner >= 0)
+        cpu_add<NODES, ACROSS, ALONG, K>(A, partial, world, brick, corner, layer, w, e);
+#else
     constexpr int LAST = (DIM - 1) * K, Q = DIM == 2 ? 1 : K, MIDDLE = DIM == 2 ? 1 : 3;
     wp::vec_t<DIM, T>* out = partial.data + size_t(world) * partial.shape[1] + brick * NODES;
-#if defined(__CUDA_ARCH__)
     constexpr int THREADS = CELLS * K;
     Node<T, DIM>* planes = shared_nodes<-1, 3 * K * NODES, T, DIM>();
     meet();  // sums that were added before may still be read
     for (int k = lane; k < 3 * K * NODES; k += THREADS)
         planes[k] = {};
     meet();
-#else
-    if (corner < 0)
-        return;
-#endif
     T x[3][Q][DIM], y[3][Q][DIM], z[3][Q][DIM];
 #pragma unroll
     for (int i = 0; i < 3; ++i)
@@ -259,7 +262,6 @@ CUDA_CALLABLE inline void add_layer(
 #pragma unroll
         for (int k = 0; k < 3; ++k) {
             T wl = w.data[LAST + layer][k], el = e.data[LAST + layer][k];
-#if defined(__CUDA_ARCH__)
             if (corner >= 0)
 #pragma unroll
                 for (int i = 0; i < 3; ++i) {
@@ -272,14 +274,8 @@ CUDA_CALLABLE inline void add_layer(
                     *node = sum;
                 }
             meet_slice<ACROSS, ALONG, DIM>();
-#else
-            for (int i = 0; i < 3; ++i)
-                for (unsigned c = 0; c < DIM; ++c)
-                    out[corner + (DIM == 2 ? i : i * ACROSS + j) * ALONG + k].c[c] += wl * plain[i][c] + el * sloped[i][c];
-#endif
         }
     }
-#if defined(__CUDA_ARCH__)
     meet();
     for (int k = lane; k < NODES; k += THREADS) {
         wp::vec_t<DIM, T> sum = {};

@@ -1,7 +1,8 @@
 """Bricks of cells: boxes of cells with the window of their nodes.
 
-On the CPU a thread has a brick, reads nodes where they are and adds to the partial sums directly. On a GPU a block of threads has a
-brick, with the nodes of its window in shared memory (bricks.h). There are no atomic additions: results are the same bits in every run.
+On the CPU a thread has a brick, reads nodes where they are and adds to the partial sums directly (fours.h). On a GPU a block of threads
+has a brick, with the nodes of its window in shared memory (bricks.h). There are no atomic additions: results are the same bits in every
+run.
 
 Particles anywhere: each thread has one particle of a row (interpolation.py). Particles on a lattice, the same in every cell: each
 thread has a layer of a cell, whose particles share weights (lattice.py).
@@ -15,8 +16,9 @@ import torch
 import warp as wp
 
 from softmpm.kernels.lagrangian.rest import UNROLLED
+from softmpm.kernels.parts import in_parts
 
-HEADER = Path(__file__).with_name("bricks.h")
+HEADER, FOURS_HEADER = (Path(__file__).with_name(name) for name in ("bricks.h", "fours.h"))
 
 
 class Bricks(NamedTuple):
@@ -119,10 +121,8 @@ def bricks_for(dim: int, particles: int, device: torch.device, dtype: torch.dtyp
 
 def brick_module(name: str) -> str:
     """Set the compile options of the Warp module of this name, as native functions need them; returns the name."""
-    source = HEADER.read_text()
-    build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)
     options = {
-        "extra_build_options": build,
+        "extra_build_options": in_parts(HEADER.read_text(), FOURS_HEADER.read_text()),
         "max_unroll": UNROLLED,
         "cuda_output": "cubin",
         "enable_backward": False,

@@ -15,6 +15,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, meet
+from softmpm.kernels.lagrangian.fours import fours
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
 
@@ -25,7 +26,7 @@ def field(dim: int, dtype: str, bricks: Bricks, number: int, layered: bool = Fal
     t, r = types(dim, dtype), rest(dim, dtype)
     real, vec, mat, Rest, weights, lean = t.real, t.vec, t.mat, r.Rest, r.weights, r.lean
     nodes, across, along = bricks.nodes, bricks.window[-2], bricks.window[-1]
-    threads = bricks.layer_threads if layered else bricks.threads
+    threads, of_one = bricks.layer_threads if layered else bricks.threads, fours(dim, dtype, bricks).gradient
 
     @wp.func_native(f"softmpm::stage<{number}, {nodes}, {threads}>(values, window, world, brick, lane);")
     def copy_window(
@@ -139,6 +140,22 @@ def field(dim: int, dtype: str, bricks: Bricks, number: int, layered: bool = Fal
                         out += (w[i, 0] * w[j, 1] * w[k, 2]) * a
             return out
 
+    if bricks.serial:
+
+        @wp.func
+        def gradient(
+            values: wp.array2d(dtype=vec),
+            inside: Rest,
+            world: int,
+            brick: int,
+            corner: int,
+            fx: vec,
+            rate: real,
+        ) -> mat:
+            """Σ a ⊗ g"""
+            w = weights(fx)
+            return rate * of_one(values, inside.window, world, brick, corner, w, lean(w, fx))
+
     return SimpleNamespace(stage=stage, gradient=gradient, value=value)
 
 
@@ -154,7 +171,7 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
     parts, slots, serial = bricks.parts, bricks.slots, bricks.serial
     across, along, kinds = bricks.window[-2], bricks.window[-1], dim + (2 if loaded else 1)
     line = wp.types.vector(count, real)
-    terms = f"{kinds * dim * slots}, {slots}"
+    terms, add_of_one = f"{kinds * dim * slots}, {slots}", fours(dim, dtype, bricks).add
     sizes = f"{nodes}, {threads}, {count}, {across}, {along}"
 
     @wp.func_native(f"softmpm::give<{terms}>(number, lane, value);")
@@ -218,14 +235,6 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
             out[k] = A[axis, k]
         return out
 
-    @wp.func
-    def place(n: int) -> int:
-        """Node n of a cell in the window, from the cell's corner on."""
-        if wp.static(dim == 2):
-            return n / 3 * along + n % 3
-        else:
-            return (n / 9 * across + (n / 3) % 3) * along + n % 3
-
     @wp.func_native(f"softmpm::clear_sums<{nodes}>(partial, world, brick);")
     def clear(partial: wp.array2d(dtype=vec), world: int, brick: int): ...
 
@@ -251,17 +260,9 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
     ) -> line:
         """Add what the particles of a row give; A and b are zero where there is none. All threads of a block call this together."""
         if wp.static(serial):
-            x = with_term(line(), fx, row_of(A, 0), b[0])
-            y = with_term(line(), fx, row_of(A, 1), b[1])
-            z = line()
-            if wp.static(dim == 3):
-                z = with_term(line(), fx, row_of(A, 2), b[dim - 1])
-            for n in range(count):
-                at = brick * nodes + corner + place(n)
-                if wp.static(dim == 2):
-                    partial[world, at] = partial[world, at] + vec(x[n], y[n])
-                else:
-                    partial[world, at] = partial[world, at] + vec(x[n], y[n], z[n])
+            if corner >= 0:  # else no cell
+                w = weights(fx)
+                add_of_one(A, b, partial, world, brick, corner, w, lean(w, fx))
             return total
         else:
             if slot < slots:

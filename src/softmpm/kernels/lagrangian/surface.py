@@ -80,7 +80,9 @@ def surface(spec: Spec) -> SimpleNamespace:
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, exact_of = f.Frame, f.recentring, f.exact
     face, depth = wall_face(spec).face, wall_face(spec).depth
-    running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
+    running, was_running, report = (
+        getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
+    )
     vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
     module = lagrangian_module(spec.module + ".lagrangian")
 
@@ -207,8 +209,9 @@ def surface(spec: Spec) -> SimpleNamespace:
         deepest = body.deepest[p]
         area = body.areas[p]
         total = vec()
+        last = wp.max(substep - 1, 0)
         deep = int(-1)
-        if running(words, world):
+        if was_running(words, world, last, in_wall):
             d = recentring(moving, middle)
             for q in range(count):
                 if wall.depth[q] > deepest:
@@ -235,7 +238,7 @@ def surface(spec: Spec) -> SimpleNamespace:
             new_anchor[world, q, p] = after[q]
         impulse[world, p] = area * total
         if deep >= 0:
-            report(words, world, wp.max(substep - 1, 0), in_wall, deep * body.points.shape[0] + p)
+            report(words, world, last, in_wall, deep * body.points.shape[0] + p)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(

@@ -13,10 +13,17 @@ from softmpm.kernels.structs import Spec, types
 @kernel_factory
 def report(dim: int, dtype: str) -> SimpleNamespace:
     """Functions that read and write the status word of a world."""
+    kind_bits = SUBSTEP_SHIFT - KIND_SHIFT
 
     @wp.func
     def running(words: wp.array(dtype=wp.int64), world: int) -> bool:
         return words[world] == wp.int64(NEVER)
+
+    @wp.func
+    def was_running(words: wp.array(dtype=wp.int64), world: int, substep: int, kind: int) -> bool:
+        """As ``running`` before a launch that itself reports failures of this substep and kind."""
+        own = (wp.int64(substep) << wp.int64(kind_bits)) | wp.int64(kind)
+        return running(words, world) or words[world] >> wp.int64(KIND_SHIFT) == own
 
     @wp.func
     def write(words: wp.array(dtype=wp.int64), world: int, substep: int, kind: int, particle: int):
@@ -33,7 +40,7 @@ def report(dim: int, dtype: str) -> SimpleNamespace:
         word = words[world]
         return word >= wp.int64(substep) << wp.int64(SUBSTEP_SHIFT) and word != wp.int64(FROZEN)
 
-    return SimpleNamespace(running=running, ran=ran, report=write)
+    return SimpleNamespace(running=running, was_running=was_running, ran=ran, report=write)
 
 
 @kernel_factory

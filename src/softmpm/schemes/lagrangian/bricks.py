@@ -54,16 +54,16 @@ def brick_launch(model: Model, launch: KernelLauncher, kernel, *inputs, layered:
     """Launch a kernel of bricks: a block of threads for each on a GPU, one thread on the CPU."""
     grid = model.rest_grid
     threads = grid.bricks.layer_threads if layered else grid.bricks.threads
-    launch(kernel, (model.worlds, grid.brick_count, threads), *inputs, block_dim=threads)
+    launch(kernel, (model.worlds, grid.brick_count, threads), *inputs, block_dim=threads, part=1)
 
 
 def node_launch(model: Model, launch: KernelLauncher, kernel, *inputs) -> None:
     """Launch a kernel of nodes."""
-    launch(kernel, (model.worlds, model.rest_grid.count), *inputs, block_dim=NODE_BLOCK)
+    launch(kernel, (model.worlds, model.rest_grid.count), *inputs, block_dim=NODE_BLOCK, part=NODE_PART)
 
 
-NODE_BLOCK = 128
-"""Threads per block of kernels of nodes."""
+NODE_BLOCK, NODE_PART = 128, 512
+"""Threads per block of kernels of nodes, and in each of the parts into which a CPU divides the launch."""
 
 
 def empty_partial(model: Model) -> Tensor:

@@ -11,6 +11,7 @@ from softmpm.kernels.lagrangian.mirror import mirror, mirror_adj, mirror_type
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import view
+from softmpm.schemes.lagrangian.bricks import NODE_PART
 from softmpm.schemes.lagrangian.surface import SurfaceContact
 
 
@@ -42,7 +43,8 @@ class Reflection:
     ) -> None:
         """(B1) of ``new_v``, and ``new_u`` that follows from it."""
         constants, kernel = self.model.constants, mirror(self.model.spec).reflect
-        launch(kernel, self.lead, constants, self.struct, self.mass, words, u, new_v, new_u)
+        arguments = (constants, self.struct, self.mass, words, u, new_v, new_u)
+        launch(kernel, self.lead, *arguments, part=NODE_PART)
 
 
 class ReflectionAdj:
@@ -81,9 +83,9 @@ class ReflectionAdj:
         """The velocity before the reflection once more; with surface contact also the adjoint of the second reflection."""
         one = self.forward
         arguments = (one.model.constants, inputs, rest, one.mass, u, p)
-        launch(self._kernels.free_again, one.mass.shape, *arguments, self._free)
+        launch(self._kernels.free_again, one.mass.shape, *arguments, self._free, part=NODE_PART)
         if self.contact is not None:
-            launch(self._kernels.free_again, one.mass.shape, *arguments, self.contact.free)
+            launch(self._kernels.free_again, one.mass.shape, *arguments, self.contact.free, part=NODE_PART)
             one.advance(launch, self._words, u, self.contact.free, self._scratch)
             self._reflect(launch, one.model.scene.dt, new_v, adj_u, adj_v)
 
@@ -98,4 +100,4 @@ class ReflectionAdj:
         """(B1.adj) at ``v``. After the second reflection v is its result, so that the masses get nothing: (K5.adj) has their part."""
         one = self.forward
         arguments = (one.struct, one.mass, moved, v, adj_u, adj_v, self._adj_mass)
-        launch(self._kernels.reflect_adj, one.lead, *arguments)
+        launch(self._kernels.reflect_adj, one.lead, *arguments, part=NODE_PART)

@@ -14,7 +14,7 @@ from softmpm.checks import check_reflected, check_shown
 from softmpm.kernels.lagrangian.projection import masses, node_sums, projection
 from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.schemes.buffers import view
+from softmpm.schemes.buffers import passing, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
@@ -74,6 +74,7 @@ class _Arrays:
         self.rest, self.launch = rest_struct(model), KernelLauncher(model, stream_of(model.device))
         self.kernels = projection(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
         self.sums = node_sums(model.spec.dim, model.spec.dtype)
+        self._held: list[Tensor] = []  # until the launches
 
     def particles(self) -> list[Tensor]:
         """Tensors for the four fields of a state."""
@@ -91,10 +92,12 @@ class _Arrays:
     def partials(self) -> list[wp.array]:
         return [view(empty_partial(self.model), self.types.vec) for _ in range(2)]
 
-    def views(self, *tensors: Tensor) -> list[wp.array]:
+    def views(self, *tensors: Tensor) -> list:
         """Scalars, vectors or matrices, by the number of axes."""
         kinds = {2: self.types.real, 3: self.types.vec, 4: self.types.mat}
-        return [view(tensor.contiguous(), kinds[tensor.ndim]) for tensor in tensors]
+        given = [tensor.contiguous() for tensor in tensors]
+        self._held += given
+        return [passing(tensor, kinds[tensor.ndim]) for tensor in given]
 
     def node_masses(self, mass: Tensor) -> Tensor:
         """Masses of the nodes, from those of the places."""

@@ -13,9 +13,13 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.lagrangian.bricks import NODE_PART
 from softmpm.schemes.lagrangian.driven import drive
 from softmpm.schemes.lagrangian.frame import frame_struct
 from softmpm.schemes.penetration import deepest
+
+POINT_PART = 64
+"""Surface points in each of the parts into which a CPU divides a launch."""
 
 
 def surface_struct(model: Model):
@@ -87,7 +91,9 @@ class SurfaceContact:
 
     def begin(self, launch: Callable[..., None]) -> None:
         """Launch what depends on the masses only."""
-        launch(surface(self.model.spec).delassus, self.points, self._struct, self._mass, self._D)
+        launch(
+            surface(self.model.spec).delassus, self.points, self._struct, self._mass, self._D, part=POINT_PART
+        )
 
     def anew(self, s: int) -> int:
         """1 if a control step begins with substep ``s``, but the first one, where the buffers are cleared."""
@@ -121,17 +127,10 @@ class SurfaceContact:
             self._impulse,
             anchors[1],
         )
-        launch(kernels.press, self.points, *parameters, *arguments)
-        parameters = (
-            model.constants,
-            self._struct,
-            self._frame,
-            self._mass,
-            self.lanes,
-            self._impulse,
-            words,
-        )
-        launch(kernels.settle, self.touched, *parameters, u, v, self.free, new_u, new_v)
+        launch(kernels.press, self.points, *parameters, *arguments, part=POINT_PART)
+        about = (self._struct, self._frame, self._mass, self.lanes, self._impulse, words)
+        arguments = (u, v, self.free, new_u, new_v)
+        launch(kernels.settle, self.touched, model.constants, *about, *arguments, part=NODE_PART)
 
     def check_end(
         self, launch: Callable[..., None], inputs: Any, s: int, end: int, u: wp.array, words: wp.array
@@ -139,7 +138,7 @@ class SurfaceContact:
         """Check the depth of the points in state ``end`` after substep ``s``, whose inputs are given."""
         kernel, about = surface(self.model.spec).check_depth, (self.model.scene.dt, s)
         parameters = (self.model.constants, inputs, self._struct, *about)
-        launch(kernel, self.points, *parameters, self.shifts[end], u, words)
+        launch(kernel, self.points, *parameters, self.shifts[end], u, words, part=POINT_PART)
 
 
 def check_start(
@@ -148,7 +147,7 @@ def check_start(
     """Check the depth of the points in the initial state of a call, with the inputs of its first substep."""
     points = (model.worlds, model.anchor_shape[2])
     arguments = (model.constants, inputs, surface_struct(model), 0.0, 0, shift, u, words)
-    launch(surface(model.spec).check_depth, points, *arguments)
+    launch(surface(model.spec).check_depth, points, *arguments, part=POINT_PART)
 
 
 class SurfaceContactAdj:
@@ -207,36 +206,24 @@ class SurfaceContactAdj:
             pending: See :mod:`softmpm.kernels.lagrangian.nodes`.
         """
         one, shift = self.forward, self.forward.shifts[s]
-        constants, adj_points, out = (
-            one.model.constants,
-            (self._adj_x, self._adj_free),
-            (self._adj_mass, adj_inputs),
-        )
+        constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
+        out = (self._adj_mass, adj_inputs)
         parameters = (constants, inputs, rest, one._mass, self.held, shift, *stored, new_v, *pending)
-        launch(
-            self._kernels.settle_adj,
-            one.nodes,
-            *parameters,
-            adj_u,
-            adj_v,
-            one.free,
-            self._shared,
-            adj_f,
-            *out,
-        )
+        arguments = (adj_u, adj_v, one.free, self._shared, adj_f, *out)
+        launch(self._kernels.settle_adj, one.nodes, *parameters, *arguments, part=NODE_PART)
         drive(one.model, launch, inputs, self._words, stored[0], self._scratch, one.free)
         about = (self.held, one.rate_array, one.anew(s))
         parameters = (constants, inputs, one._struct, one._width, one._D, *about)
         anchors = view(one.anchors[s], one._vec)
         arguments = (shift, stored[0], one.free, anchors, self._shared, self._adj_force, self._adj_anchor)
-        launch(
-            self._kernels.press_adj, one.points, *parameters, *arguments, *adj_points, self._adj_D, adj_inputs
-        )
+        arguments = (*arguments, *adj_points, self._adj_D, adj_inputs)
+        launch(self._kernels.press_adj, one.points, *parameters, *arguments, part=POINT_PART)
         parameters = (constants, inputs, rest, one._struct, one._mass, self.held, one.lanes, shift, *stored)
-        launch(self._kernels.spread_adj, one.touched, *parameters, *adj_points, adj_u, adj_v, adj_f, *out)
+        arguments = (*adj_points, adj_u, adj_v, adj_f, *out)
+        launch(self._kernels.spread_adj, one.touched, *parameters, *arguments, part=NODE_PART)
 
     def finish(self, launch: Callable[..., None]) -> None:
         """Add what the mobility D of all substeps gives to the masses."""
         one = self.forward
         arguments = (one._struct, one._mass, self._adj_D, self._adj_mass)
-        launch(self._kernels.delassus_adj, one.touched[:2], *arguments)
+        launch(self._kernels.delassus_adj, one.touched[:2], *arguments, part=NODE_PART)

@@ -1,0 +1,67 @@
+"""Launches on the CPU in parts, which threads run at the same time.
+
+A program is a list of launches. Threads take the parts of a launch from a counter and begin the next launch when all of them are done.
+A thread may come late or not at all: the others do its work.
+"""
+
+from pathlib import Path
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+
+HEADER = Path(__file__).with_name("parts.h")
+COUNT_BYTES = 64
+"""Bytes of the counters of a launch: a cache line."""
+
+
+def in_parts(source: str = "", before: str = "") -> wp.ModuleBuildOptions:
+    """Build options of modules whose kernels of two or three dimensions may be launched in parts.
+
+    Args:
+        source: Native code of the module on every device.
+        before: Further code on the CPU, before the other.
+    """
+    on_cpu = HEADER.read_text() + before + source
+    return wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=on_cpu)
+
+
+def may_be_divided(kernel: wp.Kernel) -> bool:
+    """True if the kernel's module has these options."""
+    build = kernel.module.options.get("extra_build_options")
+    return build is not None and build.extra_cpu_preamble.startswith(HEADER.read_text())
+
+
+@kernel_factory
+def runner() -> wp.Kernel:
+    """Kernel that takes part in the launches from ``first`` to ``last`` of a program."""
+    module = "softmpm.parts"
+    wp.set_module_options({"extra_build_options": in_parts()}, module=wp.get_module(module))
+
+    @wp.func_native(
+        "softmpm::run_parts(reinterpret_cast<const softmpm::Row*>(program), reinterpret_cast<softmpm::Count*>(counts), "
+        "reinterpret_cast<wp::int32*>(stop), reinterpret_cast<softmpm::GiveWay>(give_way), helper, first, last);"
+    )
+    def run_parts(
+        program: wp.int64,
+        counts: wp.int64,
+        stop: wp.int64,
+        give_way: wp.int64,
+        helper: bool,
+        first: int,
+        last: int,
+    ): ...
+
+    @wp.kernel(module=module, enable_backward=False)
+    def run(
+        program: wp.int64,  # address of one row for each launch
+        counts: wp.int64,  # address of the counters, zero at the start
+        stop: wp.int64,
+        give_way: wp.int64,  # address of a function that lets other threads run
+        helper: bool,
+        first: int,
+        last: int,
+    ):
+        run_parts(program, counts, stop, give_way, helper, first, last)
+
+    return run

@@ -1,0 +1,116 @@
+"""Threads of a CPU that share the launches of the reference formulation."""
+
+import time
+
+import pytest
+import torch
+from surface_scenes import made, slab
+
+import softmpm
+from softmpm.schemes import program
+from softmpm.schemes.lagrangian.bricks import NODE_PART
+
+
+@pytest.fixture
+def threads(monkeypatch):
+    """Function that sets PyTorch's number of threads; returns a list of the helpers that then take part.
+
+    The thread of the call waits a little, so that they have come when it begins.
+    """
+    before, take_part = torch.get_num_threads(), program._take_part
+    joined = []
+
+    def patient(arguments):
+        if arguments.helper:
+            joined.append(arguments)
+        elif torch.get_num_threads() > 1:
+            time.sleep(0.005)
+        take_part(arguments)
+
+    def set_threads(count: int) -> list:
+        joined.clear()
+        torch.set_num_threads(count)
+        return joined
+
+    monkeypatch.setattr(program, "_take_part", patient)
+    yield set_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def model() -> softmpm.Model:
+    """Worlds with a block on a floor: launches over bricks, nodes and surface points all have several parts."""
+    found = made(slab(width=20), worlds=12)
+    assert found.worlds * found.rest_grid.count > 2 * NODE_PART
+    return found
+
+
+def falling(model: softmpm.Model, speed: float) -> softmpm.State:
+    start = model.rest()
+    start.v[..., 1] = -speed
+    start.v[..., 0] = start.x[..., 1]
+    start.v.requires_grad_()
+    return start
+
+
+def run(model: softmpm.Model, start: softmpm.State) -> list[torch.Tensor]:
+    """End, forces of the walls, and gradients of one call."""
+    params = softmpm.Params(*(p.requires_grad_() for p in model.params()))
+    end = softmpm.simulate(model, start, None, params, substeps=150)
+    assert end.nodes is not None
+    loss = (end.x**2).sum() + (end.F**2).sum()
+    return [*end[:4], end.nodes.force, *torch.autograd.grad(loss, [start.v, *params])]
+
+
+def test_threads_do_not_change_a_bit(model, threads):
+    """An impact with friction: end, forces and gradients are the same with one thread and with several."""
+    threads(1)
+    alone = run(model, falling(model, 0.3))
+    assert alone[4].abs().max() > 0, "nothing touches the floor"
+    for count in (2, 3, 2):
+        joined = threads(count)
+        together = run(model, falling(model, 0.3))
+        assert joined, "no helper came"
+        for one, other in zip(alone, together, strict=True):
+            assert torch.equal(one, other)
+
+
+def test_threads_report_the_same_failure(threads):
+    """Many points are too deep in the floor at once: the message names the same one."""
+    model, said = made(slab(width=20), worlds=12, alarms=softmpm.Alarms(depth=1e-3)), []
+    for count in (1, 2, 2):
+        threads(count)
+        with pytest.raises(softmpm.UnstableError) as failed:
+            run(model, falling(model, 1.0))
+        assert failed.value.kind == "in_wall"
+        said.append(str(failed.value))
+    assert len(set(said)) == 1, said
+
+
+def test_an_interrupt_leaves_no_thread_at_work(model, threads, monkeypatch):
+    """The helper stops with the call, and the next one is right."""
+    threads(1)
+    alone = run(model, falling(model, 0.3))
+    threads(2)
+    patient, calls = program._take_part, []
+
+    def interrupted(arguments):
+        calls.append(arguments)
+        if not arguments.helper and arguments.first == program.INTERRUPTIBLE:
+            raise KeyboardInterrupt
+        patient(arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(program, "_take_part", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(model, falling(model, 0.3))
+    for one, other in zip(alone, run(model, falling(model, 0.3)), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_small_scenes_have_one_thread(threads):
+    """A start of a thread takes longer than they do."""
+    small = made(slab(width=4))
+    joined = threads(2)
+    softmpm.simulate(small, small.rest(), None, small.params(), substeps=2)
+    assert not joined
