@@ -64,9 +64,9 @@ inline void run_parts(const Row* program, Count* counts, int* stop, GiveWay give
             __atomic_fetch_add(&counts[k].done, 1, __ATOMIC_RELEASE);
         }
         for (int turn = 0; __atomic_load_n(&counts[k].done, __ATOMIC_ACQUIRE) < row.parts; ++turn) {
-            if (turn > 2000)
+            if (turn > 100000)
                 give_way();
-            if (turn == 2500 && !helper && ++long_waits == 4)
+            if (turn == 105000 && !helper && ++long_waits == 4)
                 __atomic_store_n(stop, 1, __ATOMIC_RELAXED);
         }
     }
