@@ -165,12 +165,16 @@ def _owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:
 
 
 def _check_moving(model: Model, wants: str) -> None:
-    """Raise unless this is a model of the moving formulation."""
+    """Raise unless this is a model of the moving formulation with contact at nodes."""
     check_model(model, wants)
     if model.formulation != "moving":
         raise ValueError(
             f"{wants} and softmpm.step need formulation='moving', got a model with formulation={model.formulation!r}; take "
             "softmpm.simulate."
+        )
+    if model.surface is not None:
+        raise ValueError(
+            f"{wants} and softmpm.step need contact='nodes', got a model with contact='surface'; take softmpm.simulate."
         )
 
 
