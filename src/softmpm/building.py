@@ -102,6 +102,11 @@ def build(
     if not surface:
         alarms = dataclasses.replace(alarms, depth=None)
     place = device_of(device)
+    if surface and deterministic and formulation == "moving" and place.type == "cuda":
+        raise ValueError(
+            "deterministic=True has no contact at surface points on a GPU with formulation='moving'; take formulation='reference', "
+            "whose sums have a fixed order, or contact='nodes'."
+        )
     return Model(
         scene,
         place,

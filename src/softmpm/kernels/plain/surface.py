@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import in_order, kernel_factory
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.point_share import point_share
 from softmpm.kernels.physics.spline import spline
@@ -38,8 +38,7 @@ def outline_type(dim: int, dtype: str):
 
 
 @kernel_factory
-def surface(spec: Spec, ordered: bool) -> SimpleNamespace:
-    """The kernels; ``ordered``: a GPU adds to a node in the order of the points."""
+def surface(spec: Spec) -> SimpleNamespace:
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype)
     real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
     exact_vec, GridInputs = types(dim, "float64").vec, input_types(spec).GridInputs
@@ -53,7 +52,6 @@ def surface(spec: Spec, ordered: bool) -> SimpleNamespace:
     each_world, rough = "friction" in spec.given, spec.friction
     lost, in_wall = int(Kind.LOST), int(Kind.IN_WALL)
     module = spec.module + ".surface"
-    module = in_order(module, s.count) if ordered else module
 
     @wp.func
     def friction_of(inputs: GridInputs, world: int, k: int) -> real:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import in_order, kernel_factory
+from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.point_share import point_share
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.physics.surface_contact import surface_contact
@@ -21,12 +21,12 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_
 
 
 @kernel_factory
-def surface_adj(spec: Spec, wanted: RequestedGrads, ordered: bool) -> SimpleNamespace:
+def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     dim, t, s, one = (
         spec.dim,
         types(spec.dim, spec.dtype),
         spline(spec.dim, spec.dtype),
-        surface(spec, ordered),
+        surface(spec),
     )
     real, vec, ivec, node_vec, Constants = t.real, t.vec, t.ivec, t.node, t.Constants
     exact_vec, GridInputs = types(dim, "float64").vec, input_types(spec).GridInputs
@@ -39,7 +39,6 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, ordered: bool) -> SimpleName
     friction_of, at_point, number, count = one.friction_of, one.at_point, one.number, len(spec.surface_walls)
     before_wall = wp.types.matrix((count, dim), real)
     module = adj_module(spec, wanted) + ".surface"
-    module = in_order(module, s.count) if ordered else module
 
     @wp.kernel(module=module, enable_backward=False)
     def advance_adj(

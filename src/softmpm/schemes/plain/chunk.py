@@ -17,7 +17,7 @@ from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, elapsed, grid_struct, particle_struct
 from softmpm.schemes.launch import KernelLauncher
 from softmpm.schemes.plain.footprint import PlainFootprint
-from softmpm.schemes.plain.substep import Substep, sums_in_order
+from softmpm.schemes.plain.substep import Substep
 from softmpm.schemes.plain.surface import SurfaceContact, SurfaceContactAdj, check_start
 from softmpm.schemes.surface_start import with_surface
 from softmpm.state import State
@@ -50,8 +50,7 @@ class PlainRun:
         self.structs = [self.states[i].struct(model) for i in range(len(self.states.base))]
         self.contact = None
         if start.surface is not None:
-            about = (model, chunk, keep, self.step.ordered, start.surface, self.step.launch)
-            self.contact = SurfaceContact(*about)
+            self.contact = SurfaceContact(model, chunk, keep, start.surface, self.step.launch)
         if frozen:
             self.step.words[list(frozen)] = FROZEN
         self.step.enter(start, self.structs[0])
@@ -139,7 +138,7 @@ class Plain:
                 known["elapsed"] = elapsed(model, 0, 1, 1)
             launch = KernelLauncher(model, stream_of(model.device))
             about = (grid_struct(model, known), start.surface.x, view(words, wp.int64))
-            check_start(model, sums_in_order(model), launch, *about)
+            check_start(model, launch, *about)
         return words
 
     def accept(self, run: PlainRun, words: list[int]) -> bool:

@@ -24,11 +24,6 @@ from softmpm.schemes.plain.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.state import Low, State
 
 
-def sums_in_order(model: Model) -> bool:
-    """True if the kernels of a deterministic model must be told the order of their sums; the CPU adds in one order anyway."""
-    return model.deterministic and model.device.type == "cuda"
-
-
 class Substep:
     """The launches of one substep, on grid buffers of its own that are made when first used.
 
@@ -43,7 +38,7 @@ class Substep:
     def __init__(self, model: Model):
         self.model, self.stream = model, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
-        self.ordered = sums_in_order(model)
+        self.ordered = model.deterministic and model.device.type == "cuda"  # the CPU adds in one order anyway
         # All of a module before it is first loaded: it is compiled once.
         self.transfer = transfer(model.spec, self.ordered)
         grid(model.spec)
