@@ -1,10 +1,10 @@
 """Contact at surface points on the moving grid in plain float64 PyTorch, beside :mod:`softmpm.reference_contact`.
 
-The points of the outline are carried with the grid. Their velocity is that at their place of the affine motion which fits the momenta
-of the nodes around them best, so a node counts by its mass and none needs to be left out. Derivations: docs/math/contact.md.
+The points of the outline are carried with the grid. Their velocity is that of the affine motion which fits the velocities of the nodes
+around them best, weighted by spline and mass, so light nodes need not be left out. Derivations: docs/math/contact.md.
 
-    k_i = w_i(x_s) m_i,  μ = Σ k_i,  r = x_i − x_s in cells,  r̂ = Σ k_i r_i / μ
-    K = Σ k_i (r_i − r̂)(r_i − r̂)ᵀ / μ + ε I,   b_si = (w_i / μ) (1 − r̂ᵀ K⁻¹ (r_i − r̂))            (K8)
+    k_i = w_i(x_s) m_i,  M = Σ k_i,  r = x_i − x_s in cells,  r̂ = Σ k_i r_i / M
+    K = Σ k_i (r_i − r̂)(r_i − r̂)ᵀ / M + ε I,   b_si = (w_i / M) (1 − r̂ᵀ K⁻¹ (r_i − r̂))            (K8)
     D_s = Σ_i m_i |b_si| l_i,   l_i = Σ_r |b_ri| A_r,   v_s = Σ_i m_i b_si v*_i                       (K9)
     v'_i = v*_i + Σ_s b_si A_s Σ_k J_k,   x'_s = x_s + Δt Σ_i m_i b_si v'_i                           (K10)
 """
@@ -31,7 +31,7 @@ from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
 SPREAD = 1e-6
-"""ε [cells²]: with all mass on a line or a point of nodes the motion across it is taken to be constant."""
+"""ε [cells²]: where all mass lies on nodes in a line or a plane, the motion across it is taken to be constant."""
 
 
 class Points(NamedTuple):

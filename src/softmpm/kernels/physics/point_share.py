@@ -1,14 +1,11 @@
-"""Shares of a surface point in the nodes around it, weighted by their mass, and the adjoint. Derivation: docs/math/contact.md.
+"""Affine fit to the nodes around a surface point, weighted by their mass: its share in each. Derivation: docs/math/contact.md.
 
 With k_i = w_i m_i, M = Σ k_i, r = x_i − x_s in cells, r̂ = Σ k_i r_i / M, d_i = r_i − r̂:
 
     K = Σ k_i d_i d_iᵀ / M + ε I,  z = K⁻¹ r̂,  g_i = 1 − z·d_i,  b_i = w_i g_i / M                    (K8)
 
-    z̄ = −Σ (w_i/M) b̄_i d_i,  q = K⁻¹ z̄,  h = z Σ (w_i/M) b̄_i + q
-    c_i = h·r_i − (z·d_i)(q·d_i),  k̄_i = (c_i − Σ k_j c_j / M − Σ b_j b̄_j) / M
-    w̄_i = b̄_i g_i / M + m_i k̄_i,  m̄_i += w_i k̄_i,  ∂L/∂fx = Σ w̄_i ∇w_i − q                          (K8.adj)
-
-m_i b_i is the weight of a node: Σ m_i b_i = 1 and, but for ε, Σ m_i b_i r_i = 0. b_i itself stays bounded where m_i vanishes.
+m_i b_i is the weight of a node: Σ m_i b_i = 1 and, but for ε, Σ m_i b_i r_i = 0. b_i itself stays bounded where m_i vanishes. The
+adjoint is in kernels/plain/surface_adj.py.
 """
 
 from types import SimpleNamespace
@@ -20,7 +17,7 @@ from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
 
 SPREAD = 1e-6
-"""ε [cells²]: with all mass on a line or a point of nodes the motion across it is taken to be constant."""
+"""ε [cells²]: where all mass lies on nodes in a line or a plane, the motion across it is taken to be constant."""
 
 
 @kernel_factory

@@ -1,10 +1,15 @@
 """Adjoint of contact at surface points on the moving grid (surface.py). Derivation: docs/math/contact.md.
 
-v̄'_i += Δt m_i b_si x̄'_s,  b̄_si = Δt m_i v'_i·x̄'_s,  m̄_i += Δt b_si v'_i·x̄'_s,  x̄_s = x̄'_s
-J̄_s = A_s Σ b_si v̄'_i,  b̄_si += A_s J_s·v̄'_i,  v̄*_i = v̄'_i                                      (K10.adj)
-from the last wall to the first: J̄ += A_s f̄_s / T + D v̄_s,  D̄ += J·v̄_s, then (K4.adj), (K3.adj), (K6.adj)
-v̄*_i += m_i b_si v̄_s,  b̄_si += m_i (v*_i·v̄_s ± l_i D̄_s),  m̄_i += b_si v*_i·v̄_s + |b_si| l_i D̄_s,
-l̄_i += m_i |b_si| D̄_s,  b̄_si ± = A_s l̄_i,  with the sign of b_si, then (K8.adj)                  (K9.adj)
+    v̄'_i += Δt m_i b_si x̄'_s,  b̄_si = Δt m_i v'_i·x̄'_s,  m̄_i += Δt b_si v'_i·x̄'_s,  x̄_s = x̄'_s
+    J̄_s = A_s Σ b_si v̄'_i,  b̄_si += A_s J_s·v̄'_i,  v̄*_i = v̄'_i                                      (K10.adj)
+    from the last wall to the first: J̄ += A_s f̄_s / T + D v̄_s,  D̄ += J·v̄_s, then (K4.adj), (K3.adj), (K6.adj)
+    v̄*_i += m_i b_si v̄_s,  b̄_si += m_i (v*_i·v̄_s ± l_i D̄_s),  m̄_i += b_si v*_i·v̄_s + |b_si| l_i D̄_s,
+    l̄_i += m_i |b_si| D̄_s,  b̄_si += ± A_s l̄_i,  with the sign of b_si                                (K9.adj)
+    z̄ = −Σ (w_i/M) b̄_i d_i,  q = K⁻¹ z̄,  h = z Σ (w_i/M) b̄_i + q
+    c_i = h·r_i − (z·d_i)(q·d_i),  k̄_i = (c_i − Σ k_j c_j / M − Σ b_j b̄_j) / M
+    w̄_i = b̄_i (1 − z·d_i) / M + m_i k̄_i,  m̄_i += w_i k̄_i,  x̄_s += (Σ w̄_i ∇w_i − q) / dx             (K8.adj)
+
+The points add to velocities, loads and masses of the nodes atomically.
 """
 
 from types import SimpleNamespace
@@ -78,7 +83,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         rate: real,  # 1/T
         anew: int,  # 1 at the beginning of a control step
         # In:
-        x: wp.array2d(dtype=exact_vec),
+        places: wp.array2d(dtype=exact_vec),
         anchor: wp.array3d(dtype=vec),
         node: wp.array2d(dtype=node_vec),
         free: wp.array2d(dtype=vec),
@@ -109,7 +114,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if not D > real(0.0):  # a point of a world that failed
             return
         v = at_point(node, shares, free, world, p, first, constants.shape)
-        at = x[world, p]
+        at = places[world, p]
         reached = before_wall()
         total = vec()
         for q in range(count):
@@ -188,7 +193,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         constants: Constants,
         outline: Outline,
         # In:
-        x: wp.array2d(dtype=exact_vec),
+        places: wp.array2d(dtype=exact_vec),
         node: wp.array2d(dtype=node_vec),
         shares: wp.array3d(dtype=real),
         adj_shares: wp.array3d(dtype=real),
@@ -200,7 +205,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         """(K8.adj)"""
         world, p = wp.tid()
-        at = place(x[world, p], constants.exact_spacing, constants.shape)
+        at = place(places[world, p], constants.exact_spacing, constants.shape)
         around = fit(node, world, at, constants.shape)
         if not (at.valid and around.mass > real(0.0)):
             return
