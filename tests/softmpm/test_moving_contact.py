@@ -63,6 +63,8 @@ def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
 
 
 def start_of(leaves: dict[str, torch.Tensor]) -> softmpm.State:
+    if "places" not in leaves:
+        return softmpm.State(*(leaves[name] for name in "xvCF"))
     surface = softmpm.SurfaceState(leaves["places"], leaves["anchor"], torch.zeros_like(leaves["anchor"]))
     return softmpm.State(*(leaves[name] for name in "xvCF"), surface=surface)
 
@@ -83,8 +85,8 @@ def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=Fals
         substeps=SUBSTEPS,
         inputs=inputs,
         points=reference_moving_contact.surface_points(model.scene),
-        x=leaves["places"],
-        anchor=leaves["anchor"],
+        x=leaves.get("places"),
+        anchor=leaves.get("anchor"),
         smoothing=model.contact_width * model.scene.grid.spacing,
     )
     return [*end[:4], *surface]
@@ -122,6 +124,19 @@ def test_contact_is_that_of_the_reference(dim, dtype, width, limit, device):
     for name, got, want in zip([*"xvCF", "places", "anchor", "force", *leaves], *found, strict=True):
         assert want.abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(got.detach().cpu().double(), want.detach(), limit, name)
+
+
+def test_a_state_without_points_has_gradients_too():
+    """Through the places that x and F show, and the anchors there on walls that turn: ≤ 1e-10."""
+    model = build(pressed(2), worlds=2, inputs=NAMES, contact_width=0.05)
+    leaves = {name: leaf for name, leaf in leaves_of(model).items() if name not in ("places", "anchor")}
+    names = ["x", "F", "wall_normal"]
+    found = []
+    for exact in (False, True):
+        parts = run(model, leaves, exact)
+        found.append([*parts, *torch.autograd.grad(loss_of(parts), [leaves[name] for name in names])])
+    for name, got, want in zip([*"xvCF", "places", "anchor", "force", *names], *found, strict=True):
+        assert_relative(got.detach(), want.detach(), 1e-10, name)
 
 
 def test_gradients_are_central_differences():
@@ -176,9 +191,12 @@ def test_a_world_that_fails_does_not_touch_the_others():
     with pytest.raises(softmpm.UnstableError, match="surface point .* inside wall") as raised:
         softmpm.simulate(model, start, leaves["activation"], params, **settings)
     assert (raised.value.kind, raised.value.world) == ("in_wall", 1)
-    failures = softmpm.Failures("freeze")
-    end = softmpm.simulate(model, start, leaves["activation"], params, failures=failures, **settings)
-    assert [error.world for error in failures.errors] == [1] and end.surface is not None
+    for policy in ("reset", "freeze"):
+        failures = softmpm.Failures(policy)
+        end = softmpm.simulate(model, start, leaves["activation"], params, failures=failures, **settings)
+        assert [error.world for error in failures.errors] == [1] and end.surface is not None
+        assert torch.isfinite(end.surface.x).all()
+    assert end.surface is not None
     gradient = torch.autograd.grad(
         dot(cotangent(end), end) + end.surface.x.sum(), [leaves["x"], leaves["places"]]
     )

@@ -240,8 +240,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             r = position(o) - at.fx
             d = r - around.mean
             c = wp.dot(h, r) - wp.dot(z, d) * wp.dot(q, d)
-            b = shares[world, p, n]
-            adj = adj_shares[world, p, n] + wp.sign(b) * outline.areas[p] * adj_load[world, i]
+            up = wp.sign(shares[world, p, n])
+            adj = adj_shares[world, p, n] + up * outline.areas[p] * adj_load[world, i]
             adj_k = (c - mean - sum_b) / around.mass
             adj_w = adj * (real(1.0) - wp.dot(z, d)) / around.mass + node[world, i][dim] * adj_k
             adj_fx += adj_w * weight_slope(w, slope, o)
