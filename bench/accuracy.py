@@ -45,11 +45,12 @@ def measured() -> Iterator[tuple[dict, dict]]:
             yield named("free bar, frequency", kind, (cells, 2)), waves.bar(kind, cells, 2, clamped=False)
         for cells in (16, 32, 64):
             yield named("breathing disc, frequency", kind, (cells, 2)), waves.disc(kind, cells, 2)
-    for size in ((32, 2), (32, 3), (64, 3)):
-        for quantity, found in contact.hertz(*size).items():
-            yield named(f"disc on a floor, {quantity}", "reference", size), found
-    for size in ((2, 2), (4, 2)):
-        yield named("block on a floor, gap / h", "reference", size), contact.gap(*size)
+    for kind in ("reference", "moving"):
+        for size in ((32, 2), (32, 3), (64, 3)):
+            for quantity, found in contact.hertz(*size, kind).items():
+                yield named(f"disc on a floor, {quantity}", kind, size), found
+        for size in ((2, 2), (4, 2)):
+            yield named("block on a floor, gap / h", kind, size), contact.gap(*size, kind)
 
 
 def named(problem: str, kind: str, size: tuple[int, int]) -> dict:

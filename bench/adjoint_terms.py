@@ -63,7 +63,7 @@ STRUCTS = (
         "placed",
     ),
     *("stress_adj_of", "active_stress_adj_of", "touch", "touch_adj"),
-    *("through_others", "after_all_walls_adj", "meet_adj", "response_adj", "face", "pose", "way_adj"),
+    *("through_others", "after_all_walls_adj", "meet_adj", "response_adj", "face", "pose", "way_adj", "fit"),
 )
 """Calls that return structs, which cannot be multiplied by a factor; their fields are terms where they are used."""
 FIELDS = (

@@ -1,4 +1,4 @@
-"""Accuracy of a walk: `python bench/gait.py {walk,gradient,growth,precision} --device cpu [--gait NAME] [--json FILE]`
+"""Accuracy of a walk: `python bench/gait.py {walk,surface,gradient,growth,precision} --device cpu [--gait NAME] [--json FILE]`
 
 Two open-loop gaits of the biped, learned at 80 cells per metre on the moving grid in 45 Adam steps, are replayed (``gaits.json``;
 docs/gait.md has the commands): `viscous` was learned with η/μ = 1 ms, `elastic` without viscosity.
@@ -6,6 +6,8 @@ docs/gait.md has the commands): `viscous` was learned with η/μ = 1 ms, `elasti
 **walk**: displacement of the centre of mass after 0.5 s and 1 s [mm], mean and standard deviation over four positions of the grid,
 each a quarter of a cell further; float64. Errors are those of the means, against the mean on the finest grid in the reference
 formulation; ``±`` is the uncertainty of that limit: its standard error, and its change from the next finest grid.
+
+**surface**: the same on the moving grid with contact at surface points, against the limits of `results/gait.walk.cpu.json`.
 
 **gradient**: cosine between directional derivatives of the displacement after 1 s and central secants, for eight random directions in
 the space of all activations; float64, 80 cells per metre.
@@ -39,11 +41,14 @@ CELLS = {
     4e-3: {"reference": (160, 112, 80, 56, 40), "moving": (160, 112, 80, 56, 40)},
 }
 """Cells per metre for each η/μ [s]; the first of the reference formulation is the limit."""
+ON_SURFACE = {1e-3: (112, 80, 56, 40), 4e-3: (80, 56, 40)}
+"""The same of the moving grid with contact at surface points."""
 SHIFTS = (0.0, 0.25, 0.5, 0.75)
 """Displacements of the robot against the grid in cells."""
 DIRECTIONS, STEP = 8, 1e-2
 GRADIENTS = [
     (1e-3, "moving", "nodes", 0.0),
+    *((1e-3, "moving", "surface", width) for width in (0.0, 0.01)),
     (1e-3, "reference", "nodes", 0.0),
     *((1e-3, "reference", "surface", width) for width in (0.0, 0.01, 0.03)),
     (4e-3, "moving", "nodes", 0.0),
@@ -94,10 +99,10 @@ def travelled(model: softmpm.Model, state: softmpm.State) -> torch.Tensor:
 
 @torch.no_grad()
 def walk(
-    cells: int, formulation: str, retardation: float, gait: np.ndarray, device
+    cells: int, formulation: str, retardation: float, gait: np.ndarray, device, contact: str = "auto"
 ) -> tuple[np.ndarray, float]:
     """Displacements after each half of the gait, shape (shift, 2), NaN where a simulation stopped; and seconds of one run."""
-    task = walker(cells, formulation=formulation, retardation=retardation)
+    task = walker(cells, formulation=formulation, retardation=retardation, contact=contact)
     found, begin = np.full((len(SHIFTS), 2), math.nan), time.perf_counter()
     for row, shift in zip(found, SHIFTS, strict=True):
         model, activation = replayed(task, gait, shift, device)
@@ -139,6 +144,26 @@ def walks(table: Table, gaits: dict, device) -> None:
                         f"{when} ± %": 100 * doubt[k] / limit[k],
                     }
                 table.add({k: None if v != v else v for k, v in row.items()} | {"s": seconds})
+
+
+def surface_walks(table: Table, gaits: dict, device) -> None:
+    known = json.loads(Path(__file__).with_name("results").joinpath("gait.walk.cpu.json").read_text())["rows"]
+    for (name, gait), (retardation, grids) in itertools.product(gaits.items(), ON_SURFACE.items()):
+        (limit,) = (
+            row
+            for row in known
+            if (row["gait"], row["formulation"]) == (name, "reference")
+            and math.isclose(row["η/μ ms"], 1e3 * retardation)
+            and row["0.5 s error %"] == row["1 s error %"] == 0.0
+        )
+        for cells in grids:
+            found, seconds = walk(cells, "moving", retardation, np.array(gait), device, "surface")
+            row = {"gait": name, "η/μ ms": 1e3 * retardation, "contact": "surface", "cells/m": cells}
+            for k, when in enumerate(("0.5 s", "1 s")):
+                mean = 1e3 * found[:, k].mean()
+                row |= {f"{when} mm": mean, f"{when} std": 1e3 * found[:, k].std(ddof=1)}
+                row |= {f"{when} error %": 100 * (mean / limit[f"{when} mm"] - 1)}
+            table.add({k: None if v != v else v for k, v in row.items()} | {"s": seconds})
 
 
 def gradients(table: Table, gaits: dict, device) -> None:
@@ -213,6 +238,10 @@ def growth(table: Table, gaits: dict, device) -> None:
 
 PARTS = {
     "walk": (walks, "Displacement of a walk, float64"),
+    "surface": (
+        surface_walks,
+        "Displacement of a walk on the moving grid with contact at surface points, float64",
+    ),
     "gradient": (gradients, "Gradient of 1 s of walking against secants, float64"),
     "growth": (growth, "Growth of a small change of the activations from 0.1 s to 1 s, reference, float64"),
     "precision": (precision, "1000 substeps of walking, float32 against float64"),

@@ -19,9 +19,10 @@ LAYERS = """
     reference_stress reference_walls
     reference reference_step kernels.physics
     reference_contact reference_driven reference_overlap
-    stability kernels.convert reference_lagrangian
+    stability kernels.convert reference_lagrangian reference_moving_contact
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     rest_grid
+    surface_points
     surface_grid mirror_grid overlap_grid
     driven_grid
     describe

@@ -7,6 +7,7 @@ import torch
 
 import softmpm
 from softmpm import reference, reference_contact, reference_lagrangian
+from softmpm.surface_grid import SurfaceGrid
 
 from . import exact
 from .running import Simulation, result, scene_of
@@ -15,9 +16,18 @@ YOUNG, POISSON, DENSITY, GRAVITY = 2e5, 0.3, 1000.0, 9.81
 
 
 def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the surface points in the present state [m], and the pressure of the first wall on each [Pa], by the reference."""
+    """Places of the surface points in the present state [m], and the pressure of the first wall on each [Pa]: in the reference
+    formulation that of the next substep by the float64 reference, on the moving grid the mean over the last call.
+    """
     model, scene, nodes = one.model, one.model.scene, one.state.nodes
-    assert model.surface is not None and nodes is not None
+    normal = torch.tensor(scene.walls[0].normal, dtype=torch.float64)
+    decay = math.exp(
+        -scene.damping * scene.dt
+    )  # acts on the forces, but not on the contact that balances them
+    if model.formulation == "moving":
+        forces = softmpm.contact_forces(model, one.state)
+        return forces.points[0].numpy(), (forces.traction[0, 0] @ normal / decay).numpy()
+    assert isinstance(model.surface, SurfaceGrid) and nodes is not None
     points, index = model.surface, model.rest_grid.index.cpu()
     surface = reference_contact.Surface(
         points.points.cpu(),
@@ -36,15 +46,11 @@ def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
     )
     free = reference.grid_velocity(scene, mass, mass[..., None] * v + scene.dt * force, contacts=())
     _, _, impulses = reference_contact.contact(scene, surface, u, free, nodes.anchor.cpu(), mass)
-    normal = torch.tensor(scene.walls[0].normal, dtype=torch.float64)
     places = surface.X + reference_contact.gather(surface, u)[0]
-    decay = math.exp(
-        -scene.damping * scene.dt
-    )  # acts on the forces, but not on the contact that balances them
     return places.numpy(), (impulses[0, 0] @ normal / scene.dt / decay).numpy()
 
 
-def hertz(cells: int, per_cell: int) -> dict[str, dict]:
+def hertz(cells: int, per_cell: int, formulation: str = "reference") -> dict[str, dict]:
     """A disc of the radius 1/4 that is put on the floor and comes to rest: its largest pressure, and how far its centre sinks."""
     radius, h, weight = 0.25, 1.0 / cells, DENSITY * GRAVITY
     floor = 3.5 * h
@@ -55,7 +61,7 @@ def hertz(cells: int, per_cell: int) -> dict[str, dict]:
     frequency = math.sqrt(GRAVITY / want.sinking)
     wall = softmpm.Wall(normal=(0.0, 1.0), offset=floor)
     settings = dict(gravity=(0.0, -GRAVITY), damping=1.8 * frequency, step=0.8)
-    one = Simulation(scene_of(h, shape, material, walls=[wall], **settings), "reference", contact="surface")
+    one = Simulation(scene_of(h, shape, material, walls=[wall], **settings), formulation, contact="surface")
     X = one.model.exact_positions - center
     near = np.linalg.norm(X, axis=1) < 1.5 * h / per_cell  # symmetric about the centre
 
@@ -67,7 +73,7 @@ def hertz(cells: int, per_cell: int) -> dict[str, dict]:
     return {"sinking": sinking, "pressure": result(one, (pressure.max(), 0.0), want.pressure)}
 
 
-def gap(cells: int, per_cell: int) -> dict:
+def gap(cells: int, per_cell: int, formulation: str = "reference") -> dict:
     """A block of so many cells of height, twice as wide, that is put on the floor: the largest distance of its sole from the floor, in
     cells, as its error.
     """
@@ -78,7 +84,7 @@ def gap(cells: int, per_cell: int) -> dict:
     frequency = math.sqrt(YOUNG / DENSITY) / height
     wall = softmpm.Wall(normal=(0.0, 1.0), offset=corner)
     settings = dict(gravity=(0.0, -GRAVITY), damping=1.8 * frequency, step=0.8)
-    one = Simulation(scene_of(h, shape, material, walls=[wall], **settings), "reference", contact="surface")
+    one = Simulation(scene_of(h, shape, material, walls=[wall], **settings), formulation, contact="surface")
     assert one.model.surface is not None
     sole = np.isclose(one.model.surface.points.cpu().numpy()[:, 1], corner)
 

@@ -24,7 +24,7 @@ from softmpm.scene.polygons import inside
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh, polygons
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
-from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State
+from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State, SurfaceState
 from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 from softmpm.warp_nodal import WarpNodal
@@ -60,6 +60,7 @@ __all__ = [
     "StableDt",
     "StableNeoHookean",
     "State",
+    "SurfaceState",
     "UnstableError",
     "Wall",
     "WarpNodal",

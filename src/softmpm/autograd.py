@@ -30,7 +30,8 @@ from softmpm.rollout import Trail, explain_out_of_memory, rollout, rollout_adj
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.lagrangian.nodal import particles_of, start_of
-from softmpm.state import GridField, Low, Nodal, Params, State
+from softmpm.schemes.surface_start import with_surface
+from softmpm.state import GridField, Low, Nodal, Params, State, SurfaceState
 
 _SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
@@ -96,7 +97,12 @@ def _simulate(
     check_state(model, start)
     check_activation(model, activation)
     given = check_inputs(model, inputs)
-    tensors = (*start[:4], activation, *(params if isinstance(params, tuple) else ()), *given.values())
+    tensors = (
+        *start.differentiable(),
+        activation,
+        *(params if isinstance(params, tuple) else ()),
+        *given.values(),
+    )
     refuse_batches(tensors)
     horizon = check_horizon(control_steps(activation, given), substeps)
     if not is_capturing(model):  # else nothing can be read back; NaN is reported by the kernels
@@ -104,6 +110,8 @@ def _simulate(
         check_inputs_bounds(given)
     values = derive(model, start, activation, params, given, horizon)
     if model.formulation == "moving":
+        if model.surface is not None:
+            start = with_surface(model, start, values)
         return _run(model, horizon, start, values, failures)
     normals = values["normal"][0] if model.spec.moving else None  # at the beginning of the call
     nodes = start_of(model, start, values["mass"], normals)
@@ -112,7 +120,7 @@ def _simulate(
 
 def _run(model: Model, horizon: Horizon, start: Any, values: Values, failures: Failures | None) -> Any:
     """The final state, of the type of the initial one."""
-    tensors = (*values.values(), *start[:COUNT])
+    tensors = (*values.values(), *start.differentiable())
     needed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     call = _Call(model, horizon, tuple(values), needed, failures)
     if not needed and not _has_transform_or_tangent(tensors):
@@ -163,13 +171,9 @@ def _cast(model: Model, value: Any) -> Any:
         return value
     if isinstance(value, Tensor):
         return value.to(model.dtype) if value.is_floating_point() else value
-    if isinstance(value, Nodal):
+    if isinstance(value, (Nodal, SurfaceState)):
         return value.to(model.dtype)
     return type(value)(*(_cast(model, part) for part in value))
-
-
-COUNT = 4
-"""Tensors of a state that are differentiable, its first ones, in both formulations."""
 
 
 @dataclass(eq=False)
@@ -191,8 +195,14 @@ class _Call:
         """A state of the model's formulation from its tensors and those of its low-order parts."""
         if self.model.formulation == "reference":
             return Nodal(*tensors)
-        x, v, C, F, low_x, low_F = tensors
-        return State(x, v, C, F, None if low_x is None else Low(low_x, low_F))
+        *found, low_x, low_F = tensors
+        return State.of(found)._replace(low=None if low_x is None else Low(low_x, low_F))
+
+    @property
+    def count(self) -> int:
+        """Number of the tensors of a state that are differentiable."""
+        moving_points = self.model.formulation == "moving" and self.model.surface is not None
+        return 7 if moving_points else 4
 
     def rounding(self, state: Any) -> tuple:
         """What is not differentiable of a state: the shift, or in the moving formulation the low-order parts or None in their place."""
@@ -232,12 +242,12 @@ class _Simulate(_Function):
         call, *tensors = given
         values, state = call.split(tensors)
         end = call.run(call.state(state), values)
-        return (*end[:COUNT], *call.rounding(end))
+        return (*end.differentiable(), *call.rounding(end))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
         ctx.call, *tensors = inputs
-        ctx.mark_non_differentiable(*(t for t in output[COUNT:] if t is not None))
+        ctx.mark_non_differentiable(*(t for t in output[ctx.call.count :] if t is not None))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place
 
@@ -246,12 +256,12 @@ class _Simulate(_Function):
         refuse_batches(adj_end)
         needed = dict(zip(ctx.call.names, ctx.needs_input_grad[1:], strict=False))
         found = [one.group for one in differentiable(ctx.call.model.spec) if needed.get(one.name)]
-        rounding = len(adj_end) - COUNT
-        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:COUNT]
+        count = ctx.call.count
+        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:count]
         # It may be differentiated once more:
         again = torch.is_grad_enabled() or _has_transform_or_tangent(given[2:])
         backward = _SimulateBackward.apply if again else _SimulateBackward.forward
-        return None, *backward(*given), *rounding * (None,)
+        return None, *backward(*given), *(len(adj_end) - count) * (None,)
 
 
 class _SimulateBackward(_Function):
@@ -263,8 +273,8 @@ class _SimulateBackward(_Function):
         call, wanted, *tensors = given
         values, state = call.split(tensors)
         kind: Any = Nodal if call.model.formulation == "reference" else State
-        pairs = zip(state[-COUNT:], state[:COUNT], strict=True)
-        adj_end = kind(*(torch.zeros_like(like) if adj is None else adj for adj, like in pairs))
+        pairs = zip(state[-call.count :], state[: call.count], strict=True)
+        adj_end = kind.of([torch.zeros_like(like) if adj is None else adj for adj, like in pairs])
         with explain_out_of_memory(call.model, call.horizon, gradient=True):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
         found = (adj_inputs.tensors.get(name) for name in call.names)
@@ -272,7 +282,7 @@ class _SimulateBackward(_Function):
             adj if adj is None else adj.to(value.dtype)
             for adj, value in zip(found, values.values(), strict=True)
         )
-        return *exact, *adj[:COUNT]
+        return *exact, *adj.differentiable()
 
     @staticmethod
     def setup_context(ctx, inputs, output):

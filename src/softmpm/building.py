@@ -1,6 +1,7 @@
 """``build``: a scene checked, a scheme chosen, and the model of both."""
 
 import dataclasses
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -46,8 +47,9 @@ def build(
         formulation: "moving": material point method, whose grid is reset in each substep. "reference": total Lagrangian, with weights
             taken once at rest; see docs/formulations.md. "auto": the reference formulation if the scene states ``body_contact=False``
             and it has all that is asked for; ``describe`` gives the reason.
-        contact: What meets the separating walls in the reference formulation: "nodes", "surface" (the points of the outlines,
-            :class:`softmpm.Outline`), or "auto": the surface if every body has an outline. The moving formulation has nodes.
+        contact: What meets the separating walls: "nodes", "surface" (the points of the outlines, :class:`softmpm.Outline`), or "auto":
+            in the reference formulation the surface if every body has an outline, in the moving one nodes, since the surface needs the
+            plain scheme there.
         contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
@@ -95,13 +97,18 @@ def build(
         scheme, reason = "lagrangian", "formulation='reference'"
         alarms = dataclasses.replace(alarms, gap=None)
     else:
-        check_moving(scene)
-        scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme)
+        check_moving(scene, surface)
+        scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme, surface)
     if not surface:
         alarms = dataclasses.replace(alarms, depth=None)
     if formulation != "reference":
         alarms = dataclasses.replace(alarms, overlap=None)
     place = device_of(device)
+    if surface and deterministic and formulation == "moving" and place.type == "cuda":
+        raise ValueError(
+            "deterministic=True has no contact at surface points on a GPU with formulation='moving'; take formulation='reference', "
+            "whose sums have a fixed order, or contact='nodes'."
+        )
     return Model(
         scene,
         place,
@@ -153,10 +160,6 @@ def on_surface(scene: Scene, formulation: str, contact: str, width: float) -> bo
     outlined = all(body.particles.outline is not None for body in scene.bodies)
     separating = any(wall.contact == "separate" for wall in scene.walls)
     if contact == "surface":
-        if formulation != "reference":
-            raise ValueError(
-                "contact='surface' needs formulation='reference'; the moving formulation has contact='nodes'."
-            )
         if not outlined:
             raise ValueError(
                 "contact='surface' needs an outline of every body (softmpm.Outline), which the shapes have and plain Particles have "
@@ -166,7 +169,8 @@ def on_surface(scene: Scene, formulation: str, contact: str, width: float) -> bo
             raise ValueError(
                 "contact='surface' needs a wall of the kind 'separate', and the scene has none; leave contact out."
             )
-    chosen = formulation == "reference" and contact != "nodes" and outlined and separating
+    wanted = contact == "surface" or (contact == "auto" and formulation == "reference")
+    chosen = wanted and outlined and separating
     if chosen:
         check_reach(scene)
     elif width > 0:
@@ -191,8 +195,15 @@ def check_reach(scene: Scene) -> None:
         )
 
 
-def check_moving(scene: Scene) -> None:
-    """Raise ValueError for what the moving formulation cannot do."""
+def check_moving(scene: Scene, surface: bool) -> None:
+    """Raise ValueError for what the moving formulation cannot do; ``surface`` is contact at surface points."""
+    points = sum(len(body.particles.outline) for body in scene.bodies if surface and body.particles.outline)
+    nodes = math.prod(scene.grid.shape)
+    if points > nodes:
+        raise ValueError(
+            f"formulation='moving' has contact at no more surface points than nodes of the grid, {nodes:,}, but the outlines have "
+            f"{points:,}; take outlines with fewer points, a larger grid, or contact='nodes'."
+        )
     for k, wall in enumerate(scene.walls):
         if wall.contact in MIRRORS:
             other = {"clamp": "stick", "symmetry": "slip"}[wall.contact]
@@ -236,12 +247,21 @@ def check_given(scene: Scene, inputs: Iterable[str]) -> tuple[str, ...]:
 OWNED = {"wall": "walls", "muscle": "muscles", "driven": "driven particles"}
 
 
-def choose_scheme(scene: Scene, dtype: torch.dtype, worlds: int, wanted: str) -> tuple[str, str]:
-    """Name of the scheme for ``wanted``, which may be "auto", and the reason.
+def choose_scheme(
+    scene: Scene, dtype: torch.dtype, worlds: int, wanted: str, surface: bool
+) -> tuple[str, str]:
+    """Name of the scheme for ``wanted``, which may be "auto", and the reason; ``surface`` is contact at surface points.
 
     Raises:
         ValueError: The scheme that is asked for cannot hold the scene.
     """
+    if surface:
+        if wanted == "fast":
+            raise ValueError(
+                "contact='surface' is in the plain scheme with formulation='moving', got scheme='fast'; take scheme='auto', "
+                "contact='nodes' or formulation='reference'."
+            )
+        return "plain", "contact at surface points"
     particles = worlds * sum(len(body.particles) for body in scene.bodies)
     if wanted != "auto":
         obstacle = SCHEMES[wanted].footprint.obstacle(scene.grid.shape, particles)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.planning.chunks import Horizon
-from softmpm.state import Low, Nodal, Params, State
+from softmpm.state import Low, Nodal, Params, State, SurfaceState
 from softmpm.validate import need
 
 
@@ -59,6 +59,8 @@ def check_state(model: Sizes, state: State) -> None:
         _check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
     if state.nodes is not None:
         _check_nodes(model, state.nodes)
+    if state.surface is not None:
+        _check_surface(model, state.surface)
     if state.low is None:
         return
     if not isinstance(state.low, Low):
@@ -80,6 +82,28 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
         _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
     if nodes.shift is not None:
         _check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
+
+
+def _check_surface(model: Sizes, surface: SurfaceState) -> None:
+    """Shape, dtype and device of the surface points, which only the moving formulation with contact at them has."""
+    if model.formulation != "moving" or model.anchor_shape[2] == 0:
+        raise ValueError(
+            "state.surface must be None unless formulation='moving' and contact='surface'; take state._replace(surface=None)."
+        )
+    shape = model.anchor_shape
+    _check_tensor(model, "state.surface.x", surface.x, (shape[0], *shape[2:]), torch.float64)
+    for name in ("anchor", "force"):
+        _check_tensor(model, f"state.surface.{name}", getattr(surface, name), shape)
+
+
+def check_carried(apart: Tensor, spacing: float) -> None:
+    """Surface points are near the particles, from whose outline they differ by this. Reads back once: a GPU has to wait."""
+    need(
+        not bool(apart > spacing),
+        "state.x or state.F was changed, but state.surface was not, from which a call continues: a surface point is "
+        f"{float(apart):.4g} m away from where its nearest particle shows it, at most a cell, {spacing:.4g} m, is allowed; take "
+        "state._replace(surface=None), whose points are computed from x and F.",
+    )
 
 
 def check_shown(state: State, shown: State) -> None:

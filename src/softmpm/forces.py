@@ -4,6 +4,7 @@ from softmpm.checks import check_state
 from softmpm.compiling import opaque
 from softmpm.model import Model, check_model
 from softmpm.state import ContactForces, State
+from softmpm.surface_grid import SurfaceGrid
 
 
 def contact_forces(model: Model, state: State) -> ContactForces:
@@ -14,11 +15,11 @@ def contact_forces(model: Model, state: State) -> ContactForces:
 
     Args:
         model: From :func:`softmpm.build`, with contact at surface points (docs/formulations.md).
-        state: Result of :func:`softmpm.simulate`. Differentiable, through ``state.nodes``.
+        state: Result of :func:`softmpm.simulate`. Differentiable, through ``state.nodes`` or ``state.surface``.
 
     Raises:
         TypeError: ``model`` or ``state`` are of another type.
-        ValueError: The model has no contact at surface points, or the state no nodes.
+        ValueError: The model has no contact at surface points, or the state neither nodes nor surface points.
     """
     return _contact_forces(model, state)
 
@@ -30,13 +31,16 @@ def _contact_forces(model: Model, state: State) -> ContactForces:
     surface = model.surface
     if surface is None:
         raise ValueError(
-            "contact_forces needs contact at surface points, which this model has not; build it with formulation='reference' and "
-            "contact='surface'."
+            "contact_forces needs contact at surface points, which this model has not; build it with contact='surface'."
         )
-    if state.nodes is None:
+    if state.nodes is not None:
+        assert isinstance(surface, SurfaceGrid)
+        force, points = state.nodes.force, surface.places(state.nodes.u, state.nodes.shift)
+    elif state.surface is not None:
+        force, points = state.surface.force, state.surface.x.to(state.x.dtype)
+    else:
         raise ValueError(
-            "contact_forces needs a state that simulate returned, got one without nodes; simulate from it first."
+            "contact_forces needs a state that simulate returned, got one without nodes or surface points; simulate from it first."
         )
-    force = state.nodes.force
     traction = force / surface.areas.to(force.dtype)[:, None]
-    return ContactForces(force.sum(2), traction, surface.places(state.nodes.u, state.nodes.shift))
+    return ContactForces(force.sum(2), traction, points)

@@ -28,6 +28,7 @@ from softmpm.stability import stiffening_signs
 from softmpm.state import Low, Params, State
 from softmpm.summary import counted
 from softmpm.surface_grid import SurfaceGrid
+from softmpm.surface_points import CarriedPoints
 from softmpm.workspace import Workspace
 
 
@@ -108,7 +109,12 @@ class Model:
         if formulation == "reference":
             self._rest_grid = RestGrid(scene, device, dtype, worlds, "force" in given)
             self.overlap = overlap_grid(scene, self.rest_grid, alarms.overlap, device)
-        self.surface = SurfaceGrid(scene, self.rest_grid, device) if surface else None
+        self.surface = None
+        if surface:
+            reference = formulation == "reference"
+            self.surface = (
+                SurfaceGrid(scene, self.rest_grid, device) if reference else CarriedPoints(scene, device)
+            )
         self.contact_width = contact_width
         self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface, formulation)
         self.mirror = MirrorGrid(scene, self.rest_grid, device) if self.spec.mirrors else None
@@ -257,7 +263,7 @@ class Model:
 
     @property
     def anchor_shape(self) -> tuple[int, ...]:
-        """Shape of :attr:`softmpm.state.Nodal.anchor`."""
+        """Shape of the anchors of a state."""
         points = 0 if self.surface is None else self.surface.count
         return self.worlds, len(self.spec.surface_walls), points, self.dim
 

@@ -40,6 +40,7 @@ __all__ = [
     "actuator_tangent",
     "barrier_corotated",
     "fixed_corotated",
+    "from_grid",
     "g2p",
     "grid_velocity",
     "inside",
@@ -58,6 +59,7 @@ __all__ = [
     "stress",
     "surface",
     "tangent",
+    "to_grid",
     "viscous_stress",
     "viscous_tangent",
     "wall_velocity",
@@ -224,6 +226,23 @@ def step(
     duration: float = 1.0,
 ) -> State:
     """One substep: P2G, grid, G2P. ``activation`` (world, muscle) or None; material (world, particle)."""
+    _, velocity = to_grid(scene, state, activation, mu, lam, mass, inputs, time, duration)
+    return from_grid(scene, state, velocity, inputs)
+
+
+def to_grid(
+    scene: Scene,
+    state: State,
+    activation: Tensor | None,
+    mu: Tensor,
+    lam: Tensor,
+    mass: Tensor,
+    inputs: Inputs,
+    time: float,
+    duration: float,
+    contacts: Sequence[str] = CONTACTS,
+) -> tuple[Tensor, Tensor]:
+    """Masses and velocities of the nodes after P2G and the grid stage, with the walls of the kinds ``contacts``."""
     tau, D = stress(scene, state.F, mu, lam, activation, state.C, inputs), scene.grid.spacing**2 / 4
     load = scene.dt * rest_volume(scene, mass.dtype) / D
     affine = mass[..., None, None] * state.C - load[:, None, None] * tau
@@ -231,7 +250,12 @@ def step(
     if inputs.force is not None:
         pushed = pushed + scene.dt * inputs.force.expand(state.v.shape)  # (T4)
     node_mass, momentum = p2g(scene, state.x, mass, pushed, affine)
-    v, C = g2p(scene, state.x, grid_velocity(scene, node_mass, momentum, inputs, time, duration))
+    return node_mass, grid_velocity(scene, node_mass, momentum, inputs, time, duration, contacts=contacts)
+
+
+def from_grid(scene: Scene, state: State, velocity: Tensor, inputs: Inputs) -> State:
+    """G2P: the state after the substep from the velocities of the nodes."""
+    v, C = g2p(scene, state.x, velocity)
     if len(scene.driven):
         given = _given(inputs.velocity, 0.0, v, len(v), len(scene.driven), v.shape[-1])
         v = v.index_copy(1, torch.tensor(scene.driven), given)  # (T5)

@@ -94,6 +94,34 @@ def contact(
     """
     D = delassus(scene, surface, mass)[..., None]
     x, at_points = surface.X + gather(surface, u), gather(surface, v)
+    anchors, J = meet_walls(
+        scene, surface.stiffness, D, x, at_points, anchor, inputs, smoothing, time, duration
+    )
+    J = J * torch.as_tensor(surface.free, dtype=v.dtype)[..., None]
+    share = (surface.w * surface.area[:, None])[..., None] * J.sum(1)[:, :, None]
+    sums = torch.zeros_like(v).index_add(1, surface.node.flatten(), share.flatten(1, 2))
+    return v + _per_mass(sums, mass[..., None]), anchors, J
+
+
+def meet_walls(
+    scene: Scene,
+    stiffness: Tensor,
+    D: Tensor,
+    x: Tensor,
+    v: Tensor,
+    anchor: Tensor,
+    inputs: Inputs,
+    smoothing: float,
+    time: float,
+    duration: float,
+) -> tuple[Tensor, Tensor]:
+    """Anchors and impulses per area J of the separating walls, both (world, wall, point, dim), by (K3), (K4), (K6).
+
+    Args:
+        stiffness: k of each point [Pa/m], shape (point,).
+        D: Of each point [m²/kg], shape (world, point, 1).
+        x, v: Places [m] and velocities v_s [m/s] of the points, shape (world, point, dim).
+    """
     friction = inputs.friction
     if friction is None:
         friction = torch.tensor([wall.friction for wall in scene.walls], dtype=v.dtype)
@@ -102,20 +130,17 @@ def contact(
     for number, k in enumerate(separating(scene)):
         before, wall = (wall_at(scene, k, inputs, v, at, duration) for at in (time, time + scene.dt))
         n, mu, slide = wall.unit[:, None], friction[:, k, None, None], wall.slide[:, None]
-        y, v_n = (x * n).sum(-1, keepdim=True) - level(wall), (at_points * n).sum(-1, keepdim=True)
-        x_t, v_t = _tangential(x, n), at_points - v_n * n
+        y, v_n = (x * n).sum(-1, keepdim=True) - level(wall), (v * n).sum(-1, keepdim=True)
+        x_t, v_t = _tangential(x, n), v - v_n * n
         P = hinge(-(y + scene.dt * (v_n - (slide * n).sum(-1, keepdim=True))), smoothing) / (scene.dt * D)
         carried = carry(before, wall, anchor[:, number]) + scene.dt * _tangential(slide, n)
-        T, moved = _friction(surface, scene.dt, D, P, mu, x_t, v_t, carried)
+        T, moved = _friction(stiffness, scene.dt, D, P, mu, x_t, v_t, carried)
         impulses.append(P * n + T)
         anchors.append(moved)
-        at_points = at_points + D * impulses[-1]
+        v = v + D * impulses[-1]
     if not impulses:
-        return v, anchor, torch.zeros_like(anchor)
-    J = torch.stack(impulses, 1) * torch.as_tensor(surface.free, dtype=v.dtype)[..., None]
-    share = (surface.w * surface.area[:, None])[..., None] * J.sum(1)[:, :, None]
-    sums = torch.zeros_like(v).index_add(1, surface.node.flatten(), share.flatten(1, 2))
-    return v + _per_mass(sums, mass[..., None]), torch.stack(anchors, 1), J
+        return anchor, torch.zeros_like(anchor)
+    return torch.stack(anchors, 1), torch.stack(impulses, 1)
 
 
 def level(wall: Wall) -> Tensor:
@@ -140,10 +165,10 @@ def hinge(d: Tensor, smoothing: float) -> Tensor:
 
 
 def _friction(
-    surface: Surface, dt: float, D: Tensor, P: Tensor, mu: Tensor, x_t: Tensor, v_t: Tensor, anchor: Tensor
+    stiffness: Tensor, dt: float, D: Tensor, P: Tensor, mu: Tensor, x_t: Tensor, v_t: Tensor, anchor: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Tangential impulse per area T and the anchor after the substep (K4)."""
-    k = surface.stiffness[:, None]
+    k = stiffness[:, None]
     T = -k * dt / (1 + D * k * dt**2) * (x_t + dt * v_t - anchor)
     squared, touches = (T**2).sum(-1, keepdim=True), P > 0
     sliding = touches & ((squared > (mu * P) ** 2) | (mu == 0))  # a smooth wall holds no point
@@ -162,6 +187,10 @@ def start_anchor(scene: Scene, surface: Surface, u: Tensor, inputs: Inputs = SCE
 
     ``inputs`` are those of the first control step.
     """
-    x = surface.X + gather(surface, u)
-    normals = [wall_at(scene, k, inputs, u, 0.0, 1.0).unit[:, None] for k in separating(scene)]
+    return across_walls(scene, surface.X + gather(surface, u), inputs)
+
+
+def across_walls(scene: Scene, x: Tensor, inputs: Inputs = SCENE) -> Tensor:
+    """x_t of places ``x`` (world, point, dim) by the first pose, shape (world, separating wall, point, dim)."""
+    normals = [wall_at(scene, k, inputs, x, 0.0, 1.0).unit[:, None] for k in separating(scene)]
     return torch.stack([_tangential(x, n) for n in normals], 1) if normals else x[:, None][:, :0]

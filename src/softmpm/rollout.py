@@ -122,7 +122,7 @@ def _returned(model: Model, end: Any, start: Any, runner: Runner) -> Any:
     # Worlds that never ran are returned as they were given: the fast scheme cannot represent particles off the grid.
     worlds = sorted(world for world, substep in runner.frozen.items() if reset or substep == 0)
     there, end = runner.scheme.rest() if reset else start.detach(), end.clone()
-    for tensor, wanted in zip(end[:4], there[:4], strict=True):
+    for tensor, wanted in zip(end.differentiable(), there.differentiable(), strict=True):
         tensor[worlds] = wanted[worlds]
     low, there_low = getattr(end, "low", None), getattr(there, "low", None)
     for name in () if low is None else ("x", "F"):
@@ -178,7 +178,7 @@ def rollout_adj(
         raise_gradient_failure(model, words, adj_end, last, horizon.total)
     adj = runner.scheme.to_user(adj)
     for world in trail.frozen:  # a state off the grid has no adjoint
-        for tensor in adj[:4]:
+        for tensor in adj.differentiable():
             tensor[world] = 0
         adj_inputs.clear_world(world)
     return adj, adj_inputs
@@ -186,10 +186,10 @@ def rollout_adj(
 
 def _without(frozen: dict[int, int], adj_end: Any) -> Any:
     """The adjoint of the final state, contiguous, and zero for worlds that failed."""
-    tensors = [a.clone() if frozen else a.contiguous() for a in adj_end[:4]]
+    tensors = [a.clone() if frozen else a.contiguous() for a in adj_end.differentiable()]
     for tensor in tensors if frozen else ():
         tensor[sorted(frozen)] = 0
-    return type(adj_end)(*tensors)
+    return type(adj_end).of(tensors)
 
 
 def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:

@@ -1,6 +1,6 @@
 """State, material and grid fields as named tuples of tensors that PyTorch owns."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -63,6 +63,15 @@ class Nodal(NamedTuple):
     """Translation of all nodes of a world [m], shape (world, dim), in float64 in every precision; None is none. It follows the bodies,
     so that u keeps its digits over long ways. A constant of the gradient: that with respect to u is that with respect to the sum."""
 
+    @staticmethod
+    def of(tensors: Sequence[Tensor]) -> "Nodal":
+        """The state of which :meth:`differentiable` gives these tensors."""
+        return Nodal(*tensors)
+
+    def differentiable(self) -> tuple[Tensor, ...]:
+        """u, v, the anchors and the forces."""
+        return self[:4]
+
     def __repr__(self) -> str:
         return _text(self)
 
@@ -84,8 +93,36 @@ class Nodal(NamedTuple):
         return Nodal(change(self.u), change(self.v), change(self.anchor), change(self.force), shift)
 
 
+class SurfaceState(NamedTuple):
+    """State of the surface points in the moving formulation with ``contact="surface"`` (docs/formulations.md). Differentiable."""
+
+    x: Tensor
+    """Places [m], shape (world, point, dim), in float64 in every precision."""
+    anchor: Tensor
+    """Places on the walls where surface points adhere [m], shape (world, wall, point, dim), of the separating walls."""
+    force: Tensor
+    """Mean force of each of these walls on each surface point in the last control step [N], of the same shape; see
+    :func:`softmpm.contact_forces`. A call does not read it."""
+
+    def __repr__(self) -> str:
+        return _text(self)
+
+    def detach(self) -> "SurfaceState":
+        """The same state without its history."""
+        return SurfaceState(*(tensor.detach() for tensor in self))
+
+    def clone(self) -> "SurfaceState":
+        """The same state in memory of its own. Differentiable."""
+        return SurfaceState(*(tensor.clone() for tensor in self))
+
+    def to(self, *args: Any, **kwargs: Any) -> "SurfaceState":
+        """Every tensor on another device or in another precision, but for that of ``x``; arguments as for ``torch.Tensor.to``."""
+        anchor, force = (tensor.to(*args, **kwargs) for tensor in self[1:])
+        return SurfaceState(self.x.to(anchor.device), anchor, force)
+
+
 class State(NamedTuple):
-    """State of every particle of every world; ``state[:4]`` is what is differentiable of it."""
+    """State of every particle of every world."""
 
     x: Tensor
     """Positions [m], shape (world, particle, dim)."""
@@ -102,6 +139,19 @@ class State(NamedTuple):
     nodes: Nodal | None = None
     """What the particles show, in the reference formulation; None in the moving one. A state with nodes continues without loss; for
     one without, the nodes are computed from the four tensors."""
+    surface: SurfaceState | None = None
+    """Surface points in the moving formulation with contact at them, else None. A state with them continues without loss; for one
+    without, their places are computed from x and F."""
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor]) -> "State":
+        """The state of which :meth:`differentiable` gives these tensors."""
+        x, v, C, F, *others = tensors
+        return State(x, v, C, F, surface=SurfaceState(*others) if others else None)
+
+    def differentiable(self) -> tuple[Tensor, ...]:
+        """x, v, C, F and, if there are any, the tensors of the surface points."""
+        return *self[:4], *(self.surface or ())
 
     def __repr__(self) -> str:
         return _text(self)
@@ -123,8 +173,8 @@ class State(NamedTuple):
 
     def _each(self, change: Callable[[Any], Any]) -> "State":
         x, v, C, F = (change(tensor) for tensor in self[:4])
-        low = None if self.low is None else change(self.low)
-        return State(x, v, C, F, low, None if self.nodes is None else change(self.nodes))
+        others = (None if part is None else change(part) for part in self[4:])
+        return State(x, v, C, F, *others)
 
 
 class Params(NamedTuple):

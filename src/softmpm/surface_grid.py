@@ -11,28 +11,22 @@ import torch
 from torch import Tensor
 
 from softmpm.rest_grid import RestGrid, flat, stencils
-from softmpm.scene.materials import Material
 from softmpm.scene.scene import MIRRORS, Scene
+from softmpm.surface_points import SurfacePoints
 from softmpm.validate import need
 
 LEAST = 1e-3
 """Least mass of a node that takes part, in units of that of a full cell."""
 
 
-class SurfaceGrid:
-    """Surface points of all bodies.
+class SurfaceGrid(SurfacePoints):
+    """Surface points of all bodies and their nodes.
 
     Attributes:
-        count: Number of points.
-        points: Rest positions [m], shape (point, dim), float64.
-        areas: Area of each point [m²], shape (point,), float64.
-        stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
-        waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
         stencil: Nodes of each point, numbers in the grid at rest, shape (point, 3^dim), int32. One of them is repeated for those that
             take no part.
         weights: Their weights, 0 for nodes that take no part, shape (point, 3^dim), float64.
         loads: Area that each node carries [m²], L of (K1), shape (node,), float64.
-        normals: Unit normals of the separating walls, shape (wall, dim), float64.
         nodes: Nodes that the points act on, or all nodes if some are constrained, shape (touched,), int32.
         first: First entry of each of ``nodes`` in ``members``, and their count, shape (touched + 1,), int32.
         members: Points that act on a node, node by node, shape (entry,), int32.
@@ -40,13 +34,9 @@ class SurfaceGrid:
     """
 
     def __init__(self, scene: Scene, rest: RestGrid, device: torch.device):
+        super().__init__(scene, device)
         grid, dim = scene.grid, scene.grid.dim
-        outlines = [body.particles.outline for body in scene.bodies if body.particles.outline is not None]
-        points = np.concatenate([outline.points for outline in outlines])
-        areas = np.concatenate([outline.areas for outline in outlines])
-        counts = [len(outline) for outline in outlines]
-        density = np.repeat([body.material.density for body in scene.bodies], counts)
-        modulus = np.repeat([longitudinal_modulus(body.material) for body in scene.bodies], counts)
+        points, areas, density = (one.cpu().numpy() for one in (self.points, self.areas, self.density))
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
         base, f, weights = stencils(points / grid.spacing, offsets)
         at = flat(base[:, None] + offsets, grid.shape)
@@ -76,27 +66,14 @@ class SurfaceGrid:
         order = np.argsort(owners, kind="stable")
         loads = np.zeros(len(index))
         np.add.at(loads, numbers, np.abs(weights) * areas[:, None])
-
-        def tensor(values, dtype) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(values, dtype=dtype)).to(device)
-
-        self.count = len(points)
-        normals = [wall.normal for wall in scene.walls if wall.contact == "separate"]
-        self.normals = tensor(np.array(normals), np.float64)
-        self.points, self.areas = tensor(points, np.float64), tensor(areas, np.float64)
-        self.stiffness, self.loads = (
-            tensor(4.0 * modulus / grid.spacing, np.float64),
-            tensor(loads, np.float64),
-        )
-        self.waves = tensor(np.sqrt(modulus / density), np.float64)
-        self.stencil, self.weights = tensor(numbers, np.int32), tensor(weights, np.float64)
         members, owners = members[order], owners[order]
         constrained = len(scene.driven) > 0 or any(wall.contact in MIRRORS for wall in scene.walls)
         touched = np.arange(len(index)) if constrained else np.unique(owners)
-        self.nodes = tensor(touched, np.int32)
-        self.members = tensor(members // len(offsets), np.int32)
-        self.shares = tensor(weights.reshape(-1)[members], np.float64)
-        self.first = tensor(np.append(np.searchsorted(owners, touched), len(owners)), np.int32)
+        self.loads, self.weights = self._tensor(loads), self._tensor(weights)
+        self.stencil, self.nodes = self._tensor(numbers, np.int32), self._tensor(touched, np.int32)
+        self.members = self._tensor(members // len(offsets), np.int32)
+        self.shares = self._tensor(weights.reshape(-1)[members])
+        self.first = self._tensor(np.append(np.searchsorted(owners, touched), len(owners)), np.int32)
 
     def carried(self, nodes: Tensor) -> Tensor:
         """True for points with a weight on any of these nodes, shape (point,), from shape (node,)."""
@@ -107,12 +84,6 @@ class SurfaceGrid:
         near = u[:, self.stencil.long()]
         x = self.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, self.weights.to(u.dtype))
         return x if shift is None else (x + shift[:, None]).to(u.dtype)
-
-
-def longitudinal_modulus(material: Material) -> float:
-    """λ + 2μ [Pa]."""
-    young, poisson = material.young, material.poisson
-    return young * (1 - poisson) / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def consistent(weights: np.ndarray, arms: np.ndarray) -> np.ndarray:

@@ -176,6 +176,16 @@ def _raise_failure(
     raise_failure(model, work.words.tolist(), end, values=values)
 
 
+def check_steps(model: Model, wants: str) -> None:
+    """Raise unless this is a model whose substeps can be recorded on a tape."""
+    check_model(model, wants)
+    if model.formulation == "moving" and model.surface is not None:
+        raise ValueError(
+            f"{wants} and softmpm.step need contact='nodes' in the moving formulation, got a model with contact='surface'; take "
+            "softmpm.simulate."
+        )
+
+
 def check_own(model: Model, wants: str, **given: WarpState | WarpNodal | WarpSolid) -> None:
     """Raise unless these are the model's own: the kernels trust shapes and types."""
     check_model(model, wants)
@@ -209,7 +219,7 @@ def warp_state(
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model and the state.
         UnstableError: A particle is off the grid.
     """
-    check_model(model, "warp_state")
+    check_steps(model, "warp_state")
     if state is not None:
         check_state(model, state)
         if not is_capturing(model):
@@ -279,7 +289,7 @@ def warp_solid(
     Raises:
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model, the material, the activation and the inputs.
     """
-    check_model(model, "warp_solid")
+    check_steps(model, "warp_solid")
     params = model.params() if params is None else params
     check_params(model, params)
     check_row(model, activation)

@@ -64,8 +64,8 @@ def _described(name: str, value: object) -> Iterator[tuple[str, object]]:
 
 
 def _formulation(model: Model) -> dict[str, object]:
-    """Formulation and contact; nothing for the moving formulation, like checkpoints from before there was another one."""
-    if model.formulation == "moving":
+    """Formulation and contact; nothing for the moving grid with contact at nodes, as in checkpoints from before there was another."""
+    if model.formulation == "moving" and model.surface is None:
         return {}
     found = {"formulation": model.formulation, "contact": "nodes", "contact_width": model.contact_width}
     if model.surface is not None:

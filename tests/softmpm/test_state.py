@@ -66,7 +66,7 @@ def test_detach_clone_and_to(moved):
     assert copied.x.requires_grad and copied.low is not None and moved.low is not None
     assert copied.low.F.data_ptr() != moved.low.F.data_ptr()
     leaves = _pytree.tree_leaves(moved.to(torch.float64))
-    assert all(leaf is None or leaf.dtype == torch.float64 for leaf in leaves) and len(leaves) == 7
+    assert all(leaf is None or leaf.dtype == torch.float64 for leaf in leaves) and len(leaves) == 8
     bare = moved._replace(low=None)
     assert bare.detach().low is bare.clone().low is bare.to(torch.float64).low is None
 

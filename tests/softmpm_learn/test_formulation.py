@@ -75,11 +75,11 @@ def test_another_formulation_does_not_resume(tmp_path):
 
 
 def test_a_contact_that_is_not_there_is_refused(tmp_path):
-    """The arm has no walls that separate, and the moving formulation no surface points."""
+    """The arm has no walls that separate, and by default nodes meet the walls in the moving formulation."""
     for task, changes, message in (
         ("arm", ("task.contact=surface",), "needs a wall of the kind 'separate'"),
         ("arm", ("task.contact_width=0.01",), "contact_width is for contact at surface points"),
-        ("biped", ("task.formulation=moving", "task.contact=surface"), "needs formulation='reference'"),
+        ("biped", ("task.formulation=moving",), "contact_width is for contact at surface points"),
     ):
         with pytest.raises(ValueError, match=message):
             experiment.run_experiment(conf_of(task, *changes), tmp_path / "refused")

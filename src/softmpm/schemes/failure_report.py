@@ -8,7 +8,7 @@ from softmpm.model import Model
 from softmpm.schemes.failure_messages import Case
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.overlap import Overlap
-from softmpm.schemes.penetration import Penetration
+from softmpm.schemes.penetration import Lost, Penetration
 from softmpm.state import State
 
 
@@ -79,6 +79,9 @@ def failure(
     if kind is Kind.IN_WALL:
         case = Penetration(model, world, particle, end, values, time)
         particle, where = case.particle, f"{case.where} of world {world}"
+    elif kind is Kind.LOST:
+        case = Lost(model, world, particle, end)
+        particle, where = case.particle, f"{case.where} of world {world}"
     else:
         about = model, world, particle, end
         case = Overlap(*about) if kind is Kind.OVERLAP else Case(model, kind, world, particle, end, values)
@@ -121,7 +124,7 @@ def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last:
         return
     back, kind, particle = decode(words[world])
     substep, limit = last - back, "gradients must be finite"
-    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end[:4])
+    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end.differentiable())
     cause = (
         "It overflowed in the backward pass: shorten the horizon or scale the loss"
         if given

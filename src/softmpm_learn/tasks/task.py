@@ -58,11 +58,12 @@ class TaskConf:
     """Weight of the mean squared activation in the loss; decides between motions that are equally good."""
     formulation: str = "moving"
     """moving, or reference: as in :func:`softmpm.build`. In the reference formulation nothing keeps limbs from passing through each
-    other, and the body has cut cells."""
+    other."""
     overlap: bool = False
     """reference: whether limbs may pass through each other; else the simulation stops by name where they do."""
     contact: str = "auto"
-    """reference: what meets the floor. auto and surface: the surface of the robot; nodes: the nodes around it."""
+    """What meets the floor: the surface of the robot, or the nodes around it. auto is the surface in the reference formulation, the
+    nodes in the moving one. A robot in the reference formulation or with a surface has cut cells."""
     contact_width: float = 0.0
     """Distance over which surface contact sets in [cells]; 0.01 to learn, 0 to evaluate."""
 
@@ -104,6 +105,11 @@ class TaskConf:
     def spacing(self) -> float:
         """Distance of neighbouring grid nodes [m]."""
         return 1.0 / self.cells
+
+    @property
+    def on_surface(self) -> bool:
+        """True if the surface of the robot meets the walls that separate."""
+        return self.contact == "surface" or (self.contact == "auto" and self.formulation == "reference")
 
     @property
     def build(self) -> dict[str, Any]:
@@ -178,8 +184,9 @@ def neo_hookean(conf: TaskConf) -> softmpm.NeoHookean:
 
 
 def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:
-    """Particles half a cell apart in the union of polygons; with cut cells in the reference formulation."""
-    return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=conf.formulation == "reference")
+    """Particles half a cell apart in the union of polygons; with cut cells where the outline or the mass at rest counts."""
+    cut = conf.on_surface or conf.formulation == "reference"
+    return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=cut)
 
 
 def level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
@@ -197,7 +204,7 @@ def track(conf: TaskConf, friction: float) -> tuple[softmpm.Grid, list[softmpm.W
     length, height, margin, nodes, spacing = 1.5, 0.5, 0.05, conf.cells, conf.spacing
     floor = math.floor(0.0625 * nodes) * spacing
     soles = floor + 0.5 * spacing
-    if conf.formulation == "reference" and conf.contact != "nodes":
+    if conf.on_surface:
         floor = soles
     grid = softmpm.Grid(shape=(round(length * nodes), round(height * nodes)), spacing=spacing)
     walls = [

@@ -12,6 +12,7 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import view
 from softmpm.schemes.launch import KernelLauncher
+from softmpm.surface_grid import SurfaceGrid
 
 
 def rest_struct(model: Model) -> Any:
@@ -24,7 +25,7 @@ def rest_struct(model: Model) -> Any:
         for name in ("shares", "window", "rows", "places", "corners", "order"):
             setattr(struct, name, view(getattr(grid, name), wp.int32))
         touched = torch.zeros(grid.count, dtype=torch.int32, device=model.device)
-        if model.surface is not None:
+        if isinstance(model.surface, SurfaceGrid):
             touched[model.surface.nodes.long()] = 1
         struct.touched = view(touched, wp.int32)
         return struct

@@ -21,6 +21,7 @@ from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_
 from softmpm.schemes.lagrangian.frame import quantum, shift_of
 from softmpm.schemes.launch import KernelLauncher
 from softmpm.state import Nodal, State
+from softmpm.surface_grid import SurfaceGrid
 
 
 def particles_of(model: Model, nodes: Nodal) -> State:
@@ -214,6 +215,7 @@ def _anchors(model: Model, u: Tensor, normals: Tensor | None) -> Tensor:
     surface = model.surface
     if surface is None:
         return u.new_zeros(model.anchor_shape)
+    assert isinstance(surface, SurfaceGrid)
     x = surface.places(u)
     if normals is None:
         n = surface.normals.expand(len(u), -1, -1).to(u.dtype)

@@ -17,6 +17,7 @@ from softmpm.schemes.lagrangian.bricks import NODE_PART
 from softmpm.schemes.lagrangian.driven import drive
 from softmpm.schemes.lagrangian.frame import frame_struct
 from softmpm.schemes.penetration import deepest
+from softmpm.surface_grid import SurfaceGrid
 
 POINT_PART = 64
 """Surface points in each of the parts into which a CPU divides a launch."""
@@ -25,7 +26,7 @@ POINT_PART = 64
 def surface_struct(model: Model):
     """Struct on the surface points."""
     t, points = types(model.spec.dim, model.spec.dtype), model.surface
-    assert points is not None
+    assert isinstance(points, SurfaceGrid)
     struct = surface_type(model.spec.dim, model.spec.dtype)()
     struct.points = view(points.points, types(model.spec.dim, "float64").vec)
     areas, limit = points.areas, deepest(model)
@@ -72,7 +73,7 @@ class SurfaceContact:
         self.shifts = [view(one, exact) for one in shifts]
         self.rate = torch.empty(1, dtype=model.dtype, device=model.device)
         self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
-        assert model.surface is not None
+        assert isinstance(model.surface, SurfaceGrid)
         self.lanes = LANES if model.device.type == "cuda" else 1
         self.touched = (model.worlds, len(model.surface.nodes), self.lanes)
         self._vec, self._real = (

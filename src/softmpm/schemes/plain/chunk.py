@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
+import warp as wp
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
@@ -11,10 +12,14 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.alarm_check import StartCheck, armed, check_end
-from softmpm.schemes.buffers import Motion, MotionAdj, clear
+from softmpm.schemes.buffers import Motion, MotionAdj, clear, view
+from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, elapsed, grid_struct, particle_struct
+from softmpm.schemes.launch import KernelLauncher
 from softmpm.schemes.plain.footprint import PlainFootprint
 from softmpm.schemes.plain.substep import Substep
+from softmpm.schemes.plain.surface import SurfaceContact, SurfaceContactAdj, check_start
+from softmpm.schemes.surface_start import with_surface
 from softmpm.state import State
 
 
@@ -43,16 +48,22 @@ class PlainRun:
         self.step = Substep(model)
         self.states = Motion.empty(model, chunk.length + 1 if keep else 2)
         self.structs = [self.states[i].struct(model) for i in range(len(self.states.base))]
+        self.contact = None
+        if start.surface is not None:
+            self.contact = SurfaceContact(model, chunk, keep, start.surface, self.step.launch)
         if frozen:
             self.step.words[list(frozen)] = FROZEN
         self.step.enter(start, self.structs[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
             self._use_inputs(s, s - 1)
-            self.step.advance(self.structs[now], self.structs[then], s)
+            self.step.advance(self.structs[now], self.structs[then], s, self.contact)
         self.end = self.step.leave(self.structs[chunk.length if keep else chunk.length % 2])
         if armed(model):
             check_end(model, self.step.particle_inputs, self.end, self.step.words_array, chunk.length - 1)
+        if self.contact is not None:
+            self.contact.check_end(self.step.grid_inputs, self.step.words_array)
+            self.end = self.end._replace(surface=self.contact.end())
         self.words = self.step.words
         self.outgrow: Callable[[], None] | None = None
 
@@ -78,19 +89,23 @@ class PlainRun:
         then.v.copy_(adj_end.v)
         then.C.copy_(adj_end.C)
         then.H.copy_(adj_end.F)
+        contact = None
+        if self.contact is not None and adj_end.surface is not None:
+            contact = SurfaceContactAdj(self.contact, wanted, adj_end.surface)
         for s in reversed(range(chunk.length)):
             row = chunk.row(s)
             self._use_inputs(s, s + 1)
             clear(adjoints[s % 2].flat)
             states = self.structs[s], self.structs[s + 1], structs[(s + 1) % 2], structs[s % 2]
             inputs = found.particle_struct(row, row), found.grid_struct(row)
-            step.adjoint(wanted, *states, inputs, chunk.length - 1 - s)
+            step.adjoint(wanted, *states, inputs, chunk.length - 1 - s, contact)
             if s == 0 or row != chunk.row(s - 1):
                 found.collect(row, model.fixed, step.launch)
         adj_inputs.add(found, chunk.rows)
         adj_inputs.add_particles(found, chunk.rows)
         start = adjoints[0]
-        return State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H)
+        adj = State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H)
+        return adj if contact is None else adj._replace(surface=contact.start())
 
 
 class Plain:
@@ -116,7 +131,15 @@ class Plain:
         return PlainRun(self.model, chunk, start, values, keep, frozen)
 
     def check_start(self, start: State, values: Values) -> Tensor:
-        return StartCheck(self.model)(start, values)
+        words, model = StartCheck(self.model)(start, values), self.model
+        if start.surface is not None:
+            known = model.fixed | values
+            if model.spec.moving:
+                known["elapsed"] = elapsed(model, 0, 1, 1)
+            launch = KernelLauncher(model, stream_of(model.device))
+            about = (grid_struct(model, known), start.surface.x, view(words, wp.int64))
+            check_start(model, launch, *about)
+        return words
 
     def accept(self, run: PlainRun, words: list[int]) -> bool:
         return True
@@ -130,4 +153,5 @@ class Plain:
     particles = to_user
 
     def rest(self) -> State:
-        return self.model.rest()
+        state = self.model.rest()
+        return state if self.model.surface is None else with_surface(self.model, state, {})

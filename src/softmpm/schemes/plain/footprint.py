@@ -1,5 +1,6 @@
 """Memory of the plain scheme: states in the user's order, and every node of the grid."""
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -20,11 +21,27 @@ class PlainFootprint:
     def sizes(self, model) -> Sizes:
         real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
         inside = particles * (4 * d + real * ((d if real == 4 else 0) + 2 * d + 2 * d * d))
-        return sizes_of(model, inside=inside, nodes=0, between=state_bytes(particles, d, real))
+        points, between = surface_bytes(model), state_bytes(particles, d, real)
+        return sizes_of(model, inside=inside + points, nodes=0, between=between + 2 * points)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         inside, terms = model.sizes().inside, term_bytes(model)
+        if (
+            model.surface is not None
+        ):  # shares and base nodes of the points; free velocity and load of the nodes
+            d, real, points = model.dim, model.dtype.itemsize, model.worlds * model.surface.count
+            terms += points * (3**d * real + 4 * d) + model.worlds * model.node_count * (d + 1) * real
         return Buffers(2 * inside + terms, 0, inside + terms)
+
+
+def surface_bytes(model) -> int:
+    """Bytes of the places and anchors of the surface points, if there are any."""
+    if model.surface is None:
+        return 0
+    return (
+        math.prod(model.anchor_shape) * model.dtype.itemsize
+        + 8 * model.worlds * model.surface.count * model.dim
+    )
 
 
 def term_bytes(model) -> int:

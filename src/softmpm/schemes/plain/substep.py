@@ -20,6 +20,7 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.device import stream_of
+from softmpm.schemes.plain.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.state import Low, State
 
 
@@ -88,26 +89,47 @@ class Substep:
         self.launch(self.transfer.p2g, self.particles, constants, self.particle_inputs, now, node)
         self.launch(grid(spec).grid_velocity, self.nodes, constants, self.grid_inputs, node, velocity)
 
-    def advance(self, now, then, substep: int) -> None:
+    def advance(self, now, then, substep: int, contact: SurfaceContact | None = None) -> None:
         """One whole substep."""
         self.last = substep
         self.to_grid(now)
+        if contact is not None:
+            nodes = self._array("node"), self._array("velocity"), self.words_array
+            contact.respond(substep, self.grid_inputs, *nodes)
+            contact.advance(substep, *nodes)
         arguments = (self.model.constants, self.particle_inputs, substep, self._array("velocity"), now)
         self.launch(self.transfer.g2p, self.particles, *arguments, self.words_array, then)
 
     def adjoint(
-        self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs: tuple, substep: int
+        self,
+        wanted: RequestedGrads,
+        now,
+        then,
+        adj_then,
+        adj_now,
+        adj_inputs: tuple,
+        substep: int,
+        contact: SurfaceContactAdj | None = None,
     ) -> None:
         """Adjoint of :meth:`advance`. The grid is recomputed.
 
         Args:
             adj_now, adj_inputs: Added into; the latter are the structs of the inputs of particles and of nodes.
+            substep: Number of the substep, counted backward.
         """
         adj_particle_inputs, adj_grid_inputs = adj_inputs
         self.to_grid(now)
+        nodes, s = (self._array("node"), self._array("velocity")), 0
+        if contact is not None:
+            s = contact.forward.chunk.length - 1 - substep
+            contact.forward.respond(s, self.grid_inputs, *nodes, self.words_array, again=True)
         clear(self.adj_velocity)
         self.g2p_adj(wanted, now, then, adj_then, adj_now, adj_particle_inputs)
+        if contact is not None:
+            contact.respond(s, self.grid_inputs, adj_grid_inputs, *nodes, self._array("adj_velocity"))
         self.grid_adj(wanted, adj_grid_inputs)
+        if contact is not None:
+            self.adj_node[..., -1] += contact.mass
         self.p2g_adj(wanted, now, adj_now, adj_particle_inputs, substep)
 
     def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs) -> None:

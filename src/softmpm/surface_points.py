@@ -1,0 +1,76 @@
+"""Points of the outlines of all bodies, at which separating walls act, with constants of the material around them."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softmpm.scene.materials import Material
+from softmpm.scene.scene import Scene
+from softmpm.state import State
+
+
+class SurfacePoints:
+    """Surface points of all bodies.
+
+    Attributes:
+        count: Number of points.
+        points: Rest positions [m], shape (point, dim), float64.
+        areas: Area of each point [m²], shape (point,), float64.
+        stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
+        density: Density of the material of each point [kg/m³], shape (point,), float64.
+        waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
+        normals: Unit normals of the separating walls, shape (wall, dim), float64.
+    """
+
+    def __init__(self, scene: Scene, device: torch.device):
+        outlines = [body.particles.outline for body in scene.bodies if body.particles.outline is not None]
+        counts = [len(outline) for outline in outlines]
+        density = np.repeat([body.material.density for body in scene.bodies], counts)
+        modulus = np.repeat([longitudinal_modulus(body.material) for body in scene.bodies], counts)
+        normals = [wall.normal for wall in scene.walls if wall.contact == "separate"]
+        self.device, self.count = device, sum(counts)
+        self.points = self._tensor(np.concatenate([outline.points for outline in outlines]))
+        self.areas = self._tensor(np.concatenate([outline.areas for outline in outlines]))
+        self.stiffness = self._tensor(4.0 * modulus / scene.grid.spacing)
+        self.density, self.waves = self._tensor(density), self._tensor(np.sqrt(modulus / density))
+        self.normals = self._tensor(normals)
+
+    def _tensor(self, values, dtype: type = np.float64) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, dtype=dtype)).to(self.device)
+
+
+class CarriedPoints(SurfacePoints):
+    """Surface points that the moving grid carries.
+
+    Attributes:
+        nearest: The particle of the same body nearest at rest to each point, shape (point,), int64.
+        arms: Positions of the points from these particles at rest [m], shape (point, dim), float64.
+    """
+
+    def __init__(self, scene: Scene, device: torch.device):
+        from scipy.spatial import KDTree
+
+        super().__init__(scene, device)
+        nearest, arms, first = [], [], 0
+        for body in scene.bodies:
+            outline, positions = body.particles.outline, body.particles.positions
+            assert outline is not None
+            found = KDTree(positions).query(outline.points)[1]
+            nearest.append(first + found)
+            arms.append(outline.points - positions[found])
+            first += len(positions)
+        self.nearest = self._tensor(np.concatenate(nearest), np.int64)
+        self.arms = self._tensor(np.concatenate(arms))
+
+    def shown(self, state: State) -> Tensor:
+        """Places of the points by x and F of the nearest particles [m], shape (world, point, dim), float64: exact for affine motion."""
+        x, F = state.x.double(), state.F.double()
+        if state.low is not None:
+            x, F = x + state.low.x.double(), F + state.low.F.double()
+        return x[:, self.nearest] + (F[:, self.nearest] @ self.arms[..., None])[..., 0]
+
+
+def longitudinal_modulus(material: Material) -> float:
+    """λ + 2μ [Pa]."""
+    young, poisson = material.young, material.poisson
+    return young * (1 - poisson) / ((1 + poisson) * (1 - 2 * poisson))

@@ -1,0 +1,275 @@
+"""Contact at surface points on the moving grid: every value and gradient against the float64 reference, state, and mechanics."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers import assert_relative, busy_inputs, cotangent, dot, given, little_memory
+from surface_scenes import G, block, slab, velocity
+
+import softmpm
+from softmpm import Inputs, reference_moving_contact
+from softmpm.surface_points import CarriedPoints
+
+WALLS = ("wall_offset", "wall_normal", "wall_velocity")
+NAMES = ("gravity", "friction", "viscosity", *WALLS)
+STEPS, SUBSTEPS = 3, 3
+QUIET = softmpm.Alarms(collapse=None, depth=None, step=None, gap=None)
+
+
+def pressed(dim: int) -> softmpm.Scene:
+    """A block with an edge at which two rough walls meet the same points; a third wall acts on nodes."""
+    first, _, third = block(dim).walls
+    second = softmpm.Wall(normal=(0.5, 1.0, 0.2)[:dim], offset=0.4, friction=0.2)
+    return block(dim, walls=[first, second, third])
+
+
+def build(made: softmpm.Scene, **settings) -> softmpm.Model:
+    settings = dict(device="cpu", dtype=torch.float64, contact="surface", alarms=QUIET) | settings
+    return softmpm.build(made, **settings)
+
+
+def points_of(model: softmpm.Model) -> CarriedPoints:
+    assert isinstance(model.surface, CarriedPoints)
+    return model.surface
+
+
+def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
+    """Leaves of a body near rest, whose points are a little off and adhere somewhere, and of two walls that push into it as they turn
+    and slide, other ones in each world."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    found = busy_inputs(model, control_steps=STEPS) | given(model, NAMES, STEPS)
+    for name, still in zip("xvCF", model.rest()[:4], strict=True):
+        found[name] = still + 0.05 * (found[name].detach() - still)
+    walls, rest = model.scene.walls, points_of(model).points.cpu()
+    normal = torch.tensor([wall.normal for wall in walls], dtype=torch.float64)
+    near = (rest @ normal.T).amin(0) + torch.tensor([1e-3, 1e-3, 0.0])
+    near[2] = walls[2].offset
+    rise = 6e-3 * torch.arange(STEPS + 1.0).double()[:, None, None] * torch.tensor([1.0, 1.0, 0.1])
+    offset = near + rise + 2e-4 * random(STEPS + 1, model.worlds, 3)
+    normal = normal + 2e-3 * random(STEPS + 1, model.worlds, 3, model.dim)
+    found |= {"wall_offset": 1.3 * offset, "wall_normal": 1.3 * normal}
+    shape = model.anchor_shape
+    found["places"] = rest + 1e-3 * random(shape[0], *shape[2:])
+    n = normal[0, :, :2]
+    across = rest - torch.einsum("pd,wkd->wkp", rest, n)[..., None] * n[:, :, None]
+    found["anchor"] = (across + 1e-3 * random(*shape)).to(model.dtype)
+    return {name: tensor.detach().to(model.device).requires_grad_() for name, tensor in found.items()}
+
+
+def start_of(leaves: dict[str, torch.Tensor]) -> softmpm.State:
+    if "places" not in leaves:
+        return softmpm.State(*(leaves[name] for name in "xvCF"))
+    surface = softmpm.SurfaceState(leaves["places"], leaves["anchor"], torch.zeros_like(leaves["anchor"]))
+    return softmpm.State(*(leaves[name] for name in "xvCF"), surface=surface)
+
+
+def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=False) -> list[torch.Tensor]:
+    """x, v, C, F, places, anchors and forces at the end, by the model or by the reference."""
+    start = start_of(leaves)
+    params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
+    inputs, activation = Inputs(**{name: leaves[name] for name in NAMES}), leaves["activation"]
+    if not by_reference:
+        end = softmpm.simulate(model, start, activation, params, substeps=SUBSTEPS, inputs=inputs)
+        return list(end.differentiable())
+    end, *surface = reference_moving_contact.simulate(
+        model.scene,
+        start,
+        activation,
+        params,
+        substeps=SUBSTEPS,
+        inputs=inputs,
+        points=reference_moving_contact.surface_points(model.scene),
+        x=leaves.get("places"),
+        anchor=leaves.get("anchor"),
+        smoothing=model.contact_width * model.scene.grid.spacing,
+    )
+    return [*end[:4], *surface]
+
+
+def loss_of(parts: list[torch.Tensor]) -> torch.Tensor:
+    weights = [cotangent(softmpm.State(*4 * [part]), seed=k)[0] for k, part in enumerate(parts)]
+    return sum(((w * part).sum() for w, part in zip(weights, parts, strict=True)), torch.zeros(()))
+
+
+@pytest.mark.parametrize(
+    "dim, dtype, width, limit",
+    [
+        (2, torch.float64, 0.0, 1e-10),
+        (2, torch.float64, 0.05, 1e-10),
+        (3, torch.float64, 0.05, 1e-10),
+        (2, torch.float32, 0.05, 2e-3),
+    ],
+    ids=["2d", "smooth", "3d", "single"],
+)
+def test_contact_is_that_of_the_reference(dim, dtype, width, limit, device):
+    """The state, the forces and the gradient of all of them with respect to every input and to places and anchors: points that stick,
+    slip and hang free, some at two walls, which move."""
+    settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact_width=width)
+    model = build(pressed(dim), **settings)
+    leaves = leaves_of(model)
+    copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
+    found = []
+    for tensors, exact in ((leaves, False), (copies, True)):
+        parts = run(model, tensors, exact)
+        found.append([*parts, *torch.autograd.grad(loss_of(parts), list(tensors.values()))])
+    force = found[1][6]
+    touches = (force != 0).any(-1)
+    assert touches.any(2).any(0).all() and not touches.all() and (touches.all(1).any() or width == 0)
+    for name, got, want in zip([*"xvCF", "places", "anchor", "force", *leaves], *found, strict=True):
+        assert want.abs().max() > 0, f"the test does not exercise {name}"
+        assert_relative(got.detach().cpu().double(), want.detach(), limit, name)
+
+
+def test_a_state_without_points_has_gradients_too():
+    """Through the places that x and F show, and the anchors there on walls that turn: ≤ 1e-10."""
+    model = build(pressed(2), worlds=2, inputs=NAMES, contact_width=0.05)
+    leaves = {name: leaf for name, leaf in leaves_of(model).items() if name not in ("places", "anchor")}
+    names = ["x", "F", "wall_normal"]
+    found = []
+    for exact in (False, True):
+        parts = run(model, leaves, exact)
+        found.append([*parts, *torch.autograd.grad(loss_of(parts), [leaves[name] for name in names])])
+    for name, got, want in zip([*"xvCF", "places", "anchor", "force", *names], *found, strict=True):
+        assert_relative(got.detach(), want.detach(), 1e-10, name)
+
+
+def test_gradients_are_central_differences():
+    """Along one random direction of places, positions, masses and walls: ≤ 1e-6."""
+    model = build(pressed(2), worlds=2, inputs=NAMES)
+    leaves = leaves_of(model)
+    names = ["places", "x", "v", "density", "friction", *WALLS]
+    gradient = torch.autograd.grad(loss_of(run(model, leaves)), [leaves[name] for name in names])
+    for name, slope in zip(names, gradient, strict=True):
+        d = torch.randn(slope.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        h = 1e-8 if name in ("places", "x", "wall_offset", "wall_normal") else 1e-6
+        with torch.no_grad():
+            ends = [loss_of(run(model, leaves | {name: leaves[name] + sign * h * d})) for sign in (1, -1)]
+        want = (ends[0] - ends[1]).item() / (2 * h)
+        assert (slope * d).sum().item() == pytest.approx(want, rel=1e-6), name
+
+
+def test_calls_in_turn_are_one_call():
+    """Places, anchors and walls go on where they were, also where states are recomputed: the same end but for the rounding of particles
+    between calls, ≤ 1e-13, and the same gradient."""
+    settings = dict(worlds=2, inputs=NAMES, contact_width=0.05)
+    model = build(pressed(2), **settings)
+    leaves = leaves_of(model)
+    whole = run(model, leaves)
+    params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
+    others = {name: leaves[name] for name in NAMES if name not in WALLS}
+    state = start_of(leaves)
+    for c in range(STEPS):
+        poses = {name: leaves[name][c : c + 2] for name in WALLS[:2]}
+        inputs = Inputs(**poses, wall_velocity=leaves["wall_velocity"][c : c + 1], **others)
+        row = leaves["activation"][c : c + 1]
+        state = softmpm.simulate(model, state, row, params, substeps=SUBSTEPS, inputs=inputs)
+    thrifty = build(pressed(2), **settings, **little_memory(model))
+    wanted = torch.autograd.grad(loss_of(whole), list(leaves.values()))
+    for parts in (list(state.differentiable()), run(thrifty, leaves)):
+        for got, want in zip(parts, whole, strict=True):
+            assert_relative(got, want, 1e-13)
+        gradient = torch.autograd.grad(loss_of(parts), list(leaves.values()))
+        for name, got, want in zip(leaves, gradient, wanted, strict=True):
+            assert_relative(got, want, 1e-10, name)
+
+
+def test_a_world_that_fails_does_not_touch_the_others():
+    """A wall that jumps into one world stops it with `in_wall`; its state stays, its gradient is zero."""
+    model = build(pressed(2), worlds=2, inputs=NAMES, alarms=dataclasses.replace(QUIET, depth=1.0))
+    leaves = leaves_of(model)
+    with torch.no_grad():
+        leaves["wall_offset"][1:, 1] += 0.2
+    params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
+    settings = dict(substeps=SUBSTEPS, inputs=Inputs(**{name: leaves[name] for name in NAMES}))
+    start = start_of(leaves)
+    with pytest.raises(softmpm.UnstableError, match="surface point .* inside wall") as raised:
+        softmpm.simulate(model, start, leaves["activation"], params, **settings)
+    assert (raised.value.kind, raised.value.world) == ("in_wall", 1)
+    for policy in ("reset", "freeze"):
+        failures = softmpm.Failures(policy)
+        end = softmpm.simulate(model, start, leaves["activation"], params, failures=failures, **settings)
+        assert [error.world for error in failures.errors] == [1] and end.surface is not None
+        assert torch.isfinite(end.surface.x).all()
+    assert end.surface is not None
+    gradient = torch.autograd.grad(
+        dot(cotangent(end), end) + end.surface.x.sum(), [leaves["x"], leaves["places"]]
+    )
+    for one in gradient:
+        assert one[0].abs().max() > 0 and not one[1].any()
+
+
+@pytest.fixture(scope="module")
+def settled() -> tuple[softmpm.Model, softmpm.State]:
+    model = build(slab(), alarms=None)
+    return model, softmpm.simulate(model, model.rest(), None, model.params(), substeps=2500)
+
+
+def test_a_block_rests_on_the_floor(settled):
+    """Its sole is within 0.005 cells of the floor, half a cell with contact at nodes, and the floor bears its weight."""
+    model, state = settled
+    sole = points_of(model).points[:, 1] <= model.scene.walls[0].offset + 1e-9
+    gap = state.surface.x[0, sole, 1] - model.scene.walls[0].offset
+    assert gap.abs().max() < 0.005 * model.scene.grid.spacing
+    forces = softmpm.contact_forces(model, state)
+    weight = (model.mass.sum() * G).item()
+    assert forces.total[0, 0, 1].item() == pytest.approx(weight, rel=1e-4)
+    assert torch.equal(forces.points, state.surface.x)
+
+
+@pytest.mark.parametrize("degrees", [3.0, -0.5])
+def test_a_block_on_an_incline(degrees, settled):
+    """Above the angle of friction it slides as a rigid one, within 0.5 %; below it sticks."""
+    angle = np.arctan(0.5) + np.radians(degrees)
+    made = slab(gravity=(G * np.sin(angle), -G * np.cos(angle)))
+    model, exact = build(made, alarms=None), G * (np.sin(angle) - 0.5 * np.cos(angle))
+    before = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1500)
+    end = softmpm.simulate(model, before, None, model.params(), substeps=500)
+    if degrees < 0:
+        assert velocity(model, end)[0].abs() < 1e-5
+    else:
+        gained = (velocity(model, end) - velocity(model, before))[0].item() / (500 * made.dt)
+        assert gained == pytest.approx(exact, rel=5e-3)
+
+
+def test_places_of_a_state_without_points_are_exact_for_affine_motion():
+    """x = c + B X and F = B give c + B X_s, in float32 with the low-order parts too."""
+    for dtype in (torch.float64, torch.float32):
+        model = build(slab(), dtype=dtype, alarms=None)
+        B = torch.tensor([[1.1, 0.3], [-0.2, 0.8]], dtype=torch.float64)
+        exact = torch.from_numpy(model.exact_positions) @ B.T + 0.1
+        x, F = exact.to(dtype)[None], B.to(dtype).expand(1, len(exact), 2, 2)
+        low = softmpm.Low(
+            (exact - x[0].double()).to(dtype)[None], (B - B.to(dtype).double()).to(dtype).expand_as(F)
+        )
+        state = softmpm.State(x, torch.zeros_like(x), torch.zeros_like(F), F, low)
+        want = points_of(model).points @ B.T + 0.1
+        torch.testing.assert_close(points_of(model).shown(state)[0], want, rtol=0, atol=1e-13)
+
+
+def test_what_cannot_be_is_refused(settled):
+    """The fast scheme, `step`, a state whose particles were moved alone, one of another model; points that leave the grid."""
+    model, state = settled
+    with pytest.raises(ValueError, match="contact='surface' is in the plain scheme"):
+        build(slab(), scheme="fast")
+    with pytest.raises(ValueError, match="need contact='nodes'"):
+        softmpm.warp_state(model)
+    assert "plain: contact at surface points" in model.describe()
+    args = (None, model.params())
+    with pytest.raises(ValueError, match="state.surface was not"):
+        softmpm.simulate(model, state._replace(x=state.x + 0.1), *args, substeps=1)
+    moved = softmpm.simulate(model, state._replace(x=state.x + 0.1, surface=None), *args, substeps=1)
+    assert moved.surface is not None
+    torch.testing.assert_close(moved.surface.x, state.surface.x + 0.1, rtol=0, atol=1e-3)
+    at_nodes = softmpm.build(slab(), device="cpu", dtype=torch.float64)
+    with pytest.raises(ValueError, match="state.surface must be None"):
+        softmpm.simulate(at_nodes, state, *args, substeps=1)
+    gone = state._replace(v=state.v - torch.tensor([50.0, 0.0]))
+    with pytest.raises(softmpm.UnstableError, match="surface point .* off the grid") as raised:
+        softmpm.simulate(model, gone, *args, substeps=100)
+    assert raised.value.kind == "lost"
