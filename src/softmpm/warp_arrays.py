@@ -181,7 +181,7 @@ def check_steps(model: Model, wants: str) -> None:
     check_model(model, wants)
     if model.formulation == "moving" and model.surface is not None:
         raise ValueError(
-            f"{wants} and softmpm.step need contact='nodes' in the moving formulation, got a model with contact='surface'; take "
+            f"{wants} and softmpm.step need contact='nodes' with formulation='moving', got a model with contact='surface'; take "
             "softmpm.simulate."
         )
 

@@ -127,7 +127,7 @@ class RunLogger:
                 model, state = self.run.model, frame.state
                 with torch.no_grad():
                     velocity, forces = softmpm.rasterize(model, state).velocity, None
-                    if model.surface is not None and state.nodes is not None:  # the state at rest has none
+                    if state.surface is not None or (model.surface is not None and state.nodes is not None):
                         forces = softmpm.contact_forces(model, state)
                     episode.frame(frame.time, state, frame.activation, velocity, frame.features, forces)
 

@@ -257,7 +257,7 @@ def test_what_cannot_be_is_refused(settled):
     model, state = settled
     with pytest.raises(ValueError, match="contact='surface' is in the plain scheme"):
         build(slab(), scheme="fast")
-    with pytest.raises(ValueError, match="need contact='nodes'"):
+    with pytest.raises(ValueError, match="need contact='nodes' with formulation='moving'"):
         softmpm.warp_state(model)
     assert "plain: contact at surface points" in model.describe()
     args = (None, model.params())
