@@ -10,7 +10,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 
-HEADER = Path(__file__).with_name("parts.h")
+HEADER = Path(__file__).with_name("parts.h").read_text()
 COUNT_BYTES = 64
 """Bytes of the counters of a launch: a cache line."""
 
@@ -22,14 +22,14 @@ def in_parts(source: str = "", before: str = "") -> wp.ModuleBuildOptions:
         source: Native code of the module on every device.
         before: Further code on the CPU, before the other.
     """
-    on_cpu = HEADER.read_text() + before + source
+    on_cpu = HEADER + before + source
     return wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=on_cpu)
 
 
 def may_be_divided(kernel: wp.Kernel) -> bool:
     """True if the kernel's module has these options."""
     build = kernel.module.options.get("extra_build_options")
-    return build is not None and build.extra_cpu_preamble.startswith(HEADER.read_text())
+    return build is not None and build.extra_cpu_preamble.startswith(HEADER)
 
 
 @kernel_factory
