@@ -88,7 +88,6 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         block=block,
         gradients=(gradients(0), gradients(1), gradients(2)),
         add=add,
-        places=places,
         places_of=places_of,
         taken=taken,
         put=put,
@@ -105,49 +104,11 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
     one_layer, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
-    Lattice, block, places, places_of = (
-        one_layer.Lattice,
-        one_layer.block,
-        one_layer.places,
-        one_layer.places_of,
-    )
+    Lattice, block, places_of = one_layer.Lattice, one_layer.block, one_layer.places_of
     taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
     gradients_u, gradients_v = one_layer.gradients[0], one_layer.gradients[1]
-    count, slots, serial = bricks.cell_count, bricks.slots, bricks.serial
+    count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
     module = brick_module(f"{spec.module}.lagrangian.{bricks.name}.layers")
-
-    @wp.func
-    def layer_forces(
-        constants: Constants,
-        inputs: ParticleInputs,
-        inside: Rest,
-        lattice: Lattice,
-        substep: int,
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        words: wp.array(dtype=wp.int64),
-        world: int,
-        brick: int,
-        corner: int,
-        layer: int,
-        at: places,
-    ) -> block:
-        """−V P / rate of each particle of a layer."""
-        A = block()
-        if corner >= 0:
-            H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
-            rate = block()
-            if wp.static(viscous):
-                rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
-            for n in range(points):
-                p = at[n]
-                if p >= 0:
-                    Hn = constants.rate * taken(H, n)
-                    A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
-                    A = put(A, n, constants.rate * A_n)
-                    if substep > 0:  # last, so that nothing waits for it
-                        check(constants, words, world, inside.order[p], substep - 1, Hn)
-        return A
 
     @wp.kernel(module=module, **bricks.layer_settings)
     def forces(
@@ -165,27 +126,33 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         partial: wp.array2d(dtype=vec),
     ):
         world, brick, lane = wp.tid()
-        if wp.static(serial):
-            clear(partial, world, brick)
-            for slot in range(slots):
+        corner = inside.corners[brick, lane % count]  # loaded while the nodes are awaited
+        at = places_of(inside, brick, lane)
+        stage_u(u, inside, world, brick, lane)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+        clear(partial, world, brick)
+        meet()
+        for turn in range(turns):  # a single one on a GPU
+            slot = lane + turn
+            if wp.static(serial):
                 corner = inside.corners[brick, slot % count]
-                layer = slot / count
                 at = places_of(inside, brick, slot)
-                A = layer_forces(
-                    constants, inputs, inside, lattice, substep, u, v, words, world, brick, corner, layer, at
-                )
-                add(A, partial, world, brick, corner, layer, lane, lattice)
-        else:
-            corner = inside.corners[brick, lane % count]
-            layer = lane / count
-            at = places_of(inside, brick, lane)
-            stage_u(u, inside, world, brick, lane)
-            if wp.static(viscous):
-                stage_v(v, inside, world, brick, lane)
-            meet()
-            A = layer_forces(
-                constants, inputs, inside, lattice, substep, u, v, words, world, brick, corner, layer, at
-            )
+            layer = slot / count
+            A = block()
+            if corner >= 0:
+                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
+                rate = block()
+                if wp.static(viscous):
+                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+                for n in range(points):
+                    p = at[n]
+                    if p >= 0:
+                        Hn = constants.rate * taken(H, n)
+                        A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
+                        A = put(A, n, constants.rate * A_n)
+                        if substep > 0:  # last, so that nothing waits for it
+                            check(constants, words, world, inside.order[p], substep - 1, Hn)
             add(A, partial, world, brick, corner, layer, lane, lattice)
 
     return SimpleNamespace(forces=forces)
@@ -206,59 +173,11 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(3))
     stage_u, stage_f, stage_v = of_u.stage, of_f.stage, of_v.stage
     clear, viscous = sums(dim, spec.dtype, bricks, False).clear, spec.viscosity
-    Lattice, block, places, places_of = (
-        one_layer.Lattice,
-        one_layer.block,
-        one_layer.places,
-        one_layer.places_of,
-    )
+    Lattice, block, places_of = one_layer.Lattice, one_layer.block, one_layer.places_of
     taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
     gradients_u, gradients_f, gradients_v = one_layer.gradients
-    count, slots, serial = bricks.cell_count, bricks.slots, bricks.serial
+    count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
-
-    @wp.struct
-    class LayerAdj:
-        F: block
-        rate: block
-
-    @wp.func
-    def layer_forces_adj(
-        constants: Constants,
-        inputs: ParticleInputs,
-        inside: Rest,
-        lattice: Lattice,
-        substep: int,
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        words: wp.array(dtype=wp.int64),
-        adj_inputs: ParticleInputsAdj,
-        world: int,
-        brick: int,
-        corner: int,
-        layer: int,
-        at: places,
-    ) -> LayerAdj:
-        """F̄ / rate and Ḟ̄ / rate of each particle of a layer."""
-        out = LayerAdj()
-        if corner >= 0:
-            H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
-            G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
-            rate = block()
-            if wp.static(viscous):
-                rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
-            for n in range(points):
-                p = at[n]
-                if p >= 0:
-                    Hn = constants.rate * taken(H, n)
-                    Gn = constants.rate * taken(G, n)
-                    adj = forced_adj(inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs)
-                    check_adj(words, world, inside.order[p], substep, adj)
-                    out.F = put(out.F, n, constants.rate * adj.F)  # (Q1.adj)
-                    if wp.static(viscous):
-                        out.rate = put(out.rate, n, constants.rate * adj.rate)
-        return out
 
     @wp.kernel(module=module, **bricks.layer_settings)
     def forces_adj(
@@ -281,62 +200,43 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         partial_v: wp.array2d(dtype=vec),
     ):
         world, brick, lane = wp.tid()
-        if wp.static(serial):
-            clear(partial_u, world, brick)
-            if wp.static(viscous):
-                clear(partial_v, world, brick)
-            for slot in range(slots):
+        corner = inside.corners[brick, lane % count]  # loaded while the nodes are awaited
+        at = places_of(inside, brick, lane)
+        stage_u(u, inside, world, brick, lane)
+        stage_f(adj_f, inside, world, brick, lane)
+        clear(partial_u, world, brick)
+        if wp.static(viscous):
+            stage_v(v, inside, world, brick, lane)
+            clear(partial_v, world, brick)
+        meet()
+        for turn in range(turns):  # a single one on a GPU
+            slot = lane + turn
+            if wp.static(serial):
                 corner = inside.corners[brick, slot % count]
-                layer = slot / count
                 at = places_of(inside, brick, slot)
-                adj = layer_forces_adj(
-                    constants,
-                    inputs,
-                    inside,
-                    lattice,
-                    substep,
-                    u,
-                    v,
-                    adj_f,
-                    words,
-                    adj_inputs,
-                    world,
-                    brick,
-                    corner,
-                    layer,
-                    at,
-                )
-                add(adj.F, partial_u, world, brick, corner, layer, lane, lattice)
+            layer = slot / count
+            A = block()
+            B = block()
+            if corner >= 0:
+                H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
+                G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
+                rate = block()
                 if wp.static(viscous):
-                    add(adj.rate, partial_v, world, brick, corner, layer, lane, lattice)
-        else:
-            corner = inside.corners[brick, lane % count]
-            layer = lane / count
-            at = places_of(inside, brick, lane)
-            stage_u(u, inside, world, brick, lane)
-            stage_f(adj_f, inside, world, brick, lane)
+                    rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
+                for n in range(points):
+                    p = at[n]
+                    if p >= 0:
+                        Hn = constants.rate * taken(H, n)
+                        Gn = constants.rate * taken(G, n)
+                        adj = forced_adj(
+                            inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs
+                        )
+                        check_adj(words, world, inside.order[p], substep, adj)
+                        A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
+                        if wp.static(viscous):
+                            B = put(B, n, constants.rate * adj.rate)
+            add(A, partial_u, world, brick, corner, layer, lane, lattice)
             if wp.static(viscous):
-                stage_v(v, inside, world, brick, lane)
-            meet()
-            adj = layer_forces_adj(
-                constants,
-                inputs,
-                inside,
-                lattice,
-                substep,
-                u,
-                v,
-                adj_f,
-                words,
-                adj_inputs,
-                world,
-                brick,
-                corner,
-                layer,
-                at,
-            )
-            add(adj.F, partial_u, world, brick, corner, layer, lane, lattice)
-            if wp.static(viscous):
-                add(adj.rate, partial_v, world, brick, corner, layer, lane, lattice)
+                add(B, partial_v, world, brick, corner, layer, lane, lattice)
 
     return SimpleNamespace(forces_adj=forces_adj)
