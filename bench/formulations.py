@@ -1,7 +1,8 @@
 """Both formulations on one body: `python bench/formulations.py [--device cpu --threads 1 2] [--json FILE]`
 
 Microseconds of a substep in calls without gradient, in calls that store their states, and of the backward pass; medians after a
-warm-up, the two formulations in turn. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving formulation's
+warm-up, the two formulations in turn. ``further``: of one more substep in a call without gradient,
+without what a call costs in any case. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving formulation's
 figure over that of the reference formulation.
 
 ``cube``: particles on a lattice, without walls, in one world or several. ``block`` has an outline; ``on a floor`` it also meets a wall
@@ -31,7 +32,10 @@ CASES = [
 ]
 ON_A_CPU = [(2, 3_000, 96, 1), (2, 20_000, 192, 1), (3, 8_000, 32, 1)]
 """Dimension, particles of a world, nodes along an axis, worlds."""
-FIGURES = "forward", "stored", "backward", "kept"
+FIGURES = "forward", "further", "stored", "backward", "kept"
+
+LONGER = 5
+"""Length of the longer of two calls, whose difference is the cost of a further substep."""
 
 
 def block(dim: int, cells: int, floor: bool) -> softmpm.Scene:
@@ -80,13 +84,15 @@ def figures(
     )
     ahead, back = measure(model, substeps, args.repeats)
     sizes, (alone, cores) = model.sizes(), forward(model, substeps, args.repeats)
-    return (alone, ahead, back, sizes.inside + sizes.nodes), cores
+    longer = forward(model, LONGER * substeps, args.repeats)[0]
+    further = (LONGER * longer - alone) / (LONGER - 1)
+    return (alone, further, ahead, back, sizes.inside + sizes.nodes), cores
 
 
 def main():
     args = arguments(__doc__, threads=True)
     device = torch.device(args.device)
-    table, before = Table("Two formulations [us/substep], float32", device, args.json), (1.0,) * 4
+    table, before = Table("Two formulations [us/substep], float32", device, args.json), (1.0,) * len(FIGURES)
     runs = [("moving", args.threads[0]), *(("reference", count) for count in args.threads)]
     for name, dim, worlds, particles, scene in cases(device.type == "cpu"):
         if particles * worlds > (args.largest or particles * worlds):
