@@ -1,10 +1,11 @@
-"""Scenes and models with contact at surface points, for several tests."""
+"""Scenes and models of the reference formulation with contact at surface points, and their comparison with the float64 reference."""
 
 import numpy as np
 import torch
+from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
 
 import softmpm
-from softmpm import reference_contact
+from softmpm import Inputs, reference_contact, reference_lagrangian
 
 G = 9.81
 
@@ -37,14 +38,38 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     )
 
 
-def surface_of(model: softmpm.Model) -> reference_contact.Surface:
-    """The model's surface points for the reference, which does not compute weights."""
-    points, rest = model.surface, model.rest_grid
-    assert points is not None
-    node = rest.index.cpu()[points.stencil.cpu().long()]
-    return reference_contact.Surface(
-        points.points.cpu(), node, points.weights.cpu(), points.areas.cpu(), points.stiffness.cpu()
-    )
+def by_reference(model: softmpm.Model, start, activation, params, **call) -> softmpm.State:
+    """:func:`softmpm.simulate` by the float64 reference, with contact at surface points if the model has it."""
+    made, settings = model.scene, {}
+    u, v = reference_lagrangian.project(made, start, params)
+    if model.surface is not None:
+        surface, width = surface_of(model), model.contact_width * made.grid.spacing
+        anchor = reference_contact.start_anchor(made, surface, u)
+        settings = dict(surface=surface, anchor=anchor, smoothing=width)
+    u, v, *_ = reference_lagrangian.simulate(made, u, v, activation, params, **call, **settings)
+    return reference_lagrangian.evaluate(made, u, v)
+
+
+def compare(model: softmpm.Model, names, limit: float, steps=3) -> None:
+    """Assert that the end of a call of ``steps`` control steps and all its gradients are those of the reference.
+
+    Args:
+        names: Inputs that the call gives.
+        limit: Of the relative difference.
+    """
+    leaves = busy_inputs(model, control_steps=steps) | given(model, names, steps)
+    copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
+    found = []
+    for simulate, tensors in ((softmpm.simulate, leaves), (by_reference, copies)):
+        start = softmpm.State(*(tensors[name] for name in "xvCF"))
+        params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
+        inputs = Inputs(**{name: tensors[name] for name in names})
+        end = simulate(model, start, tensors["activation"], params, substeps=2, inputs=inputs)
+        loss = dot(cotangent(end), end)
+        found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
+    for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
+        assert want.abs().max() > 0, f"the test does not exercise {name}"
+        assert_relative(got.detach().cpu().double(), want.detach(), limit, f"{name} in {model.dtype}")
 
 
 def slab(friction=0.5, gravity=(0.0, -G), width=8, **changes) -> softmpm.Scene:

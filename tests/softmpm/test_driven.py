@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from helpers import assert_relative, busy_inputs, cotangent, dot, given
-from surface_scenes import block, build, surface_of
+from helpers import busy_inputs, cotangent, dot, given
+from surface_scenes import block, build, compare
 
 import softmpm
-from softmpm import Inputs, reference_contact, reference_driven, reference_lagrangian
+from softmpm import Inputs, reference_driven, reference_lagrangian
 from softmpm.schemes.lagrangian.driven import of_nodes
 
 STEPS = 3
@@ -28,32 +28,7 @@ def gripped(dim: int) -> softmpm.Scene:
 def test_the_end_and_all_gradients_are_those_of_the_reference(dim, contact, device):
     """Driven particles with other velocities each, in two worlds, beside and between nodes that walls stop and push."""
     model = build(gripped(dim), device=device, dtype=torch.float64, worlds=2, contact=contact)
-    leaves = busy_inputs(model, control_steps=STEPS) | given(model, ("velocity",), STEPS)
-    copies = {name: t.detach().cpu().requires_grad_() for name, t in leaves.items()}
-    found = []
-    for tensors in (leaves, copies):
-        start = softmpm.State(*(tensors[name] for name in "xvCF"))
-        params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
-        call, inputs = dict(substeps=2), Inputs(velocity=tensors["velocity"])
-        if tensors is leaves:
-            end = softmpm.simulate(model, start, tensors["activation"], params, inputs=inputs, **call)
-        else:
-            end = by_reference(model, start, tensors["activation"], params, inputs=inputs, **call)
-        loss = dot(cotangent(end), end)
-        found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
-    for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
-        assert want.abs().max() > 0, f"the test does not exercise {name}"
-        assert_relative(got.detach().cpu(), want.detach(), 1e-10, name)
-
-
-def by_reference(model, start, activation, params, **call) -> softmpm.State:
-    made, settings = model.scene, {}
-    u, v = reference_lagrangian.project(made, start, params)
-    if model.surface is not None:
-        surface = surface_of(model)
-        settings = dict(surface=surface, anchor=reference_contact.start_anchor(made, surface, u))
-    u, v, *_ = reference_lagrangian.simulate(made, u, v, activation, params, **call, **settings)
-    return reference_lagrangian.evaluate(made, u, v)
+    compare(model, ("velocity",), 1e-10)
 
 
 def test_the_gradient_agrees_with_central_differences():

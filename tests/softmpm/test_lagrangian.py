@@ -5,15 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, given
+from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene
+from surface_scenes import by_reference, compare
 
 import softmpm
-from softmpm import Inputs, reference_lagrangian
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
 GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
-STEPS = 3
 
 
 def build(made: softmpm.Scene, **settings) -> softmpm.Model:
@@ -21,33 +20,6 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     return softmpm.build(
         made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
     )
-
-
-def by_reference(made, start, activation, params, substeps, inputs):
-    """:func:`softmpm.simulate` by the reference."""
-    u, v = reference_lagrangian.project(made, start, params)
-    u, v = reference_lagrangian.simulate(made, u, v, activation, params, substeps=substeps, inputs=inputs)
-    return reference_lagrangian.evaluate(made, u, v)
-
-
-def compare(model: softmpm.Model, names, limit: float, substeps=2) -> None:
-    """Assert that the end of a call and every gradient are those of the reference."""
-    leaves = busy_inputs(model, control_steps=STEPS) | given(model, names, STEPS)
-    copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
-    found = []
-    for kind, tensors in ((model, leaves), (model.scene, copies)):
-        start = softmpm.State(*(tensors[name] for name in "xvCF"))
-        params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
-        inputs, activation = Inputs(**{name: tensors[name] for name in names}), tensors["activation"]
-        if kind is model:
-            end = softmpm.simulate(model, start, activation, params, substeps=substeps, inputs=inputs)
-        else:
-            end = by_reference(kind, start, activation, params, substeps, inputs)
-        loss = dot(cotangent(end), end)
-        found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
-    for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
-        assert want.abs().max() > 0, f"the test does not exercise {name}"
-        assert_relative(got.detach().cpu().double(), want.detach(), limit, name)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -83,7 +55,7 @@ def test_each_law_alone(law, dim, device):
         if tensors is leaves:
             end = softmpm.simulate(model, start, None, params, substeps=4)
         else:
-            end = by_reference(made, start, None, params, 4, Inputs())
+            end = by_reference(model, start, None, params, substeps=4)
         found.append([*end[:4], *torch.autograd.grad(dot(cotangent(end), end), list(tensors.values()))])
     for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
         assert_relative(got.detach().cpu(), want.detach(), 1e-10, name)

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
+from helpers import assert_relative, busy_inputs, cotangent, dot, surface_of
+from surface_scenes import build, compare
 
 import softmpm
-from softmpm import Inputs, reference_contact, reference_lagrangian
+from softmpm import reference_lagrangian
 from softmpm.schemes.lagrangian.nodal import particles_of
 
 NAMES = ("gravity", "damping", "friction", "viscosity", "force")
-STEPS = 3
 
 
 def corner(dim: int, **changes) -> softmpm.Scene:
@@ -41,25 +41,6 @@ def corner(dim: int, **changes) -> softmpm.Scene:
     return softmpm.Scene(**(settings | changes))
 
 
-def build(made: softmpm.Scene, **settings) -> softmpm.Model:
-    alarms = softmpm.Alarms(collapse=None, depth=None)
-    return softmpm.build(
-        made, device=settings.pop("device", "cpu"), formulation="reference", alarms=alarms, **settings
-    )
-
-
-def by_reference(model, start, activation, params, substeps, inputs) -> softmpm.State:
-    made, settings = model.scene, {}
-    u, v = reference_lagrangian.project(made, start, params)
-    if model.surface is not None:
-        surface = surface_of(model)
-        settings = dict(surface=surface, anchor=reference_contact.start_anchor(made, surface, u))
-    u, v, *_ = reference_lagrangian.simulate(
-        made, u, v, activation, params, substeps=substeps, inputs=inputs, **settings
-    )
-    return reference_lagrangian.evaluate(made, u, v)
-
-
 @pytest.mark.parametrize("contact", ["nodes", "surface"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_end_and_all_gradients_are_those_of_the_reference(dim, contact, device):
@@ -67,22 +48,7 @@ def test_the_end_and_all_gradients_are_those_of_the_reference(dim, contact, devi
     for dtype, limit in ((torch.float64, 1e-10), (torch.float32, 2e-3)):
         settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact=contact)
         model = build(corner(dim), **settings)
-        leaves = busy_inputs(model, control_steps=STEPS) | given(model, NAMES, STEPS)
-        copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
-        found = []
-        for tensors in (leaves, copies):
-            start = softmpm.State(*(tensors[name] for name in "xvCF"))
-            params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
-            inputs, activation = Inputs(**{name: tensors[name] for name in NAMES}), tensors["activation"]
-            if tensors is leaves:
-                end = softmpm.simulate(model, start, activation, params, substeps=2, inputs=inputs)
-            else:
-                end = by_reference(model, start, activation, params, 2, inputs)
-            loss = dot(cotangent(end), end)
-            found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
-        for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
-            assert want.abs().max() > 0, f"the test does not exercise {name}"
-            assert_relative(got.detach().cpu().double(), want.detach(), limit, f"{name} in {dtype}")
+        compare(model, NAMES, limit)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -5,27 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, cotangent, dot, given
-from surface_scenes import block, build, surface_of
+from helpers import assert_relative, busy_inputs, cotangent, dot
+from surface_scenes import block, build, compare
 
 import softmpm
-from softmpm import Inputs, reference_contact, reference_lagrangian
 from softmpm.surface_grid import consistent
 
-STEPS = 3
 NAMES = ("gravity", "friction", "viscosity")
-
-
-def by_reference(model, start, activation, params, substeps, inputs) -> softmpm.State:
-    surface, made = surface_of(model), model.scene
-    width = model.contact_width * made.grid.spacing
-    u, v = reference_lagrangian.project(made, start, params)
-    anchor = reference_contact.start_anchor(made, surface, u)
-    settings = dict(surface=surface, anchor=anchor, smoothing=width)
-    u, v, *_ = reference_lagrangian.simulate(
-        made, u, v, activation, params, substeps=substeps, inputs=inputs, **settings
-    )
-    return reference_lagrangian.evaluate(made, u, v)
 
 
 @pytest.mark.parametrize("width", [0.0, 0.05])
@@ -35,22 +21,7 @@ def test_the_end_and_all_gradients_are_those_of_the_reference(dim, width, device
     for dtype, limit in ((torch.float64, 1e-10), (torch.float32, 2e-3)):
         settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact_width=width)
         model = build(block(dim), **settings)
-        leaves = busy_inputs(model, control_steps=STEPS) | given(model, NAMES, STEPS)
-        copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
-        found = []
-        for tensors in (leaves, copies):
-            start = softmpm.State(*(tensors[name] for name in "xvCF"))
-            params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
-            inputs, activation = Inputs(**{name: tensors[name] for name in NAMES}), tensors["activation"]
-            if tensors is leaves:
-                end = softmpm.simulate(model, start, activation, params, substeps=2, inputs=inputs)
-            else:
-                end = by_reference(model, start, activation, params, 2, inputs)
-            loss = dot(cotangent(end), end)
-            found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
-        for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
-            assert want.abs().max() > 0, f"the test does not exercise {name}"
-            assert_relative(got.detach().cpu().double(), want.detach(), limit, f"{name} in {dtype}")
+        compare(model, NAMES, limit)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

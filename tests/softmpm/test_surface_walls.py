@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, cotangent, dot, given
-from surface_scenes import G, block, build, made, settled, slab, surface_of, velocity
+from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
+from surface_scenes import G, block, build, made, settled, slab, velocity
 
 import softmpm
 from softmpm import Inputs, reference_lagrangian
