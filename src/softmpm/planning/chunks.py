@@ -21,6 +21,15 @@ class Chunk:
         begins = range(-self.first % self.substeps, self.length, self.substeps)
         return self.length, tuple(s for s in begins if s > 0)
 
+    @property
+    def begins(self) -> bool:
+        """True if a control step begins with the chunk."""
+        return self.first % self.substeps == 0
+
+    def anew(self, s: int) -> int:
+        """1 if a control step begins with substep ``s`` of the chunk, but not with the first one."""
+        return int(s in self.shape[1])
+
     @functools.cached_property
     def rows(self) -> slice:
         """Control steps that the chunk touches."""

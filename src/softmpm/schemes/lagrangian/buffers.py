@@ -94,7 +94,7 @@ class ChunkBuffers:
         given_states = (*start[:3], shift_of(self.model, start))
         for own, given in zip((self.u, self.v, self.anchor, self.shift), given_states, strict=True):
             own[0].copy_(given.detach())
-        if begins(chunk):
+        if chunk.begins:
             clear(self.force)
         else:
             self.force.copy_(start.force.detach())
@@ -107,11 +107,6 @@ class ChunkBuffers:
         last = self.index(self.chunk.length)
         u, v, anchor, shift = (one[last].clone() for one in (self.u, self.v, self.anchor, self.shift))
         return Nodal(u, v, anchor, self.force.clone(), shift)
-
-
-def begins(chunk: Chunk) -> bool:
-    """True if a chunk begins with a control step."""
-    return chunk.first % chunk.substeps == 0
 
 
 class SharedAdjoint:
@@ -194,6 +189,6 @@ class ChunkAdjoint:
         """Add the adjoints of the inputs into ``adj_inputs``; returns that of the initial state."""
         adj_inputs.add(self.found, chunk.rows)
         add_unsorted(stream, self._unsort, self.found, chunk.rows, adj_inputs)
-        if begins(chunk):
+        if chunk.begins:
             clear(self.shared.force)
         return Nodal(*(one.clone() for one in self.shared.state))

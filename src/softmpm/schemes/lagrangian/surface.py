@@ -96,10 +96,6 @@ class SurfaceContact:
             surface(self.model.spec).delassus, self.points, self._struct, self._mass, self._D, part=POINT_PART
         )
 
-    def anew(self, s: int) -> int:
-        """1 if a control step begins with substep ``s``, but the first one, where the buffers are cleared."""
-        return int(s in self.chunk.shape[1])
-
     def advance(
         self,
         launch: Callable[..., None],
@@ -116,7 +112,7 @@ class SurfaceContact:
         """Substep ``s``, from :attr:`free` and the state before to that after; ``now`` and ``then`` count their anchors."""
         model, kernels = self.model, surface(self.model.spec)
         anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
-        about = (s, self.rate_array, self.anew(s))
+        about = (s, self.rate_array, self.chunk.anew(s))
         parameters = (model.constants, inputs, self._struct, self._frame, self._width, self._D, *about)
         arguments = (
             self.shifts[now],
@@ -213,7 +209,7 @@ class SurfaceContactAdj:
         arguments = (adj_u, adj_v, one.free, self._shared, adj_f, *out)
         launch(self._kernels.settle_adj, one.nodes, *parameters, *arguments, part=NODE_PART)
         drive(one.model, launch, inputs, self._words, stored[0], self._scratch, one.free)
-        about = (self.held, one.rate_array, one.anew(s))
+        about = (self.held, one.rate_array, one.chunk.anew(s))
         parameters = (constants, inputs, one._struct, one._width, one._D, *about)
         anchors = view(one.anchors[s], one._vec)
         arguments = (shift, stored[0], one.free, anchors, self._shared, self._adj_force, self._adj_anchor)

@@ -56,7 +56,7 @@ class SurfaceContact:
         self.x = torch.empty(stored, *self.points, dim, dtype=exact, device=model.device)
         self.anchor, self.force = self.tensor(stored, *model.anchor_shape), self.tensor(*model.anchor_shape)
         self.x[0], self.anchor[0] = start.x.detach(), start.anchor.detach()
-        self.force.copy_(torch.zeros_like(self.force) if begins(chunk) else start.force.detach())
+        self.force.copy_(torch.zeros_like(self.force) if chunk.begins else start.force.detach())
         self.places = [view(one, types(model.spec.dim, "float64").vec) for one in self.x]
         self.anchors = [view(one, t.vec) for one in self.anchor]
         self.force_array = view(self.force, t.vec)
@@ -74,17 +74,21 @@ class SurfaceContact:
         """Number of the stored state before substep ``s``."""
         return s if self.keep else s % 2
 
-    def anew(self, s: int) -> int:
-        """1 if a control step begins with substep ``s``, but the first one, where the mean forces are zero."""
-        return int(s in self.chunk.shape[1])
-
     def respond(
         self, s: int, inputs: Any, node: wp.array, velocity: wp.array, words: wp.array, again: bool = False
     ) -> None:
         """Add what the walls give to the velocity of the nodes in substep ``s``; ``again`` changes neither anchors nor forces."""
         x, anchor = self.places[self.index(s)], self.anchors[self.index(s)]
         out = self._scratch if again else (self.force_array, self.anchors[self.index(s + 1)])
-        parameters = (self.model.constants, inputs, self.outline, self.width, s, self.rate, self.anew(s))
+        parameters = (
+            self.model.constants,
+            inputs,
+            self.outline,
+            self.width,
+            s,
+            self.rate,
+            self.chunk.anew(s),
+        )
         about = (self.base, self.shares, self.load_array)
         clear(self.load)
         wp.copy(self.free, velocity, stream=self.stream)
@@ -109,11 +113,6 @@ class SurfaceContact:
         """Copy of the final state."""
         last = self.index(self.chunk.length)
         return SurfaceState(self.x[last].clone(), self.anchor[last].clone(), self.force.clone())
-
-
-def begins(chunk: Chunk) -> bool:
-    """True if a chunk begins with a control step."""
-    return chunk.first % chunk.substeps == 0
 
 
 def check_start(model: Model, launch: Callable[..., None], inputs: Any, x: Tensor, words: wp.array) -> None:
@@ -153,7 +152,7 @@ class SurfaceContactAdj:
         arguments = (node, velocity, *about, adj_x, self._shares, adj_velocity, self._mass_array)
         one.launch(self.kernels.advance_adj, one.points, constants, *arguments)
         wp.copy(self._free, adj_velocity, stream=one.stream)
-        parameters = (inputs, one.outline, one.width, one.model.node_count, one.rate, one.anew(s))
+        parameters = (inputs, one.outline, one.width, one.model.node_count, one.rate, one.chunk.anew(s))
         arrays = (x, anchor, node, one.free, *about, one.load_array, adj_velocity)
         state = (adj_force, adj_anchor, adj_x, self._shares)
         out = (self._free, self._load_array, self._mass_array, adj_inputs)
@@ -164,5 +163,5 @@ class SurfaceContactAdj:
 
     def start(self) -> SurfaceState:
         """Adjoint of the initial state."""
-        force = torch.zeros_like(self.force) if begins(self.forward.chunk) else self.force
+        force = torch.zeros_like(self.force) if self.forward.chunk.begins else self.force
         return SurfaceState(self.x.double(), self.anchor, force)
