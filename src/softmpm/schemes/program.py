@@ -22,7 +22,7 @@ MOST_PARTS = 256
 PARTS_PER_THREAD = 2
 """Parts of the longest launch for each thread at least."""
 PARTS_PER_START = 64
-"""Parts of all launches for each further thread at least: a part takes 5 µs and more, the start of a thread 50 µs."""
+"""Parts of all launches for each further thread at least, so that its start pays; an estimate."""
 INTERRUPTIBLE = 64
 """Launches after which Python may handle an interrupt."""
 
