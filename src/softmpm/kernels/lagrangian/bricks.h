@@ -109,7 +109,8 @@ CUDA_CALLABLE inline void clear_sums(const wp::array_t<wp::vec_t<DIM, T>>& parti
 }
 
 // Write the sums that each thread has for one component of the COUNT nodes of a cell, of which `corner` is the first in the window, or -1.
-// Each component has planes of its own, for every first offset, so that only the cells of a slice add to the same node, in turns.
+// Sums of each component are taken in three planes, one for each first offset of a node in its cell. Within a plane only cells with the
+// same first coordinate share nodes, and these add one offset after the other.
 template <int NODES, int THREADS, int COUNT, int ACROSS, int ALONG, typename T, unsigned DIM>
 CUDA_CALLABLE inline void write_sums(
     const wp::vec_t<COUNT, T>& total, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick, int corner, int axis,
