@@ -8,16 +8,23 @@ template <typename T, unsigned DIM> struct alignas(DIM == 2 ? 2 * sizeof(T) : 16
 };
 
 #if defined(__CUDA_ARCH__)
+// Groups of a block that have a brick each, and that of this thread.
+#if !defined(SOFTMPM_GROUPS)
+#define SOFTMPM_GROUPS 1
+#endif
+constexpr int GROUPS = SOFTMPM_GROUPS;
+CUDA_CALLABLE inline int group() { return GROUPS == 1 ? 0 : threadIdx.x / (blockDim.x / GROUPS); }
+
 template <int FIELD, int NODES, typename T, unsigned DIM> CUDA_CALLABLE inline Node<T, DIM>* shared_nodes()
 {
-    __shared__ Node<T, DIM> nodes[NODES];
-    return nodes;
+    __shared__ Node<T, DIM> nodes[GROUPS * NODES];
+    return nodes + group() * NODES;
 }
 
 template <int SIZE, typename T> CUDA_CALLABLE inline T* shared_terms()
 {
-    __shared__ T terms[SIZE];
-    return terms;
+    __shared__ T terms[GROUPS * SIZE];
+    return terms + group() * SIZE;
 }
 #else  // never read: on the CPU bricks are serial
 template <int, int, typename T, unsigned DIM> CUDA_CALLABLE inline Node<T, DIM>* shared_nodes() { return nullptr; }
@@ -27,7 +34,18 @@ template <int, typename T> CUDA_CALLABLE inline T* shared_terms() { return nullp
 CUDA_CALLABLE inline void meet()
 {
 #if defined(__CUDA_ARCH__)
-    __syncthreads();
+    if (GROUPS == 1)
+        __syncthreads();
+    else
+        asm volatile("bar.sync %0, %1;" ::"r"(group() + 1), "r"(blockDim.x / GROUPS) : "memory");
+#endif
+}
+
+// Wait for all threads of a cluster of blocks; they see what the others have written before.
+CUDA_CALLABLE inline void meet_cluster()
+{
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    asm volatile("barrier.cluster.arrive.release;\n\tbarrier.cluster.wait.acquire;" ::: "memory");
 #endif
 }
 

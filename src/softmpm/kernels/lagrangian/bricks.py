@@ -119,10 +119,12 @@ def bricks_for(dim: int, particles: int, device: torch.device, dtype: torch.dtyp
     return Bricks(cells, places if lattice else 8 if few else 4, lattice)
 
 
-def brick_module(name: str) -> str:
+def brick_module(name: str, groups: int = 1) -> str:
     """Set the compile options of the Warp module of this name, as native functions need them; returns the name."""
     options = {
-        "extra_build_options": in_parts(HEADER.read_text(), FOURS_HEADER.read_text()),
+        "extra_build_options": in_parts(
+            f"#define SOFTMPM_GROUPS {groups}\n" * (groups > 1) + HEADER.read_text(), FOURS_HEADER.read_text()
+        ),
         "max_unroll": UNROLLED,
         "cuda_output": "cubin",
         "enable_backward": False,
@@ -133,3 +135,7 @@ def brick_module(name: str) -> str:
 
 @wp.func_native("softmpm::meet();")
 def meet(): ...
+
+
+@wp.func_native("softmpm::meet_cluster();")
+def meet_cluster(): ...

@@ -34,8 +34,11 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     count, turns, threads, serial = bricks.cell_count, bricks.turns, bricks.threads, bricks.serial
     module = brick_module(f"{spec.module}.lagrangian.{bricks.name}")
 
-    @wp.kernel(module=module, **settings)
-    def forces(
+    @wp.func
+    def forces_at(
+        world: int,
+        brick: int,
+        lane: int,
         # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
@@ -48,7 +51,6 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         words: wp.array(dtype=wp.int64),
         partial: wp.array2d(dtype=vec),
     ):
-        world, brick, lane = wp.tid()
         first = inside.rows[brick]  # loaded while the nodes are awaited
         last = inside.rows[brick + 1]
         corner = inside.corners[brick, lane % count]
@@ -83,6 +85,23 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         p = place_of(inside, row + 1, lane)
                 total = add(total, partial, world, brick, slot, corner, fx, A, b)
         write(total, partial, inside, world, brick, lane)
+
+    @wp.kernel(module=module, **settings)
+    def forces(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        partial: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        forces_at(world, brick, lane, constants, inputs, inside, substep, u, v, words, partial)
 
     @wp.kernel(module=module, **settings)
     def check_end(
@@ -137,7 +156,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         at = place
                     check_step(constants, inputs, words, world, at, p, substep, H)
 
-    return SimpleNamespace(forces=forces, check_end=check_end, check_start=check_start)
+    return SimpleNamespace(forces=forces, forces_at=forces_at, check_end=check_end, check_start=check_start)
 
 
 @kernel_factory
@@ -166,8 +185,11 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
     serial = bricks.serial
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}")
 
-    @wp.kernel(module=module, **settings)
-    def forces_adj(
+    @wp.func
+    def forces_adj_at(
+        world: int,
+        brick: int,
+        lane: int,
         # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
@@ -185,7 +207,6 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         partial_u: wp.array2d(dtype=vec),
         partial_v: wp.array2d(dtype=vec),
     ):
-        world, brick, lane = wp.tid()
         first = inside.rows[brick]  # loaded while the nodes are awaited
         last = inside.rows[brick + 1]
         corner = inside.corners[brick, lane % count]
@@ -231,4 +252,41 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         if wp.static(viscous):
             write(total_v, partial_v, inside, world, brick, lane)
 
-    return SimpleNamespace(forces_adj=forces_adj)
+    @wp.kernel(module=module, **settings)
+    def forces_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        # Out, added into:
+        adj_inputs: ParticleInputsAdj,
+        # Out:
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        forces_adj_at(
+            world,
+            brick,
+            lane,
+            constants,
+            inputs,
+            inside,
+            substep,
+            u,
+            v,
+            adj_f,
+            words,
+            adj_inputs,
+            partial_u,
+            partial_v,
+        )
+
+    return SimpleNamespace(forces_adj=forces_adj, forces_adj_at=forces_adj_at)

@@ -110,8 +110,11 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
     module = brick_module(f"{spec.module}.lagrangian.{bricks.name}.layers")
 
-    @wp.kernel(module=module, **bricks.layer_settings)
-    def forces(
+    @wp.func
+    def forces_at(
+        world: int,
+        brick: int,
+        lane: int,
         # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
@@ -125,7 +128,6 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         words: wp.array(dtype=wp.int64),
         partial: wp.array2d(dtype=vec),
     ):
-        world, brick, lane = wp.tid()
         corner = inside.corners[brick, lane % count]  # loaded while the nodes are awaited
         at = places_of(inside, brick, lane)
         stage_u(u, inside, world, brick, lane)
@@ -155,7 +157,25 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                             check(constants, words, world, inside.order[p], substep - 1, Hn)
             add(A, partial, world, brick, corner, layer, lane, lattice)
 
-    return SimpleNamespace(forces=forces)
+    @wp.kernel(module=module, **bricks.layer_settings)
+    def forces(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        partial: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        forces_at(world, brick, lane, constants, inputs, inside, lattice, substep, u, v, words, partial)
+
+    return SimpleNamespace(forces=forces, forces_at=forces_at)
 
 
 @kernel_factory
@@ -179,8 +199,11 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
 
-    @wp.kernel(module=module, **bricks.layer_settings)
-    def forces_adj(
+    @wp.func
+    def forces_adj_at(
+        world: int,
+        brick: int,
+        lane: int,
         # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
@@ -199,7 +222,6 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         partial_u: wp.array2d(dtype=vec),
         partial_v: wp.array2d(dtype=vec),
     ):
-        world, brick, lane = wp.tid()
         corner = inside.corners[brick, lane % count]  # loaded while the nodes are awaited
         at = places_of(inside, brick, lane)
         stage_u(u, inside, world, brick, lane)
@@ -239,4 +261,43 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
             if wp.static(viscous):
                 add(B, partial_v, world, brick, corner, layer, lane, lattice)
 
-    return SimpleNamespace(forces_adj=forces_adj)
+    @wp.kernel(module=module, **bricks.layer_settings)
+    def forces_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        lattice: Lattice,
+        substep: int,
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
+        # Out:
+        words: wp.array(dtype=wp.int64),
+        # Out, added into:
+        adj_inputs: ParticleInputsAdj,
+        # Out:
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
+    ):
+        world, brick, lane = wp.tid()
+        forces_adj_at(
+            world,
+            brick,
+            lane,
+            constants,
+            inputs,
+            inside,
+            lattice,
+            substep,
+            u,
+            v,
+            adj_f,
+            words,
+            adj_inputs,
+            partial_u,
+            partial_v,
+        )
+
+    return SimpleNamespace(forces_adj=forces_adj, forces_adj_at=forces_adj_at)

@@ -59,8 +59,10 @@ def nodes(spec: Spec) -> SimpleNamespace:
         """Present position of a node [m]."""
         return position(constants, inside.nodes[i]) + shift + exact(u)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def advance(
+    @wp.func
+    def advance_at(
+        world: int,
+        i: int,
         # Parameters:
         constants: Constants,
         inputs: GridInputs,
@@ -81,7 +83,6 @@ def nodes(spec: Spec) -> SimpleNamespace:
         new_v: wp.array2d(dtype=vec),
     ):
         """(Q3), (Q4). Where surface points act on a node, the velocity without contact goes to ``free``, and surface.py goes on."""
-        world, i = wp.tid()
         here = u[world, i]  # all of it loaded while the status is awaited
         middle = u[world, body.middle]
         new = v[world, i]
@@ -107,7 +108,49 @@ def nodes(spec: Spec) -> SimpleNamespace:
             new_u[world, i] = here
             new_v[world, i] = new
 
-    return SimpleNamespace(advance=advance, place=place)
+    @wp.kernel(module=module, enable_backward=False)
+    def advance(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        inside: Rest,
+        body: Frame,
+        mass: wp.array2d(dtype=real),
+        partial: wp.array2d(dtype=vec),
+        words: wp.array(dtype=wp.int64),
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        # Out:
+        p: wp.array2d(dtype=vec),
+        free: wp.array2d(dtype=vec),
+        new_shift: wp.array(dtype=exact_vec),
+        new_u: wp.array2d(dtype=vec),
+        new_v: wp.array2d(dtype=vec),
+    ):
+        world, i = wp.tid()
+        advance_at(
+            world,
+            i,
+            constants,
+            inputs,
+            inside,
+            body,
+            mass,
+            partial,
+            words,
+            shift,
+            u,
+            v,
+            p,
+            free,
+            new_shift,
+            new_u,
+            new_v,
+        )
+
+    return SimpleNamespace(advance=advance, advance_at=advance_at, place=place)
 
 
 @kernel_factory
@@ -166,8 +209,10 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if wp.static(viscous):
             adj_v[world, i] = adj_v[world, i] + gathered(partial_v, inside, world, i)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def advance_adj(
+    @wp.func
+    def advance_adj_at(
+        world: int,
+        i: int,
         # Parameters:
         constants: Constants,
         inputs: GridInputs,
@@ -192,7 +237,6 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: GridInputsAdj,
     ):
         """(Q4.adj), (Q3.adj); after surface contact v̄' has been computed already."""
-        world, i = wp.tid()
         if pending:
             gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
         adj_new = adj_v[world, i]
@@ -219,6 +263,54 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         )
 
     @wp.kernel(module=module, enable_backward=False)
+    def advance_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        inside: Rest,
+        mass: wp.array2d(dtype=real),
+        held: int,
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        p: wp.array2d(dtype=vec),
+        pending: bool,  # whether the partial sums of the substep after are still to be added
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
+        # In and out:
+        adj_u: wp.array2d(dtype=vec),
+        adj_v: wp.array2d(dtype=vec),
+        # Out:
+        adj_f: wp.array2d(dtype=vec),
+        # Out, added into:
+        adj_mass: wp.array2d(dtype=real),
+        adj_inputs: GridInputsAdj,
+    ):
+        world, i = wp.tid()
+        advance_adj_at(
+            world,
+            i,
+            constants,
+            inputs,
+            inside,
+            mass,
+            held,
+            shift,
+            u,
+            v,
+            p,
+            pending,
+            partial_u,
+            partial_v,
+            adj_u,
+            adj_v,
+            adj_f,
+            adj_mass,
+            adj_inputs,
+        )
+
+    @wp.kernel(module=module, enable_backward=False)
     def gather_adj(
         # Parameters:
         inside: Rest,
@@ -232,4 +324,10 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, i = wp.tid()
         gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
 
-    return SimpleNamespace(advance_adj=advance_adj, gather_adj=gather_adj, gather=gather, moved_adj=moved_adj)
+    return SimpleNamespace(
+        advance_adj=advance_adj,
+        advance_adj_at=advance_adj_at,
+        gather_adj=gather_adj,
+        gather=gather,
+        moved_adj=moved_adj,
+    )

@@ -23,16 +23,17 @@ from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face
 from softmpm.kernels.structs import Spec, input_types, types
 
-LANES = 32
+LANES = {2: 8, 3: 32}
 """Threads of a node on a GPU; the CPU has one."""
 BATCH = 4
 """Entries that a thread reads at once."""
 TOGETHER = """
     auto total = value;
 #if defined(__CUDA_ARCH__)
+    const unsigned own = threadIdx.x % 32 / {lanes} * {lanes}, mask = (0xffffffffu >> (32 - {lanes})) << own;
     for (int other = {lanes} / 2; other > 0; other /= 2)
         for (unsigned axis = 0; axis < {dim}; ++axis)
-            total.c[axis] += __shfl_xor_sync(0xffffffffu, total.c[axis], other);
+            total.c[axis] += __shfl_xor_sync(mask, total.c[axis], other);
 #endif
     return total;
 """
@@ -132,7 +133,7 @@ def surface(spec: Spec) -> SimpleNamespace:
             total += body.weights[p, n] * nodal[world, body.stencil[p, n]]
         return total
 
-    @wp.func_native(TOGETHER.format(lanes=LANES, dim=dim))
+    @wp.func_native(TOGETHER.format(lanes=LANES[dim], dim=dim))
     def together(value: vec) -> vec:
         """Sum over the threads of a node, for all of them."""
 
@@ -167,8 +168,10 @@ def surface(spec: Spec) -> SimpleNamespace:
                 total += wp.abs(body.weights[p, n]) * body.loads[i] / mass[world, i]
         D[world, p] = total
 
-    @wp.kernel(module=module, enable_backward=False)
-    def press(
+    @wp.func
+    def press_at(
+        world: int,
+        p: int,
         # Parameters:
         constants: Constants,
         inputs: GridInputs,
@@ -192,7 +195,6 @@ def surface(spec: Spec) -> SimpleNamespace:
         new_anchor: wp.array3d(dtype=vec),
     ):
         """(K2) to (K4), (K6), (K7): impulse A J of each point."""
-        world, p = wp.tid()
         middle = u[world, moving.middle]  # all of it loaded while the status is awaited
         x = present(body, p, at_point(body, u, world, p))
         v = at_point(body, free, world, p)
@@ -241,7 +243,57 @@ def surface(spec: Spec) -> SimpleNamespace:
             report(words, world, last, in_wall, deep * body.points.shape[0] + p)
 
     @wp.kernel(module=module, enable_backward=False)
-    def settle(
+    def press(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        body: Surface,
+        moving: Frame,
+        smoothing: real,
+        D: wp.array2d(dtype=real),
+        substep: int,
+        rate: wp.array(dtype=real),  # 1/T
+        anew: int,  # 1 at the beginning of a control step
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        free: wp.array2d(dtype=vec),
+        anchor: wp.array3d(dtype=vec),
+        # In and out:
+        words: wp.array(dtype=wp.int64),
+        force: wp.array3d(dtype=vec),
+        # Out:
+        impulse: wp.array2d(dtype=vec),
+        new_anchor: wp.array3d(dtype=vec),
+    ):
+        world, p = wp.tid()
+        press_at(
+            world,
+            p,
+            constants,
+            inputs,
+            body,
+            moving,
+            smoothing,
+            D,
+            substep,
+            rate,
+            anew,
+            shift,
+            u,
+            free,
+            anchor,
+            words,
+            force,
+            impulse,
+            new_anchor,
+        )
+
+    @wp.func
+    def settle_at(
+        world: int,
+        n: int,
+        lane: int,
         # Parameters:
         constants: Constants,
         body: Surface,
@@ -259,7 +311,6 @@ def surface(spec: Spec) -> SimpleNamespace:
         new_v: wp.array2d(dtype=vec),
     ):
         """(K5), at the nodes that surface points act on."""
-        world, n, lane = wp.tid()
         i = body.nodes[n]
         here = u[world, i]
         new = free[world, i]  # loaded while the status is awaited
@@ -274,6 +325,29 @@ def surface(spec: Spec) -> SimpleNamespace:
         if lane == 0:
             new_u[world, i] = here
             new_v[world, i] = new
+
+    @wp.kernel(module=module, enable_backward=False)
+    def settle(
+        # Parameters:
+        constants: Constants,
+        body: Surface,
+        moving: Frame,
+        mass: wp.array2d(dtype=real),
+        step: int,  # threads of a node
+        impulse: wp.array2d(dtype=vec),
+        words: wp.array(dtype=wp.int64),
+        # In:
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        free: wp.array2d(dtype=vec),
+        # Out:
+        new_u: wp.array2d(dtype=vec),
+        new_v: wp.array2d(dtype=vec),
+    ):
+        world, n, lane = wp.tid()
+        settle_at(
+            world, n, lane, constants, body, moving, mass, step, impulse, words, u, v, free, new_u, new_v
+        )
 
     @wp.kernel(module=module, enable_backward=False)
     def check_depth(
@@ -300,6 +374,8 @@ def surface(spec: Spec) -> SimpleNamespace:
         delassus=delassus,
         press=press,
         settle=settle,
+        press_at=press_at,
+        settle_at=settle_at,
         check_depth=check_depth,
         faces_of=faces_of,
         vecs=vecs,

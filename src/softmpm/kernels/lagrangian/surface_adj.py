@@ -41,8 +41,10 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     gather, moved_adj = back.gather, back.moved_adj
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
-    @wp.kernel(module=module, enable_backward=False)
-    def settle_adj(
+    @wp.func
+    def settle_adj_at(
+        world: int,
+        i: int,
         # Parameters:
         constants: Constants,
         inputs: GridInputs,
@@ -71,7 +73,6 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: GridInputsAdj,
     ):
         """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m. Nodes that no surface points act on are done here."""
-        world, i = wp.tid()
         if pending:
             gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
         adj = adj_v[world, i] + constants.dt * adj_u[world, i]
@@ -110,7 +111,64 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             )
 
     @wp.kernel(module=module, enable_backward=False)
-    def press_adj(
+    def settle_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        inside: Rest,
+        mass: wp.array2d(dtype=real),
+        held: int,  # accumulators of one world
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        p: wp.array2d(dtype=vec),
+        new_v: wp.array2d(dtype=vec),
+        pending: bool,  # whether the partial sums of the substep after are still to be added
+        partial_u: wp.array2d(dtype=vec),
+        partial_v: wp.array2d(dtype=vec),
+        # In and out:
+        adj_u: wp.array2d(dtype=vec),
+        adj_v: wp.array2d(dtype=vec),
+        # Out, with clamps in:
+        free: wp.array2d(dtype=vec),
+        # Out:
+        shared: wp.array2d(dtype=vec),
+        adj_f: wp.array2d(dtype=vec),
+        # Out, added into:
+        adj_mass: wp.array2d(dtype=real),
+        adj_inputs: GridInputsAdj,
+    ):
+        world, i = wp.tid()
+        settle_adj_at(
+            world,
+            i,
+            constants,
+            inputs,
+            inside,
+            mass,
+            held,
+            shift,
+            u,
+            v,
+            p,
+            new_v,
+            pending,
+            partial_u,
+            partial_v,
+            adj_u,
+            adj_v,
+            free,
+            shared,
+            adj_f,
+            adj_mass,
+            adj_inputs,
+        )
+
+    @wp.func
+    def press_adj_at(
+        world: int,
+        p: int,
         # Parameters:
         constants: Constants,
         inputs: GridInputs,
@@ -136,7 +194,6 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_D: wp.array2d(dtype=real),
         adj_inputs: GridInputsAdj,
     ):
-        world, p = wp.tid()
         x = present(body, p, at_point(body, u, world, p))
         v = at_point(body, free, world, p)
         dv = D[world, p]
@@ -206,7 +263,62 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_D[world, p] = adj_D[world, p] + total_D
 
     @wp.kernel(module=module, enable_backward=False)
-    def spread_adj(
+    def press_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        body: Surface,
+        smoothing: real,
+        D: wp.array2d(dtype=real),
+        held: int,  # accumulators of one world
+        rate: wp.array(dtype=real),  # 1/T
+        anew: int,  # 1 at the beginning of a control step
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        free: wp.array2d(dtype=vec),
+        anchor: wp.array3d(dtype=vec),
+        shared: wp.array2d(dtype=vec),
+        # In and out:
+        adj_force: wp.array3d(dtype=vec),
+        adj_anchor: wp.array3d(dtype=vec),
+        # Out:
+        adj_x: wp.array2d(dtype=vec),
+        adj_v: wp.array2d(dtype=vec),
+        # Out, added into:
+        adj_D: wp.array2d(dtype=real),
+        adj_inputs: GridInputsAdj,
+    ):
+        world, p = wp.tid()
+        press_adj_at(
+            world,
+            p,
+            constants,
+            inputs,
+            body,
+            smoothing,
+            D,
+            held,
+            rate,
+            anew,
+            shift,
+            u,
+            free,
+            anchor,
+            shared,
+            adj_force,
+            adj_anchor,
+            adj_x,
+            adj_v,
+            adj_D,
+            adj_inputs,
+        )
+
+    @wp.func
+    def spread_adj_at(
+        world: int,
+        n: int,
+        lane: int,
         # Parameters:
         constants: Constants,
         inputs: GridInputs,
@@ -232,7 +344,6 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: GridInputsAdj,
     ):
         """(K2.adj), then (Q3.adj), at the nodes that surface points act on; the adjoint of constraints comes between."""
-        world, n, lane = wp.tid()
         i = body.nodes[n]
         more_u = from_points(body, adj_x, world, n, lane, step)
         more_v = from_points(body, adj_free, world, n, lane, step)
@@ -263,6 +374,57 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 )
 
     @wp.kernel(module=module, enable_backward=False)
+    def spread_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        inside: Rest,
+        body: Surface,
+        mass: wp.array2d(dtype=real),
+        held: int,  # accumulators of one world
+        step: int,  # threads of a node
+        # In:
+        shift: wp.array(dtype=exact_vec),
+        u: wp.array2d(dtype=vec),
+        v: wp.array2d(dtype=vec),
+        p: wp.array2d(dtype=vec),
+        adj_x: wp.array2d(dtype=vec),
+        adj_free: wp.array2d(dtype=vec),
+        # In and out:
+        adj_u: wp.array2d(dtype=vec),
+        adj_v: wp.array2d(dtype=vec),
+        # Out:
+        adj_f: wp.array2d(dtype=vec),
+        # Out, added into:
+        adj_mass: wp.array2d(dtype=real),
+        adj_inputs: GridInputsAdj,
+    ):
+        world, n, lane = wp.tid()
+        spread_adj_at(
+            world,
+            n,
+            lane,
+            constants,
+            inputs,
+            inside,
+            body,
+            mass,
+            held,
+            step,
+            shift,
+            u,
+            v,
+            p,
+            adj_x,
+            adj_free,
+            adj_u,
+            adj_v,
+            adj_f,
+            adj_mass,
+            adj_inputs,
+        )
+
+    @wp.kernel(module=module, enable_backward=False)
     def delassus_adj(
         body: Surface,
         mass: wp.array2d(dtype=real),
@@ -280,5 +442,11 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_mass[world, i] = adj_mass[world, i] - total * body.loads[i] / square
 
     return SimpleNamespace(
-        settle_adj=settle_adj, press_adj=press_adj, spread_adj=spread_adj, delassus_adj=delassus_adj
+        settle_adj_at=settle_adj_at,
+        press_adj_at=press_adj_at,
+        spread_adj_at=spread_adj_at,
+        settle_adj=settle_adj,
+        press_adj=press_adj,
+        spread_adj=spread_adj,
+        delassus_adj=delassus_adj,
     )

@@ -8,6 +8,7 @@ from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
 from softmpm.schemes.lagrangian.driven import drive, drive_adj
 from softmpm.schemes.lagrangian.nodal import launch_masses
+from softmpm.schemes.lagrangian.persistent import cluster_of, launch_march, launch_march_adj, segments
 from softmpm.schemes.launch import KernelLauncher
 
 CHECKED = 8
@@ -23,11 +24,16 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     launch_masses(model, launch, buffers.rest, *masses)
     if buffers.contact is not None:
         buffers.contact.begin(launch)
-    for s in range(buffers.chunk.length):
-        if s % CHECKED == 0 and model.alarms.step is not None:
-            _check_step(buffers, s, buffers.index(s), launch)
-        _forces(buffers, s, launch)
-        _advance(buffers, s, launch)
+    cluster, checked = cluster_of(model), model.alarms.step is not None
+    for first, last in segments(buffers.chunk, CHECKED if checked else buffers.chunk.length):
+        if checked and first % CHECKED == 0:
+            _check_step(buffers, first, buffers.index(first), launch)
+        if cluster is not None:
+            launch_march(buffers, cluster, first, last, launch)
+        else:
+            for s in range(first, last):
+                _forces(buffers, s, launch)
+                _advance(buffers, s, launch)
     last = buffers.chunk.length
     if model.alarms.step is not None and last > 1:  # else the next substep is checked
         _check_step(buffers, last - 1, buffers.index(last), launch)
@@ -90,11 +96,17 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     """Turn the adjoint of the final state into that of the initial state, and accumulate those of the inputs."""
     forward, shared = adjoint.forward, adjoint.shared
     model, chunk = forward.model, forward.chunk
-    for s in reversed(range(chunk.length)):
-        _advance_adj(adjoint, s, launch)
-        _forces_adj(adjoint, s, launch)
-        if s == 0 or chunk.row(s) != chunk.row(s - 1):
-            adjoint.found.collect(chunk.row(s), forward.inputs.values, launch)
+    cluster = cluster_of(model)
+    for first, last in reversed(list(segments(chunk, chunk.length))):
+        if cluster is not None:
+            launch_march_adj(adjoint, cluster, first, last, launch)
+            if first == 0:
+                _gather_adj(adjoint, launch)
+        else:
+            for s in reversed(range(first, last)):
+                _advance_adj(adjoint, s, launch)
+                _forces_adj(adjoint, s, launch)
+        adjoint.found.collect(chunk.row(first), forward.inputs.values, launch)
     if adjoint.contact is not None:
         adjoint.contact.finish(launch)
     if adjoint.adj_placed_mass is not None:
@@ -154,5 +166,11 @@ def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         kernel = cells_adj(model.spec, shared.wanted, bricks).forces_adj
         brick_launch(model, launch, kernel, *parameters, *arguments)
     if s == 0 or model.spec.constrained:  # else the substep before adds the sums
-        kernel, out = nodes_adj(model.spec, shared.wanted).gather_adj, (shared.u_array, shared.v_array)
-        node_launch(model, launch, kernel, forward.rest, *shared.partial_arrays, *out)
+        _gather_adj(adjoint, launch)
+
+
+def _gather_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
+    """Add the sums of the bricks to the adjoint of the state."""
+    model, shared = adjoint.model, adjoint.shared
+    kernel, out = nodes_adj(model.spec, shared.wanted).gather_adj, (shared.u_array, shared.v_array)
+    node_launch(model, launch, kernel, adjoint.forward.rest, *shared.partial_arrays, *out)

@@ -74,17 +74,17 @@ class SurfaceContact:
         self.rate = torch.empty(1, dtype=model.dtype, device=model.device)
         self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
         assert isinstance(model.surface, SurfaceGrid)
-        self.lanes = LANES if model.device.type == "cuda" else 1
+        self.lanes = LANES[model.dim] if model.device.type == "cuda" else 1
         self.touched = (model.worlds, len(model.surface.nodes), self.lanes)
         self._vec, self._real = (
             getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
         )
-        self._struct, self._mass = surface_struct(model), view(mass, self._real)
+        self.struct, self._mass = surface_struct(model), view(mass, self._real)
         self._force, self.rate_array = view(force, self._vec), view(self.rate, self._real)
-        self._width = model.contact_width * model.scene.grid.spacing
+        self.width = model.contact_width * model.scene.grid.spacing
         self.free = self._vectors(self.nodes)
-        self._impulse = self._vectors(self.points)
-        self._D = view(torch.empty(self.points, dtype=model.dtype, device=model.device), self._real)
+        self.impulse = self._vectors(self.points)
+        self.D = view(torch.empty(self.points, dtype=model.dtype, device=model.device), self._real)
 
     def _vectors(self, lead: tuple[int, ...]) -> wp.array:
         model = self.model
@@ -93,7 +93,7 @@ class SurfaceContact:
     def begin(self, launch: Callable[..., None]) -> None:
         """Launch what depends on the masses only."""
         launch(
-            surface(self.model.spec).delassus, self.points, self._struct, self._mass, self._D, part=POINT_PART
+            surface(self.model.spec).delassus, self.points, self.struct, self._mass, self.D, part=POINT_PART
         )
 
     def advance(
@@ -113,7 +113,7 @@ class SurfaceContact:
         model, kernels = self.model, surface(self.model.spec)
         anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
         about = (s, self.rate_array, self.chunk.anew(s))
-        parameters = (model.constants, inputs, self._struct, self._frame, self._width, self._D, *about)
+        parameters = (model.constants, inputs, self.struct, self._frame, self.width, self.D, *about)
         arguments = (
             self.shifts[now],
             u,
@@ -121,11 +121,11 @@ class SurfaceContact:
             anchors[0],
             words,
             self._force,
-            self._impulse,
+            self.impulse,
             anchors[1],
         )
         launch(kernels.press, self.points, *parameters, *arguments, part=POINT_PART)
-        about = (self._struct, self._frame, self._mass, self.lanes, self._impulse, words)
+        about = (self.struct, self._frame, self._mass, self.lanes, self.impulse, words)
         arguments = (u, v, self.free, new_u, new_v)
         launch(kernels.settle, self.touched, model.constants, *about, *arguments, part=NODE_PART)
 
@@ -134,7 +134,7 @@ class SurfaceContact:
     ) -> None:
         """Check the depth of the points in state ``end`` after substep ``s``, whose inputs are given."""
         kernel, about = surface(self.model.spec).check_depth, (self.model.scene.dt, s)
-        parameters = (self.model.constants, inputs, self._struct, *about)
+        parameters = (self.model.constants, inputs, self.struct, *about)
         launch(kernel, self.points, *parameters, self.shifts[end], u, words, part=POINT_PART)
 
 
@@ -169,13 +169,13 @@ class SurfaceContactAdj:
     ):
         self.forward, self.held, self._adj_mass = forward, held, adj_mass
         self._kernels = surface_adj(forward.model.spec, wanted)
-        self._adj_anchor, self._adj_force = view(adj_anchor, forward._vec), view(adj_force, forward._vec)
-        self._shared, self._words = forward._vectors(forward.nodes), words
-        self._scratch = forward._vectors(forward.nodes) if forward.model.driven_grid else self._shared
-        self._adj_x, self._adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
+        self.adj_anchor, self.adj_force = view(adj_anchor, forward._vec), view(adj_force, forward._vec)
+        self.shared, self._words = forward._vectors(forward.nodes), words
+        self._scratch = forward._vectors(forward.nodes) if forward.model.driven_grid else self.shared
+        self.adj_x, self.adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
         model = forward.model
         self._total_D = torch.empty(forward.points, dtype=model.dtype, device=model.device)
-        self._adj_D = view(self._total_D, forward._real)
+        self.adj_D = view(self._total_D, forward._real)
 
     def clear(self) -> None:
         """Set all sums to zero."""
@@ -203,24 +203,24 @@ class SurfaceContactAdj:
             pending: See :mod:`softmpm.kernels.lagrangian.nodes`.
         """
         one, shift = self.forward, self.forward.shifts[s]
-        constants, adj_points = one.model.constants, (self._adj_x, self._adj_free)
+        constants, adj_points = one.model.constants, (self.adj_x, self.adj_free)
         out = (self._adj_mass, adj_inputs)
         parameters = (constants, inputs, rest, one._mass, self.held, shift, *stored, new_v, *pending)
-        arguments = (adj_u, adj_v, one.free, self._shared, adj_f, *out)
+        arguments = (adj_u, adj_v, one.free, self.shared, adj_f, *out)
         launch(self._kernels.settle_adj, one.nodes, *parameters, *arguments, part=NODE_PART)
         drive(one.model, launch, inputs, self._words, stored[0], self._scratch, one.free)
         about = (self.held, one.rate_array, one.chunk.anew(s))
-        parameters = (constants, inputs, one._struct, one._width, one._D, *about)
+        parameters = (constants, inputs, one.struct, one.width, one.D, *about)
         anchors = view(one.anchors[s], one._vec)
-        arguments = (shift, stored[0], one.free, anchors, self._shared, self._adj_force, self._adj_anchor)
-        arguments = (*arguments, *adj_points, self._adj_D, adj_inputs)
+        arguments = (shift, stored[0], one.free, anchors, self.shared, self.adj_force, self.adj_anchor)
+        arguments = (*arguments, *adj_points, self.adj_D, adj_inputs)
         launch(self._kernels.press_adj, one.points, *parameters, *arguments, part=POINT_PART)
-        parameters = (constants, inputs, rest, one._struct, one._mass, self.held, one.lanes, shift, *stored)
+        parameters = (constants, inputs, rest, one.struct, one._mass, self.held, one.lanes, shift, *stored)
         arguments = (*adj_points, adj_u, adj_v, adj_f, *out)
         launch(self._kernels.spread_adj, one.touched, *parameters, *arguments, part=NODE_PART)
 
     def finish(self, launch: Callable[..., None]) -> None:
         """Add what the mobility D of all substeps gives to the masses."""
         one = self.forward
-        arguments = (one._struct, one._mass, self._adj_D, self._adj_mass)
+        arguments = (one.struct, one._mass, self.adj_D, self._adj_mass)
         launch(self._kernels.delassus_adj, one.touched[:2], *arguments, part=NODE_PART)
