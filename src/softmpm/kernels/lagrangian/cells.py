@@ -14,6 +14,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
+from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
 from softmpm.kernels.lagrangian.rest import rest
@@ -25,7 +26,8 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     vec, mat, Constants, dim = t.vec, t.mat, t.Constants, spec.dim
     ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
-    check, check_step = one.check, one.check_step
+    check, check_step, memory = one.check, one.check_step, chunk(dim, spec.dtype)
+    Chunk, state_of = memory.Chunk, memory.state_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number) for number in range(2))
     stage_u, stage_v, gradient_u, gradient_v = of_u.stage, of_v.stage, of_u.gradient, of_v.gradient
     viscous, loaded, settings = spec.viscosity, "force" in spec.given, bricks.settings
@@ -39,18 +41,15 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         world: int,
         brick: int,
         lane: int,
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        partial: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
+        now = state_of(at, s)
+        u = at.u[now]
+        v = at.v[now]
         first = inside.rows[brick]  # loaded while the nodes are awaited
         last = inside.rows[brick + 1]
         corner = inside.corners[brick, lane % count]
@@ -58,7 +57,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         stage_u(u, inside, world, brick, lane)
         if wp.static(viscous):
             stage_v(v, inside, world, brick, lane)
-        clear(partial, world, brick)
+        clear(at.partial, world, brick)
         meet()
         total = line()
         for row in range(first, last):
@@ -78,30 +77,24 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     A = constants.rate * forced(inputs, world, p, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
-                    if substep > 0:  # last, so that nothing waits for it
-                        check(constants, words, world, inside.order[p], substep - 1, H)
+                    if s > 0:  # last, so that nothing waits for it
+                        check(constants, at.words, world, inside.order[p], s - 1, H)
                 if wp.static(not serial):
                     if row + 1 < last:
                         p = place_of(inside, row + 1, lane)
-                total = add(total, partial, world, brick, slot, corner, fx, A, b)
-        write(total, partial, inside, world, brick, lane)
+                total = add(total, at.partial, world, brick, slot, corner, fx, A, b)
+        write(total, at.partial, inside, world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def forces(
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        partial: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
         world, brick, lane = wp.tid()
-        forces_at(world, brick, lane, constants, inputs, inside, substep, u, v, words, partial)
+        forces_at(world, brick, lane, constants, inputs, inside, at, s)
 
     @wp.kernel(module=module, **settings)
     def check_end(
@@ -182,7 +175,8 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         total_of.place_of,
     )
     count, turns, threads, settings = bricks.cell_count, bricks.turns, bricks.threads, bricks.settings
-    serial = bricks.serial
+    serial, memory = bricks.serial, chunk(dim, spec.dtype)
+    Chunk, Adjoint = memory.Chunk, memory.Adjoint
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}")
 
     @wp.func
@@ -190,33 +184,26 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         world: int,
         brick: int,
         lane: int,
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        # Out, added into:
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: ParticleInputsAdj,
-        # Out:
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
+        s: int,
     ):
+        u = at.u[s]
+        v = at.v[s]
         first = inside.rows[brick]  # loaded while the nodes are awaited
         last = inside.rows[brick + 1]
         corner = inside.corners[brick, lane % count]
         p = place_of(inside, first, lane)
         stage_u(u, inside, world, brick, lane)
-        stage_f(adj_f, inside, world, brick, lane)
-        clear(partial_u, world, brick)
+        stage_f(bar.f, inside, world, brick, lane)
+        clear(bar.partial_u, world, brick)
         if wp.static(viscous):
             stage_v(v, inside, world, brick, lane)
-            clear(partial_v, world, brick)
+            clear(bar.partial_v, world, brick)
         meet()
         total_u = line()
         total_v = line()
@@ -231,62 +218,38 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
                 if p >= 0:
                     fx = inside.fraction[p]
                     H = gradient_u(u, inside, world, brick, corner, fx, constants.rate)
-                    G = gradient_f(adj_f, inside, world, brick, corner, fx, constants.rate)
+                    G = gradient_f(bar.f, inside, world, brick, corner, fx, constants.rate)
                     rate = mat()
                     if wp.static(viscous):
                         rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
                     adj = forced_adj(inputs, world, p, H, rate, G, adj_inputs)
-                    check_adj(words, world, inside.order[p], substep, adj)
+                    check_adj(at.words, world, inside.order[p], at.length - 1 - s, adj)
                     A = constants.rate * adj.F  # (Q1.adj)
                     B = constants.rate * adj.rate
                     if wp.static(loaded):
-                        share = value_f(adj_f, inside, world, brick, corner, fx)
+                        share = value_f(bar.f, inside, world, brick, corner, fx)
                         adj_inputs.force[world, p] = adj_inputs.force[world, p] + share
                 if wp.static(not serial):
                     if row + 1 < last:
                         p = place_of(inside, row + 1, lane)
-                total_u = add(total_u, partial_u, world, brick, slot, corner, fx, A, vec())
+                total_u = add(total_u, bar.partial_u, world, brick, slot, corner, fx, A, vec())
                 if wp.static(viscous):
-                    total_v = add(total_v, partial_v, world, brick, slot, corner, fx, B, vec())
-        write(total_u, partial_u, inside, world, brick, lane)
+                    total_v = add(total_v, bar.partial_v, world, brick, slot, corner, fx, B, vec())
+        write(total_u, bar.partial_u, inside, world, brick, lane)
         if wp.static(viscous):
-            write(total_v, partial_v, inside, world, brick, lane)
+            write(total_v, bar.partial_v, inside, world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def forces_adj(
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        # Out, added into:
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: ParticleInputsAdj,
-        # Out:
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
+        s: int,
     ):
         world, brick, lane = wp.tid()
-        forces_adj_at(
-            world,
-            brick,
-            lane,
-            constants,
-            inputs,
-            inside,
-            substep,
-            u,
-            v,
-            adj_f,
-            words,
-            adj_inputs,
-            partial_u,
-            partial_v,
-        )
+        forces_adj_at(world, brick, lane, constants, inputs, inside, at, bar, adj_inputs, s)
 
     return SimpleNamespace(forces_adj=forces_adj, forces_adj_at=forces_adj_at)

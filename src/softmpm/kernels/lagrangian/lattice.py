@@ -6,6 +6,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
+from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
 from softmpm.kernels.lagrangian.rest import rest
@@ -98,9 +99,10 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
 def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     """As :func:`cells`, for particles on a lattice without external forces of their own."""
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
-    vec, Constants, dim = t.vec, t.Constants, spec.dim
+    Constants, dim = t.Constants, spec.dim
     ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
-    check = one.check
+    check, memory = one.check, chunk(dim, spec.dtype)
+    Chunk, state_of = memory.Chunk, memory.state_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage, of_v.stage, sums(dim, spec.dtype, bricks, False).clear
     one_layer, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
@@ -115,31 +117,28 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         world: int,
         brick: int,
         lane: int,
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
         lattice: Lattice,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        partial: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
+        now = state_of(at, s)
+        u = at.u[now]
+        v = at.v[now]
         corner = inside.corners[brick, lane % count]  # loaded while the nodes are awaited
-        at = places_of(inside, brick, lane)
+        place = places_of(inside, brick, lane)
         stage_u(u, inside, world, brick, lane)
         if wp.static(viscous):
             stage_v(v, inside, world, brick, lane)
-        clear(partial, world, brick)
+        clear(at.partial, world, brick)
         meet()
         for turn in range(turns):  # a single one on a GPU
             slot = lane + turn
             if wp.static(serial):
                 corner = inside.corners[brick, slot % count]
-                at = places_of(inside, brick, slot)
+                place = places_of(inside, brick, slot)
             layer = slot / count
             A = block()
             if corner >= 0:
@@ -148,32 +147,26 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                 if wp.static(viscous):
                     rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
                 for n in range(points):
-                    p = at[n]
+                    p = place[n]
                     if p >= 0:
                         Hn = constants.rate * taken(H, n)
                         A_n = forced(inputs, world, p, Hn, constants.rate * taken(rate, n))  # (Q2)
                         A = put(A, n, constants.rate * A_n)
-                        if substep > 0:  # last, so that nothing waits for it
-                            check(constants, words, world, inside.order[p], substep - 1, Hn)
-            add(A, partial, world, brick, corner, layer, lane, lattice)
+                        if s > 0:  # last, so that nothing waits for it
+                            check(constants, at.words, world, inside.order[p], s - 1, Hn)
+            add(A, at.partial, world, brick, corner, layer, lane, lattice)
 
     @wp.kernel(module=module, **bricks.layer_settings)
     def forces(
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
         lattice: Lattice,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        partial: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
         world, brick, lane = wp.tid()
-        forces_at(world, brick, lane, constants, inputs, inside, lattice, substep, u, v, words, partial)
+        forces_at(world, brick, lane, constants, inputs, inside, lattice, at, s)
 
     return SimpleNamespace(forces=forces, forces_at=forces_at)
 
@@ -186,7 +179,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         rest(spec.dim, spec.dtype).Rest,
         particle_forces_adj(spec, wanted),
     )
-    vec, Constants, dim = t.vec, t.Constants, spec.dim
+    Constants, dim = t.Constants, spec.dim
     ParticleInputs = input_types(spec).ParticleInputs
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     forced_adj, check_adj, one_layer = one.forced_adj, one.check_adj, layers(dim, spec.dtype, bricks)
@@ -197,6 +190,8 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
     gradients_u, gradients_f, gradients_v = one_layer.gradients
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
+    memory = chunk(dim, spec.dtype)
+    Chunk, Adjoint = memory.Chunk, memory.Adjoint
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
 
     @wp.func
@@ -204,100 +199,68 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         world: int,
         brick: int,
         lane: int,
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
         lattice: Lattice,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        # Out, added into:
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: ParticleInputsAdj,
-        # Out:
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
+        s: int,
     ):
+        u = at.u[s]
+        v = at.v[s]
         corner = inside.corners[brick, lane % count]  # loaded while the nodes are awaited
-        at = places_of(inside, brick, lane)
+        place = places_of(inside, brick, lane)
         stage_u(u, inside, world, brick, lane)
-        stage_f(adj_f, inside, world, brick, lane)
-        clear(partial_u, world, brick)
+        stage_f(bar.f, inside, world, brick, lane)
+        clear(bar.partial_u, world, brick)
         if wp.static(viscous):
             stage_v(v, inside, world, brick, lane)
-            clear(partial_v, world, brick)
+            clear(bar.partial_v, world, brick)
         meet()
         for turn in range(turns):  # a single one on a GPU
             slot = lane + turn
             if wp.static(serial):
                 corner = inside.corners[brick, slot % count]
-                at = places_of(inside, brick, slot)
+                place = places_of(inside, brick, slot)
             layer = slot / count
             A = block()
             B = block()
             if corner >= 0:
                 H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
-                G = gradients_f(adj_f, inside.window, world, brick, corner, layer, lattice)
+                G = gradients_f(bar.f, inside.window, world, brick, corner, layer, lattice)
                 rate = block()
                 if wp.static(viscous):
                     rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
                 for n in range(points):
-                    p = at[n]
+                    p = place[n]
                     if p >= 0:
                         Hn = constants.rate * taken(H, n)
                         Gn = constants.rate * taken(G, n)
                         adj = forced_adj(
                             inputs, world, p, Hn, constants.rate * taken(rate, n), Gn, adj_inputs
                         )
-                        check_adj(words, world, inside.order[p], substep, adj)
+                        check_adj(at.words, world, inside.order[p], at.length - 1 - s, adj)
                         A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
                         if wp.static(viscous):
                             B = put(B, n, constants.rate * adj.rate)
-            add(A, partial_u, world, brick, corner, layer, lane, lattice)
+            add(A, bar.partial_u, world, brick, corner, layer, lane, lattice)
             if wp.static(viscous):
-                add(B, partial_v, world, brick, corner, layer, lane, lattice)
+                add(B, bar.partial_v, world, brick, corner, layer, lane, lattice)
 
     @wp.kernel(module=module, **bricks.layer_settings)
     def forces_adj(
-        # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
         lattice: Lattice,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        # Out, added into:
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: ParticleInputsAdj,
-        # Out:
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
+        s: int,
     ):
         world, brick, lane = wp.tid()
-        forces_adj_at(
-            world,
-            brick,
-            lane,
-            constants,
-            inputs,
-            inside,
-            lattice,
-            substep,
-            u,
-            v,
-            adj_f,
-            words,
-            adj_inputs,
-            partial_u,
-            partial_v,
-        )
+        forces_adj_at(world, brick, lane, constants, inputs, inside, lattice, at, bar, adj_inputs, s)
 
     return SimpleNamespace(forces_adj=forces_adj, forces_adj_at=forces_adj_at)

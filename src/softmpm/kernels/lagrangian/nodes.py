@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
@@ -45,13 +46,14 @@ def gathering(dim: int, dtype: str):
 @kernel_factory
 def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
-    real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
+    vec, Constants, Rest = t.vec, t.Constants, r.Rest
     exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
     position, node_velocity = g.position, g.node_velocity
     gathered, surface = gathering(spec.dim, spec.dtype), bool(spec.surface_walls)
     apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
-    Frame, recentring, exact = f.Frame, f.recentring, f.exact
+    Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
+    Chunk, state_of, momenta_of = memory.Chunk, memory.state_of, memory.momenta_of
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
@@ -63,92 +65,53 @@ def nodes(spec: Spec) -> SimpleNamespace:
     def advance_at(
         world: int,
         i: int,
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
         body: Frame,
-        mass: wp.array2d(dtype=real),
-        partial: wp.array2d(dtype=vec),
-        words: wp.array(dtype=wp.int64),
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # Out:
-        p: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        new_shift: wp.array(dtype=exact_vec),
-        new_u: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
         """(Q3), (Q4). Where surface points act on a node, the velocity without contact goes to ``free``, and surface.py goes on."""
-        here = u[world, i]  # all of it loaded while the status is awaited
-        middle = u[world, body.middle]
-        new = v[world, i]
-        m = mass[world, i]
-        f = gathered(partial, inside, world, i)
-        x = place(constants, inside, i, shift[world], here)
+        now = state_of(at, s)
+        then = state_of(at, s + 1)
+        p = momenta_of(at, s)
+        here = at.u[now, world, i]  # all of it loaded while the status is awaited
+        middle = at.u[now, world, body.middle]
+        new = at.v[now, world, i]
+        m = at.mass[world, i]
+        f = gathered(at.partial, inside, world, i)
+        x = place(constants, inside, i, at.shift[now, world], here)
         d = vec()
-        if running(words, world):
+        if running(at.words, world):
             d = recentring(body, middle)
             momentum = m * new + constants.dt * f  # (Q3)
-            p[world, i] = momentum
+            at.p[p, world, i] = momentum
             new = node_velocity(constants, inputs, world, x, momentum, m)
             here = (here - d) + constants.dt * new  # (Q4)
         if i == 0:
-            new_shift[world] = shift[world] + exact(d)
+            at.shift[then, world] = at.shift[now, world] + exact(d)
         if wp.static(surface):
-            free[world, i] = new
+            at.free[world, i] = new
         if wp.static(apart):
             if inside.touched[i] == 0:
-                new_u[world, i] = here
-                new_v[world, i] = new
+                at.u[then, world, i] = here
+                at.v[then, world, i] = new
         if wp.static(not surface):
-            new_u[world, i] = here
-            new_v[world, i] = new
+            at.u[then, world, i] = here
+            at.v[then, world, i] = new
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
         body: Frame,
-        mass: wp.array2d(dtype=real),
-        partial: wp.array2d(dtype=vec),
-        words: wp.array(dtype=wp.int64),
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # Out:
-        p: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        new_shift: wp.array(dtype=exact_vec),
-        new_u: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
         world, i = wp.tid()
-        advance_at(
-            world,
-            i,
-            constants,
-            inputs,
-            inside,
-            body,
-            mass,
-            partial,
-            words,
-            shift,
-            u,
-            v,
-            p,
-            free,
-            new_shift,
-            new_u,
-            new_v,
-        )
+        advance_at(world, i, constants, inputs, inside, body, at, s)
 
     return SimpleNamespace(advance=advance, advance_at=advance_at, place=place)
 
@@ -156,178 +119,95 @@ def nodes(spec: Spec) -> SimpleNamespace:
 @kernel_factory
 def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, r, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), nodes(spec)
-    real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
+    vec, Constants, Rest = t.vec, t.Constants, r.Rest
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
-    gathered, place, exact_vec = gathering(spec.dim, spec.dtype), one.place, types(spec.dim, "float64").vec
+    gathered, place = gathering(spec.dim, spec.dtype), one.place
     viscous, surface, moving = spec.viscosity, bool(spec.surface_walls), spec.moving
+    constrained, memory = spec.constrained, chunk(spec.dim, spec.dtype)
+    Chunk, Adjoint = memory.Chunk, memory.Adjoint
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.func
     def moved_adj(
+        world: int,
+        i: int,
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
-        mass: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        world: int,
-        i: int,
-        adj_new: vec,
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        adj_mass: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
+        adj_new: vec,
     ):
         """(Q3.adj) of a node, from v̄'."""
-        m = mass[world, i]
-        here = place(constants, inside, i, shift[world], u[world, i])
-        number = world * held + i
-        adj = node_velocity_adj(constants, inputs, world, here, p[world, i], m, adj_new, number, adj_inputs)
-        adj_mass[world, i] = adj_mass[world, i] + adj.m + wp.dot(v[world, i], adj.p)
-        adj_f[world, i] = constants.dt * adj.p
-        adj_v[world, i] = m * adj.p
+        m = at.mass[world, i]
+        here = place(constants, inside, i, at.shift[s, world], at.u[s, world, i])
+        p = at.p[s, world, i]
+        number = world * bar.held + i
+        adj = node_velocity_adj(constants, inputs, world, here, p, m, adj_new, number, adj_inputs)
+        bar.mass[world, i] = bar.mass[world, i] + adj.m + wp.dot(at.v[s, world, i], adj.p)
+        bar.f[world, i] = constants.dt * adj.p
+        bar.v[world, i] = m * adj.p
         if wp.static(moving):
-            adj_u[world, i] = adj_u[world, i] + adj.x
+            bar.u[world, i] = bar.u[world, i] + adj.x
 
     @wp.func
-    def gather(
-        inside: Rest,
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        world: int,
-        i: int,
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-    ):
+    def gather(world: int, i: int, inside: Rest, bar: Adjoint):
         """What the forces of a substep give to its displacements and velocities (Q1.adj)."""
-        adj_u[world, i] = adj_u[world, i] + gathered(partial_u, inside, world, i)
+        bar.u[world, i] = bar.u[world, i] + gathered(bar.partial_u, inside, world, i)
         if wp.static(viscous):
-            adj_v[world, i] = adj_v[world, i] + gathered(partial_v, inside, world, i)
+            bar.v[world, i] = bar.v[world, i] + gathered(bar.partial_v, inside, world, i)
+
+    @wp.func
+    def gather_pending(world: int, i: int, inside: Rest, at: Chunk, bar: Adjoint, s: int):
+        """What the forces of the substep after ``s`` have given, unless it has been added already."""
+        if wp.static(not constrained):
+            if s < at.length - 1:
+                gather(world, i, inside, bar)
 
     @wp.func
     def advance_adj_at(
         world: int,
         i: int,
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
-        mass: wp.array2d(dtype=real),
-        held: int,
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        pending: bool,  # whether the partial sums of the substep after are still to be added
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out:
-        adj_f: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
     ):
         """(Q4.adj), (Q3.adj); after surface contact v̄' has been computed already."""
-        if pending:
-            gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
-        adj_new = adj_v[world, i]
+        gather_pending(world, i, inside, at, bar, s)
+        adj_new = bar.v[world, i]
         if wp.static(not surface):
-            adj_new += constants.dt * adj_u[world, i]
-        moved_adj(
-            constants,
-            inputs,
-            inside,
-            mass,
-            held,
-            shift,
-            u,
-            v,
-            p,
-            world,
-            i,
-            adj_new,
-            adj_u,
-            adj_v,
-            adj_f,
-            adj_mass,
-            adj_inputs,
-        )
+            adj_new += constants.dt * bar.u[world, i]
+        moved_adj(world, i, constants, inputs, inside, at, bar, adj_inputs, s, adj_new)
 
     @wp.kernel(module=module, enable_backward=False)
     def advance_adj(
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
-        mass: wp.array2d(dtype=real),
-        held: int,
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        pending: bool,  # whether the partial sums of the substep after are still to be added
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out:
-        adj_f: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
     ):
         world, i = wp.tid()
-        advance_adj_at(
-            world,
-            i,
-            constants,
-            inputs,
-            inside,
-            mass,
-            held,
-            shift,
-            u,
-            v,
-            p,
-            pending,
-            partial_u,
-            partial_v,
-            adj_u,
-            adj_v,
-            adj_f,
-            adj_mass,
-            adj_inputs,
-        )
+        advance_adj_at(world, i, constants, inputs, inside, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
-    def gather_adj(
-        # Parameters:
-        inside: Rest,
-        # In:
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-    ):
+    def gather_adj(inside: Rest, bar: Adjoint):
         world, i = wp.tid()
-        gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
+        gather(world, i, inside, bar)
 
     return SimpleNamespace(
         advance_adj=advance_adj,
         advance_adj_at=advance_adj_at,
         gather_adj=gather_adj,
-        gather=gather,
+        gather_pending=gather_pending,
         moved_adj=moved_adj,
     )

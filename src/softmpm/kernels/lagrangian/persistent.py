@@ -6,6 +6,7 @@ a launch. The stages are the functions of the kernels of single launches: result
 Groups of threads of a block have a brick each. On the CPU, for tests, one thread does everything.
 """
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import warp as wp
@@ -13,6 +14,7 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet_cluster
 from softmpm.kernels.lagrangian.cells import cells, cells_adj
+from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj, layers
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
@@ -52,64 +54,20 @@ class Cluster(NamedTuple):
 
 
 @kernel_factory
-def arrays_type(dim: int, dtype: str):
-    t, exact_vec = types(dim, dtype), types(dim, "float64").vec
-
-    class Arrays:
-        """See :class:`softmpm.schemes.lagrangian.buffers.ChunkBuffers`; the first axis of states counts substeps."""
-
-        shift: wp.array2d(dtype=exact_vec)
-        u: wp.array3d(dtype=t.vec)
-        v: wp.array3d(dtype=t.vec)
-        p: wp.array3d(dtype=t.vec)
-        anchor: wp.array4d(dtype=t.vec)
-        mass: wp.array2d(dtype=t.real)
-        partial: wp.array2d(dtype=t.vec)
-        words: wp.array(dtype=wp.int64)
-        free: wp.array2d(dtype=t.vec)
-        force: wp.array3d(dtype=t.vec)
-        impulse: wp.array2d(dtype=t.vec)
-        D: wp.array2d(dtype=t.real)
-        rate: wp.array(dtype=t.real)
-
-    class ArraysAdj:
-        """See :class:`softmpm.schemes.lagrangian.buffers.SharedAdjoint`."""
-
-        u: wp.array2d(dtype=t.vec)
-        v: wp.array2d(dtype=t.vec)
-        f: wp.array2d(dtype=t.vec)
-        mass: wp.array2d(dtype=t.real)
-        partial_u: wp.array2d(dtype=t.vec)
-        partial_v: wp.array2d(dtype=t.vec)
-        anchor: wp.array3d(dtype=t.vec)
-        force: wp.array3d(dtype=t.vec)
-        shared: wp.array2d(dtype=t.vec)
-        x: wp.array2d(dtype=t.vec)
-        free: wp.array2d(dtype=t.vec)
-        D: wp.array2d(dtype=t.real)
-
-    module = f"softmpm.types.d{dim}.{dtype}"
-    return wp.struct(Arrays, module=module), wp.struct(ArraysAdj, module=module)
-
-
-@kernel_factory
 def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
-    t, bricks, Rest = types(spec.dim, spec.dtype), cluster.bricks, rest(spec.dim, spec.dtype).Rest
-    Constants, Frame, Arrays = (
-        t.Constants,
-        frame(spec.dim, spec.dtype).Frame,
-        arrays_type(spec.dim, spec.dtype)[0],
-    )
-    real, given, Surface = t.real, input_types(spec), surface_type(spec.dim, spec.dtype)
-    ParticleInputs, GridInputs = given.ParticleInputs, given.GridInputs
+    """Kernel of the substeps from ``first`` to before ``last``."""
+    bricks, given, memory = cluster.bricks, input_types(spec), chunk(spec.dim, spec.dtype)
+    ParticleInputs, GridInputs, Chunk = given.ParticleInputs, given.GridInputs, memory.Chunk
+    Constants, Rest = types(spec.dim, spec.dtype).Constants, rest(spec.dim, spec.dtype).Rest
+    Frame, Surface = frame(spec.dim, spec.dtype).Frame, surface_type(spec.dim, spec.dtype)
     Lattice, lattice = layers(spec.dim, spec.dtype, bricks).Lattice, bricks.lattice
     forces_at = lattice_cells(spec, bricks).forces_at if lattice else cells(spec, bricks).forces_at
     advance_at, contact = nodes(spec).advance_at, bool(spec.surface_walls)
-    press_at = settle_at = None
-    if contact:
-        press_at, settle_at = surface(spec).press_at, surface(spec).settle_at
-    T, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    number = each_of(cluster)
+    press_at = surface(spec).press_at if contact else None
+    settle_at = surface(spec).settle_at if contact else None
+    size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
+    numbers = numbering(cluster)
+    number, rounded = numbers.number, numbers.rounded
     module = brick_module(f"{spec.module}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -121,134 +79,33 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
         weights: Lattice,
         moving: Frame,
         body: Surface,
-        smoothing: real,
-        lanes: int,
-        a: Arrays,
-        keep: bool,
+        at: Chunk,
         first: int,
         last: int,
-        anew: int,  # 1 if a control step begins with the first substep, but not with the first one of the chunk
+        anew: int,  # 1 if a control step begins with the first substep, but not with the chunk
     ):
         world, block, thread = wp.tid()
-        each = number(block, thread)
+        own = number(block, thread)
+        lane = thread % size
         for s in range(first, last):
-            now = wp.where(keep, s, s % 2)
-            then = wp.where(keep, s + 1, (s + 1) % 2)
-            u = a.u[now]
-            v = a.v[now]
-            for brick in range(block + blocks * (thread / T), inside.corners.shape[0], blocks * groups):
+            for brick in range(block + blocks * (thread / size), inside.corners.shape[0], blocks * groups):
                 if wp.static(lattice):
-                    forces_at(
-                        world,
-                        brick,
-                        thread % T,
-                        constants,
-                        inputs,
-                        inside,
-                        weights,
-                        s,
-                        u,
-                        v,
-                        a.words,
-                        a.partial,
-                    )
+                    forces_at(world, brick, lane, constants, inputs, inside, weights, at, s)
                 else:
-                    forces_at(
-                        world, brick, thread % T, constants, inputs, inside, s, u, v, a.words, a.partial
-                    )
+                    forces_at(world, brick, lane, constants, inputs, inside, at, s)
             meet_cluster()
-            p = a.p[wp.where(keep, s, 0)]
-            new_u = a.u[then]
-            new_v = a.v[then]
-            shift = a.shift[now]
-            new_shift = a.shift[then]
-            for i in range(each, inside.nodes.shape[0], blocks * threads):
-                if wp.static(contact):
-                    advance_at(
-                        world,
-                        i,
-                        constants,
-                        grid_inputs,
-                        inside,
-                        moving,
-                        a.mass,
-                        a.partial,
-                        a.words,
-                        shift,
-                        u,
-                        v,
-                        p,
-                        a.free,
-                        new_shift,
-                        new_u,
-                        new_v,
-                    )
-                else:
-                    advance_at(
-                        world,
-                        i,
-                        constants,
-                        grid_inputs,
-                        inside,
-                        moving,
-                        a.mass,
-                        a.partial,
-                        a.words,
-                        shift,
-                        u,
-                        v,
-                        p,
-                        new_v,
-                        new_shift,
-                        new_u,
-                        new_v,
-                    )
+            for i in range(own, inside.nodes.shape[0], blocks * threads):
+                advance_at(world, i, constants, grid_inputs, inside, moving, at, s)
             meet_cluster()
             if wp.static(contact):
-                anchor = a.anchor[now]
-                new_anchor = a.anchor[then]
                 begins = wp.where(s == first, anew, 0)
-                for k in range(each, body.points.shape[0], blocks * threads):
-                    press_at(
-                        world,
-                        k,
-                        constants,
-                        grid_inputs,
-                        body,
-                        moving,
-                        smoothing,
-                        a.D,
-                        s,
-                        a.rate,
-                        begins,
-                        shift,
-                        u,
-                        a.free,
-                        anchor,
-                        a.words,
-                        a.force,
-                        a.impulse,
-                        new_anchor,
-                    )
+                for p in range(own, body.points.shape[0], blocks * threads):
+                    press_at(world, p, constants, grid_inputs, body, moving, at, s, begins)
                 meet_cluster()
-                for n in range(each, body.nodes.shape[0] * lanes, blocks * threads):
-                    settle_at(
-                        world,
-                        n / lanes,
-                        n % lanes,
-                        constants,
-                        body,
-                        moving,
-                        a.mass,
-                        lanes,
-                        a.impulse,
-                        a.words,
-                        u,
-                        v,
-                        a.free,
-                        new_u,
-                        new_v,
-                    )
+                count = body.nodes.shape[0]
+                for k in range(own, rounded(count * body.lanes), blocks * threads):
+                    n = wp.min(k / body.lanes, count - 1)
+                    settle_at(world, n, k - n * body.lanes, constants, body, moving, at, s)
                 meet_cluster()
 
     return march
@@ -256,22 +113,22 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
 
 @kernel_factory
 def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel:
-    t, bricks, Rest = types(spec.dim, spec.dtype), cluster.bricks, rest(spec.dim, spec.dtype).Rest
-    Constants, (Arrays, ArraysAdj) = t.Constants, arrays_type(spec.dim, spec.dtype)
-    real, given, Surface = t.real, input_types(spec), surface_type(spec.dim, spec.dtype)
+    """Adjoint of :func:`march`; the sums of the bricks in substep ``first`` are still to be added to the adjoint of the state."""
+    bricks, given, memory = cluster.bricks, input_types(spec), chunk(spec.dim, spec.dtype)
     ParticleInputs, GridInputs = given.ParticleInputs, given.GridInputs
-    adjoints = input_adj_types(spec, wanted)
+    Chunk, Adjoint, adjoints = memory.Chunk, memory.Adjoint, input_adj_types(spec, wanted)
     ParticleInputsAdj, GridInputsAdj = adjoints.ParticleInputsAdj, adjoints.GridInputsAdj
+    Constants, Rest = types(spec.dim, spec.dtype).Constants, rest(spec.dim, spec.dtype).Rest
+    Surface, contact = surface_type(spec.dim, spec.dtype), bool(spec.surface_walls)
     Lattice, lattice = layers(spec.dim, spec.dtype, bricks).Lattice, bricks.lattice
     of_cells = lattice_cells_adj(spec, wanted, bricks) if lattice else cells_adj(spec, wanted, bricks)
     forces_adj_at, advance_adj_at = of_cells.forces_adj_at, nodes_adj(spec, wanted).advance_adj_at
-    contact = bool(spec.surface_walls)
-    settle_adj_at = press_adj_at = spread_adj_at = None
-    if contact:
-        one = surface_adj(spec, wanted)
-        settle_adj_at, press_adj_at, spread_adj_at = one.settle_adj_at, one.press_adj_at, one.spread_adj_at
-    T, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    number = each_of(cluster)
+    settle_adj_at = surface_adj(spec, wanted).settle_adj_at if contact else None
+    press_adj_at = surface_adj(spec, wanted).press_adj_at if contact else None
+    spread_adj_at = surface_adj(spec, wanted).spread_adj_at if contact else None
+    size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
+    numbers = numbering(cluster)
+    number, rounded = numbers.number, numbers.rounded
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -282,181 +139,68 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
         inside: Rest,
         weights: Lattice,
         body: Surface,
-        smoothing: real,
-        lanes: int,
-        held: int,  # accumulators of one world
-        a: Arrays,
-        b: ArraysAdj,
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: ParticleInputsAdj,
         adj_grid_inputs: GridInputsAdj,
-        length: int,  # of the chunk
         first: int,
         last: int,
-        anew: int,  # as in the forward pass
+        anew: int,
     ):
         world, block, thread = wp.tid()
-        each = number(block, thread)
+        own = number(block, thread)
+        lane = thread % size
         for back in range(last - first):
             s = last - 1 - back
-            u = a.u[s]
-            v = a.v[s]
-            p = a.p[s]
-            shift = a.shift[s]
-            pending = s < length - 1
             if wp.static(contact):
-                new_v = a.v[s + 1]
-                for i in range(each, inside.nodes.shape[0], blocks * threads):
-                    settle_adj_at(
-                        world,
-                        i,
-                        constants,
-                        grid_inputs,
-                        inside,
-                        a.mass,
-                        held,
-                        shift,
-                        u,
-                        v,
-                        p,
-                        new_v,
-                        pending,
-                        b.partial_u,
-                        b.partial_v,
-                        b.u,
-                        b.v,
-                        a.free,
-                        b.shared,
-                        b.f,
-                        b.mass,
-                        adj_grid_inputs,
-                    )
+                for i in range(own, inside.nodes.shape[0], blocks * threads):
+                    settle_adj_at(world, i, constants, grid_inputs, inside, at, bar, adj_grid_inputs, s)
                 meet_cluster()
-                anchor = a.anchor[s]
                 begins = wp.where(s == first, anew, 0)
-                for k in range(each, body.points.shape[0], blocks * threads):
-                    press_adj_at(
-                        world,
-                        k,
-                        constants,
-                        grid_inputs,
-                        body,
-                        smoothing,
-                        a.D,
-                        held,
-                        a.rate,
-                        begins,
-                        shift,
-                        u,
-                        a.free,
-                        anchor,
-                        b.shared,
-                        b.force,
-                        b.anchor,
-                        b.x,
-                        b.free,
-                        b.D,
-                        adj_grid_inputs,
-                    )
+                for p in range(own, body.points.shape[0], blocks * threads):
+                    press_adj_at(world, p, constants, grid_inputs, body, at, bar, adj_grid_inputs, s, begins)
                 meet_cluster()
-                for n in range(each, body.nodes.shape[0] * lanes, blocks * threads):
+                count = body.nodes.shape[0]
+                for k in range(own, rounded(count * body.lanes), blocks * threads):
+                    n = wp.min(k / body.lanes, count - 1)
+                    turn = k - n * body.lanes
                     spread_adj_at(
-                        world,
-                        n / lanes,
-                        n % lanes,
-                        constants,
-                        grid_inputs,
-                        inside,
-                        body,
-                        a.mass,
-                        held,
-                        lanes,
-                        shift,
-                        u,
-                        v,
-                        p,
-                        b.x,
-                        b.free,
-                        b.u,
-                        b.v,
-                        b.f,
-                        b.mass,
-                        adj_grid_inputs,
+                        world, n, turn, constants, grid_inputs, inside, body, at, bar, adj_grid_inputs, s
                     )
             else:
-                for i in range(each, inside.nodes.shape[0], blocks * threads):
-                    advance_adj_at(
-                        world,
-                        i,
-                        constants,
-                        grid_inputs,
-                        inside,
-                        a.mass,
-                        held,
-                        shift,
-                        u,
-                        v,
-                        p,
-                        pending,
-                        b.partial_u,
-                        b.partial_v,
-                        b.u,
-                        b.v,
-                        b.f,
-                        b.mass,
-                        adj_grid_inputs,
-                    )
+                for i in range(own, inside.nodes.shape[0], blocks * threads):
+                    advance_adj_at(world, i, constants, grid_inputs, inside, at, bar, adj_grid_inputs, s)
             meet_cluster()
-            for brick in range(block + blocks * (thread / T), inside.corners.shape[0], blocks * groups):
+            for brick in range(block + blocks * (thread / size), inside.corners.shape[0], blocks * groups):
                 if wp.static(lattice):
                     forces_adj_at(
-                        world,
-                        brick,
-                        thread % T,
-                        constants,
-                        inputs,
-                        inside,
-                        weights,
-                        length - 1 - s,
-                        u,
-                        v,
-                        b.f,
-                        a.words,
-                        adj_inputs,
-                        b.partial_u,
-                        b.partial_v,
+                        world, brick, lane, constants, inputs, inside, weights, at, bar, adj_inputs, s
                     )
                 else:
-                    forces_adj_at(
-                        world,
-                        brick,
-                        thread % T,
-                        constants,
-                        inputs,
-                        inside,
-                        length - 1 - s,
-                        u,
-                        v,
-                        b.f,
-                        a.words,
-                        adj_inputs,
-                        b.partial_u,
-                        b.partial_v,
-                    )
+                    forces_adj_at(world, brick, lane, constants, inputs, inside, at, bar, adj_inputs, s)
             meet_cluster()
 
     return march_adj
 
 
 @kernel_factory
-def each_of(cluster: Cluster):
+def numbering(cluster: Cluster) -> SimpleNamespace:
     blocks, serial = cluster.blocks, cluster.bricks.serial
 
     @wp.func
     def number(block: int, thread: int) -> int:
-        """Number of a thread in its cluster; neighbouring warps are in different blocks."""
+        """Number of a thread in its cluster; warps take turns among the blocks."""
         if wp.static(serial):
             return 0
         else:
             return (thread / 32 * blocks + block) * 32 + thread % 32
 
-    return number
+    @wp.func
+    def rounded(count: int) -> int:
+        """Number of threads, in whole warps: those that sum together must all be there."""
+        if wp.static(serial):
+            return count
+        else:
+            return (count + 31) / 32 * 32
+
+    return SimpleNamespace(number=number, rounded=rounded)

@@ -16,6 +16,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
@@ -30,10 +31,9 @@ BATCH = 4
 TOGETHER = """
     auto total = value;
 #if defined(__CUDA_ARCH__)
-    const unsigned own = threadIdx.x % 32 / {lanes} * {lanes}, mask = (0xffffffffu >> (32 - {lanes})) << own;
     for (int other = {lanes} / 2; other > 0; other /= 2)
         for (unsigned axis = 0; axis < {dim}; ++axis)
-            total.c[axis] += __shfl_xor_sync(mask, total.c[axis], other);
+            total.c[axis] += __shfl_xor_sync(0xffffffffu, total.c[axis], other);
 #endif
     return total;
 """
@@ -49,6 +49,8 @@ def surface_type(dim: int, dtype: str):
         points: wp.array(dtype=exact_vec)
         areas: wp.array(dtype=t.real)
         newtons: wp.array(dtype=t.real)  # areas in the units of force
+        width: t.real  # over which contact sets in
+        lanes: int  # threads of a node
         deepest: wp.array(dtype=t.real)
         stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
         loads: wp.array(dtype=t.real)
@@ -79,7 +81,8 @@ def surface(spec: Spec) -> SimpleNamespace:
     number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
     count, each_world, rough = len(walls), "friction" in spec.given, spec.friction
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
-    Frame, recentring, exact_of = f.Frame, f.recentring, f.exact
+    Frame, recentring, exact_of, memory = f.Frame, f.recentring, f.exact, chunk(dim, spec.dtype)
+    Chunk, state_of = memory.Chunk, memory.state_of
     face, depth = wall_face(spec).face, wall_face(spec).depth
     running, was_running, report = (
         getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
@@ -138,17 +141,15 @@ def surface(spec: Spec) -> SimpleNamespace:
         """Sum over the threads of a node, for all of them."""
 
     @wp.func
-    def from_points(
-        body: Surface, values: wp.array2d(dtype=vec), world: int, n: int, lane: int, step: int
-    ) -> vec:
+    def from_points(body: Surface, values: wp.array2d(dtype=vec), world: int, n: int, lane: int) -> vec:
         """Σ w a of a field of the surface points, at node ``n`` of those they act on, in a fixed order."""
         last = body.first[n + 1]
         total = vec()
-        for m in range(body.first[n] + lane, last, BATCH * step):
+        for m in range(body.first[n] + lane, last, BATCH * body.lanes):
             for k in range(BATCH):  # several that wait for memory together
-                at = wp.min(m + k * step, last - 1)
-                share = body.shares[at] * values[world, body.members[at]]
-                if m + k * step < last:
+                entry = wp.min(m + k * body.lanes, last - 1)
+                share = body.shares[entry] * values[world, body.members[entry]]
+                if m + k * body.lanes < last:
                     total += share
         return together(total)
 
@@ -172,48 +173,38 @@ def surface(spec: Spec) -> SimpleNamespace:
     def press_at(
         world: int,
         p: int,
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         body: Surface,
         moving: Frame,
-        smoothing: real,
-        D: wp.array2d(dtype=real),
-        substep: int,
-        rate: wp.array(dtype=real),  # 1/T
-        anew: int,  # 1 at the beginning of a control step
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        anchor: wp.array3d(dtype=vec),
-        # In and out:
-        words: wp.array(dtype=wp.int64),
-        force: wp.array3d(dtype=vec),
-        # Out:
-        impulse: wp.array2d(dtype=vec),
-        new_anchor: wp.array3d(dtype=vec),
+        at: Chunk,
+        s: int,
+        anew: int,  # 1 if a control step begins
     ):
         """(K2) to (K4), (K6), (K7): impulse A J of each point."""
+        now = state_of(at, s)
+        then = state_of(at, s + 1)
+        u = at.u[now]
+        anchor = at.anchor[now]
         middle = u[world, moving.middle]  # all of it loaded while the status is awaited
         x = present(body, p, at_point(body, u, world, p))
-        v = at_point(body, free, world, p)
-        dv = D[world, p]
+        v = at_point(body, at.free, world, p)
+        dv = at.D[world, p]
         stiffness = body.stiffness[p]
-        per_force = rate[0] * body.newtons[p]
-        wall = faces_of(constants, inputs, anchor, world, p, x + shift[world])
+        per_force = at.rate[0] * body.newtons[p]
+        wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[now, world])
         after = vecs()
         pushed = vecs()
         for q in range(count):
             after[q] = anchor[world, q, p]
             if anew == 0:
-                pushed[q] = force[world, q, p]
+                pushed[q] = at.force[world, q, p]
         deepest = body.deepest[p]
         area = body.areas[p]
         total = vec()
-        last = wp.max(substep - 1, 0)
+        last = wp.max(s - 1, 0)
         deep = int(-1)
-        if was_running(words, world, last, in_wall):
+        if was_running(at.words, world, last, in_wall):
             d = recentring(moving, middle)
             for q in range(count):
                 if wall.depth[q] > deepest:
@@ -228,126 +219,66 @@ def surface(spec: Spec) -> SimpleNamespace:
                     wall.friction[q],
                     stiffness,
                     constants.dt,
-                    smoothing,
+                    body.width,
                 )
                 after[q] = found.anchor - across(wall.n[q], d)
                 total += found.J
                 v += dv * found.J
                 pushed[q] = pushed[q] + per_force * found.J
             for q in range(count):
-                force[world, q, p] = pushed[q]
+                at.force[world, q, p] = pushed[q]
         for q in range(count):
-            new_anchor[world, q, p] = after[q]
-        impulse[world, p] = area * total
+            at.anchor[then, world, q, p] = after[q]
+        at.impulse[world, p] = area * total
         if deep >= 0:
-            report(words, world, last, in_wall, deep * body.points.shape[0] + p)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def press(
-        # Parameters:
-        constants: Constants,
-        inputs: GridInputs,
-        body: Surface,
-        moving: Frame,
-        smoothing: real,
-        D: wp.array2d(dtype=real),
-        substep: int,
-        rate: wp.array(dtype=real),  # 1/T
-        anew: int,  # 1 at the beginning of a control step
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        anchor: wp.array3d(dtype=vec),
-        # In and out:
-        words: wp.array(dtype=wp.int64),
-        force: wp.array3d(dtype=vec),
-        # Out:
-        impulse: wp.array2d(dtype=vec),
-        new_anchor: wp.array3d(dtype=vec),
-    ):
-        world, p = wp.tid()
-        press_at(
-            world,
-            p,
-            constants,
-            inputs,
-            body,
-            moving,
-            smoothing,
-            D,
-            substep,
-            rate,
-            anew,
-            shift,
-            u,
-            free,
-            anchor,
-            words,
-            force,
-            impulse,
-            new_anchor,
-        )
+            report(at.words, world, last, in_wall, deep * body.points.shape[0] + p)
 
     @wp.func
     def settle_at(
         world: int,
         n: int,
         lane: int,
-        # Parameters:
         constants: Constants,
         body: Surface,
         moving: Frame,
-        mass: wp.array2d(dtype=real),
-        step: int,  # threads of a node
-        impulse: wp.array2d(dtype=vec),
-        words: wp.array(dtype=wp.int64),
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        # Out:
-        new_u: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
     ):
         """(K5), at the nodes that surface points act on."""
+        now = state_of(at, s)
+        then = state_of(at, s + 1)
         i = body.nodes[n]
-        here = u[world, i]
-        new = free[world, i]  # loaded while the status is awaited
-        middle = u[world, moving.middle]
-        push = from_points(body, impulse, world, n, lane, step)
-        if running(words, world):
+        here = at.u[now, world, i]
+        new = at.free[world, i]  # loaded while the status is awaited
+        middle = at.u[now, world, moving.middle]
+        push = from_points(body, at.impulse, world, n, lane)
+        if running(at.words, world):
             if body.first[n + 1] > body.first[n]:
-                new += push / mass[world, i]
+                new += push / at.mass[world, i]
             here = (here - recentring(moving, middle)) + constants.dt * new
         else:
-            new = v[world, i]
+            new = at.v[now, world, i]
         if lane == 0:
-            new_u[world, i] = here
-            new_v[world, i] = new
+            at.u[then, world, i] = here
+            at.v[then, world, i] = new
 
     @wp.kernel(module=module, enable_backward=False)
-    def settle(
-        # Parameters:
+    def press(
         constants: Constants,
+        inputs: GridInputs,
         body: Surface,
         moving: Frame,
-        mass: wp.array2d(dtype=real),
-        step: int,  # threads of a node
-        impulse: wp.array2d(dtype=vec),
-        words: wp.array(dtype=wp.int64),
-        # In:
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        # Out:
-        new_u: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
+        at: Chunk,
+        s: int,
+        anew: int,
     ):
+        world, p = wp.tid()
+        press_at(world, p, constants, inputs, body, moving, at, s, anew)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def settle(constants: Constants, body: Surface, moving: Frame, at: Chunk, s: int):
         world, n, lane = wp.tid()
-        settle_at(
-            world, n, lane, constants, body, moving, mass, step, impulse, words, u, v, free, new_u, new_v
-        )
+        settle_at(world, n, lane, constants, body, moving, at, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_depth(

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.lagrangian.surface import surface, surface_type
@@ -36,178 +37,73 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     touch, touch_adj, number = block.touch, block.touch_adj, one.number
     faces_of, face_adj, present = one.faces_of, wall_face_adj(spec, wanted), one.present
     at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
-    exact_vec, mirrored, constrained = types(dim, "float64").vec, bool(spec.mirrors), spec.constrained
+    mirrored, constrained = bool(spec.mirrors), spec.constrained
     place, vecs, back = nodes(spec).place, one.vecs, nodes_adj(spec, wanted)
-    gather, moved_adj = back.gather, back.moved_adj
+    gather_pending, moved_adj, memory = back.gather_pending, back.moved_adj, chunk(dim, spec.dtype)
+    Chunk, Adjoint = memory.Chunk, memory.Adjoint
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.func
     def settle_adj_at(
         world: int,
         i: int,
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
-        mass: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
-        pending: bool,  # whether the partial sums of the substep after are still to be added
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out, with clamps in:
-        free: wp.array2d(dtype=vec),
-        # Out:
-        shared: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
     ):
         """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m. Nodes that no surface points act on are done here."""
-        if pending:
-            gather(inside, partial_u, partial_v, world, i, adj_u, adj_v)
-        adj = adj_v[world, i] + constants.dt * adj_u[world, i]
+        gather_pending(world, i, inside, at, bar, s)
+        adj = bar.v[world, i] + constants.dt * bar.u[world, i]
         if inside.touched[i] == 1:
-            m = mass[world, i]
-            x = place(constants, inside, i, shift[world], u[world, i])
-            free_v = node_velocity(constants, inputs, world, x, p[world, i], m)
+            m = at.mass[world, i]
+            x = place(constants, inside, i, at.shift[s, world], at.u[s, world, i])
+            free_v = node_velocity(constants, inputs, world, x, at.p[s, world, i], m)
             if wp.static(mirrored):
-                free_v = free[world, i]  # reflected already
-            free[world, i] = free_v
-            adj_v[world, i] = adj
+                free_v = at.free[world, i]  # reflected already
+            at.free[world, i] = free_v
+            bar.v[world, i] = adj
             each = vec()
             if m > real(0.0):
                 each = adj / m
-            shared[world, i] = each
-            adj_mass[world, i] = adj_mass[world, i] - wp.dot(new_v[world, i] - free_v, each)
+            bar.shared[world, i] = each
+            bar.mass[world, i] = bar.mass[world, i] - wp.dot(at.v[s + 1, world, i] - free_v, each)
         else:
-            moved_adj(
-                constants,
-                inputs,
-                inside,
-                mass,
-                held,
-                shift,
-                u,
-                v,
-                p,
-                world,
-                i,
-                adj,
-                adj_u,
-                adj_v,
-                adj_f,
-                adj_mass,
-                adj_inputs,
-            )
-
-    @wp.kernel(module=module, enable_backward=False)
-    def settle_adj(
-        # Parameters:
-        constants: Constants,
-        inputs: GridInputs,
-        inside: Rest,
-        mass: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        new_v: wp.array2d(dtype=vec),
-        pending: bool,  # whether the partial sums of the substep after are still to be added
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out, with clamps in:
-        free: wp.array2d(dtype=vec),
-        # Out:
-        shared: wp.array2d(dtype=vec),
-        adj_f: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
-        adj_inputs: GridInputsAdj,
-    ):
-        world, i = wp.tid()
-        settle_adj_at(
-            world,
-            i,
-            constants,
-            inputs,
-            inside,
-            mass,
-            held,
-            shift,
-            u,
-            v,
-            p,
-            new_v,
-            pending,
-            partial_u,
-            partial_v,
-            adj_u,
-            adj_v,
-            free,
-            shared,
-            adj_f,
-            adj_mass,
-            adj_inputs,
-        )
+            moved_adj(world, i, constants, inputs, inside, at, bar, adj_inputs, s, adj)
 
     @wp.func
     def press_adj_at(
         world: int,
         p: int,
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         body: Surface,
-        smoothing: real,
-        D: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        rate: wp.array(dtype=real),  # 1/T
-        anew: int,  # 1 at the beginning of a control step
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        anchor: wp.array3d(dtype=vec),
-        shared: wp.array2d(dtype=vec),
-        # In and out:
-        adj_force: wp.array3d(dtype=vec),
-        adj_anchor: wp.array3d(dtype=vec),
-        # Out:
-        adj_x: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_D: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
+        anew: int,  # 1 if a control step begins
     ):
+        """(K7.adj), and (K4.adj), (K3.adj), (K6.adj) from the last wall to the first."""
+        u = at.u[s]
+        anchor = at.anchor[s]
         x = present(body, p, at_point(body, u, world, p))
-        v = at_point(body, free, world, p)
-        dv = D[world, p]
+        v = at_point(body, at.free, world, p)
+        dv = at.D[world, p]
         stiffness = body.stiffness[p]
-        per_force = rate[0] * body.newtons[p]
-        wall = faces_of(constants, inputs, anchor, world, p, x + shift[world])
+        per_force = at.rate[0] * body.newtons[p]
+        wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[s, world])
         before = vecs()
         adj_after = vecs()
         pushed = vecs()
         for q in range(count):
             before[q] = anchor[world, q, p]
-            adj_after[q] = adj_anchor[world, q, p]
-            pushed[q] = adj_force[world, q, p]
-        adj_J = body.areas[p] * at_point(body, shared, world, p)
+            adj_after[q] = bar.anchor[world, q, p]
+            pushed[q] = bar.force[world, q, p]
+        adj_J = body.areas[p] * at_point(body, bar.shared, world, p)
         reached = vecs()
         for q in range(count):
             reached[q] = v
@@ -221,14 +117,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 wall.friction[q],
                 stiffness,
                 constants.dt,
-                smoothing,
+                body.width,
             )
             v += dv * found.J
         back_x = vec()
         back_v = vec()
         total_D = real(0.0)
         after = v
-        i = world * held + p
+        i = world * bar.held + p
         for back in range(count):
             q = count - 1 - back
             k = number[q]
@@ -243,186 +139,91 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 wall.friction[q],
                 stiffness,
                 constants.dt,
-                smoothing,
+                body.width,
                 adj_J + dv * back_v + per_force * pushed[q],
                 adj_after[q],
             )
             total_D += wp.dot(after - here, back_v) / dv + adj.D
             back_v += adj.v
             back_x += adj.x
-            adj_anchor[world, q, p] = face_adj(
+            bar.anchor[world, q, p] = face_adj(
                 constants, inputs, world, k, before[q], adj.n, adj.y, adj.anchor, i, adj_inputs
             )
             if anew == 1:  # the mean before is dropped
-                adj_force[world, q, p] = vec()
+                bar.force[world, q, p] = vec()
             if wp.static("friction" in wanted):
                 adj_inputs.friction[k, i] = adj_inputs.friction[k, i] + adj.friction
             after = here
-        adj_x[world, p] = back_x
-        adj_v[world, p] = back_v
-        adj_D[world, p] = adj_D[world, p] + total_D
-
-    @wp.kernel(module=module, enable_backward=False)
-    def press_adj(
-        # Parameters:
-        constants: Constants,
-        inputs: GridInputs,
-        body: Surface,
-        smoothing: real,
-        D: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        rate: wp.array(dtype=real),  # 1/T
-        anew: int,  # 1 at the beginning of a control step
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        free: wp.array2d(dtype=vec),
-        anchor: wp.array3d(dtype=vec),
-        shared: wp.array2d(dtype=vec),
-        # In and out:
-        adj_force: wp.array3d(dtype=vec),
-        adj_anchor: wp.array3d(dtype=vec),
-        # Out:
-        adj_x: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_D: wp.array2d(dtype=real),
-        adj_inputs: GridInputsAdj,
-    ):
-        world, p = wp.tid()
-        press_adj_at(
-            world,
-            p,
-            constants,
-            inputs,
-            body,
-            smoothing,
-            D,
-            held,
-            rate,
-            anew,
-            shift,
-            u,
-            free,
-            anchor,
-            shared,
-            adj_force,
-            adj_anchor,
-            adj_x,
-            adj_v,
-            adj_D,
-            adj_inputs,
-        )
+        bar.x[world, p] = back_x
+        bar.free[world, p] = back_v
+        bar.D[world, p] = bar.D[world, p] + total_D
 
     @wp.func
     def spread_adj_at(
         world: int,
         n: int,
         lane: int,
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
         body: Surface,
-        mass: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        step: int,  # threads of a node
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        adj_x: wp.array2d(dtype=vec),
-        adj_free: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out:
-        adj_f: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
     ):
         """(K2.adj), then (Q3.adj), at the nodes that surface points act on; the adjoint of constraints comes between."""
         i = body.nodes[n]
-        more_u = from_points(body, adj_x, world, n, lane, step)
-        more_v = from_points(body, adj_free, world, n, lane, step)
+        more_u = from_points(body, bar.x, world, n, lane)
+        more_v = from_points(body, bar.free, world, n, lane)
         if lane == 0:
-            adj_u[world, i] = adj_u[world, i] + more_u
-            adj_new = adj_v[world, i] + more_v
+            bar.u[world, i] = bar.u[world, i] + more_u
+            adj_new = bar.v[world, i] + more_v
             if wp.static(constrained):
-                adj_v[world, i] = adj_new
+                bar.v[world, i] = adj_new
             else:
-                moved_adj(
-                    constants,
-                    inputs,
-                    inside,
-                    mass,
-                    held,
-                    shift,
-                    u,
-                    v,
-                    p,
-                    world,
-                    i,
-                    adj_new,
-                    adj_u,
-                    adj_v,
-                    adj_f,
-                    adj_mass,
-                    adj_inputs,
-                )
+                moved_adj(world, i, constants, inputs, inside, at, bar, adj_inputs, s, adj_new)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def settle_adj(
+        constants: Constants,
+        inputs: GridInputs,
+        inside: Rest,
+        at: Chunk,
+        bar: Adjoint,
+        adj_inputs: GridInputsAdj,
+        s: int,
+    ):
+        world, i = wp.tid()
+        settle_adj_at(world, i, constants, inputs, inside, at, bar, adj_inputs, s)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def press_adj(
+        constants: Constants,
+        inputs: GridInputs,
+        body: Surface,
+        at: Chunk,
+        bar: Adjoint,
+        adj_inputs: GridInputsAdj,
+        s: int,
+        anew: int,
+    ):
+        world, p = wp.tid()
+        press_adj_at(world, p, constants, inputs, body, at, bar, adj_inputs, s, anew)
 
     @wp.kernel(module=module, enable_backward=False)
     def spread_adj(
-        # Parameters:
         constants: Constants,
         inputs: GridInputs,
         inside: Rest,
         body: Surface,
-        mass: wp.array2d(dtype=real),
-        held: int,  # accumulators of one world
-        step: int,  # threads of a node
-        # In:
-        shift: wp.array(dtype=exact_vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
-        adj_x: wp.array2d(dtype=vec),
-        adj_free: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out:
-        adj_f: wp.array2d(dtype=vec),
-        # Out, added into:
-        adj_mass: wp.array2d(dtype=real),
+        at: Chunk,
+        bar: Adjoint,
         adj_inputs: GridInputsAdj,
+        s: int,
     ):
         world, n, lane = wp.tid()
-        spread_adj_at(
-            world,
-            n,
-            lane,
-            constants,
-            inputs,
-            inside,
-            body,
-            mass,
-            held,
-            step,
-            shift,
-            u,
-            v,
-            p,
-            adj_x,
-            adj_free,
-            adj_u,
-            adj_v,
-            adj_f,
-            adj_mass,
-            adj_inputs,
-        )
+        spread_adj_at(world, n, lane, constants, inputs, inside, body, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus_adj(

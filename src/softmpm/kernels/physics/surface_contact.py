@@ -73,8 +73,9 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
         v_t = across(n, v)
         out = Touch()
         out.anchor = x_t + dt * v_t
-        P = hinge(-(y + dt * wp.dot(n, v)), s) / (dt * D)  # (K3)
-        if P > real(0.0):
+        pressed = hinge(-(y + dt * wp.dot(n, v)), s)
+        if pressed > real(0.0):  # no division for the many points that are not
+            P = pressed / (dt * D)  # (K3)
             T = (-k * dt / (real(1.0) + D * k * dt * dt)) * (x_t + dt * v_t - anchor)  # (K4)
             out.anchor = anchor
             size = wp.length(T)
@@ -105,9 +106,11 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
         adj_x = adj_next
         adj_v = dt * adj_next
         d = -(y + dt * wp.dot(n, v))
-        P = hinge(d, s) / (dt * D)
+        pressed = hinge(d, s)
+        P = real(0.0)
         adj_y = real(0.0)
-        if P > real(0.0):
+        if pressed > real(0.0):
+            P = pressed / (dt * D)
             c = k * dt / (real(1.0) + D * k * dt * dt)
             e = x_t + dt * v_t - anchor
             T = -c * e

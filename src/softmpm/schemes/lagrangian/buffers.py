@@ -1,12 +1,14 @@
 """Buffers of a chunk of the reference formulation, forward and adjoint."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
+from softmpm.kernels.lagrangian.chunk import chunk as memory
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
@@ -62,14 +64,26 @@ class ChunkBuffers:
         self.placed_mass = view(self.inputs.values["mass"], real)
         self.words_array = view(self.words, wp.int64)
         self.contact = self.reflection = None
+        self.struct = self._struct()
         if model.surface is not None:
-            self.contact = SurfaceContact(model, chunk, self.mass, self.anchor, self.shift, self.force)
+            self.contact = SurfaceContact(model, chunk)
+            self.contact.add_to(self.struct)
         if model.mirror is not None:
             self.reflection = Reflection(model, self.mass)
         self.overlap = None if model.overlap is None else OverlapCheck(model)
 
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
+
+    def _struct(self) -> Any:
+        """Struct of the memory, as kernels see it."""
+        t, exact = self.types, types(self.model.spec.dim, "float64").vec
+        struct = memory(self.model.spec.dim, self.model.spec.dtype).Chunk()
+        struct.length, struct.keep = self.chunk.length, int(self.keep)
+        struct.words, struct.mass, struct.shift = self.words_array, self.mass_array, view(self.shift, exact)
+        for name in ("partial", "u", "v", "p", "anchor", "force"):
+            setattr(struct, name, view(getattr(self, name), t.vec))
+        return struct
 
     @property
     def bytes(self) -> int:
@@ -171,8 +185,20 @@ class ChunkAdjoint:
             given = shared.wanted, forward.words_array, shared.mass_array
             self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
-            given = shared.wanted, shared.held, shared.anchor, shared.force, shared.mass_array
-            self.contact = SurfaceContactAdj(forward.contact, *given, forward.words_array)
+            self.contact = SurfaceContactAdj(forward.contact, shared.wanted)
+        self.struct = self._struct()
+
+    def _struct(self) -> Any:
+        """Struct of the adjoints, as kernels see them."""
+        shared, t = self.shared, self.forward.types
+        struct = memory(self.model.spec.dim, self.model.spec.dtype).Adjoint()
+        struct.held, struct.mass = shared.held, shared.mass_array
+        struct.partial_u, struct.partial_v = shared.partial_arrays
+        for name in ("u", "v", "f", "anchor", "force"):
+            setattr(struct, name, view(getattr(shared, name), t.vec))
+        if self.contact is not None:
+            self.contact.add_to(struct)
+        return struct
 
     def load(self, adj_end: Nodal) -> None:
         """Copy the adjoint of the final state into the buffers, and clear all sums."""

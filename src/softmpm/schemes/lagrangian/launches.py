@@ -1,5 +1,9 @@
 """Launches of a chunk of the reference formulation, forward and adjoint, in their order."""
 
+from typing import Any
+
+import warp as wp
+
 from softmpm.kernels.lagrangian.cells import cells, cells_adj
 from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
@@ -23,7 +27,7 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     masses = buffers.placed_mass, buffers.partial_array, buffers.mass_array
     launch_masses(model, launch, buffers.rest, *masses)
     if buffers.contact is not None:
-        buffers.contact.begin(launch)
+        buffers.contact.begin(launch, buffers.struct)
     cluster, checked = cluster_of(model), model.alarms.step is not None
     for first, last in segments(buffers.chunk, CHECKED if checked else buffers.chunk.length):
         if checked and first % CHECKED == 0:
@@ -40,7 +44,8 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     kernel, u = cells(model.spec, model.rest_grid.bricks).check_end, buffers.u_arrays[buffers.index(last)]
     if buffers.contact is not None:
         inputs = buffers.inputs.grid_struct(last - 1)
-        buffers.contact.check_end(launch, inputs, last - 1, buffers.index(last), u, buffers.words_array)
+        shift = buffers.shift_arrays[buffers.index(last)]
+        buffers.contact.check_end(launch, inputs, last - 1, shift, u, buffers.words_array)
     brick_launch(model, launch, kernel, model.constants, buffers.rest, last - 1, u, buffers.words_array)
     if buffers.overlap is not None:
         buffers.overlap.check(launch, last - 1, u, buffers.words_array)
@@ -56,40 +61,40 @@ def _check_step(buffers: ChunkBuffers, s: int, state: int, launch: KernelLaunche
 
 def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Internal and external forces of substep ``s`` on the nodes of each brick."""
-    model, now = buffers.model, buffers.index(s)
-    inputs, bricks = buffers.inputs.particle_struct(s, s), model.rest_grid.bricks
-    state = buffers.u_arrays[now], buffers.v_arrays[now]
-    arguments = (s, *state, buffers.words_array, buffers.partial_array)
+    model, bricks = buffers.model, buffers.model.rest_grid.bricks
+    parameters, out = (
+        (model.constants, buffers.inputs.particle_struct(s, s), buffers.rest),
+        (buffers.struct, s),
+    )
     if bricks.lattice:
-        parameters = (model.constants, inputs, buffers.rest, lattice_struct(model))
-        kernel = lattice_cells(model.spec, bricks).forces
-        brick_launch(model, launch, kernel, *parameters, *arguments, layered=True)
+        kernel, lattice = lattice_cells(model.spec, bricks).forces, lattice_struct(model)
+        brick_launch(model, launch, kernel, *parameters, lattice, *out, layered=True)
     else:
-        kernel = cells(model.spec, bricks).forces
-        brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
+        brick_launch(model, launch, cells(model.spec, bricks).forces, *parameters, *out)
 
 
 def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Motion of the nodes in substep ``s``, with contact."""
-    model, now, then = buffers.model, buffers.index(s), buffers.index(s + 1)
-    inputs, contact = buffers.inputs.grid_struct(s), buffers.contact
-    state = buffers.u_arrays[now], buffers.v_arrays[now]
-    new = buffers.u_arrays[then], buffers.v_arrays[then]
-    p = buffers.p_arrays[s if buffers.keep else 0]
-    velocity = new[1] if contact is None else contact.free
-    sums = buffers.mass_array, buffers.partial_array, buffers.words_array
-    shift, new_shift = buffers.shift_arrays[now], buffers.shift_arrays[then]
-    parameters = (model.constants, inputs, buffers.rest, buffers.frame)
-    arguments = (*parameters, *sums, shift, *state, p, velocity, new_shift, *new)
-    node_launch(model, launch, nodes(model.spec).advance, *arguments)
+    model, inputs, at = buffers.model, buffers.inputs.grid_struct(s), buffers.struct
+    node_launch(
+        model, launch, nodes(model.spec).advance, model.constants, inputs, buffers.rest, buffers.frame, at, s
+    )
+    _constrain(buffers, s, inputs, None if buffers.contact is None else at.free, launch)
+    if buffers.contact is not None:
+        buffers.contact.advance(launch, inputs, at, s)
+        _constrain(buffers, s, inputs, None, launch)
+
+
+def _constrain(
+    buffers: ChunkBuffers, s: int, inputs: Any, velocity: wp.array | None, launch: KernelLauncher
+) -> None:
+    """Constraints of nodes in substep ``s``, for the new velocity or for that without contact."""
+    now, then = buffers.index(s), buffers.index(s + 1)
+    u, new_u = buffers.u_arrays[now], buffers.u_arrays[then]
+    velocity = buffers.v_arrays[then] if velocity is None else velocity
     if buffers.reflection is not None:
-        buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
-    drive(model, launch, inputs, buffers.words_array, state[0], new[0], velocity)
-    if contact is not None:
-        contact.advance(launch, s, inputs, buffers.words_array, now, then, *state, *new)
-        if buffers.reflection is not None:
-            buffers.reflection.advance(launch, buffers.words_array, state[0], new[1], new[0])
-        drive(model, launch, inputs, buffers.words_array, state[0], *new)
+        buffers.reflection.advance(launch, buffers.words_array, u, velocity, new_u)
+    drive(buffers.model, launch, inputs, buffers.words_array, u, new_u, velocity)
 
 
 def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
@@ -108,7 +113,7 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
                 _forces_adj(adjoint, s, launch)
         adjoint.found.collect(chunk.row(first), forward.inputs.values, launch)
     if adjoint.contact is not None:
-        adjoint.contact.finish(launch)
+        adjoint.contact.finish(launch, forward.struct, adjoint.struct)
     if adjoint.adj_placed_mass is not None:
         kernel = masses(model.spec.dim, model.spec.dtype, model.rest_grid.bricks).masses_adj
         brick_launch(model, launch, kernel, forward.rest, shared.mass_array, adjoint.adj_placed_mass)
@@ -117,60 +122,40 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
 def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     """Adjoint of the motion of the nodes in substep ``s``."""
     forward, shared = adjoint.forward, adjoint.shared
-    model, row = forward.model, forward.chunk.row(s)
-    inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(row)
-    stored, new_v = (forward.u_arrays[s], forward.v_arrays[s], forward.p_arrays[s]), forward.v_arrays[s + 1]
-    shift, out, sums = (
-        forward.shift_arrays[s],
-        (shared.u_array, shared.v_array),
-        (shared.f_array, shared.mass_array),
-    )
-    last, reflection, constrained = s == forward.chunk.length - 1, adjoint.reflection, model.spec.constrained
-    pending = (not last and not constrained, shared.partial_arrays[0], shared.partial_arrays[1])
-    drive_adj(model, launch, shared.wanted, model.scene.dt, *out, adj_inputs)
+    model, reflection = forward.model, adjoint.reflection
+    inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
+    given, out = (inputs, forward.rest), (forward.struct, adjoint.struct, adj_inputs, s)
+    state = shared.u_array, shared.v_array
+    drive_adj(model, launch, shared.wanted, model.scene.dt, *state, adj_inputs)
     if reflection is not None:
-        reflection.begin(launch, inputs, forward.rest, stored[0], stored[2], new_v, *out)
+        stored = forward.u_arrays[s], forward.p_arrays[s], forward.v_arrays[s + 1]
+        reflection.begin(launch, *given, *stored, *state)
     if adjoint.contact is not None:
-        given = inputs, adj_inputs, forward.rest, stored, new_v, pending
-        adjoint.contact.advance(launch, s, *given, *out, shared.f_array)
-        drive_adj(model, launch, shared.wanted, 0.0, *out, adj_inputs)
+        adjoint.contact.advance(launch, *given, *out, forward.u_arrays[s])
+        drive_adj(model, launch, shared.wanted, 0.0, *state, adj_inputs)
     if reflection is not None:
-        reflection.finish(launch, *out)
-    if adjoint.contact is None or constrained:
-        parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held, shift)
+        reflection.finish(launch, *state)
+    if adjoint.contact is None or model.spec.constrained:
         kernel = nodes_adj(model.spec, shared.wanted).advance_adj
-        node_launch(model, launch, kernel, *parameters, *stored, *pending, *out, *sums, adj_inputs)
+        node_launch(model, launch, kernel, model.constants, *given, *out)
 
 
 def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     """Adjoint of the forces of substep ``s``."""
-    forward, shared = adjoint.forward, adjoint.shared
-    model, row = forward.model, forward.chunk.row(s)
-    inputs, adj_inputs = forward.inputs.particle_struct(s, s), adjoint.found.particle_struct(row, row)
-    parameters, bricks = (model.constants, inputs, forward.rest), model.rest_grid.bricks
-    state = (forward.u_arrays[s], forward.v_arrays[s], shared.f_array)
-    arguments = (
-        forward.chunk.length - 1 - s,
-        *state,
-        forward.words_array,
-        adj_inputs,
-        *shared.partial_arrays,
-    )
+    forward, wanted, row = adjoint.forward, adjoint.shared.wanted, adjoint.forward.chunk.row(s)
+    model, bricks = forward.model, forward.model.rest_grid.bricks
+    parameters = (model.constants, forward.inputs.particle_struct(s, s), forward.rest)
+    out = (forward.struct, adjoint.struct, adjoint.found.particle_struct(row, row), s)
     if bricks.lattice:
-        kernel, lattice = (
-            lattice_cells_adj(model.spec, shared.wanted, bricks).forces_adj,
-            lattice_struct(model),
-        )
-        brick_launch(model, launch, kernel, *parameters, lattice, *arguments, layered=True)
+        kernel, lattice = lattice_cells_adj(model.spec, wanted, bricks).forces_adj, lattice_struct(model)
+        brick_launch(model, launch, kernel, *parameters, lattice, *out, layered=True)
     else:
-        kernel = cells_adj(model.spec, shared.wanted, bricks).forces_adj
-        brick_launch(model, launch, kernel, *parameters, *arguments)
+        brick_launch(model, launch, cells_adj(model.spec, wanted, bricks).forces_adj, *parameters, *out)
     if s == 0 or model.spec.constrained:  # else the substep before adds the sums
         _gather_adj(adjoint, launch)
 
 
 def _gather_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     """Add the sums of the bricks to the adjoint of the state."""
-    model, shared = adjoint.model, adjoint.shared
-    kernel, out = nodes_adj(model.spec, shared.wanted).gather_adj, (shared.u_array, shared.v_array)
-    node_launch(model, launch, kernel, adjoint.forward.rest, *shared.partial_arrays, *out)
+    kernel = nodes_adj(adjoint.model.spec, adjoint.shared.wanted).gather_adj
+    node_launch(adjoint.model, launch, kernel, adjoint.forward.rest, adjoint.struct)

@@ -36,6 +36,8 @@ def surface_struct(model: Model):
     struct.areas = view(areas.to(model.dtype), t.real)
     for name in ("loads", "weights", "shares"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
+    struct.width = model.contact_width * model.scene.grid.spacing
+    struct.lanes = LANES[model.dim] if model.device.type == "cuda" else 1
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
     struct.newtons = view(areas.to(model.dtype) * model.mass_unit, t.real)
     struct.deepest = view(limit.to(model.dtype), t.real)
@@ -47,95 +49,53 @@ def surface_struct(model: Model):
 class SurfaceContact:
     """Contact of the surface points with the separating walls, from the velocity without it to the new state.
 
-    Args:
-        chunk: Substeps that it takes part in.
-        mass: Masses of the nodes, shape (world, node).
-        anchors: Anchors of each stored state, shape (state, world, wall, point, dim).
-        shifts: Translation of each stored state, shape (state, world, dim).
-        force: Mean forces in the control step so far [N], shape (world, wall, point, dim); updated in place.
-
     Attributes:
+        struct: Struct on the surface points.
         free: Nodal velocities without contact.
         rate: 1/T, T being the duration of a control step [1/s], shape (1,): calls whose chunks have one shape may differ in it.
+        impulse, D: Impulse and mobility of each point.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        chunk: Chunk,
-        mass: Tensor,
-        anchors: Tensor,
-        shifts: Tensor,
-        force: Tensor,
-    ):
-        self.model, self.chunk, self.anchors = model, chunk, anchors
-        self._frame, exact = frame_struct(model), types(model.spec.dim, "float64").vec
-        self.shifts = [view(one, exact) for one in shifts]
-        self.rate = torch.empty(1, dtype=model.dtype, device=model.device)
-        self.nodes, self.points = tuple(mass.shape), (model.worlds, anchors.shape[3])
+    def __init__(self, model: Model, chunk: Chunk):
+        self.model, self.chunk, self._frame = model, chunk, frame_struct(model)
         assert isinstance(model.surface, SurfaceGrid)
-        self.lanes = LANES[model.dim] if model.device.type == "cuda" else 1
-        self.touched = (model.worlds, len(model.surface.nodes), self.lanes)
-        self._vec, self._real = (
-            getattr(types(model.spec.dim, model.spec.dtype), name) for name in ("vec", "real")
+        self.struct, self.nodes = surface_struct(model), (model.worlds, model.rest_grid.count)
+        self.points = (model.worlds, model.anchor_shape[2])
+        self.touched = (model.worlds, len(model.surface.nodes), self.struct.lanes)
+        self.rate, D = self.tensor(1), self.tensor(*self.points)
+        self.free, self.impulse = self.vectors(self.nodes), self.vectors(self.points)
+        self.D, self.rate_array = (
+            view(one, types(model.spec.dim, model.spec.dtype).real) for one in (D, self.rate)
         )
-        self.struct, self._mass = surface_struct(model), view(mass, self._real)
-        self._force, self.rate_array = view(force, self._vec), view(self.rate, self._real)
-        self.width = model.contact_width * model.scene.grid.spacing
-        self.free = self._vectors(self.nodes)
-        self.impulse = self._vectors(self.points)
-        self.D = view(torch.empty(self.points, dtype=model.dtype, device=model.device), self._real)
 
-    def _vectors(self, lead: tuple[int, ...]) -> wp.array:
-        model = self.model
-        return view(torch.empty(*lead, model.dim, dtype=model.dtype, device=model.device), self._vec)
+    def tensor(self, *shape: int) -> Tensor:
+        return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
 
-    def begin(self, launch: Callable[..., None]) -> None:
+    def vectors(self, lead: tuple[int, ...]) -> wp.array:
+        return view(self.tensor(*lead, self.model.dim), types(self.model.spec.dim, self.model.spec.dtype).vec)
+
+    def add_to(self, at: Any) -> None:
+        """Set the fields of contact in the struct of the chunk's memory."""
+        at.rate, at.D, at.free, at.impulse = self.rate_array, self.D, self.free, self.impulse
+
+    def begin(self, launch: Callable[..., None], at: Any) -> None:
         """Launch what depends on the masses only."""
-        launch(
-            surface(self.model.spec).delassus, self.points, self.struct, self._mass, self.D, part=POINT_PART
-        )
+        launch(surface(self.model.spec).delassus, self.points, self.struct, at.mass, at.D, part=POINT_PART)
 
-    def advance(
-        self,
-        launch: Callable[..., None],
-        s: int,
-        inputs: Any,
-        words: wp.array,
-        now: int,
-        then: int,
-        u: wp.array,
-        v: wp.array,
-        new_u: wp.array,
-        new_v: wp.array,
-    ) -> None:
-        """Substep ``s``, from :attr:`free` and the state before to that after; ``now`` and ``then`` count their anchors."""
-        model, kernels = self.model, surface(self.model.spec)
-        anchors = [view(self.anchors[k], self._vec) for k in (now, then)]
-        about = (s, self.rate_array, self.chunk.anew(s))
-        parameters = (model.constants, inputs, self.struct, self._frame, self.width, self.D, *about)
-        arguments = (
-            self.shifts[now],
-            u,
-            self.free,
-            anchors[0],
-            words,
-            self._force,
-            self.impulse,
-            anchors[1],
-        )
-        launch(kernels.press, self.points, *parameters, *arguments, part=POINT_PART)
-        about = (self.struct, self._frame, self._mass, self.lanes, self.impulse, words)
-        arguments = (u, v, self.free, new_u, new_v)
-        launch(kernels.settle, self.touched, model.constants, *about, *arguments, part=NODE_PART)
+    def advance(self, launch: Callable[..., None], inputs: Any, at: Any, s: int) -> None:
+        """Substep ``s``, from the velocities without contact and the state before to that after."""
+        constants, kernels = self.model.constants, surface(self.model.spec)
+        arguments = (constants, inputs, self.struct, self._frame, at, s, self.chunk.anew(s))
+        launch(kernels.press, self.points, *arguments, part=POINT_PART)
+        launch(kernels.settle, self.touched, constants, self.struct, self._frame, at, s, part=NODE_PART)
 
     def check_end(
-        self, launch: Callable[..., None], inputs: Any, s: int, end: int, u: wp.array, words: wp.array
+        self, launch: Callable[..., None], inputs: Any, s: int, shift: wp.array, u: wp.array, words: wp.array
     ) -> None:
-        """Check the depth of the points in state ``end`` after substep ``s``, whose inputs are given."""
+        """Check the depth of the points in the state after substep ``s``, whose inputs are given."""
         kernel, about = surface(self.model.spec).check_depth, (self.model.scene.dt, s)
         parameters = (self.model.constants, inputs, self.struct, *about)
-        launch(kernel, self.points, *parameters, self.shifts[end], u, words, part=POINT_PART)
+        launch(kernel, self.points, *parameters, shift, u, words, part=POINT_PART)
 
 
 def check_start(
@@ -148,79 +108,48 @@ def check_start(
 
 
 class SurfaceContactAdj:
-    """Adjoint of :class:`SurfaceContact`.
+    """Adjoint of :class:`SurfaceContact`."""
 
-    Args:
-        held: Accumulators of one world in the structs of the inputs' adjoints.
-        adj_anchor, adj_force: Adjoints of the anchors and of the mean forces, updated in place.
-        adj_mass: Adjoint of the masses of the nodes, added into.
-        words: Status words, all of them of worlds that run.
-    """
+    def __init__(self, forward: SurfaceContact, wanted: RequestedGrads):
+        self.forward, self._kernels = forward, surface_adj(forward.model.spec, wanted)
+        self._shared = forward.vectors(forward.nodes)
+        self._scratch = forward.vectors(forward.nodes) if forward.model.driven_grid else self._shared
+        self._x, self._free = forward.vectors(forward.points), forward.vectors(forward.points)
+        self._D = forward.tensor(*forward.points)
 
-    def __init__(
-        self,
-        forward: SurfaceContact,
-        wanted: RequestedGrads,
-        held: int,
-        adj_anchor: Tensor,
-        adj_force: Tensor,
-        adj_mass: wp.array,
-        words: wp.array,
-    ):
-        self.forward, self.held, self._adj_mass = forward, held, adj_mass
-        self._kernels = surface_adj(forward.model.spec, wanted)
-        self.adj_anchor, self.adj_force = view(adj_anchor, forward._vec), view(adj_force, forward._vec)
-        self.shared, self._words = forward._vectors(forward.nodes), words
-        self._scratch = forward._vectors(forward.nodes) if forward.model.driven_grid else self.shared
-        self.adj_x, self.adj_free = forward._vectors(forward.points), forward._vectors(forward.points)
-        model = forward.model
-        self._total_D = torch.empty(forward.points, dtype=model.dtype, device=model.device)
-        self.adj_D = view(self._total_D, forward._real)
+    def add_to(self, bar: Any) -> None:
+        """Set the fields of contact in the struct of the adjoints, except for those of the state."""
+        bar.shared, bar.x, bar.free = self._shared, self._x, self._free
+        bar.D = view(self._D, types(self.forward.model.spec.dim, self.forward.model.spec.dtype).real)
 
     def clear(self) -> None:
         """Set all sums to zero."""
-        clear(self._total_D)
+        clear(self._D)
 
     def advance(
         self,
         launch: Callable[..., None],
-        s: int,
         inputs: Any,
-        adj_inputs: Any,
         rest: Any,
-        stored: tuple[wp.array, ...],
-        new_v: wp.array,
-        pending: tuple[bool, wp.array, wp.array],
-        adj_u: wp.array,
-        adj_v: wp.array,
-        adj_f: wp.array,
+        at: Any,
+        bar: Any,
+        adj_inputs: Any,
+        s: int,
+        u: wp.array,
     ) -> None:
         """Adjoint of substep ``s``, from that of the new state to those of the forces and of the state before; with constraints of
-        nodes to that of the velocity without contact, in ``adj_v``.
+        nodes to that of the velocity without contact, in v̄. ``u`` are the displacements before the substep."""
+        one = self.forward
+        constants, out = one.model.constants, (at, bar, adj_inputs, s)
+        launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, *out, part=NODE_PART)
+        drive(one.model, launch, inputs, at.words, u, self._scratch, one.free)
+        arguments = (constants, inputs, one.struct, *out, one.chunk.anew(s))
+        launch(self._kernels.press_adj, one.points, *arguments, part=POINT_PART)
+        arguments = (constants, inputs, rest, one.struct, *out)
+        launch(self._kernels.spread_adj, one.touched, *arguments, part=NODE_PART)
 
-        Args:
-            stored: Displacements, velocities and momenta of the nodes.
-            pending: See :mod:`softmpm.kernels.lagrangian.nodes`.
-        """
-        one, shift = self.forward, self.forward.shifts[s]
-        constants, adj_points = one.model.constants, (self.adj_x, self.adj_free)
-        out = (self._adj_mass, adj_inputs)
-        parameters = (constants, inputs, rest, one._mass, self.held, shift, *stored, new_v, *pending)
-        arguments = (adj_u, adj_v, one.free, self.shared, adj_f, *out)
-        launch(self._kernels.settle_adj, one.nodes, *parameters, *arguments, part=NODE_PART)
-        drive(one.model, launch, inputs, self._words, stored[0], self._scratch, one.free)
-        about = (self.held, one.rate_array, one.chunk.anew(s))
-        parameters = (constants, inputs, one.struct, one.width, one.D, *about)
-        anchors = view(one.anchors[s], one._vec)
-        arguments = (shift, stored[0], one.free, anchors, self.shared, self.adj_force, self.adj_anchor)
-        arguments = (*arguments, *adj_points, self.adj_D, adj_inputs)
-        launch(self._kernels.press_adj, one.points, *parameters, *arguments, part=POINT_PART)
-        parameters = (constants, inputs, rest, one.struct, one._mass, self.held, one.lanes, shift, *stored)
-        arguments = (*adj_points, adj_u, adj_v, adj_f, *out)
-        launch(self._kernels.spread_adj, one.touched, *parameters, *arguments, part=NODE_PART)
-
-    def finish(self, launch: Callable[..., None]) -> None:
+    def finish(self, launch: Callable[..., None], at: Any, bar: Any) -> None:
         """Add what the mobility D of all substeps gives to the masses."""
         one = self.forward
-        arguments = (one.struct, one._mass, self.adj_D, self._adj_mass)
+        arguments = (one.struct, at.mass, bar.D, bar.mass)
         launch(self._kernels.delassus_adj, one.touched[:2], *arguments, part=NODE_PART)
