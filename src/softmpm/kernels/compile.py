@@ -56,6 +56,14 @@ def launch(kernel, dim, inputs: Sequence, device: wp.Device, **settings):
         return launched
 
 
+def clusters_are_launchable(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> bool:
+    """True if the device has clusters of as many blocks as the kernel asks for."""
+    if not device.is_cuda or device.arch < 90:
+        return False
+    with _lock:
+        return wp.get_cuda_max_cluster_dim(kernel, device, block_dim=block_dim) > 1
+
+
 def _launch_in_order(kernel, dim, inputs: Sequence, stream: wp.Stream, **settings):
     """Launch a kernel of a module of :func:`in_order`.
 

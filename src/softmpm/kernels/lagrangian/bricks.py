@@ -77,6 +77,15 @@ class Bricks(NamedTuple):
     def nodes(self) -> int:
         return math.prod(self.window)
 
+    def shared_bytes(self, number: int) -> int:
+        """Bytes of shared memory of the adjoint kernel with viscosity, the largest, for numbers of this size (bricks.h)."""
+        fields = 3 * self.nodes * (2 if self.dim == 2 else 4)
+        if self.lattice:
+            planes = 3 * self.parts * self.nodes * (2 if self.dim == 2 else 4)
+        else:
+            planes = 3 * self.nodes * self.dim + (self.dim + 2) * self.dim * self.slots
+        return number * (fields + planes)
+
     @property
     def name(self) -> str:
         kind = "l" if self.lattice else "p"
@@ -120,7 +129,11 @@ def bricks_for(dim: int, particles: int, device: torch.device, dtype: torch.dtyp
 
 
 def brick_module(name: str, groups: int = 1) -> str:
-    """Set the compile options of the Warp module of this name, as native functions need them; returns the name."""
+    """Set the compile options of the Warp module of this name, as native functions need them; returns the name.
+
+    Args:
+        groups: Bricks that a block of threads has at a time.
+    """
     options = {
         "extra_build_options": in_parts(
             f"#define SOFTMPM_GROUPS {groups}\n" * (groups > 1) + HEADER.read_text(), FOURS_HEADER.read_text()

@@ -1,9 +1,8 @@
-"""Kernels that take all substeps of a control step in one launch, for small scenes on a GPU.
+"""One kernel for all substeps of a control step, for small scenes on a GPU.
 
-A cluster of blocks has a world; its multiprocessors wait for each other by a barrier of the hardware where the other form would begin
-a launch. The stages are the functions of the kernels of single launches: results are the same to the last bit.
-
-Groups of threads of a block have a brick each. On the CPU, for tests, one thread does everything.
+A cluster of blocks has a world. Where the launches of launches.py follow each other, its multiprocessors wait for each other at a
+barrier of the hardware, which takes half a microsecond. The stages are the functions of the kernels that are launched one by one, and
+the results have the same bits. On the CPU, for tests, one thread does everything.
 """
 
 from types import SimpleNamespace
@@ -19,22 +18,22 @@ from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj, layers
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import rest
-from softmpm.kernels.lagrangian.surface import surface, surface_type
+from softmpm.kernels.lagrangian.surface import LANES, surface, surface_type
 from softmpm.kernels.lagrangian.surface_adj import surface_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
 class Cluster(NamedTuple):
-    """Threads that have a world."""
+    """Blocks of threads that have a world."""
 
     bricks: Bricks
     blocks: int
-    """Blocks of the cluster."""
     groups: int
-    """Bricks that a block has at a time."""
+    """Groups of threads in a block; each has a brick."""
 
     @property
     def group_threads(self) -> int:
+        """Threads of a group."""
         return self.bricks.layer_threads if self.bricks.lattice else self.bricks.threads
 
     @property
@@ -66,7 +65,7 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
     press_at = surface(spec).press_at if contact else None
     settle_at = surface(spec).settle_at if contact else None
     size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    numbers = numbering(cluster)
+    numbers, lanes = numbering(cluster), 1 if bricks.serial else LANES[spec.dim]
     number, rounded = numbers.number, numbers.rounded
     module = brick_module(f"{spec.module}.lagrangian.{cluster.name}", groups)
 
@@ -103,9 +102,9 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
                     press_at(world, p, constants, grid_inputs, body, moving, at, s, begins)
                 meet_cluster()
                 count = body.nodes.shape[0]
-                for k in range(own, rounded(count * body.lanes), blocks * threads):
-                    n = wp.min(k / body.lanes, count - 1)
-                    settle_at(world, n, k - n * body.lanes, constants, body, moving, at, s)
+                for k in range(own, rounded(count * lanes), blocks * threads):
+                    n = wp.min(k / lanes, count - 1)
+                    settle_at(world, n, k - n * lanes, constants, body, moving, at, s)
                 meet_cluster()
 
     return march
@@ -127,7 +126,7 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
     press_adj_at = surface_adj(spec, wanted).press_adj_at if contact else None
     spread_adj_at = surface_adj(spec, wanted).spread_adj_at if contact else None
     size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    numbers = numbering(cluster)
+    numbers, lanes = numbering(cluster), 1 if bricks.serial else LANES[spec.dim]
     number, rounded = numbers.number, numbers.rounded
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{cluster.name}", groups)
 
@@ -161,9 +160,9 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     press_adj_at(world, p, constants, grid_inputs, body, at, bar, adj_grid_inputs, s, begins)
                 meet_cluster()
                 count = body.nodes.shape[0]
-                for k in range(own, rounded(count * body.lanes), blocks * threads):
-                    n = wp.min(k / body.lanes, count - 1)
-                    turn = k - n * body.lanes
+                for k in range(own, rounded(count * lanes), blocks * threads):
+                    n = wp.min(k / lanes, count - 1)
+                    turn = k - n * lanes
                     spread_adj_at(
                         world, n, turn, constants, grid_inputs, inside, body, at, bar, adj_grid_inputs, s
                     )

@@ -4,8 +4,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
-import torch
-
+from softmpm.kernels.compile import clusters_are_launchable
 from softmpm.kernels.lagrangian.lattice import layers
 from softmpm.kernels.lagrangian.persistent import Cluster, march, march_adj
 from softmpm.kernels.lagrangian.surface import surface_type
@@ -16,28 +15,29 @@ from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
 from softmpm.schemes.launch import KernelLauncher
 
 BLOCKS = 16
-"""Blocks of a cluster, the most that there are."""
-TURNS = 2
-"""Bricks that a group of threads has one after the other, at most."""
-THREADS = 512
-"""Of a block, at most."""
+"""Blocks of a cluster; a GPU of 132 multiprocessors has eight such clusters at a time."""
+THREADS, BYTES = 512, 46 * 1024
+"""Threads of a block, at most, and shared memory for their bricks: the compiler takes up to two kilobytes more."""
 WORLDS = 8
 
 
 def cluster_of(model: Model) -> Cluster | None:
-    """The threads that have a world, or None if there are too many bricks, or nodes are held, or no clusters of blocks."""
+    """The threads that have a world if they suffice for all its bricks at once; None else, and if nodes or walls are prescribed."""
+    return model.workspace.get(cluster_of, lambda: _cluster_of(model))
+
+
+def _cluster_of(model: Model) -> Cluster | None:
     grid, spec = model.rest_grid, model.spec
-    if spec.constrained or spec.moving or model.device.type != "cuda" or model.worlds > WORLDS:
-        return None
-    if torch.cuda.get_device_capability(model.device) < (9, 0):
+    if model.device.type != "cuda" or model.worlds > WORLDS or spec.constrained or spec.moving:
         return None
     one = Cluster(grid.bricks, BLOCKS, 1)
-    groups = 1
-    while groups * BLOCKS < grid.brick_count and 2 * groups * one.threads <= THREADS:
-        groups *= 2
-    if one.threads % 32 or grid.brick_count > TURNS * groups * BLOCKS:
+    most = min(THREADS // one.threads, BYTES // grid.bricks.shared_bytes(model.dtype.itemsize))
+    groups = next((n for n in (1, 2, 4, 8) if n * BLOCKS >= grid.brick_count), most + 1)
+    if groups > most or one.threads % 32:
         return None
-    return one._replace(groups=groups)
+    cluster = one._replace(groups=groups)
+    launchable = clusters_are_launchable(march(spec, cluster), model.wp_device, cluster.threads)
+    return cluster if launchable else None
 
 
 def segments(chunk: Chunk, longest: int) -> Iterator[tuple[int, int]]:
