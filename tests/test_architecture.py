@@ -18,7 +18,7 @@ LAYERS = """
     checks
     reference_stress reference_walls
     reference reference_step kernels.physics
-    reference_contact reference_driven reference_overlap
+    reference_contact reference_driven reference_overlap reference_mirror
     stability kernels.convert reference_lagrangian reference_moving_contact
     kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     rest_grid

@@ -42,6 +42,8 @@ class Sizes(Protocol):
     def rest_grid(self) -> Any: ...
     @property
     def anchor_shape(self) -> tuple[int, ...]: ...
+    @property
+    def reaction_shape(self) -> tuple[int, ...]: ...
     def shape_of(self, name: str, control_steps: int) -> tuple[int, ...]: ...
 
 
@@ -80,6 +82,8 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
     wanted_shapes = {"u": shape, "v": shape, "anchor": model.anchor_shape, "force": model.anchor_shape}
     for name, wanted in wanted_shapes.items():
         _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
+    if nodes.reaction is not None:
+        _check_tensor(model, "state.nodes.reaction", nodes.reaction, model.reaction_shape)
     if nodes.shift is not None:
         _check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
 

@@ -268,6 +268,11 @@ class Model:
         return self.worlds, len(self.spec.surface_walls), points, self.dim
 
     @property
+    def reaction_shape(self) -> tuple[int, ...]:
+        """Shape of the mean forces of clamps and planes of symmetry in a state."""
+        return self.worlds, 0 if self.mirror is None else self.mirror.count, self.dim
+
+    @property
     def rest_low(self) -> Tensor:
         """Remainders of rounding the rest positions [m], shape (particle, dim); zeros in float64."""
         return torch.zeros_like(self.positions) if self._low is None else self._low

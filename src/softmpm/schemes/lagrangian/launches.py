@@ -77,7 +77,9 @@ def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     arguments = (*parameters, *sums, shift, *state, p, velocity, new_shift, *new)
     node_launch(model, launch, nodes(model.spec).advance, *arguments)
     if buffers.reflection is not None:
-        buffers.reflection.advance(launch, buffers.words_array, state[0], velocity, new[0])
+        buffers.reflection.advance(
+            launch, buffers.words_array, state[0], velocity, new[0], buffers.chunk.anew(s)
+        )
     drive(model, launch, inputs, buffers.words_array, state[0], new[0], velocity)
     if contact is not None:
         contact.advance(launch, s, inputs, buffers.words_array, now, then, *state, *new)
@@ -123,7 +125,7 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         adjoint.contact.advance(launch, s, *given, *out, shared.f_array)
         drive_adj(model, launch, shared.wanted, 0.0, *out, adj_inputs)
     if reflection is not None:
-        reflection.finish(launch, *out)
+        reflection.finish(launch, forward.chunk.anew(s), *out)
     if adjoint.contact is None or constrained:
         parameters = (model.constants, inputs, forward.rest, forward.mass_array, shared.held, shift)
         kernel = nodes_adj(model.spec, shared.wanted).advance_adj
