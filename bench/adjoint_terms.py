@@ -27,7 +27,7 @@ STORES = {
 }
 """Calls that store a value, and the index of that argument."""
 ON_HOST = "from mutant import on_host as factor\n"
-IN_KERNELS = "from mutant import in_kernel as factor\nfrom softmpm.kernels.structs import types\n"
+IN_KERNELS = "from mutant import in_kernel as factor\n"
 """First lines of a source with factors."""
 INTEGERS = (
     *(
@@ -40,16 +40,10 @@ INTEGERS = (
         "node_index",
         "node_coordinates",
     ),
-    *(
-        "place_of",
-        "place",
-        "present",
-        "exact_vec",
-        "float64",
-    ),  # in float64, which a factor of the model's precision is not
+    *("place_of", "place", "present", "exact_vec"),
     *("coordinates", "offset", "range", "len", "law_of", "actuator_of"),
 )
-"""Calls that return integers, or numbers of another precision."""
+"""Calls that return integers, or places in float64, which decide between branches."""
 STRUCTS = (
     *(
         "moved_adj",
@@ -62,15 +56,25 @@ STRUCTS = (
         "slide_adj",
         "placed",
     ),
-    *("stress_adj_of", "active_stress_adj_of", "touch", "touch_adj"),
-    *("through_others", "after_all_walls_adj", "meet_adj", "response_adj", "face", "pose", "way_adj", "fit"),
+    *("stress_adj_of", "active_stress_adj_of", "forced_adj", "touch", "touch_adj"),
+    *(
+        "through_others",
+        "after_all_walls_adj",
+        "meet_adj",
+        "response_adj",
+        "face",
+        "faces_of",
+        "pose",
+        "way_adj",
+        "fit",
+    ),
 )
 """Calls that return structs, which cannot be multiplied by a factor; their fields are terms where they are used."""
 FIELDS = (
     *("shape", "count", "muscle", "base", "origin", "order", "places", "law", "driven", "actuator"),
-    *("particles", "first", "members", "stencil", "cell_nodes", "node_cells", "number"),
+    *("particles", "first", "members", "stencil", "cell_nodes", "node_cells", "number", "shift"),
 )
-"""Attributes and arrays of integers."""
+"""Attributes and arrays of integers or places."""
 COUNTS = ("count", "arms")
 """Constants of a factory that are integers."""
 
@@ -103,38 +107,15 @@ def terms_of(path: Path, file: str) -> list[Term]:
 
 
 def with_factors(source: str, terms: list[Term], first: int) -> str:
-    """The source with ``factor(k) * (term)`` for each term, k from ``first`` on, in the scalar type of the kernels."""
-    kernels = "@wp." in source
+    """The source with ``factor(k, term)`` for each term, k from ``first`` on."""
     openings, closings = collections.defaultdict(str), collections.Counter()
     for k, term in sorted(
         enumerate(terms, first), key=lambda pair: pair[1].start - pair[1].end
     ):  # outer ones first
-        openings[term.start] += f"real(factor({k})) * (" if kernels else f"factor({k}) * ("
+        openings[term.start] += f"factor({k}, "
         closings[term.end] += 1
     parts = [openings[i] + letter + ")" * closings[i + 1] for i, letter in enumerate(source)]
-    changed = "".join(parts)
-    return IN_KERNELS + _with_real(changed) if kernels else ON_HOST + changed
-
-
-def _with_real(source: str) -> str:
-    """The source with ``real`` defined in each outermost function that has a factor and not yet that name."""
-    lines, shift = source.splitlines(keepends=True), 0
-    for node in ast.parse(source).body:
-        names = {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
-        if (
-            not isinstance(node, ast.FunctionDef)
-            or "real" in names
-            or "real(factor(" not in ast.unparse(node)
-        ):
-            continue
-        first = next(
-            s for s in node.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
-        )
-        of_spec = "spec" in {a.arg for a in node.args.args}
-        kind = "types(spec.dim, spec.dtype)" if of_spec else "types(dim, dtype)"
-        lines.insert(first.lineno - 1 + shift, f"{' ' * first.col_offset}real = {kind}.real\n")
-        shift += 1
-    return "".join(lines)
+    return (IN_KERNELS if "@wp." in source else ON_HOST) + "".join(parts)
 
 
 def _adjoints(node: ast.AST, inside: bool) -> Iterator[ast.FunctionDef]:

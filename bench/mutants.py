@@ -50,14 +50,29 @@ CELL = 0x7E0000000000
 """Address of the number of the active mutant: compiled into the kernels, hence the same in every run."""
 FACTOR = f"""
 import ctypes
+from typing import Any
+
 import warp as wp
 
 @wp.func_native("return *reinterpret_cast<const volatile int*>({CELL}ull) == k ? 1.01 : 1.0;")
-def in_kernel(k: int) -> wp.float64: ...
+def number(k: int) -> wp.float64: ...
 
-def on_host(k: int) -> float:
-    return 1.01 if ctypes.c_int.from_address({CELL}).value == k else 1.0
+@wp.func
+def in_kernel(k: int, term: Any):
+    return term.dtype(number(k)) * term
+
+@wp.func
+def in_kernel(k: int, term: wp.float32):
+    return wp.float32(number(k)) * term
+
+@wp.func
+def in_kernel(k: int, term: wp.float64):
+    return number(k) * term
+
+def on_host(k: int, term):
+    return (1.01 if ctypes.c_int.from_address({CELL}).value == k else 1.0) * term
 """
+"""Module of the factors, whose precision is that of their terms: kernels of float32 compute places and poses in float64."""
 HOMOGENEOUS = (
     "contact is homogeneous in the velocity, so that its adjoint depends on the direction of that alone"
 )
@@ -150,6 +165,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--file", default="", help="only files whose name contains this")
     parser.add_argument("--most", type=int, default=None, help="largest number of mutants, drawn at random")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--tests", nargs="+", default=TESTS, help="tests to run instead of all that TESTS lists"
+    )
     parser.add_argument("--results", type=Path, default=Path("mutants.jsonl"))
     parser.add_argument("--list", action="store_true", help="print the terms, run nothing")
     return parser.parse_args()
@@ -218,7 +236,7 @@ def main() -> None:
         trials = Trials(numbers, report)
         options = ["-s", "-m", "not gpu", "-p", "no:randomly", "-p", "no:cacheprovider", "-p", "no:terminal"]
         options += [f"--ignore={IGNORED}"]
-        pytest.main([*options, *TESTS], plugins=[trials])
+        pytest.main([*options, *args.tests], plugins=[trials])
         if trials.failure[0]:
             print("no mutant ran")
             sys.exit(1)

@@ -38,20 +38,28 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     )
 
 
-def by_reference(model: softmpm.Model, start, activation, params, **call) -> softmpm.State:
-    """:func:`softmpm.simulate` by the float64 reference, with contact at surface points if the model has it."""
+def by_kernels(model: softmpm.Model, *arguments, **call) -> tuple[softmpm.State, torch.Tensor]:
+    """End of :func:`softmpm.simulate`, and the forces of clamps and planes of symmetry, if there are any."""
+    end = softmpm.simulate(model, *arguments, **call)
+    return end, torch.zeros(0) if model.mirror is None else softmpm.clamp_forces(model, end)
+
+
+def by_reference(
+    model: softmpm.Model, start, activation, params, **call
+) -> tuple[softmpm.State, torch.Tensor]:
+    """The same by the float64 reference, with contact at surface points if the model has it."""
     made, settings = model.scene, {}
     u, v = reference_lagrangian.project(made, start, params)
     if model.surface is not None:
         surface, width = surface_of(model), model.contact_width * made.grid.spacing
         anchor = reference_contact.start_anchor(made, surface, u)
         settings = dict(surface=surface, anchor=anchor, smoothing=width)
-    u, v, *_ = reference_lagrangian.simulate(made, u, v, activation, params, **call, **settings)
-    return reference_lagrangian.evaluate(made, u, v)
+    u, v, *others = reference_lagrangian.simulate(made, u, v, activation, params, **call, **settings)
+    return reference_lagrangian.evaluate(made, u, v), torch.zeros(0) if model.mirror is None else others[-1]
 
 
 def compare(model: softmpm.Model, names, limit: float, steps=3) -> None:
-    """Assert that the end of a call of ``steps`` control steps and all its gradients are those of the reference.
+    """Assert that the end of a call of ``steps`` control steps, the forces of clamps and all gradients are those of the reference.
 
     Args:
         names: Inputs that the call gives.
@@ -60,14 +68,16 @@ def compare(model: softmpm.Model, names, limit: float, steps=3) -> None:
     leaves = busy_inputs(model, control_steps=steps) | given(model, names, steps)
     copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
     found = []
-    for simulate, tensors in ((softmpm.simulate, leaves), (by_reference, copies)):
+    for simulate, tensors in ((by_kernels, leaves), (by_reference, copies)):
         start = softmpm.State(*(tensors[name] for name in "xvCF"))
         params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))
         inputs = Inputs(**{name: tensors[name] for name in names})
-        end = simulate(model, start, tensors["activation"], params, substeps=2, inputs=inputs)
-        loss = dot(cotangent(end), end)
-        found.append([*end[:4], *torch.autograd.grad(loss, list(tensors.values()))])
-    for name, got, want in zip([*"xvCF", *leaves], *found, strict=True):
+        end, forces = simulate(model, start, tensors["activation"], params, substeps=2, inputs=inputs)
+        loss = dot(cotangent(end), end) + dot(cotangent(softmpm.State(*4 * [forces]), seed=3)[:1], [forces])
+        shown = [*end[:4], *([forces] if model.mirror else [])]
+        found.append([*shown, *torch.autograd.grad(loss, list(tensors.values()))])
+    names_shown = [*"xvCF", *(["forces of clamps"] if model.mirror else [])]
+    for name, got, want in zip([*names_shown, *leaves], *found, strict=True):
         assert want.abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(got.detach().cpu().double(), want.detach(), limit, f"{name} in {model.dtype}")
 

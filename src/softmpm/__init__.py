@@ -12,7 +12,7 @@ from softmpm.autograd import rasterize, simulate
 from softmpm.building import build
 from softmpm.cuda_graph import Graph
 from softmpm.errors import UnstableError
-from softmpm.forces import contact_forces
+from softmpm.forces import clamp_forces, contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
 from softmpm.recording.reader import Recording
@@ -69,6 +69,7 @@ __all__ = [
     "ball",
     "box",
     "build",
+    "clamp_forces",
     "contact_forces",
     "image",
     "inside",

@@ -10,15 +10,8 @@ from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
 from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
-from softmpm.checks import (
-    check_activation,
-    check_finite,
-    check_horizon,
-    check_inputs,
-    check_inputs_bounds,
-    check_state,
-    control_steps,
-)
+from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
+from softmpm.checks import check_activation, check_finite, check_horizon, check_state
 from softmpm.compiling import opaque
 from softmpm.inputs import Inputs, differentiable
 from softmpm.kernel_inputs import derive
@@ -194,15 +187,17 @@ class _Call:
     def state(self, tensors: Sequence) -> Any:
         """A state of the model's formulation from its tensors and those of its low-order parts."""
         if self.model.formulation == "reference":
-            return Nodal(*tensors)
+            *found, shift = tensors
+            return Nodal.of(found)._replace(shift=shift)
         *found, low_x, low_F = tensors
         return State.of(found)._replace(low=None if low_x is None else Low(low_x, low_F))
 
     @property
     def count(self) -> int:
         """Number of the tensors of a state that are differentiable."""
-        moving_points = self.model.formulation == "moving" and self.model.surface is not None
-        return 7 if moving_points else 4
+        if self.model.formulation == "reference":
+            return 5
+        return 4 if self.model.surface is None else 7
 
     def rounding(self, state: Any) -> tuple:
         """What is not differentiable of a state: the shift, or in the moving formulation the low-order parts or None in their place."""

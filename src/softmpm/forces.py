@@ -1,4 +1,7 @@
-"""Forces of the walls on surface points, as a function of a state. Derivation: docs/math/contact.md, (K7)."""
+"""Forces of the walls as functions of a state. Derivation: (K7) of docs/math/contact.md and (B3) of docs/math/mirror.md."""
+
+import torch
+from torch import Tensor
 
 from softmpm.checks import check_state
 from softmpm.compiling import opaque
@@ -44,3 +47,43 @@ def _contact_forces(model: Model, state: State) -> ContactForces:
         )
     traction = force / surface.areas.to(force.dtype)[:, None]
     return ContactForces(force.sum(2), traction, points)
+
+
+def clamp_forces(model: Model, state: State) -> Tensor:
+    """Force of each clamp and plane of symmetry on the bodies in the control step that ended in ``state``.
+
+    The mean over a control step of T seconds, as with :func:`contact_forces`: T times the sum of the forces of all walls, gravity and
+    other loads is what the bodies gain in momentum. A plane of symmetry has the force of the half that is not simulated. Where planes
+    meet, the force on the nodes near the edge is divided equally among those that hold the component.
+
+    Args:
+        model: From :func:`softmpm.build`, of a scene with walls of the kinds ``clamp`` or ``symmetry``.
+        state: Result of :func:`softmpm.simulate`. Differentiable, through ``state.nodes``.
+
+    Returns:
+        Forces [N], in 2D N per metre of depth, shape (world, wall, dim), of the walls of these kinds in the order of the scene.
+
+    Raises:
+        TypeError: ``model`` or ``state`` are of another type.
+        ValueError: The scene has no such walls, or the state no nodes with their forces.
+    """
+    return _clamp_forces(model, state)
+
+
+@opaque
+def _clamp_forces(model: Model, state: State) -> Tensor:
+    check_model(model, "clamp_forces")
+    check_state(model, state)
+    if model.mirror is None:
+        kinds = sorted({wall.contact for wall in model.scene.walls})
+        raise ValueError(
+            f"clamp_forces needs a wall of the kind clamp or symmetry, got {', '.join(kinds) or 'no walls'}; contact_forces has the "
+            "forces of separating walls at surface points."
+        )
+    if state.nodes is None or state.nodes.reaction is None:
+        raise ValueError(
+            "clamp_forces needs a state that simulate returned, got one without nodes or their reaction; simulate from it first."
+        )
+    return torch.einsum(
+        "kgd,wgd->wkd", model.mirror.shares.to(state.nodes.reaction.dtype), state.nodes.reaction
+    )

@@ -22,6 +22,8 @@ class MirrorGrid:
         present: True for nodes with mass, shape (node,).
         first: First node with mass of each node's group, or the node itself, shape (node,), int64.
         signs: Motion of each node along each axis over that of its group: 1 or -1, and 0 where it is held, shape (node, dim), float64.
+        shares: Share of each clamp and plane of symmetry, in the order of the scene, in the force on each group along each axis (B3),
+            shape (wall, group, dim), float64.
     """
 
     def __init__(self, scene: Scene, rest: RestGrid, device: torch.device):
@@ -53,6 +55,15 @@ class MirrorGrid:
             row = row[row < rest.count]
             first[row] = row[np.argmax(mass[row] > 0)]
         self.present = torch.from_numpy(mass > 0).to(device)
+        twice = 2 * rest.nodes.cpu().numpy().astype(np.int64)
+        part = np.zeros((len(mirrors), self.count, scene.grid.dim))
+        for k, one in enumerate(mirrors):
+            reached = (one.side * (twice[:, one.axis] - one.twice) <= 0) & (mass > 0)
+            taking = np.append(reached, False)[members].any(
+                axis=1
+            )  # groups with nodes on the plane or behind it
+            part[k] = np.outer(taking, one.held)
+        self.shares = torch.from_numpy(part / part.sum(axis=0).clip(min=1.0)).to(device)
         self.first = torch.from_numpy(first).to(device)
 
     def reflected(self, mass: Tensor, *fields: Tensor) -> tuple[Tensor, ...]:

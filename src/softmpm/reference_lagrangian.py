@@ -9,7 +9,7 @@ deformations". Stress and walls are those of :mod:`softmpm.reference`, and so is
     f_i = −Σ V_p P_p g_ip + Σ N_i f_p,   P = τ F⁻ᵀ,   m_i = Σ m_p N_i                (Q2)
     v*_i = exp(−γ Δt) (v_i + Δt (f_i/m_i + g))                                       (Q3)
     v'_i = W(v*_i) by the walls at X_i + u_i,   u'_i = u_i + Δt v'_i                 (Q4)
-    v'_i from Σ m_j s_j v'_j over the images of a node in clamps and symmetries      (B1)
+    v'_i from Σ m_j s_j v'_j over the images of a node in clamps and symmetries      (B1), with its impulse (B3)
     v'_i = V_i on the nodes of driven particles                                      (Q10)
     x = X + Σ N u,   v = Σ N v,   C = L                                              (Q5)
     u_i = Σ m_p N_i [x_p − X_p + (F_p − I)(X_i − X_p)] / m_i
@@ -35,6 +35,7 @@ from softmpm.reference import (
 )
 from softmpm.reference_contact import Surface, contact, start_anchor
 from softmpm.reference_driven import fit, held
+from softmpm.reference_mirror import pull, reflected
 from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
@@ -127,49 +128,31 @@ def step(
     ``drive`` are the nodes of driven particles and their velocities (Q10), shape (world, node, dim).
 
     Returns:
-        u and v, with a surface also the anchors and the impulses per area J of :func:`softmpm.reference_contact.contact`.
+        u and v, with a surface also the anchors and the impulses per area J of :func:`softmpm.reference_contact.contact`, and with
+        clamps or planes of symmetry at last the impulse of each.
     """
     impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
     contacts = ("stick", "slip", "separate") if surface is None else ("stick", "slip")
     momentum = mass[..., None] * v + impulse
     v = grid_velocity(scene, mass, momentum, inputs, time, duration, displacement=u, contacts=contacts)
-    v = driven(reflected(scene, mass, v), drive)
-    if surface is None:
-        return u + scene.dt * v, v
-    anchor = start_anchor(scene, surface, u, inputs) if anchor is None else anchor
-    v, *rest = contact(scene, surface, u, v, anchor, mass, inputs, smoothing, time, duration)
-    v = driven(reflected(scene, mass, v), drive)
-    return u + scene.dt * v, v, *rest
+    free, v = v, reflected(scene, mass, v)
+    change, v, rest = v - free, driven(v, drive), []
+    if surface is not None:
+        anchor = start_anchor(scene, surface, u, inputs) if anchor is None else anchor
+        free, *rest = contact(scene, surface, u, v, anchor, mass, inputs, smoothing, time, duration)
+        v = reflected(scene, mass, free)
+        change, v = change + v - free, driven(v, drive)
+    pulls = [pull(scene, mass, change)] if _mirrored(scene) else []
+    return u + scene.dt * v, v, *rest, *pulls
+
+
+def _mirrored(scene: Scene) -> bool:
+    return any(wall.contact in ("clamp", "symmetry") for wall in scene.walls)
 
 
 def driven(v: Tensor, drive: tuple[Tensor, Tensor] | None) -> Tensor:
     """(Q10)"""
     return v if drive is None else v.index_copy(1, *drive)
-
-
-def reflected(scene: Scene, mass: Tensor, field: Tensor) -> Tensor:
-    """The mean of a field on the nodes and its images in clamps and symmetries, weighted by mass (B1).
-
-    Planes that face each other must be three cells apart here.
-    """
-    mirrors = [wall for wall in scene.walls if wall.contact in ("clamp", "symmetry")]
-    if not mirrors:
-        return field
-    shape, dim = scene.grid.shape, scene.grid.dim
-    total, weighted = mass.unflatten(1, shape), (mass[..., None] * field).unflatten(1, shape)
-    for wall in mirrors:
-        axis = [abs(n) for n in wall.normal].index(1.0)
-        image = round(2 * wall.offset * wall.normal[axis] / scene.grid.spacing) - torch.arange(shape[axis])
-        there = (image >= 0) & (image < shape[axis])
-        source = image.clamp(0, shape[axis] - 1)
-        there = there.to(mass.dtype).view(-1, *(1,) * (dim - 1 - axis))
-        sign = torch.ones(dim, dtype=mass.dtype)
-        sign[slice(None) if wall.contact == "clamp" else axis] = -1.0
-        total = total + there * total.index_select(1 + axis, source)
-        weighted = weighted + there[..., None] * sign * weighted.index_select(1 + axis, source)
-    total, weighted = total.flatten(1, dim), weighted.flatten(1, dim)
-    mean = weighted / torch.where(total > 0, total, torch.ones_like(total))[..., None]
-    return torch.where((mass > 0)[..., None], mean, torch.zeros_like(mean))
 
 
 def simulate(
@@ -196,7 +179,8 @@ def simulate(
 
     Returns:
         u and v after ``control_step * substeps * dt`` seconds, with a surface also the anchors and the mean force of each wall on each
-        point in the last control step [N], shape (world, separating wall, point, dim).
+        point in the last control step [N], shape (world, separating wall, point, dim), and with clamps or planes of symmetry at last
+        the mean force of each, shape (world, clamp or symmetry, dim).
     """
     if inputs.position is not None:
         raise NotImplementedError(
@@ -209,7 +193,7 @@ def simulate(
     steps, duration = control_steps(activation, inputs), substeps * scene.dt
     if surface is not None and anchor is None:
         anchor = start_anchor(scene, surface, u, of_control_step(inputs, 0, steps))
-    force, drive, spread = torch.zeros(0), None, torch.zeros(0)
+    force, drive, spread, reaction = torch.zeros(0), None, torch.zeros(0), torch.zeros(0)
     if len(scene.driven):
         nodes = held(scene, points.node, points.N)
         spread = fit(scene, points.X, nodes)
@@ -218,17 +202,20 @@ def simulate(
             surface = surface._replace(free=free.any(1).to(u.dtype))
     for c in range(steps):
         row, now = None if activation is None else activation[c], of_control_step(inputs, c, steps)
-        force = torch.zeros_like(u if anchor is None else anchor)
+        force, reaction = torch.zeros_like(u if anchor is None else anchor), torch.zeros(())
         if len(scene.driven):
             V = torch.zeros(1, dtype=u.dtype) if now.velocity is None else now.velocity
             drive = nodes, spread @ V.expand(len(u), len(scene.driven), u.shape[-1])
         for s in range(substeps):
             about = (row, mu, lam, mass, now, surface, anchor, smoothing, s * scene.dt, duration, drive)
             u, v, *contacts = step(scene, points, u, v, *about)
+            if _mirrored(scene):
+                reaction = reaction + contacts.pop() / duration
             if surface is not None:
                 anchor, impulse = contacts
                 force = force + surface.area[:, None] * impulse / duration
-    return (u, v) if anchor is None else (u, v, anchor, force)
+    found = (u, v) if anchor is None else (u, v, anchor, force)
+    return (*found, reaction) if _mirrored(scene) else found
 
 
 def evaluate(scene: Scene, u: Tensor, v: Tensor) -> State:

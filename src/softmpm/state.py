@@ -62,15 +62,19 @@ class Nodal(NamedTuple):
     shift: Tensor | None = None
     """Translation of all nodes of a world [m], shape (world, dim), in float64 in every precision; None is none. It follows the bodies,
     so that u keeps its digits over long ways. A constant of the gradient: that with respect to u is that with respect to the sum."""
+    reaction: Tensor | None = None
+    """Mean force of clamps and planes of symmetry on each group of nodes that are images of each other, in the last control step [N],
+    shape (world, group, dim); see :func:`softmpm.clamp_forces`. A call does not read it."""
 
     @staticmethod
     def of(tensors: Sequence[Tensor]) -> "Nodal":
         """The state of which :meth:`differentiable` gives these tensors."""
-        return Nodal(*tensors)
+        return Nodal(*tensors[:4], reaction=tensors[4])
 
     def differentiable(self) -> tuple[Tensor, ...]:
-        """u, v, the anchors and the forces."""
-        return self[:4]
+        """u, v, the anchors and the forces, of a state that has all of them."""
+        assert self.reaction is not None
+        return *self[:4], self.reaction
 
     def __repr__(self) -> str:
         return _text(self)
@@ -89,8 +93,9 @@ class Nodal(NamedTuple):
         return moved if self.shift is None else moved._replace(shift=self.shift.to(moved.u.device))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Nodal":
-        shift = None if self.shift is None else change(self.shift)
-        return Nodal(change(self.u), change(self.v), change(self.anchor), change(self.force), shift)
+        u, v, anchor, force = (change(tensor) for tensor in self[:4])
+        others = (None if part is None else change(part) for part in self[4:])
+        return Nodal(u, v, anchor, force, *others)
 
 
 class SurfaceState(NamedTuple):

@@ -84,7 +84,7 @@ def _adjoint(model: Model, state_in: Any, state_out: Any, solid: WarpSolid, subs
     if isinstance(work, NodalStep):
         now, adj_then = state_in.nodal(), state_out.adj()
         adj, adj_inputs = work.adjoint(now, adj_then, solid.values(), wanted, substep)
-        for grad, found in zip(state_in.adj()[:4], adj[:4], strict=True):
+        for grad, found in zip(state_in.adj().differentiable(), adj.differentiable(), strict=True):
             grad += found
     else:
         adj_inputs = _adjoint_of_particles(model, work, state_in, state_out, wanted, substep)

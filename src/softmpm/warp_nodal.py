@@ -33,12 +33,16 @@ class WarpNodal:
     step."""
     shift: wp.array
     """Translation of all nodes of a world [m], vectors of float64, shape (world,)."""
+    reaction: wp.array
+    """Mean force of clamps and planes of symmetry on each group of nodes in the latest step [N], vectors of shape (world, group). Not
+    read by a step."""
 
     def __post_init__(self):
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         nodes, points = (model.worlds, model.rest_grid.count), model.anchor_shape[:-1]
         for name, array in self.arrays().items():
-            shape = {"u": nodes, "v": nodes, "shift": nodes[:1]}.get(name, points)
+            other = {"u": nodes, "v": nodes, "shift": nodes[:1], "reaction": model.reaction_shape[:-1]}
+            shape = other.get(name, points)
             kind = types(model.spec.dim, "float64").vec if name == "shift" else t.vec
             check_array(model, name, array, shape, kind)
 
@@ -47,7 +51,7 @@ class WarpNodal:
         return {name: getattr(self, name) for name in Nodal._fields}
 
     def differentiable(self) -> list[wp.array]:
-        return [self.u, self.v, self.anchor, self.force]
+        return [self.u, self.v, self.anchor, self.force, self.reaction]
 
     def nodal(self) -> Nodal:
         """The same state in tensors that share its memory."""
@@ -55,16 +59,16 @@ class WarpNodal:
 
     def adj(self) -> Nodal:
         """Gradients in tensors that share their memory."""
-        return Nodal(*(wp.to_torch(array.grad) for array in self.differentiable()))  # pyright: ignore[reportArgumentType]
+        return Nodal.of([wp.to_torch(array.grad) for array in self.differentiable()])  # pyright: ignore[reportArgumentType]
 
 
 def warp_nodal(model: Model, nodes: Nodal, requires_grad: bool) -> WarpNodal:
-    """Copy of a nodal state with a shift."""
+    """Copy of a nodal state that has all parts."""
     vec, exact = (types(model.spec.dim, dtype).vec for dtype in (model.spec.dtype, "float64"))
-    u, v, anchor, force = (owned(tensor, vec, requires_grad) for tensor in nodes[:4])
     assert nodes.shift is not None
+    arrays = Nodal.of([owned(tensor, vec, requires_grad) for tensor in nodes.differentiable()])  # pyright: ignore[reportArgumentType]
     shift = owned(nodes.shift, exact, False)
-    return WarpNodal(model=model, u=u, v=v, anchor=anchor, force=force, shift=shift)
+    return WarpNodal(model=model, **arrays._replace(shift=shift)._asdict())
 
 
 def owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:

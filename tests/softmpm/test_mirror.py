@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, cotangent, dot, surface_of
+import warp as wp
+from helpers import assert_relative, busy_inputs, cotangent, dot, little_memory, surface_of
 from surface_scenes import build, compare
 
 import softmpm
@@ -71,7 +72,8 @@ def test_the_reference_agrees_with_central_differences(dim):
         end = reference_lagrangian.simulate(
             made, u, v, None, params._replace(density=density), substeps=4, surface=surface
         )
-        return dot(cotangent(softmpm.State(*end[:2], *end[:2])), softmpm.State(*end[:2], *end[:2]))
+        forces = (torch.arange(1.0, 1 + end[-1].numel()).view_as(end[-1]) * end[-1]).sum()
+        return dot(cotangent(softmpm.State(*end[:2], *end[:2])), softmpm.State(*end[:2], *end[:2])) + forces
 
     leaves = [v.clone().requires_grad_(), params.density.clone().requires_grad_()]
     gradient = dot(ways, torch.autograd.grad(loss(*leaves), leaves)).item()
@@ -105,22 +107,101 @@ def test_a_reflection_is_a_projection_that_takes_energy(device):
     assert free.any() and torch.equal(once[:, free], v[:, free])
 
 
-def test_calls_in_turn_are_one_call(device):
-    """A state with nodes continues to the bit, with its gradient."""
+def test_calls_in_turn_and_short_chunks_are_one_call(device):
+    """A state with nodes continues to the bit, with its gradient; forces of clamps also where a chunk ends within a control step."""
     model = build(corner(2), device=device, dtype=torch.float64)
-    inputs = busy_inputs(model, control_steps=4)
-    start = softmpm.State(*(inputs[name] for name in "xvCF"))
-    rows = inputs["activation"]
-    whole = softmpm.simulate(model, start, rows, model.params(), substeps=5)
-    first = softmpm.simulate(model, start, rows[:2], model.params(), substeps=5)
-    parts = softmpm.simulate(model, first, rows[2:], model.params(), substeps=5)
-    for got, want in zip(parts[:4], whole[:4], strict=True):
-        assert torch.equal(got, want)
-    found = [
-        torch.autograd.grad(dot(cotangent(end), end), list(inputs.values())[:5]) for end in (whole, parts)
-    ]
-    for name, want, got in zip(inputs, *found, strict=False):
-        assert_relative(got, want, 1e-12, name)
+    short = build(corner(2), device=device, dtype=torch.float64, **little_memory(model))
+    inputs = busy_inputs(model, control_steps=3)
+    start, rows = softmpm.State(*(inputs[name] for name in "xvCF")), inputs["activation"]
+    whole = softmpm.simulate(model, start, rows, model.params(), substeps=7)
+    first = softmpm.simulate(model, start, rows[:2], model.params(), substeps=7)
+    parts = softmpm.simulate(model, first, rows[2:], model.params(), substeps=7)
+    little = softmpm.simulate(short, start, rows, short.params(), substeps=7)
+    found = []
+    for end in (whole, parts, little):
+        forces = softmpm.clamp_forces(model, end)
+        assert torch.equal(forces, softmpm.clamp_forces(model, whole))
+        for got, want in zip(end[:4], whole[:4], strict=True):
+            assert torch.equal(got, want)
+        loss = dot(cotangent(end), end) + (forces * torch.tensor([1.0, -2.0]).to(forces)).sum()
+        found.append(torch.autograd.grad(loss, list(inputs.values())[:5]))
+    for other in found[1:]:
+        for name, want, got in zip(inputs, found[0], other, strict=False):
+            assert_relative(got, want, 1e-12, name)
+
+
+def test_the_force_of_a_clamp_is_the_weight_at_rest(device):
+    """Of a block that hangs in a clamp, to 1e-6, with the gradient of a weight: the mass."""
+    body = corner(2).bodies[0]
+    bodies = [softmpm.Body(body.particles, dataclasses.replace(body.material, viscosity=0.5))]
+    made = corner(2, bodies=bodies, walls=corner(2).walls[:1], muscles=[], gravity=(9.8, 0.0), damping=0.0)
+    model = build(made, device=device, dtype=torch.float64, inputs=("gravity",))
+    rest = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1000).detach()
+    gravity = torch.tensor([9.8, 0.0], dtype=torch.float64, device=model.device, requires_grad=True)
+    inputs = softmpm.Inputs(gravity=gravity)
+    end = softmpm.simulate(model, rest, None, model.params(), substeps=1000, inputs=inputs)
+    force, mass = softmpm.clamp_forces(model, end)[0, 0], model.mass.sum().item()
+    assert force.tolist() == pytest.approx([-9.8 * mass, 0.0], abs=1e-6 * 9.8 * mass)
+    (slope,) = torch.autograd.grad(force[0], gravity)
+    assert slope.tolist() == pytest.approx([-mass, 0.0], abs=1e-6 * mass)
+
+
+@pytest.mark.parametrize("contact", ["nodes", "surface"])
+def test_forces_of_clamps_are_the_change_of_momentum(contact, device):
+    """Of a moving block between a clamp and a plane of symmetry that meet, T times their forces, those of the floor and the weight:
+    ≤ 1e-12. The plane of symmetry pulls along its normal only."""
+    symmetry = softmpm.Wall(normal=(0.0, -1.0), offset=-0.5, contact="symmetry")
+    floor = [softmpm.Wall(normal=(0.0, 1.0), offset=0.331, friction=0.4)] if contact == "surface" else []
+    shape = softmpm.box((0.2, 0.33), (0.42, 0.5), spacing=0.05)
+    bodies = [softmpm.Body(shape, corner(2).bodies[0].material)]
+    walls = [corner(2).walls[0], *floor, symmetry]
+    made = corner(2, bodies=bodies, walls=walls, muscles=[], damping=0.0)
+    model = build(made, device=device, dtype=torch.float64, contact=contact)
+    state, T = model.rest(), 20 * made.dt
+    for _ in range(3):
+        before = (model.mass[:, None] * state.v[0]).sum(0)
+        state = softmpm.simulate(model, state, None, model.params(), substeps=20)
+        gained = (model.mass[:, None] * state.v[0]).sum(0) - before
+        forces = softmpm.clamp_forces(model, state)[0]
+        total = forces.sum(0) + model.mass.sum() * torch.tensor(made.gravity, dtype=torch.float64).to(gained)
+        if floor:
+            touched = softmpm.contact_forces(model, state).total[0, 0]
+            total = total + touched
+        torch.testing.assert_close(T * total, gained, rtol=0, atol=1e-12)
+        assert (forces[0] != 0).all() and forces[1, 0] == 0 and forces[1, 1] != 0
+    assert not floor or (touched != 0).all()
+
+
+def test_a_step_on_warp_arrays_has_the_forces_of_simulate(device):
+    """Forces and their gradient with respect to the state, to the bit."""
+    model = build(corner(2), device=device, dtype=torch.float64)
+    start = softmpm.State(*(t.detach() for t in list(busy_inputs(model).values())[:4]))
+    solid = softmpm.warp_solid(model, requires_grad=True)
+    now, then = (softmpm.warp_state(model, start, solid, requires_grad=True) for _ in range(2))
+    assert isinstance(now, softmpm.WarpNodal) and isinstance(then, softmpm.WarpNodal)
+    nodes = now.nodal().clone()
+    nodes = nodes._replace(u=nodes.u.requires_grad_(), v=nodes.v.requires_grad_())
+    end = softmpm.simulate(model, particles_of(model, nodes), None, model.params(), substeps=1)
+    assert end.nodes is not None and end.nodes.reaction is not None
+    reaction = end.nodes.reaction
+    weights = cotangent(softmpm.State(*4 * [reaction]), seed=3)[0]
+    want = torch.autograd.grad((weights * reaction).sum(), [nodes.u, nodes.v])
+    tape = wp.Tape()
+    softmpm.step(model, now, then, solid, tape=tape)
+    tape.backward(grads={then.reaction: wp.from_torch(weights, dtype=wp.vec2d)})
+    assert torch.equal(then.nodal().reaction, reaction.detach())
+    for got, there in zip(now.adj(), want, strict=False):
+        assert there.abs().max() > 0 and torch.equal(got, there)
+
+
+def test_what_has_no_forces_of_clamps_is_refused():
+    """A scene without clamps, and a state that simulate did not return."""
+    model = build(corner(2), dtype=torch.float64)
+    with pytest.raises(ValueError, match="got one without nodes or their reaction; simulate from it first"):
+        softmpm.clamp_forces(model, model.rest())
+    other = build(corner(2, walls=corner(2).walls[1:3]), dtype=torch.float64)
+    with pytest.raises(ValueError, match="needs a wall of the kind clamp or symmetry, got separate"):
+        softmpm.clamp_forces(other, other.rest())
 
 
 def test_nodes_that_are_not_images_are_refused():

@@ -1,7 +1,9 @@
 """Clamps and planes of symmetry: the images of a node move as one. Derivation: docs/math/mirror.md.
 
     w = Σ m_i s_i v_i / M,  M = Σ m_i  over the nodes of a group,  v'_i = s_i w,  u'_i = u_i + Δt v'_i    (B1)
-    w̄ = Σ s_i v̄'_i,  v̄_i = m_i s_i w̄ / M,  m̄_i += (s_i v_i − w)·w̄ / M                                 (B1.adj)
+    R = (1/T) Σ m_i (v'_i − v_i),  the mean force of the constraint in a control step of T seconds           (B3)
+    ā_i = v̄'_i + m_i R̄/T,  w̄ = Σ s_i ā_i,  v̄_i = m_i (s_i w̄/M − R̄/T)
+    m̄_i += (s_i v_i − w)·w̄ / M + (v'_i − v_i)·R̄/T                                               (B1.adj), (B3.adj)
 
 with the signs s_i axis by axis.
 """
@@ -69,10 +71,13 @@ def mirror(spec: Spec) -> SimpleNamespace:
         constants: Constants,
         groups: Mirror,
         mass: wp.array2d(dtype=real),
+        rate: wp.array(dtype=real),  # 1/T, in the unit of force
+        anew: int,  # 1 at the beginning of a control step
         words: wp.array(dtype=wp.int64),
         # In:
         u: wp.array2d(dtype=vec),
         # In and out:
+        reaction: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         # Out:
         new_u: wp.array2d(dtype=vec),
@@ -81,13 +86,19 @@ def mirror(spec: Spec) -> SimpleNamespace:
         total = total_mass(groups, mass, world, g)
         if running(words, world) and total > real(0.0):
             w = mean(groups, mass, v, total, world, g)
+            impulse = vec()
             for k in range(groups.members.shape[1]):
                 i = groups.members[g, k]
                 if i < mass.shape[1]:
                     if mass[world, i] > real(0.0):
                         new = wp.cw_mul(groups.signs[i], w)
+                        impulse += mass[world, i] * (new - v[world, i])
                         v[world, i] = new
                         new_u[world, i] = u[world, i] + constants.dt * new
+            pulled = rate[0] * impulse
+            if anew == 0:
+                pulled += reaction[world, g]
+            reaction[world, g] = pulled
 
     return SimpleNamespace(total_mass=total_mass, mean=mean, reflect=reflect)
 
@@ -128,10 +139,13 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         groups: Mirror,
         mass: wp.array2d(dtype=real),
         moved: real,  # Δt if v' moved the nodes and (Q4.adj) is still to come, else 0
+        rate: wp.array(dtype=real),
+        anew: int,
         # In:
         v: wp.array2d(dtype=vec),
         adj_u: wp.array2d(dtype=vec),
         # In and out:
+        adj_reaction: wp.array2d(dtype=vec),
         adj_v: wp.array2d(dtype=vec),
         # Out, added into:
         adj_mass: wp.array2d(dtype=real),
@@ -141,19 +155,24 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         total = total_mass(groups, mass, world, g)
         if total > real(0.0):
             w = mean(groups, mass, v, total, world, g)
+            pull = rate[0] * adj_reaction[world, g]
             adj_w = vec()
             for k in range(groups.members.shape[1]):
                 i = groups.members[g, k]
                 if i < mass.shape[1]:
                     if mass[world, i] > real(0.0):
-                        adj_w += wp.cw_mul(groups.signs[i], adj_v[world, i] + moved * adj_u[world, i])
+                        adj_new = adj_v[world, i] + moved * adj_u[world, i] + mass[world, i] * pull
+                        adj_w += wp.cw_mul(groups.signs[i], adj_new)
             adj_w = adj_w / total
             for k in range(groups.members.shape[1]):
                 i = groups.members[g, k]
                 if i < mass.shape[1]:
                     s = groups.signs[i]
-                    adj_v[world, i] = mass[world, i] * wp.cw_mul(s, adj_w) - moved * adj_u[world, i]
-                    from_mass = wp.dot(wp.cw_mul(s, v[world, i]) - w, adj_w)
+                    old = v[world, i]
+                    adj_v[world, i] = mass[world, i] * (wp.cw_mul(s, adj_w) - pull) - moved * adj_u[world, i]
+                    from_mass = wp.dot(wp.cw_mul(s, old) - w, adj_w) + wp.dot(wp.cw_mul(s, w) - old, pull)
                     adj_mass[world, i] = adj_mass[world, i] + from_mass
+            if anew == 1:  # the mean before is dropped
+                adj_reaction[world, g] = vec()
 
     return SimpleNamespace(free_again=free_again, reflect_adj=reflect_adj)

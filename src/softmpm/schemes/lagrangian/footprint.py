@@ -22,7 +22,8 @@ class LagrangianFootprint:
     def sizes(self, model) -> Sizes:
         field = model.worlds * model.rest_grid.count * model.dim * model.dtype.itemsize
         anchors = math.prod(model.anchor_shape) * model.dtype.itemsize + 8 * model.worlds * model.dim
-        return sizes_of(model, inside=3 * field + anchors, nodes=0, between=2 * field + 2 * anchors)
+        held = math.prod(model.reaction_shape) * model.dtype.itemsize
+        return sizes_of(model, inside=3 * field + anchors, nodes=0, between=2 * field + 2 * anchors + held)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         real, nodal = model.dtype.itemsize, model.sizes().inside

@@ -76,24 +76,24 @@ def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
 def _advance(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Motion of the nodes in substep ``s``, with contact."""
     model, inputs, at = buffers.model, buffers.inputs.grid_struct(s), buffers.struct
-    node_launch(
-        model, launch, nodes(model.spec).advance, model.constants, inputs, buffers.rest, buffers.frame, at, s
-    )
-    _constrain(buffers, s, inputs, None if buffers.contact is None else at.free, launch)
-    if buffers.contact is not None:
+    kernel, arguments = nodes(model.spec).advance, (inputs, buffers.rest, buffers.frame, at, s)
+    node_launch(model, launch, kernel, model.constants, *arguments)
+    new_v = buffers.v_arrays[buffers.index(s + 1)]
+    if buffers.contact is None:
+        _constrain(buffers, s, inputs, new_v, buffers.chunk.anew(s), launch)
+    else:
+        _constrain(buffers, s, inputs, buffers.contact.free, buffers.chunk.anew(s), launch)
         buffers.contact.advance(launch, inputs, at, s)
-        _constrain(buffers, s, inputs, None, launch)
+        _constrain(buffers, s, inputs, new_v, 0, launch)
 
 
 def _constrain(
-    buffers: ChunkBuffers, s: int, inputs: Any, velocity: wp.array | None, launch: KernelLauncher
+    buffers: ChunkBuffers, s: int, inputs: Any, velocity: wp.array, anew: int, launch: KernelLauncher
 ) -> None:
     """Constraints of nodes in substep ``s``, for the new velocity or for that without contact."""
-    now, then = buffers.index(s), buffers.index(s + 1)
-    u, new_u = buffers.u_arrays[now], buffers.u_arrays[then]
-    velocity = buffers.v_arrays[then] if velocity is None else velocity
+    u, new_u = buffers.u_arrays[buffers.index(s)], buffers.u_arrays[buffers.index(s + 1)]
     if buffers.reflection is not None:
-        buffers.reflection.advance(launch, buffers.words_array, u, velocity, new_u)
+        buffers.reflection.advance(launch, buffers.words_array, u, velocity, new_u, anew)
     drive(buffers.model, launch, inputs, buffers.words_array, u, new_u, velocity)
 
 
@@ -134,7 +134,7 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         adjoint.contact.advance(launch, *given, *out, forward.u_arrays[s])
         drive_adj(model, launch, shared.wanted, 0.0, *state, adj_inputs)
     if reflection is not None:
-        reflection.finish(launch, *state)
+        reflection.finish(launch, forward.chunk.anew(s), *state)
     if adjoint.contact is None or model.spec.constrained:
         kernel = nodes_adj(model.spec, shared.wanted).advance_adj
         node_launch(model, launch, kernel, model.constants, *given, *out)

@@ -10,9 +10,11 @@ from torch import Tensor
 from softmpm.kernels.lagrangian.mirror import mirror, mirror_adj, mirror_type
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
-from softmpm.schemes.buffers import view
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.lagrangian.bricks import NODE_PART
 from softmpm.schemes.lagrangian.surface import SurfaceContact
+from softmpm.state import Nodal
 
 
 class Reflection:
@@ -20,6 +22,10 @@ class Reflection:
 
     Args:
         mass: Masses of the nodes, shape (world, node).
+
+    Attributes:
+        reaction: Mean forces on the groups in the control step so far [N], shape (world, group, dim).
+        rate: 1/T in the unit of force, T being the duration of a control step, shape (1,).
     """
 
     def __init__(self, model: Model, mass: Tensor):
@@ -31,6 +37,18 @@ class Reflection:
         self.struct.members = view(groups.members, wp.int32)
         self._signs = groups.signs.to(model.dtype)
         self.struct.signs = view(self._signs, t.vec)
+        self.reaction = torch.empty(*self.lead, model.dim, dtype=model.dtype, device=model.device)
+        self.rate = torch.empty(1, dtype=model.dtype, device=model.device)
+        self._reaction, self.rate_array = view(self.reaction, t.vec), view(self.rate, t.real)
+
+    def load(self, chunk: Chunk, start: Nodal) -> None:
+        """Prepare the mean forces for a chunk that begins with this state."""
+        if chunk.begins:
+            clear(self.reaction)
+        else:
+            assert start.reaction is not None
+            self.reaction.copy_(start.reaction.detach())
+        self.rate.copy_(self.model.mass_unit / (chunk.substeps * self.model.scene.dt))
 
     def vectors(self) -> wp.array:
         """Scratch memory of a nodal field."""
@@ -39,12 +57,18 @@ class Reflection:
         return view(tensor, types(model.spec.dim, model.spec.dtype).vec)
 
     def advance(
-        self, launch: Callable[..., None], words: wp.array, u: wp.array, new_v: wp.array, new_u: wp.array
+        self,
+        launch: Callable[..., None],
+        words: wp.array,
+        u: wp.array,
+        new_v: wp.array,
+        new_u: wp.array,
+        anew: int = 0,
     ) -> None:
-        """(B1) of ``new_v``, and ``new_u`` that follows from it."""
+        """(B1) of ``new_v``, and ``new_u`` that follows from it; ``anew`` is 1 if a control step begins, whose mean force is new."""
         constants, kernel = self.model.constants, mirror(self.model.spec).reflect
-        arguments = (constants, self.struct, self.mass, words, u, new_v, new_u)
-        launch(kernel, self.lead, *arguments, part=NODE_PART)
+        parameters = (constants, self.struct, self.mass, self.rate_array, anew, words)
+        launch(kernel, self.lead, *parameters, u, self._reaction, new_v, new_u, part=NODE_PART)
 
 
 class ReflectionAdj:
@@ -54,6 +78,9 @@ class ReflectionAdj:
         contact: Surface contact of the chunk, or None.
         words: Status words, all of them of worlds that run.
         adj_mass: Adjoint of the masses of the nodes, added into.
+
+    Attributes:
+        reaction: Adjoint of the mean forces.
     """
 
     def __init__(
@@ -68,6 +95,8 @@ class ReflectionAdj:
         self._words, self._adj_mass = words, adj_mass
         self._kernels = mirror_adj(forward.model.spec, wanted)
         self._free, self._scratch = forward.vectors(), forward.vectors()
+        self.reaction = torch.empty_like(forward.reaction)
+        self._reaction = view(self.reaction, types(forward.model.spec.dim, forward.model.spec.dtype).vec)
 
     def begin(
         self,
@@ -86,18 +115,37 @@ class ReflectionAdj:
         launch(self._kernels.free_again, one.mass.shape, *arguments, self._free, part=NODE_PART)
         if self.contact is not None:
             launch(self._kernels.free_again, one.mass.shape, *arguments, self.contact.free, part=NODE_PART)
-            one.advance(launch, self._words, u, self.contact.free, self._scratch)
-            self._reflect(launch, one.model.scene.dt, new_v, adj_u, adj_v)
+            one.advance(
+                launch, self._words, u, self.contact.free, self._scratch
+            )  # its mean forces are not read
+            self._reflect(launch, one.model.scene.dt, 0, new_v, adj_u, adj_v)
 
-    def finish(self, launch: Callable[..., None], adj_u: wp.array, adj_v: wp.array) -> None:
+    def finish(self, launch: Callable[..., None], anew: int, adj_u: wp.array, adj_v: wp.array) -> None:
         """Adjoint of the first reflection."""
         moved = self.forward.model.scene.dt if self.contact is None else 0.0
-        self._reflect(launch, moved, self._free, adj_u, adj_v)
+        self._reflect(launch, moved, anew, self._free, adj_u, adj_v)
+
+    def load(self, adj_end: Nodal) -> None:
+        """Take the adjoint of the mean forces in the final state of a chunk."""
+        assert adj_end.reaction is not None
+        self.reaction.copy_(adj_end.reaction)
+
+    def unload(self, chunk: Chunk) -> Tensor:
+        """Adjoint of the mean forces in the initial state of a chunk, which it reads unless a control step begins with it."""
+        return torch.zeros_like(self.reaction) if chunk.begins else self.reaction.clone()
 
     def _reflect(
-        self, launch: Callable[..., None], moved: float, v: wp.array, adj_u: wp.array, adj_v: wp.array
+        self,
+        launch: Callable[..., None],
+        moved: float,
+        anew: int,
+        v: wp.array,
+        adj_u: wp.array,
+        adj_v: wp.array,
     ) -> None:
-        """(B1.adj) at ``v``. After the second reflection v is its result, so that the masses get nothing: (K5.adj) has their part."""
+        """(B1.adj) and (B3.adj) at ``v``. After the second reflection v is its result, so that the masses get nothing: (K5.adj) has
+        their part."""
         one = self.forward
-        arguments = (one.struct, one.mass, moved, v, adj_u, adj_v, self._adj_mass)
-        launch(self._kernels.reflect_adj, one.lead, *arguments, part=NODE_PART)
+        parameters = (one.struct, one.mass, moved, one.rate_array, anew)
+        arguments = (v, adj_u, self._reaction, adj_v, self._adj_mass)
+        launch(self._kernels.reflect_adj, one.lead, *parameters, *arguments, part=NODE_PART)

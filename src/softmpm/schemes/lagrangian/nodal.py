@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from softmpm.checks import check_reflected, check_shown
-from softmpm.kernels.lagrangian.projection import masses, node_sums, projection
+from softmpm.kernels.lagrangian.node_sums import node_sums
+from softmpm.kernels.lagrangian.projection import masses, projection
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import passing, view
@@ -48,7 +49,7 @@ def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     if model.mirror is not None:
         u, v = model.mirror.reflected(of_nodes, u, v)
     anchors = _anchors(model, u, normals)
-    return Nodal(u, v, anchors, torch.zeros_like(anchors), shift)
+    return with_reaction(model, Nodal(u, v, anchors, torch.zeros_like(anchors), shift))
 
 
 def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = None) -> Nodal:
@@ -64,7 +65,12 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
         check_shown(state, particles_of(model, nodes.detach()))
         if model.mirror is not None:
             check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
-    return nodes._replace(shift=shift_of(model, nodes).detach())
+    return with_reaction(model, nodes._replace(shift=shift_of(model, nodes).detach()), nodes.reaction)
+
+
+def with_reaction(model: Model, nodes: Nodal, reaction: Tensor | None = None) -> Nodal:
+    """The state with these mean forces of clamps and planes of symmetry; None is zero."""
+    return nodes._replace(reaction=nodes.u.new_zeros(model.reaction_shape) if reaction is None else reaction)
 
 
 class _Arrays:

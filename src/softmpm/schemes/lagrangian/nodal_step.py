@@ -48,7 +48,7 @@ class NodalStep:
         self.last, failed = substep, self.words != NEVER
         graph = self._launch(now, values, failed)
         self._take(graph.buffers.words, substep)
-        for own, found in zip(then, graph.buffers.end(), strict=True):
+        for own, found in zip(then, graph.end(), strict=True):
             assert own is not None and found is not None
             own.copy_(found)
 
@@ -61,10 +61,10 @@ class NodalStep:
         if wanted not in self._adjoints:
             self._adjoints[wanted] = ChunkGraphAdj(graph, SharedAdjoint(graph.buffers, wanted))
         adjoint = self._adjoints[wanted]
-        adjoint.buffers.load(adj_then)
+        adjoint.load(adj_then)
         adjoint.run(self.stream)
         self._take(graph.buffers.words, substep)
-        return adjoint.buffers.unload(self.stream, ONE, adj_inputs), adj_inputs
+        return adjoint.unload(self.stream, ONE, adj_inputs), adj_inputs
 
     def checked(self, end: Nodal, values: Values) -> Tensor:
         """Status words after all alarms on particles in the state after the latest step."""
@@ -85,7 +85,7 @@ class NodalStep:
             )
         if self._graph is None:
             self._graph = ChunkGraph(self.model, ONE, keep=True)
-        self._graph.buffers.load(self.stream, ONE, now, values, ())
+        self._graph.load(self.stream, ONE, now, values, ())
         if failed is not None:
             self._graph.buffers.words.masked_fill_(failed, FROZEN)
         self._graph.run(self.stream)

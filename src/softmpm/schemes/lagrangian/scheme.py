@@ -24,7 +24,7 @@ from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
 from softmpm.schemes.lagrangian.frame import shift_of
 from softmpm.schemes.lagrangian.kernels import define
 from softmpm.schemes.lagrangian.launches import launch_chunk, launch_chunk_adj
-from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
+from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of, with_reaction
 from softmpm.schemes.lagrangian.surface import check_start
 from softmpm.schemes.launch import KernelLauncher, LaunchReplay
 from softmpm.state import Nodal, State
@@ -37,9 +37,22 @@ class ChunkGraph:
         self.buffers = ChunkBuffers(model, chunk, keep)
         self._replay = LaunchReplay(model)
 
+    def load(
+        self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Sequence[int]
+    ) -> None:
+        """Copy the initial state and the inputs of a chunk into the buffers."""
+        self.buffers.load(stream, chunk, start, values, frozen)
+        if self.buffers.reflection is not None:
+            self.buffers.reflection.load(chunk, start)
+
     def run(self, stream: wp.Stream | None) -> None:
         """Launch all substeps on what the buffers hold."""
         self._replay.run(stream, lambda launch: launch_chunk(self.buffers, launch))
+
+    def end(self) -> Nodal:
+        """Copy of the final state."""
+        end, reflection = self.buffers.end(), self.buffers.reflection
+        return with_reaction(self.buffers.model, end, reflection and reflection.reaction.clone())
 
 
 class ChunkGraphAdj:
@@ -48,6 +61,17 @@ class ChunkGraphAdj:
     def __init__(self, graph: ChunkGraph, shared: SharedAdjoint):
         self.buffers = ChunkAdjoint(graph.buffers, shared)
         self._replay = LaunchReplay(graph.buffers.model)
+
+    def load(self, adj_end: Nodal) -> None:
+        """Copy the adjoint of the final state into the buffers, and clear all sums."""
+        self.buffers.load(adj_end)
+        if self.buffers.reflection is not None:
+            self.buffers.reflection.load(adj_end)
+
+    def unload(self, stream: wp.Stream | None, chunk: Chunk, adj_inputs: InputsAdj) -> Nodal:
+        """Add the adjoints of the inputs into ``adj_inputs``; returns that of the initial state."""
+        adj, reflection = self.buffers.unload(stream, chunk, adj_inputs), self.buffers.reflection
+        return with_reaction(self.buffers.model, adj, reflection and reflection.unload(chunk))
 
     def run(self, stream: wp.Stream | None) -> None:
         """Turn the adjoint of the final state in the buffers into that of the initial state."""
@@ -90,18 +114,18 @@ class LagrangianRun:
         self.pool, self.chunk, self.start = pool, chunk, start
         self._lease = Lease(pool, chunk, keep)
         graph, stream = self._lease.cached.graph, stream_of(pool.model.device)
-        graph.buffers.load(stream, chunk, start, values, frozen)
+        graph.load(stream, chunk, start, values, frozen)
         graph.run(stream)
-        self.end, self.words = graph.buffers.end(), graph.buffers.words
+        self.end, self.words = graph.end(), graph.buffers.words
 
     def vjp(self, adj_end: Nodal, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Nodal:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         with self.pool.lock:
             adjoint = self.pool.adjoint(self._lease.cached, wanted)
-            adjoint.buffers.load(adj_end)
+            adjoint.load(adj_end)
             stream = stream_of(self.pool.model.device)
             adjoint.run(stream)
-            return adjoint.buffers.unload(stream, self.chunk, adj_inputs)
+            return adjoint.unload(stream, self.chunk, adj_inputs)
 
 
 class Lagrangian:
