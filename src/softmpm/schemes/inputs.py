@@ -1,6 +1,7 @@
 """Inputs of the kernels on a device, and their adjoints: structs, accumulators and sums, all derived from the table in inputs.py."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 import warp as wp
@@ -17,15 +18,35 @@ Values = dict[str, Tensor]
 (world, muscle), (world, driven), (world, driven node), (world,) or (world, wall), then the axis of a vector."""
 
 
-def particle_struct(model: Model, values: Mapping[str, Tensor], p2g: int = 0, g2p: int = 0):
-    """Struct of the inputs of particles, in row ``p2g`` for the stress and ``g2p`` for the motion; others are unset."""
-    struct = input_types(model.spec).ParticleInputs()
+def particle_struct(
+    model: Model, values: Mapping[str, Tensor], p2g: int = 0, g2p: int = 0, struct: Any = None
+):
+    """Struct of the inputs of particles, in row ``p2g`` for the stress and ``g2p`` for the motion; others are unset, or remain as they
+    are in ``struct``."""
+    struct = input_types(model.spec).ParticleInputs() if struct is None else struct
     for one in present(model.spec):
         if one.stage != "grid" and one.name in values:
             tensor = values[one.name]
             tensor = tensor[{"p2g": p2g, "g2p": g2p}[one.stage]] if one.rows else tensor
             setattr(struct, one.name, view(tensor, element_type(model.spec, one)))
     return struct
+
+
+class ReusedParticleStruct:
+    """Struct of the inputs of particles in the first row, of which only those fields are set again whose tensor is another one."""
+
+    def __init__(self, model: Model):
+        self._model, self._struct = model, input_types(model.spec).ParticleInputs()
+        self._set: dict[str, tuple[Tensor, int]] = {}
+
+    def of(self, values: Mapping[str, Tensor]):
+        new = {}
+        for name, tensor in values.items():
+            before, address = self._set.get(name, (None, 0))
+            if before is not tensor or address != tensor.data_ptr():
+                new[name] = tensor
+                self._set[name] = tensor, tensor.data_ptr()
+        return particle_struct(self._model, new, struct=self._struct)
 
 
 def grid_struct(model: Model, values: Mapping[str, Tensor], row: int = 0, substep: int = 0):

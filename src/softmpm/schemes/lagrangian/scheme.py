@@ -17,7 +17,7 @@ from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.graph_cache import GraphCache, Lease
-from softmpm.schemes.inputs import InputsAdj, Values, elapsed, grid_struct, particle_struct, stiffest
+from softmpm.schemes.inputs import InputsAdj, ReusedParticleStruct, Values, elapsed, grid_struct, stiffest
 from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers, SharedAdjoint
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
@@ -143,6 +143,7 @@ class Lagrangian:
 
     def __init__(self, model: Model):
         self.model, self._pool = model, LagrangianGraphs(model)
+        self._start_inputs = ReusedParticleStruct(model)
         define(model.spec)
 
     def run(
@@ -154,7 +155,7 @@ class Lagrangian:
         model = self.model
         words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
-        inputs = particle_struct(model, model.fixed | stiffest(model, values))
+        inputs = self._start_inputs.of(model.fixed | stiffest(model, values))
         arguments = (model.constants, inputs, rest_struct(model), 0, False, u, view(words, wp.int64))
         kernel = cells(model.spec, model.rest_grid.bricks).check_start
         launch = KernelLauncher(model, stream_of(model.device))

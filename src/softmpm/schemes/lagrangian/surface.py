@@ -25,6 +25,10 @@ POINT_PART = 64
 
 def surface_struct(model: Model):
     """Struct on the surface points."""
+    return model.workspace.get(surface_struct, lambda: _surface_struct(model))
+
+
+def _surface_struct(model: Model):
     t, points = types(model.spec.dim, model.spec.dtype), model.surface
     assert isinstance(points, SurfaceGrid)
     struct = surface_type(model.spec.dim, model.spec.dtype)()
