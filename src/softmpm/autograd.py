@@ -10,15 +10,8 @@ from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
 from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
-from softmpm.checks import (
-    check_activation,
-    check_finite,
-    check_horizon,
-    check_inputs,
-    check_inputs_bounds,
-    check_state,
-    control_steps,
-)
+from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
+from softmpm.checks import check_activation, check_finite, check_horizon, check_state
 from softmpm.compiling import opaque
 from softmpm.inputs import Inputs, differentiable
 from softmpm.kernel_inputs import derive

@@ -1,4 +1,4 @@
-"""Every rule of the tensors that meet a model.
+"""Rules of the tensors that meet a model; those of inputs are in ``check_inputs.py``.
 
 Each message names the rule, the value received and a remedy.
 """
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.inputs import QUANTITIES, Inputs
+from softmpm.inputs import QUANTITIES
 from softmpm.planning.chunks import Horizon
 from softmpm.state import Low, Nodal, Params, State, SurfaceState
 from softmpm.validate import need
@@ -58,7 +58,7 @@ def check_state(model: Sizes, state: State) -> None:
     lead, d = (model.worlds, model.particle_count), model.dim
     shapes = {"x": (*lead, d), "v": (*lead, d), "C": (*lead, d, d), "F": (*lead, d, d)}
     for name in shapes:
-        _check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
+        check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
     if state.nodes is not None:
         _check_nodes(model, state.nodes)
     if state.surface is not None:
@@ -68,7 +68,7 @@ def check_state(model: Sizes, state: State) -> None:
     if not isinstance(state.low, Low):
         raise TypeError(f"state.low must be a softmpm.Low or None, got {type(state.low).__name__}.")
     for name in ("x", "F"):
-        _check_tensor(model, f"state.low.{name}", getattr(state.low, name), shapes[name])
+        check_tensor(model, f"state.low.{name}", getattr(state.low, name), shapes[name])
 
 
 def _check_nodes(model: Sizes, nodes: Nodal) -> None:
@@ -81,11 +81,11 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
     shape = (model.worlds, model.rest_grid.count, model.dim)
     wanted_shapes = {"u": shape, "v": shape, "anchor": model.anchor_shape, "force": model.anchor_shape}
     for name, wanted in wanted_shapes.items():
-        _check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
+        check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
     if nodes.reaction is not None:
-        _check_tensor(model, "state.nodes.reaction", nodes.reaction, model.reaction_shape)
+        check_tensor(model, "state.nodes.reaction", nodes.reaction, model.reaction_shape)
     if nodes.shift is not None:
-        _check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
+        check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
 
 
 def _check_surface(model: Sizes, surface: SurfaceState) -> None:
@@ -95,9 +95,9 @@ def _check_surface(model: Sizes, surface: SurfaceState) -> None:
             "state.surface must be None unless formulation='moving' and contact='surface'; take state._replace(surface=None)."
         )
     shape = model.anchor_shape
-    _check_tensor(model, "state.surface.x", surface.x, (shape[0], *shape[2:]), torch.float64)
+    check_tensor(model, "state.surface.x", surface.x, (shape[0], *shape[2:]), torch.float64)
     for name in ("anchor", "force"):
-        _check_tensor(model, f"state.surface.{name}", getattr(surface, name), shape)
+        check_tensor(model, f"state.surface.{name}", getattr(surface, name), shape)
 
 
 def check_carried(apart: Tensor, spacing: float) -> None:
@@ -136,7 +136,7 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
     """Shape (control_step, world, muscle), dtype and device; None is no activation."""
     if activation is None:
         return
-    _check_tensor(model, "activation", activation)
+    check_tensor(model, "activation", activation)
     want = (model.worlds, model.muscle_count)
     if activation.ndim != 3 or activation.shape[1:] != want:
         rows = activation.ndim == 2 and model.worlds == 1 and len(activation) > 1
@@ -155,95 +155,13 @@ def check_row(model: Sizes, activation: Tensor | None) -> None:
     """Shape (world, muscle), dtype and device of one row of activation; None is no activation."""
     if activation is None:
         return
-    _check_tensor(model, "activation", activation)
+    check_tensor(model, "activation", activation)
     want = (model.worlds, model.muscle_count)
     need(
         activation.shape == want,
         f"activation must have shape (world, muscle) = {want}, got {tuple(activation.shape)}; "
         "of several control steps take one row, activation[k].",
     )
-
-
-def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
-    """Inputs that are given, by name: such as the model was built for, with shapes that broadcast, its dtype and its device."""
-    if inputs is None:
-        return {}
-    given = {name: value for name, value in _fields("inputs", inputs, Inputs._fields) if value is not None}
-    for name, value in given.items():
-        need(
-            name in (*model.spec.given, *model.defaults, "strength")
-            or (name == "position" and "velocity" in model.defaults),
-            f"inputs.{name} was given, but the model's kernels do not take it; build the model with inputs=({name!r},).",
-        )
-        dtype = torch.float64 if QUANTITIES[name].double else model.dtype
-        _check_tensor(model, f"inputs.{name}", value, dtype=dtype)
-        axes, steps = QUANTITIES[name].axes, _steps(name, value)
-        want = model.shape_of(name, 1 if steps is None else steps)
-        shape = tuple(value.shape)
-        pairs = list(zip(reversed(shape), reversed(want), reversed(axes), strict=False))
-        fits = all(n in (1, full) or axis in ("pose", "control_step") for n, full, axis in pairs)
-        # With one axis less nobody can tell whether it is that of the rows or of the worlds:
-        in_doubt = axes[0] in ("pose", "control_step") and len(shape) == len(want) - 1
-        if not fits or in_doubt or len(shape) > len(want):
-            full = ", ".join(
-                axis if axis in ("pose", "control_step") else str(n)
-                for axis, n in zip(axes, want, strict=True)
-            )
-            raise ValueError(
-                f"inputs.{name} must broadcast to ({', '.join(axes)}) = ({full}), got shape {shape}"
-                + (
-                    "; give the first two axes both or neither, of size 1 where all share it."
-                    if in_doubt
-                    else "."
-                )
-            )
-    need(
-        not {"position", "velocity"} <= given.keys(),
-        "inputs.position and inputs.velocity were both given; give the driven particles one of them.",
-    )
-    return given
-
-
-def _steps(name: str, value: Tensor) -> int | None:
-    """Control steps that an input tells; None if it serves any number."""
-    axes = QUANTITIES[name].axes
-    if value.ndim < len(axes) or len(value) == 1 or axes[0] not in ("pose", "control_step"):
-        return None
-    return len(value) - (axes[0] == "pose")
-
-
-def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
-    """Of a call: those of the activation or, without one, of the inputs, which must agree."""
-    if activation is not None and not given:
-        return activation.shape[0]
-    told = {} if activation is None else {"activation": len(activation)}
-    for name, value in given.items():
-        if (steps := _steps(name, value)) is not None:
-            told[f"inputs.{name}"] = steps
-    need(
-        len(set(told.values())) <= 1,
-        "activation and inputs must have as many control steps (poses are one more), got "
-        + ", ".join(f"{steps} in {name}" for name, steps in told.items())
-        + "; one row serves all of them but in activation.",
-    )
-    return next(iter(told.values()), 1)
-
-
-def check_inputs_bounds(given: dict[str, Tensor]) -> None:
-    """All inputs are finite and within their bounds. Reads back once: a GPU has to wait."""
-    if not given:
-        return
-    given = {name: value.detach() for name, value in given.items()}
-    ends = [end.double() for value in given.values() for end in torch.aminmax(value)]
-    ends = torch.stack(ends).tolist()
-    for (name, value), low, high in zip(given.items(), ends[::2], ends[1::2], strict=True):
-        known = QUANTITIES[name]
-        least = math.nextafter(known.low, -math.inf) if known.closed else known.low
-        if not (least < low and high < known.high):
-            _demand(f"inputs.{name}", value, (value > least) & (value < known.high), known.rule)
-    for name in {"wall_normal", "direction"} & given.keys():
-        length = given[name].norm(dim=-1)
-        _demand(f"the length of inputs.{name}", length, length > 0, "> 0")
 
 
 def check_horizon(steps: int, substeps: int) -> Horizon:
@@ -260,8 +178,8 @@ def check_horizon(steps: int, substeps: int) -> Horizon:
 def check_params(model: Sizes, params: NamedTuple) -> None:
     """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
     want = (model.worlds, model.particle_count)
-    for name, value in _fields("params", params, Params._fields):
-        _check_tensor(model, f"params.{name}", value)
+    for name, value in fields("params", params, Params._fields):
+        check_tensor(model, f"params.{name}", value)
         shape = tuple(value.shape)
         fits = all(n in (1, full) for n, full in zip(reversed(shape), reversed(want), strict=False))
         if not fits or len(shape) > 2:
@@ -286,18 +204,18 @@ def check_bounds(params: NamedTuple, mass: Tensor, unit: Tensor) -> None:
         mass: That of the particles [kg], density times volume.
         unit: In which the kernels count it [kg], shape ().
     """
-    given = [*_fields("params", params, Params._fields), ("mass", mass)]
+    given = [*fields("params", params, Params._fields), ("mass", mass)]
     found = [end for _, value in given for end in torch.aminmax(value)]
     *ends, lightest, heaviest, one = torch.stack([*found, unit]).tolist()
     for (name, value), low, high in zip(given[:-1], ends[::2], ends[1::2], strict=True):
         least, most, rule = QUANTITIES[name].low, QUANTITIES[name].high, QUANTITIES[name].rule
         if not (least < low and high < most):
-            _demand(f"params.{name}", value, (value > least) & (value < most), rule)
+            demand(f"params.{name}", value, (value > least) & (value < most), rule)
     real = torch.finfo(mass.dtype)
     least, most = max(one, 1.0) * real.tiny, min(one, 1.0) * real.max  # in both units
     if not (least <= lightest and heaviest <= most):
         rule = f"in [{least:.3g}, {most:.3g}] kg to be exact in {mass.dtype}; change params.density, or the units"
-        _demand("mass = density * volume", mass, (mass >= least) & (mass <= most), rule)
+        demand("mass = density * volume", mass, (mass >= least) & (mass <= most), rule)
 
 
 @torch.no_grad()
@@ -312,10 +230,10 @@ def check_finite(state: State | None, activation: Tensor | None) -> None:
     # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
     for (name, value), total in zip(given, torch.stack([v.sum() for _, v in given]).tolist(), strict=True):
         if not math.isfinite(total):
-            _demand(name, value, torch.isfinite(value), "finite")
+            demand(name, value, torch.isfinite(value), "finite")
 
 
-def _demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
+def demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
     """Raise ValueError for the first value that breaks the rule."""
     if not bool(holds.all()):
         index = torch.nonzero(~holds)[0].tolist()
@@ -323,14 +241,14 @@ def _demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
         raise ValueError(f"{name} must be {rule}, but {name}{place} is {value[tuple(index)].item():g}.")
 
 
-def _fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
+def fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
     for name in names:
         if not hasattr(record, name):
             raise TypeError(f"{what} must be a softmpm.{what.capitalize()}, got {type(record).__name__}.")
         yield name, getattr(record, name)
 
 
-def _check_tensor(
+def check_tensor(
     model: Sizes,
     name: str,
     value: Tensor,

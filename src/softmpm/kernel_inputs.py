@@ -36,7 +36,7 @@ def derive(
 
     Args:
         start, activation, params: As in :func:`softmpm.simulate`.
-        given: Fields of :class:`softmpm.Inputs` that are not None, already checked (checks.py).
+        given: Fields of :class:`softmpm.Inputs` that are not None, already checked (check_inputs.py).
         horizon: Length of the call; inputs that vary in time have a row for each of its control steps.
     """
     found: Values = dict(zip(("mu", "lam", "mass"), material(model, params), strict=True))

@@ -3,9 +3,6 @@
 import functools
 import html
 import math
-import pkgutil
-import re
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,14 +13,13 @@ from softmpm.alarms import Alarms
 from softmpm.describe import describe
 from softmpm.driven_grid import DrivenGrid
 from softmpm.inputs import QUANTITIES, direction_of, stored
-from softmpm.kernels import physics
-from softmpm.kernels.structs import Spec, types
 from softmpm.mirror_grid import MirrorGrid
 from softmpm.overlap_grid import overlap_grid
 from softmpm.planning.memory import Footprint, Sizes, check_room, default_budget
 from softmpm.rest_grid import RestGrid
 from softmpm.scene.neighbours import rest_neighbours
-from softmpm.scene.scene import MIRRORS, Scene
+from softmpm.scene.scene import Scene
+from softmpm.specification import ACTUATORS, LAWS, constants_of, kernel_of, muscle_slots, specification
 from softmpm.stability import stiffening_signs
 from softmpm.state import Low, Params, State
 from softmpm.summary import counted
@@ -115,8 +111,8 @@ class Model:
             self.surface = (
                 SurfaceGrid(scene, self.rest_grid, device) if reference else CarriedPoints(scene, device)
             )
-        self.contact_width = contact_width
-        self.spec = _spec(scene, dtype, slots.shape[1], given, fixed_point, surface, formulation)
+        self.contact_width, precision = contact_width, str(dtype).removeprefix("torch.")
+        self.spec = specification(scene, precision, slots.shape[1], given, fixed_point, surface, formulation)
         self.mirror = MirrorGrid(scene, self.rest_grid, device) if self.spec.mirrors else None
         self.driven_grid = (
             DrivenGrid(scene, self.rest_grid, self.mirror, device) if self.spec.driven_nodes else None
@@ -139,28 +135,12 @@ class Model:
         }
         wp.init()
         self.wp_device = wp.device_from_torch(device)
-        self.constants = self._constants()
+        self.constants = constants_of(scene, self.spec, alarms)
         check_room(self)
         self.neighbours = self._neighbours()
 
     def _tensor(self, values) -> Tensor:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
-
-    def _constants(self):
-        scene, t = self.scene, types(self.spec.dim, self.spec.dtype)
-        constants = t.Constants()
-        constants.shape = t.ivec(*scene.grid.shape)
-        constants.dt = scene.dt
-        constants.spacing = constants.exact_spacing = scene.grid.spacing
-        constants.rate, constants.width = _inverse_pair(scene.grid.spacing, self.dtype)
-        constants.gravity = t.vec(*(scene.gravity or ()))
-        constants.decay = math.exp(-scene.damping * scene.dt)
-        survives = all(body.material.survives_inversion for body in scene.bodies)
-        alarms, least = self.alarms, -math.inf if survives else 0.0
-        constants.collapse = (least if alarms.collapse is None else alarms.collapse) - 1.0
-        constants.gap = math.inf if alarms.gap is None else alarms.gap**2
-        constants.step = math.inf if alarms.step is None else alarms.step**2
-        return constants
 
     def _neighbours(self) -> Tensor:
         """Neighbours at rest of each particle, -1 for none, shape (particle, dim); without columns if no alarm needs them."""
@@ -300,81 +280,6 @@ class Model:
     def describe(self, substeps: int = 1000) -> str:
         """Summary of the compiled features, the features left out, and the memory of calls of this many substeps."""
         return describe(self, substeps)
-
-
-def _inverse_pair(spacing: float, dtype: torch.dtype) -> tuple[float, float]:
-    """4/dx and dx as numbers of a precision whose product is 4 as nearly as a few units in their last place allow.
-
-    C goes through both in every substep: rounded one by one they let a free body spin up or down by 1e-4 in 10,000 substeps of float32.
-    """
-    real = np.float32 if dtype == torch.float32 else np.float64
-    rate = real(4.0 / spacing)
-    rates = [rate + k * np.spacing(rate) for k in sorted(range(-16, 17), key=abs)]
-    pairs = [(float(r), float(real(4.0 / float(r)))) for r in rates]
-    return min(pairs, key=lambda pair: abs(pair[0] * pair[1] - 4.0))
-
-
-def muscle_slots(scene: Scene, particle_count: int) -> np.ndarray:
-    """Muscles of each particle, shape (particle, most that overlap on one), filled up with -1."""
-    members = np.zeros(particle_count, dtype=np.int64)
-    for muscle in scene.muscles:
-        members[muscle.particles] += 1
-    slots = np.full((particle_count, int(members.max(initial=0))), -1, dtype=np.int32)
-    members[:] = 0
-    for k, muscle in enumerate(scene.muscles):
-        slots[muscle.particles, members[muscle.particles]] = k
-        members[muscle.particles] += 1
-    return slots
-
-
-LAWS, ACTUATORS = "laws", "actuators"
-
-
-def kernel_of(part: object, package: str) -> str:
-    """Name of the file of kernels/physics that has the kernels of a material or an actuator: that of its class."""
-    name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(part).__name__).lower()
-    known = [found.name for found in pkgutil.iter_modules([str(Path(physics.__file__).parent / package)])]
-    if name not in known:
-        raise TypeError(
-            f"{type(part).__name__} has no kernels: kernels/physics/{package} has {', '.join(known)}, and no {name}."
-        )
-    return name
-
-
-def _spec(
-    scene: Scene,
-    dtype: torch.dtype,
-    slots: int,
-    given: tuple[str, ...],
-    fixed_point: bool,
-    surface: bool,
-    formulation: str,
-) -> Spec:
-
-    def has(name: str) -> bool:
-        """True if the scene has a quantity other than zero, or calls give it."""
-        default = QUANTITIES[name].default
-        return name in given or (default is not None and bool(np.any(default(scene))))
-
-    return Spec(
-        dim=scene.grid.dim,
-        dtype=str(dtype).removeprefix("torch."),
-        laws=tuple(sorted({kernel_of(body.material, LAWS) for body in scene.bodies})),
-        muscle_slots=slots,
-        contacts=tuple(wall.contact for wall in scene.walls),
-        friction=has("friction"),
-        gravity=has("gravity"),
-        damping=has("damping"),
-        actuators=tuple(sorted({kernel_of(muscle, ACTUATORS) for muscle in scene.muscles})),
-        fibres=any(hasattr(muscle, "direction") for muscle in scene.muscles),
-        viscosity=has("viscosity"),
-        driven=len(scene.driven) > 0 and formulation == "moving",
-        driven_nodes=len(scene.driven) > 0 and formulation == "reference",
-        given=given,
-        deterministic=fixed_point,
-        surface=surface,
-        mirrors=tuple(k for k, wall in enumerate(scene.walls) if wall.contact in MIRRORS),
-    )
 
 
 def check_model(model: object, wants: str) -> None:

@@ -1,12 +1,10 @@
 """The whole method again in plain PyTorch: slow, readable, the truth in tests; no code shared with kernels.
 
 Every function takes tensors with any leading axes and is differentiated by torch.autograd; meant for float64.
-The stress of a particle stands in ``reference_stress.py``, walls in ``reference_walls.py``, the total Lagrangian formulation in
-``reference_lagrangian.py``. Derivations and labels: docs/math/.
+The stress of a particle stands in ``reference_stress.py``, transfers in ``reference_transfer.py``, walls in ``reference_walls.py``, the
+total Lagrangian formulation in ``reference_lagrangian.py``. Derivations and labels: docs/math/.
 """
 
-import itertools
-import math
 from collections.abc import Sequence
 
 import torch
@@ -30,6 +28,7 @@ from softmpm.reference_stress import (
     viscous_stress,
     viscous_tangent,
 )
+from softmpm.reference_transfer import g2p, p2g, stencil
 from softmpm.reference_walls import inside, respond, surface, wall_velocity
 from softmpm.scene.scene import CONTACTS, Actuator, Scene
 from softmpm.state import GridField, Params, State
@@ -118,47 +117,6 @@ def _given(value: Tensor | None, scenes: float | Sequence[float], like: Tensor, 
     return value.expand(shape)
 
 
-def stencil(scene: Scene, x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """For each of the 3^dim nodes near every particle: flat node index, weight and r = x_i − x_p (S1)."""
-    dx, shape = scene.grid.spacing, scene.grid.shape
-    base = torch.floor(x.detach() / dx - 0.5)
-    outside = ~((base >= 0) & (base <= torch.tensor(shape) - 3)).all(-1)  # also where x is not a number
-    if outside.any():
-        first = tuple(outside.nonzero()[0].tolist())
-        raise ValueError(
-            f"particle {first[-1]} of world {first[0]} must stay half a cell inside the grid, got "
-            f"x = {x[first].tolist()} m; make the grid larger or dt smaller."
-        )
-    nodes = []
-    for offset in itertools.product(range(3), repeat=len(shape)):
-        node = base + torch.tensor(offset, dtype=x.dtype)
-        r = node * dx - x
-        weight = spline(r / dx).prod(-1)
-        flat = torch.zeros(x.shape[:-1], dtype=torch.int64)
-        for axis, count in enumerate(shape):
-            flat = flat * count + node[..., axis].long()
-        nodes.append((flat, weight, r))
-    return nodes
-
-
-def spline(distance: Tensor) -> Tensor:
-    """Quadratic B-spline of a distance in cells; |distance| ≤ 3/2 by the choice of the stencil."""
-    d = distance.abs()
-    return torch.where(d < 0.5, 0.75 - d**2, 0.5 * (1.5 - d) ** 2)
-
-
-def p2g(scene: Scene, x: Tensor, mass: Tensor, momentum: Tensor, affine: Tensor) -> tuple[Tensor, Tensor]:
-    """m_i = Σ w m_p and (mv)_i = Σ w (p + A r) (T1), shapes (world, node) and (world, node, dim)."""
-    count = math.prod(scene.grid.shape)
-    node_mass = x.new_zeros(len(x), count)
-    node_momentum = x.new_zeros(len(x), count, x.shape[-1])
-    for node, weight, r in stencil(scene, x):
-        node_mass = node_mass.scatter_add(1, node, weight * mass)
-        share = weight[..., None] * (momentum + (affine @ r[..., None])[..., 0])
-        node_momentum = node_momentum.scatter_add(1, node[..., None].expand_as(share), share)
-    return node_mass, node_momentum
-
-
 def grid_velocity(
     scene: Scene,
     mass: Tensor,
@@ -192,16 +150,6 @@ def grid_velocity(
         response = u + respond(wall, v - u, friction[:, k, None, None], where.unit[:, None])  # (C5)
         v = torch.where(inside(scene, where, displacement)[..., None] & present, response, v)
     return torch.where(present, v, torch.zeros_like(v))
-
-
-def g2p(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """v = Σ w v_i and C = Σ w v_i rᵀ / D (T2)."""
-    v, C, D = torch.zeros_like(x), x.new_zeros(*x.shape, x.shape[-1]), scene.grid.spacing**2 / 4
-    for node, weight, r in stencil(scene, x):
-        share = weight[..., None] * velocity.gather(1, node[..., None].expand_as(x))
-        v = v + share
-        C = C + share[..., :, None] * r[..., None, :] / D
-    return v, C
 
 
 def _of_materials(scene: Scene, name: str) -> list[float]:

@@ -7,22 +7,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.checks import (
-    check_finite,
-    check_inputs,
-    check_inputs_bounds,
-    check_params,
-    check_row,
-    check_state,
-    control_steps,
-)
+from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
+from softmpm.checks import check_finite, check_params, check_row, check_state
 from softmpm.inputs import INPUTS, Input, Inputs, differentiable, stored
 from softmpm.kernel_inputs import derive
-from softmpm.kernels.structs import element_type, types
+from softmpm.kernels.structs import element_type
 from softmpm.model import Model, check_model
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.alarm_check import armed, check_end
-from softmpm.schemes.buffers import Motion
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.failure_report import raise_failure
@@ -32,56 +24,7 @@ from softmpm.schemes.lagrangian.nodal_step import NodalStep
 from softmpm.schemes.plain.substep import Substep
 from softmpm.state import Params, State
 from softmpm.warp_nodal import WarpNodal, check_array, owned, warp_nodal
-
-
-@dataclass(eq=False, frozen=True, kw_only=True)
-class WarpState:
-    """State of all particles in Warp arrays of shape (world, particle); all but ``base`` can carry a gradient.
-
-    Arrays are written into (``wp.copy``), not replaced.
-    Small quantities are not stored on top of large ones: position is x = (base + fx + fx_low) dx, deformation F = I + H.
-    """
-
-    model: Model
-    """The model that it was made for, and works with."""
-    base: wp.array
-    """First node of the stencil, integer vectors."""
-    fx: wp.array
-    """Position from the base node in cells [-]; its gradient is dx ∂L/∂x."""
-    v: wp.array
-    """Velocity [m/s]."""
-    C: wp.array
-    """Affine velocity [1/s]."""
-    H: wp.array
-    """F − I [-]; its gradient is ∂L/∂F."""
-    fx_low: wp.array | None = None
-    """Part of ``fx`` that rounding removed (float32 only)."""
-
-    def __post_init__(self):
-        t = types(self.model.spec.dim, self.model.spec.dtype)
-        kinds = {"base": t.ivec, "fx": t.vec, "v": t.vec, "C": t.mat, "H": t.mat, "fx_low": t.vec}
-        for name, array in self.arrays().items():
-            check_array(self.model, name, array, (self.model.worlds, self.model.particle_count), kinds[name])
-
-    def differentiable(self) -> list[wp.array]:
-        return [self.fx, self.v, self.C, self.H]
-
-    def struct(self, model: Model):
-        struct = types(model.spec.dim, model.spec.dtype).Motion()
-        for name, array in self.arrays().items():
-            setattr(struct, name, array)
-        return struct
-
-    def arrays(self) -> dict[str, wp.array]:
-        """Every array by its name."""
-        names = ("base", "fx", "v", "C", "H", "fx_low")
-        return {name: getattr(self, name) for name in names[: 6 if self.model.dtype == torch.float32 else 5]}
-
-    def adj_struct(self, model: Model):
-        struct = types(model.spec.dim, model.spec.dtype).MotionAdj()
-        for name in ("fx", "v", "C", "H"):
-            setattr(struct, name, getattr(self, name).grad)
-        return struct
+from softmpm.warp_particles import WarpState, torch_particles, warp_particles
 
 
 @dataclass(eq=False, frozen=True, kw_only=True)
@@ -229,7 +172,7 @@ def warp_state(
     start = model.rest() if state is None else state
     if model.formulation == "reference":
         return _warp_nodal(model, start, solid, requires_grad)
-    return _warp_state(model, start, requires_grad)
+    return warp_particles(model, start, requires_grad)
 
 
 @torch.no_grad()
@@ -241,34 +184,12 @@ def _warp_nodal(model: Model, state: State, solid: WarpSolid | None, requires_gr
     return warp_nodal(model, start_of(model, state, mass, normals), requires_grad)
 
 
-@on_its_gpu
-def _warp_state(model: Model, state: State, requires_grad: bool) -> WarpState:
-    t = types(model.spec.dim, model.spec.dtype)
-    motion, work = Motion.empty(model), Substep(model)
-    work.enter(state, motion.struct(model))
-    raise_failure(model, work.words.tolist(), state)
-    return WarpState(
-        model=model,
-        base=owned(motion.base, t.ivec, False),
-        fx=owned(motion.fx, t.vec, requires_grad),
-        v=owned(motion.v, t.vec, requires_grad),
-        C=owned(motion.C, t.mat, requires_grad),
-        H=owned(motion.H, t.mat, requires_grad),
-        fx_low=None if motion.fx_low is None else owned(motion.fx_low, t.vec, False),
-    )
-
-
 def torch_state(model: Model, state: WarpState | WarpNodal) -> State:
     """The :class:`softmpm.State` that a state of this model in Warp arrays holds, in new tensors."""
     check_own(model, "torch_state", state=state)
     if isinstance(state, WarpNodal):
         return particles_of(model, state.nodal().clone())
-    return _torch_state(model, state)
-
-
-@on_its_gpu
-def _torch_state(model: Model, state: WarpState) -> State:
-    return Substep(model).leave(state.struct(model))
+    return torch_particles(model, state)
 
 
 def warp_solid(

@@ -9,7 +9,8 @@ docs/math/lagrangian.md.
     x̄ = m Σ N_i ũ,  F̄ = m (U + Cᵀ V),  v̄ = m Σ N_i ṽ,  C̄ = m V Fᵀ
     m̄ += (x − X)·Σ N_i ũ + (F − I):U + v·Σ N_i ṽ + (C F):V − Σ N_i (ũ·u_i + ṽ·v_i)                   (Q6.adj)
 
-Particles of a state are in the user's order, masses in the order of the places.
+Particles of a state are in the user's order, masses in the order of the places. Here each brick adds up what its particles give;
+node_sums.py adds up the bricks.
 """
 
 from types import SimpleNamespace
@@ -20,8 +21,7 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.interpolation import field, sums
-from softmpm.kernels.lagrangian.nodes import gathering
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
@@ -264,74 +264,3 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     adj_mass[world, place] = adj_mass[world, place] + affine + linear
 
     return SimpleNamespace(show=show, show_adj=show_adj, project=project, project_adj=project_adj)
-
-
-@kernel_factory
-def node_sums(dim: int, dtype: str) -> SimpleNamespace:
-    """Sums over the bricks around each node."""
-    t, Rest, gathered = types(dim, dtype), rest(dim, dtype).Rest, gathering(dim, dtype)
-    real, vec = t.real, t.vec
-    module = lagrangian_module(f"softmpm.d{dim}.{dtype}.node_sums")
-
-    @wp.kernel(module=module, enable_backward=False)
-    def mass(inside: Rest, partial: wp.array2d(dtype=vec), out: wp.array2d(dtype=real)):
-        """(Q2)"""
-        world, i = wp.tid()
-        out[world, i] = gathered(partial, inside, world, i)[0]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def fields(
-        inside: Rest,
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-    ):
-        """(Q5.adj)"""
-        world, i = wp.tid()
-        u[world, i] = gathered(partial_u, inside, world, i)
-        v[world, i] = gathered(partial_v, inside, world, i)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def means(
-        inside: Rest,
-        mass: wp.array2d(dtype=real),
-        partial_u: wp.array2d(dtype=vec),
-        partial_v: wp.array2d(dtype=vec),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-    ):
-        """(Q6); nodes at the very edge of a spline have no mass."""
-        world, i = wp.tid()
-        m = mass[world, i]
-        if m > real(0.0):
-            u[world, i] = gathered(partial_u, inside, world, i) / m
-            v[world, i] = gathered(partial_v, inside, world, i) / m
-        else:
-            u[world, i] = vec()
-            v[world, i] = vec()
-
-    @wp.kernel(module=module, enable_backward=False)
-    def means_adj(
-        mass: wp.array2d(dtype=real),
-        u: wp.array2d(dtype=vec),
-        v: wp.array2d(dtype=vec),
-        # In and out:
-        adj_u: wp.array2d(dtype=vec),
-        adj_v: wp.array2d(dtype=vec),
-        # Out:
-        adj_mass: wp.array2d(dtype=real),
-    ):
-        """ũ, ṽ and the last term of the mass in (Q6.adj)"""
-        world, i = wp.tid()
-        m = mass[world, i]
-        each_u = vec()
-        each_v = vec()
-        if m > real(0.0):
-            each_u = adj_u[world, i] / m
-            each_v = adj_v[world, i] / m
-        adj_u[world, i] = each_u
-        adj_v[world, i] = each_v
-        adj_mass[world, i] = -wp.dot(each_u, u[world, i]) - wp.dot(each_v, v[world, i])
-
-    return SimpleNamespace(mass=mass, fields=fields, means=means, means_adj=means_adj)

@@ -6,9 +6,10 @@
     v̄ += m Σ w p̄_i,  Ā = Σ w p̄_i rᵀ,  C̄ += m Ā,  τ̄ = −(Δt V⁰ / D) Ā,  m̄ += Σ w (p̄_i·(v + C r) + m̄_i)   (T1.adj)
     v̄' += Δt x̄',  C̄' += Δt H̄' (I + H)ᵀ,  H̄ += H̄' + Δt C'ᵀ H̄',  x̄ += x̄'                              (T3.adj)
 
-Lengths here are in cells: fx = x/dx − base, and B and A are per cell. The factors 4/dx and dx of C are chosen together (model.py),
-since their rounding would let a free body spin up or down. In float32 fx is a compensated sum: the rounding error of adding Δt v'/dx
-is stored and added in the next step. Symbols and sources: kernels/plain/transfer.py. Derivation: docs/math/transfer.md.
+Lengths here are in cells: fx = x/dx − base, and B and A are per cell. The factors 4/dx and dx of C are chosen together
+(specification.py), since their rounding would let a free body spin up or down. In float32 fx is a compensated sum: the rounding error
+of adding Δt v'/dx is stored and added in the next step. Symbols and sources: kernels/plain/transfer.py. Derivation:
+docs/math/transfer.md.
 """
 
 from types import SimpleNamespace

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from softmpm.checks import check_reflected, check_shown
-from softmpm.kernels.lagrangian.projection import masses, node_sums, projection
+from softmpm.kernels.lagrangian.node_sums import node_sums
+from softmpm.kernels.lagrangian.projection import masses, projection
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import passing, view

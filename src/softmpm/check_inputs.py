@@ -1,0 +1,95 @@
+"""Rules of the inputs that a call gives, :class:`softmpm.Inputs`.
+
+Each message names the rule, the value received and a remedy.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from softmpm.checks import Sizes, check_tensor, demand, fields
+from softmpm.inputs import QUANTITIES, Inputs
+from softmpm.validate import need
+
+
+def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
+    """Inputs that are given, by name: such as the model was built for, with shapes that broadcast, its dtype and its device."""
+    if inputs is None:
+        return {}
+    given = {name: value for name, value in fields("inputs", inputs, Inputs._fields) if value is not None}
+    for name, value in given.items():
+        need(
+            name in (*model.spec.given, *model.defaults, "strength")
+            or (name == "position" and "velocity" in model.defaults),
+            f"inputs.{name} was given, but the model's kernels do not take it; build the model with inputs=({name!r},).",
+        )
+        dtype = torch.float64 if QUANTITIES[name].double else model.dtype
+        check_tensor(model, f"inputs.{name}", value, dtype=dtype)
+        axes, steps = QUANTITIES[name].axes, _steps(name, value)
+        want = model.shape_of(name, 1 if steps is None else steps)
+        shape = tuple(value.shape)
+        pairs = list(zip(reversed(shape), reversed(want), reversed(axes), strict=False))
+        fits = all(n in (1, full) or axis in ("pose", "control_step") for n, full, axis in pairs)
+        # With one axis less nobody can tell whether it is that of the rows or of the worlds:
+        in_doubt = axes[0] in ("pose", "control_step") and len(shape) == len(want) - 1
+        if not fits or in_doubt or len(shape) > len(want):
+            full = ", ".join(
+                axis if axis in ("pose", "control_step") else str(n)
+                for axis, n in zip(axes, want, strict=True)
+            )
+            raise ValueError(
+                f"inputs.{name} must broadcast to ({', '.join(axes)}) = ({full}), got shape {shape}"
+                + (
+                    "; give the first two axes both or neither, of size 1 where all share it."
+                    if in_doubt
+                    else "."
+                )
+            )
+    need(
+        not {"position", "velocity"} <= given.keys(),
+        "inputs.position and inputs.velocity were both given; give the driven particles one of them.",
+    )
+    return given
+
+
+def _steps(name: str, value: Tensor) -> int | None:
+    """Control steps that an input tells; None if it serves any number."""
+    axes = QUANTITIES[name].axes
+    if value.ndim < len(axes) or len(value) == 1 or axes[0] not in ("pose", "control_step"):
+        return None
+    return len(value) - (axes[0] == "pose")
+
+
+def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
+    """Of a call: those of the activation or, without one, of the inputs, which must agree."""
+    if activation is not None and not given:
+        return activation.shape[0]
+    told = {} if activation is None else {"activation": len(activation)}
+    for name, value in given.items():
+        if (steps := _steps(name, value)) is not None:
+            told[f"inputs.{name}"] = steps
+    need(
+        len(set(told.values())) <= 1,
+        "activation and inputs must have as many control steps (poses are one more), got "
+        + ", ".join(f"{steps} in {name}" for name, steps in told.items())
+        + "; one row serves all of them but in activation.",
+    )
+    return next(iter(told.values()), 1)
+
+
+def check_inputs_bounds(given: dict[str, Tensor]) -> None:
+    """All inputs are finite and within their bounds. Reads back once: a GPU has to wait."""
+    if not given:
+        return
+    given = {name: value.detach() for name, value in given.items()}
+    ends = [end.double() for value in given.values() for end in torch.aminmax(value)]
+    ends = torch.stack(ends).tolist()
+    for (name, value), low, high in zip(given.items(), ends[::2], ends[1::2], strict=True):
+        known = QUANTITIES[name]
+        least = math.nextafter(known.low, -math.inf) if known.closed else known.low
+        if not (least < low and high < known.high):
+            demand(f"inputs.{name}", value, (value > least) & (value < known.high), known.rule)
+    for name in {"wall_normal", "direction"} & given.keys():
+        length = given[name].norm(dim=-1)
+        demand(f"the length of inputs.{name}", length, length > 0, "> 0")
