@@ -83,7 +83,7 @@ UNCHANGED = {
         "grid_velocity_adj",
         "load_node(node_before, i)",
     ): "momentum and mass alike, of which only the quotient is used",
-    ("press_adj", "v"): "the velocity after the last wall has no adjoint",
+    ("press_adj_at", "v"): "the velocity after the last wall has no adjoint",
 }
 """Equivalent mutants, which do not change any result, and the reason."""
 PATIENCE = 300.0

@@ -17,7 +17,8 @@ NAMES = ("gravity", "damping", "friction", "viscosity", "force")
 
 
 def corner(dim: int, **changes) -> softmpm.Scene:
-    """A block in a clamp on the left, between two planes of symmetry in front, on two rough floors and at a slipping side wall."""
+    """A block in a clamp on the left, between two planes of symmetry in front, on two rough floors and at a slipping side wall. No node
+    lies on a wall: rounding would decide its side."""
     lower, upper = (0.2, 0.33, 0.15)[:dim], (0.42, 0.52, 0.45)[:dim]
     shape = softmpm.box(lower, upper, spacing=0.05)
     material = softmpm.NeoHookean(density=1.2, young=80.0, poisson=0.3, viscosity=0.02)
@@ -27,8 +28,8 @@ def corner(dim: int, **changes) -> softmpm.Scene:
         muscles=[softmpm.Muscle(particles=np.arange(6), direction=(1.0, 0.4, 0.2)[:dim], strength=10.0)],
         walls=[
             softmpm.Wall(normal=(1.0, 0.0, 0.0)[:dim], offset=0.2, contact="clamp"),
-            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.35, friction=0.4),
-            softmpm.Wall(normal=(-0.4, 1.0, 0.0)[:dim], offset=0.22, friction=0.2),
+            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.353, friction=0.4),
+            softmpm.Wall(normal=(-0.4, 1.0, 0.0)[:dim], offset=0.223, friction=0.2),
             softmpm.Wall(normal=(-1.0, 0.2, 0.0)[:dim], offset=-0.35, contact="slip"),
             *[
                 softmpm.Wall(normal=(0.0, 0.0, side), offset=side * place, contact="symmetry")

@@ -103,7 +103,7 @@ class Bricks(NamedTuple):
         return dict(enable_backward=False, grid_stride=False, launch_bounds=bounds)
 
 
-FEW = 20_000
+FEW = {2: 50_000, 3: 20_000}
 """Below this number of particles bricks are small, so that more multiprocessors have one."""
 LARGEST_LATTICE = 3
 """Places along each axis."""
@@ -117,7 +117,7 @@ def bricks_for(dim: int, particles: int, device: torch.device, dtype: torch.dtyp
         places: Places along each axis if the particles are on a lattice, else 0.
     """
     lattice = 0 < places <= LARGEST_LATTICE
-    serial, few = device.type == "cpu", particles < FEW
+    serial, few = device.type == "cpu", particles < FEW[dim]
     if dim == 2:
         return Bricks((4, 4) if few and not serial else (8, 8), places if lattice else 4, lattice, serial)
     if serial:

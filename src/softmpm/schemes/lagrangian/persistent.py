@@ -18,7 +18,10 @@ BLOCKS = 16
 """Blocks of a cluster; a GPU of 132 multiprocessors has eight such clusters at a time."""
 THREADS, BYTES = 512, 46 * 1024
 """Threads of a block, at most, and shared memory for their bricks: the compiler takes up to two kilobytes more."""
+GROUP_THREADS = 32, 64
+"""Threads that have a brick, in whole warps: with larger bricks a multiprocessor has less to do at a time than single launches have."""
 WORLDS = 8
+"""Worlds, at most: as many as there are clusters at a time."""
 
 
 def cluster_of(model: Model) -> Cluster | None:
@@ -33,7 +36,7 @@ def _cluster_of(model: Model) -> Cluster | None:
     one = Cluster(grid.bricks, BLOCKS, 1)
     most = min(THREADS // one.threads, BYTES // grid.bricks.shared_bytes(model.dtype.itemsize))
     groups = next((n for n in (1, 2, 4, 8) if n * BLOCKS >= grid.brick_count), most + 1)
-    if groups > most or one.threads % 32:
+    if groups > most or one.threads not in GROUP_THREADS:
         return None
     cluster = one._replace(groups=groups)
     launchable = clusters_are_launchable(march(spec, cluster), model.wp_device, cluster.threads)
