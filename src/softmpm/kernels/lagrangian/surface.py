@@ -79,7 +79,7 @@ def surface(spec: Spec) -> SimpleNamespace:
     )
     walls = spec.surface_walls
     number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
-    count, each_world, rough = len(walls), "friction" in spec.given, spec.friction
+    count, friction_of = len(walls), wall_face(spec).friction_of
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, exact_of, memory = f.Frame, f.recentring, f.exact, chunk(dim, spec.dtype)
     Chunk, state_of = memory.Chunk, memory.state_of
@@ -97,15 +97,6 @@ def surface(spec: Spec) -> SimpleNamespace:
         depth: reals
         anchor: vecs
         friction: reals
-
-    @wp.func
-    def friction_of(inputs: GridInputs, world: int, k: int) -> real:
-        if wp.static(rough and each_world):
-            return inputs.friction[world, k]
-        elif wp.static(rough):
-            return inputs.friction[k]
-        else:
-            return real(0.0)
 
     @wp.func
     def faces_of(
