@@ -6,6 +6,7 @@ that all take the same step. What is not the same everywhere belongs to the firs
 No process waits for one that has failed: what may fail in one of them stands in :meth:`Group.fail_together`.
 """
 
+import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -153,6 +154,9 @@ def joined() -> Iterator[Group]:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Group()
         return
+    # Defaults of its functions are the group that exists when they are defined. The first step of an optimizer imports it: the group
+    # and its threads would then last until the interpreter is torn down, where a thread that needs Python ends the process.
+    importlib.import_module("torch.distributed.nn")
     gpus = torch.cuda.is_available() and dist.is_nccl_available()
     dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo")
     try:

@@ -239,6 +239,17 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
         assert row == pytest.approx(want, rel=SAME, nan_ok=True)
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="native threads are listed by Linux only")
+def test_no_thread_of_the_group_outlives_it(both):
+    """A native thread that runs while the interpreter is torn down may end the process with SIGABRT, now and then."""
+    out, *_ = both
+    for rank in range(2):
+        names = json.loads((out / f"threads.{rank}.json").read_text())
+        assert any("gloo" in name for name in names["inside"]) and not any(
+            "gloo" in name for name in names["after"]
+        )
+
+
 # One process alone
 
 
@@ -285,6 +296,14 @@ def test_each_process_has_its_own_gpu(monkeypatch):
     assert third.device("auto") is None
 
 
+def native_threads() -> list[str]:
+    """Names of the threads of this process, those of libraries too."""
+    return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
+
+
 if __name__ == "__main__":
     with distributed.joined() as the_group:
         one_of_two(Path(sys.argv[1]), the_group)
+        names = {"inside": native_threads()}
+    names["after"] = native_threads()
+    (Path(sys.argv[1]) / f"threads.{the_group.rank}.json").write_text(json.dumps(names))
