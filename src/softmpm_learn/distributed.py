@@ -154,8 +154,8 @@ def joined() -> Iterator[Group]:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Group()
         return
-    # Defaults of its functions are the group that exists when they are defined. The first step of an optimizer imports it: the group and
-    # its threads would then last until the interpreter is torn down, where a thread that needs Python ends the process.
+    # Defaults of its functions are the group that exists when they are defined. The first step of an optimizer imports it: the group
+    # and its threads would then last until the interpreter is torn down, where a thread that needs Python ends the process.
     importlib.import_module("torch.distributed.nn")
     gpus = torch.cuda.is_available() and dist.is_nccl_available()
     dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo")

@@ -28,8 +28,8 @@ def corner(dim: int, **changes) -> softmpm.Scene:
         muscles=[softmpm.Muscle(particles=np.arange(6), direction=(1.0, 0.4, 0.2)[:dim], strength=10.0)],
         walls=[
             softmpm.Wall(normal=(1.0, 0.0, 0.0)[:dim], offset=0.2, contact="clamp"),
-            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.353, friction=0.4),
-            softmpm.Wall(normal=(-0.4, 1.0, 0.0)[:dim], offset=0.223, friction=0.2),
+            softmpm.Wall(normal=(0.1, 1.0, 0.05)[:dim], offset=0.3501, friction=0.4),
+            softmpm.Wall(normal=(-0.4, 1.0, 0.0)[:dim], offset=0.2201, friction=0.2),
             softmpm.Wall(normal=(-1.0, 0.2, 0.0)[:dim], offset=-0.35, contact="slip"),
             *[
                 softmpm.Wall(normal=(0.0, 0.0, side), offset=side * place, contact="symmetry")
