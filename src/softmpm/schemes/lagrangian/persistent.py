@@ -19,7 +19,7 @@ BLOCKS = 16
 THREADS, BYTES = 512, 46 * 1024
 """Threads of a block, at most, and shared memory for their bricks: the compiler takes up to two kilobytes more."""
 GROUP_THREADS = 32, 64
-"""Threads that have a brick, in whole warps: with larger bricks a multiprocessor has less to do at a time than single launches have."""
+"""Threads of a group, whole warps; with larger bricks single launches are faster."""
 WORLDS = 8
 """Worlds, at most: as many as there are clusters at a time."""
 
