@@ -20,7 +20,7 @@ LAYERS = """
     reference reference_step kernels.physics
     reference_contact reference_driven reference_overlap
     stability kernels.convert reference_lagrangian reference_moving_contact
-    kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
+    kernels.rasterize kernels.carried kernels.plain kernels.fast kernels.lagrangian
     rest_grid
     surface_points
     surface_grid mirror_grid overlap_grid

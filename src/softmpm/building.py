@@ -48,8 +48,7 @@ def build(
             taken once at rest; see docs/formulations.md. "auto": the reference formulation if the scene states ``body_contact=False``
             and it has all that is asked for; ``describe`` gives the reason.
         contact: What meets the separating walls: "nodes", "surface" (the points of the outlines, :class:`softmpm.Outline`), or "auto":
-            in the reference formulation the surface if every body has an outline, in the moving one nodes, since the surface needs the
-            plain scheme there.
+            in the reference formulation the surface if every body has an outline, in the moving one nodes.
         contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
@@ -98,7 +97,7 @@ def build(
         alarms = dataclasses.replace(alarms, gap=None)
     else:
         check_moving(scene, surface)
-        scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme, surface)
+        scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme, surface and bool(deterministic))
     if not surface:
         alarms = dataclasses.replace(alarms, depth=None)
     if formulation != "reference":
@@ -248,20 +247,23 @@ OWNED = {"wall": "walls", "muscle": "muscles", "driven": "driven particles"}
 
 
 def choose_scheme(
-    scene: Scene, dtype: torch.dtype, worlds: int, wanted: str, surface: bool
+    scene: Scene, dtype: torch.dtype, worlds: int, wanted: str, points_in_order: bool
 ) -> tuple[str, str]:
-    """Name of the scheme for ``wanted``, which may be "auto", and the reason; ``surface`` is contact at surface points.
+    """Name of the scheme for ``wanted``, which may be "auto", and the reason.
+
+    Args:
+        points_in_order: Whether a deterministic model has contact at surface points, whose sums are not in fixed point.
 
     Raises:
         ValueError: The scheme that is asked for cannot hold the scene.
     """
-    if surface:
+    if points_in_order:
         if wanted == "fast":
             raise ValueError(
-                "contact='surface' is in the plain scheme with formulation='moving', got scheme='fast'; take scheme='auto', "
-                "contact='nodes' or formulation='reference'."
+                "deterministic=True has no contact at surface points in the fast scheme, got scheme='fast'; take scheme='auto', on a "
+                "CPU the plain one, or formulation='reference', whose sums have a fixed order."
             )
-        return "plain", "contact at surface points"
+        return "plain", "deterministic contact at surface points"
     particles = worlds * sum(len(body.particles) for body in scene.bodies)
     if wanted != "auto":
         obstacle = SCHEMES[wanted].footprint.obstacle(scene.grid.shape, particles)

@@ -31,17 +31,21 @@ MARGIN = {2: 6, 3: 3}
 """Initial margin of the window around the particles' stencils, in nodes on each side, in 2D and 3D."""
 
 
-def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int) -> tuple[int, ...]:
+def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int, least: int = 0) -> tuple[int, ...]:
     """Nodes along each axis of the window, the part of the grid that is allocated.
 
     Args:
         grid: Nodes of the whole grid.
         reach: Distance between the outermost base nodes of the particles along each axis.
         margin: Nodes around their stencils on each side.
+        least: Nodes that there must be, of those of the grid; the margin is doubled until there are.
     """
     wide = [apart + 3 + 2 * margin for apart in reach]
     wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns are aligned for memory reads
-    return tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
+    shape = tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
+    if math.prod(shape) < min(least, math.prod(grid)):
+        return window_shape(grid, reach, 2 * margin + 1, least)
+    return shape
 
 
 def longest_chunk(particles: int) -> int:
@@ -244,6 +248,22 @@ def input_bytes(model, control_steps: int) -> int:
         if one.per == "particle" and one.kind != "index":
             numbers += (model.dim if one.kind == "vector" else 1) * (control_steps if one.rows else 1)
     return model.worlds * model.particle_count * numbers * model.dtype.itemsize
+
+
+def surface_bytes(model) -> int:
+    """Bytes of the places and anchors of the surface points that the moving grid carries, if there are any."""
+    if model.surface is None:
+        return 0
+    anchors = math.prod(model.anchor_shape) * model.dtype.itemsize
+    return anchors + 8 * model.worlds * model.surface.count * model.dim
+
+
+def stencil_bytes(model) -> int:
+    """Bytes of what the nodes around each of them are to it in a substep."""
+    if model.surface is None:
+        return 0
+    d, real = model.dim, model.dtype.itemsize
+    return model.worlds * model.surface.count * (4 * d + real * (2 * 3**d + d))
 
 
 def adjoint_bytes(model, control_steps: int) -> int:

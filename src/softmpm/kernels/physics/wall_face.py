@@ -27,6 +27,7 @@ def wall_face(spec: Spec) -> SimpleNamespace:
     t, exact_vec = types(spec.dim, spec.dtype), types(spec.dim, "float64").vec
     real, vec, Constants, GridInputs = t.real, t.vec, t.Constants, input_types(spec).GridInputs
     dim, moving, Pose, way = spec.dim, spec.moving, carry(spec.dim).Pose, carry(spec.dim).way
+    rough, each_world = spec.friction, "friction" in spec.given
 
     @wp.struct
     class Face:
@@ -86,7 +87,16 @@ def wall_face(spec: Spec) -> SimpleNamespace:
             out.anchor = anchor
         return out
 
-    return SimpleNamespace(face=face, depth=depth, pose=pose, elapsed=elapsed)
+    @wp.func
+    def friction_of(inputs: GridInputs, world: int, k: int) -> real:
+        if wp.static(rough and each_world):
+            return inputs.friction[world, k]
+        elif wp.static(rough):
+            return inputs.friction[k]
+        else:
+            return real(0.0)
+
+    return SimpleNamespace(face=face, depth=depth, pose=pose, elapsed=elapsed, friction_of=friction_of)
 
 
 @kernel_factory

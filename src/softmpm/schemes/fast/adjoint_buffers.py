@@ -8,6 +8,7 @@ from softmpm.kernels.fast.sorting import sorting
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import placeholder, view
+from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.sorted_state import SortedAdj
@@ -24,6 +25,7 @@ class SharedAdjoint:
         adj: Packed adjoint of the state.
         nodes: Adjoints of mass and momentum of the nodes, of two successive substeps.
         velocity: Recomputed nodal velocities.
+        contact: Adjoint of contact at surface points, or None.
         exact: Fixed-point sums of a deterministic model.
     """
 
@@ -35,12 +37,15 @@ class SharedAdjoint:
 
         self.model, self.wanted = model, wanted
         self.adj = tensor(buffers.rows.shape[1])
-        self.nodes = tensor(2, len(buffers.velocity), 4)
-        self.velocity = tensor(len(buffers.velocity), 4)
+        self.nodes = tensor(2, buffers.held, 4)
+        self.velocity = tensor(buffers.held, 4)
         self.adj_array = view(self.adj, t.real)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_array = view(self.velocity, t.aligned)
         self._accumulators: dict[int, Accumulators] = {}
+        self.contact = None
+        if model.surface is not None:
+            self.contact = SurfaceContactAdj(model, wanted, buffers.held // model.worlds)
         self.exact = None
         if model.spec.deterministic:
             self.exact = FixedPointAccumulator(model, self.adj_array, self.node_arrays)
@@ -82,6 +87,8 @@ class ChunkAdjoint:
         if self.shared.exact is not None:
             self.shared.exact.begin(None)
         self.forward.reset_status()
+        if self.shared.contact is not None and adj_end.surface is not None:
+            self.shared.contact.load(adj_end.surface)
         if isinstance(adj_end, SortedAdj):
             self._move(stream, adj_end.inverse_permutation(), adj_end.rows)
         else:

@@ -18,6 +18,8 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import passing, placeholder, view
 from softmpm.schemes.capture import is_capturing
+from softmpm.schemes.carried import Nodes, SurfaceContact
+from softmpm.schemes.fast.contact_views import contact_nodes
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.launch_size import LaunchSize
 from softmpm.schemes.fast.particle_order import ParticleLayout
@@ -40,7 +42,8 @@ class ChunkBuffers:
         inputs: Inputs in this order.
         base, rows: Packed states, one or, if ``keep``, one more than substeps; the last one is the final state.
         nodes: Mass and momentum of the window's nodes, two or, if ``keep``, one for each substep.
-        velocity: Nodal velocities of the present substep.
+        velocity: Nodal velocities of the present substep; with contact at surface points those of the substep before as well.
+        contact: Contact at surface points, or None.
         exact: Fixed-point sums of a deterministic model.
     """
 
@@ -65,13 +68,15 @@ class ChunkBuffers:
         self.base = tensor(stored, places, dtype=torch.int32)
         self.rows = tensor(stored, places * t.rows)
         self.nodes = tensor(grids, model.worlds * layout.node_count, 4)
-        self.velocity = tensor(model.worlds * layout.node_count, 4)
+        self.held = model.worlds * layout.node_count
+        self.velocity = tensor(1 if model.surface is None else 2, self.held, 4)
         self.nothing = view(tensor(0, 4), t.aligned)
         self._view()
         self.exact = None
         if model.spec.deterministic:
             sums = view(tensor(places * t.rows), t.real)
             self.exact = FixedPointAccumulator(model, sums, self.node_arrays)
+        self.contact = None if model.surface is None else SurfaceContact(model, self.window, chunk, keep)
         self._prepare_loading(places)
 
     def _view(self) -> None:
@@ -84,7 +89,7 @@ class ChunkBuffers:
             packed.base, packed.rows = view(base, wp.int32), view(rows, t.real)
             self.packed.append(packed)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
-        self.velocity_array = view(self.velocity, t.aligned)
+        self.velocity_arrays = [view(velocity, t.aligned) for velocity in self.velocity]
         self.order_array = view(self.order, wp.int32)
         self.order_flat = view(self.order.view(-1), wp.int32)
         self.words_array = view(self.words, wp.int64)
@@ -118,7 +123,19 @@ class ChunkBuffers:
     def bytes(self) -> int:
         """Bytes of the buffers."""
         sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
-        return sum(tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums))
+        points = 0 if self.contact is None else self.contact.bytes
+        return points + sum(
+            tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums)
+        )
+
+    def velocity_array(self, s: int) -> wp.array:
+        """Nodal velocities of substep ``s``, as long as no later one needs their place."""
+        return self.velocity_arrays[s % len(self.velocity)]
+
+    def contact_nodes(self, s: int) -> Nodes:
+        """Nodes of substep ``s`` as contact at surface points takes them."""
+        nodes, velocities = self.nodes, self.velocity
+        return contact_nodes(self.model, nodes[s % len(nodes)], velocities[s % len(velocities)])
 
     def reset_status(self) -> None:
         """Reset all status words."""
@@ -151,6 +168,8 @@ class ChunkBuffers:
         self.inputs.take(stream, chunk, values, moved)
         self._version = self.layout.version
         self.load_state(stream, start)
+        if self.contact is not None and start.surface is not None:
+            self.contact.load(chunk, start.surface)
         if self.exact is not None:
             self.exact.begin(values["mass"])
 

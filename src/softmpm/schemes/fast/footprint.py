@@ -15,6 +15,8 @@ from softmpm.planning.memory import (
     Sizes,
     input_bytes,
     sizes_of,
+    stencil_bytes,
+    surface_bytes,
     window_shape,
 )
 
@@ -36,12 +38,14 @@ class FastFootprint:
         """Nodes of the window around the particles at rest."""
         cells = np.floor(model.exact_positions / model.scene.grid.spacing - 0.5)
         reach = np.ptp(cells, axis=0).astype(int).tolist()
-        return math.prod(window_shape(model.scene.grid.shape, reach, MARGIN[model.dim]))
+        least = 0 if model.surface is None else model.surface.count
+        return math.prod(window_shape(model.scene.grid.shape, reach, MARGIN[model.dim], least))
 
     def sizes(self, model) -> Sizes:
         real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
-        inside = particles * (4 + real * packed_rows(d).rows)
-        between = inside + 4 * particles  # and the order
+        points = surface_bytes(model)
+        inside = particles * (4 + real * packed_rows(d).rows) + points
+        between = inside + 4 * particles + points  # the order, and at most as much for the forces
         nodes = model.worlds * model.held_nodes * 4 * real
         return sizes_of(model, inside=inside, nodes=nodes, between=between)
 
@@ -49,10 +53,15 @@ class FastFootprint:
         sizes = model.sizes()
         material = input_bytes(model, 1)
         fixed_point = 2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0
-        graph = material + sizes.nodes + fixed_point
+        second = 0 if model.surface is None else sizes.nodes  # velocities of the substep before
+        graph = material + sizes.nodes + fixed_point + second + stencil_bytes(model)
         small = graph + sizes.inside + 2 * sizes.nodes
         forward = small * _at_once(horizon, sizes.longest)
         passed = 2 * sizes.inside  # adjoints in the order of the previous chunk, and their copy
+        if (
+            model.surface is not None
+        ):  # stencils; nodal velocities without contact and the adjoint of the load
+            passed += stencil_bytes(model) + sizes.nodes
         if chosen.keep_all:
             kept = model.calls * graph * len(horizon.chunks(chosen.longest))
             return Buffers(forward, kept, passed)

@@ -5,23 +5,27 @@ from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.native import BLOCK
 from softmpm.kernels.fast.sorting import sorting
 from softmpm.schemes.alarm_check import armed
+from softmpm.schemes.carried import SurfaceContact
 from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
 from softmpm.schemes.launch import KernelLauncher
 
 
 def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     """Advance the first packed state by all substeps of the chunk, then check the last one."""
-    kernels, held = fused(buffers.model.spec), len(buffers.velocity)
-    launch(kernels.clear, held, buffers.velocity_array, block_dim=BLOCK)
-    if buffers.exact is None:
-        launch(kernels.clear, held, buffers.node_arrays[0], block_dim=BLOCK)
+    cleared = [*buffers.velocity_arrays, *([buffers.node_arrays[0]] if buffers.exact is None else [])]
+    for nodes in cleared:
+        launch(fused(buffers.model.spec).clear, buffers.held, nodes, block_dim=BLOCK)
     _p2g_first(buffers, launch)
     for s in range(buffers.chunk.length):
         _grid(buffers, s, launch)
+        if buffers.contact is not None:
+            _contact(buffers, buffers.contact, s, launch)
         _g2p2g(buffers, s, launch)
     _survey(buffers, launch)
     if armed(buffers.model):
         _check(buffers, launch)
+    if buffers.contact is not None:
+        _end_contact(buffers, buffers.contact, launch)
 
 
 def _p2g_first(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
@@ -45,8 +49,15 @@ def _grid(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     if buffers.exact is not None:
         now, then = buffers.exact.sums(s), buffers.nothing
     inputs = buffers.inputs.grid_struct(s)
-    arguments = (model.constants, inputs, buffers.window, now, buffers.velocity_array, then)
-    launch(fused(model.spec).grid_velocity, len(buffers.velocity), *arguments, block_dim=BLOCK)
+    arguments = (model.constants, inputs, buffers.window, now, buffers.velocity_array(s), then)
+    launch(fused(model.spec).grid_velocity, buffers.held, *arguments, block_dim=BLOCK)
+
+
+def _contact(buffers: ChunkBuffers, contact: SurfaceContact, s: int, launch: KernelLauncher) -> None:
+    """Contact at surface points in substep ``s``, after they are carried with the velocities of the substep before."""
+    nodes, last = buffers.contact_nodes(s), buffers.contact_nodes(s - 1).velocity if s > 0 else None
+    contact.share(s, nodes, last, buffers.words_array, launch)
+    contact.press(s, buffers.inputs.grid_struct(s), nodes, buffers.words_array, launch)
 
 
 def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
@@ -64,7 +75,7 @@ def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
         size.per_warp,
     )
     sizes = (model.particle_count, size.particles, buffers.order_flat)
-    arguments = (*parameters, *sizes, buffers.velocity_array, now, buffers.words_array, then, sink)
+    arguments = (*parameters, *sizes, buffers.velocity_array(s), now, buffers.words_array, then, sink)
     launch(fused(model.spec).g2p2g[size.few], size.threads, *arguments, block_dim=size.block)
     if exact is not None and not last:
         exact.accumulate(buffers, s + 1, then, buffers.mass, launch)
@@ -86,3 +97,11 @@ def _check(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     arguments = (model.constants, inputs, buffers.layout.neighbours, *sizes)
     kernel = packed_alarms(model.spec).check
     launch(kernel, total, *arguments, buffers.packed[-1], buffers.words_array)
+
+
+def _end_contact(buffers: ChunkBuffers, contact: SurfaceContact, launch: KernelLauncher) -> None:
+    """Carry the surface points to the final state, and check their depth there."""
+    last = buffers.chunk.length - 1
+    contact.carry(last, buffers.contact_nodes(last).velocity, launch)
+    if buffers.model.alarms.depth is not None:
+        contact.check_end(buffers.inputs.grid_struct(last), buffers.words_array, launch)

@@ -5,7 +5,9 @@ import warp as wp
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK
+from softmpm.schemes.carried import Nodes
 from softmpm.schemes.fast.adjoint_buffers import ChunkAdjoint
+from softmpm.schemes.fast.contact_views import contact_nodes, vector_and_number
 from softmpm.schemes.launch import KernelLauncher
 
 
@@ -15,7 +17,11 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     launch(fused(adjoint.model.spec).clear, len(shared.velocity), shared.velocity_array, block_dim=BLOCK)
     for s in range(chunk.length, -1, -1):
         _grid(adjoint, s, launch)
+        if s > 0:
+            _contact_again(adjoint, s - 1, launch)
         _particles(adjoint, s, launch)
+        if s > 0:
+            _contact(adjoint, s - 1, launch)
         if s == 0 or (s < chunk.length and chunk.row(s - 1) != chunk.row(s)):
             adjoint.found.collect(chunk.row(s), adjoint.forward.inputs.values, launch)
 
@@ -40,6 +46,34 @@ def _grid(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         grids = (now, then, here, shared.velocity_array, before)
         arguments = (model.constants, inputs, forward.window, *grids, adj_inputs)
         launch(kernel, len(shared.velocity), *arguments, block_dim=BLOCK)
+
+
+def _contact_again(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
+    """Contact at surface points in substep ``s`` once more, and the adjoint of how it carries them."""
+    forward, back = adjoint.forward, adjoint.shared.contact
+    if forward.contact is not None and back is not None:
+        inputs, nodes = forward.inputs.grid_struct(s), _contact_nodes(adjoint, s)
+        adj_velocity, _ = _adj_contact_nodes(adjoint, s)
+        back.again(forward.contact, s, inputs, nodes, adj_velocity, forward.words_array, launch)
+
+
+def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
+    """Adjoint of contact at surface points in substep ``s``."""
+    forward, back = adjoint.forward, adjoint.shared.contact
+    if forward.contact is not None and back is not None:
+        inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
+        nodes, adj_nodes = _contact_nodes(adjoint, s), _adj_contact_nodes(adjoint, s)
+        back.respond(forward.contact, s, inputs, adj_inputs, nodes, *adj_nodes, launch)
+
+
+def _contact_nodes(adjoint: ChunkAdjoint, s: int) -> Nodes:
+    """Nodes of substep ``s`` as contact takes them."""
+    return contact_nodes(adjoint.model, adjoint.forward.nodes[s], adjoint.shared.velocity)
+
+
+def _adj_contact_nodes(adjoint: ChunkAdjoint, s: int) -> tuple[wp.array, wp.array]:
+    """Adjoints of the nodes' velocities in substep ``s``, and what contact adds to those of the masses."""
+    return vector_and_number(adjoint.model, adjoint.shared.nodes[s % 2])
 
 
 def _adj_nodes(adjoint: ChunkAdjoint, s: int) -> tuple[wp.array, wp.array]:

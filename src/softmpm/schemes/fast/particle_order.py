@@ -69,7 +69,8 @@ class ParticleLayout:
         self._locate(x)
         low, high = self._ends.tolist()  # waits for the device
         apart = [[max(0, h - b) for b, h in zip(*ends, strict=True)] for ends in zip(low, high, strict=True)]
-        wide = window_shape(grid, [max(axis) for axis in zip(*apart, strict=True)], self._margin)
+        reach, points = [max(axis) for axis in zip(*apart, strict=True)], model.surface
+        wide = window_shape(grid, reach, self._margin, 0 if points is None else points.count)
         self.shape = tuple(max(sizes) for sizes in zip(wide, before.shape if before else wide, strict=True))
         self._centre = self._centre_launch()
         self.resort(x)

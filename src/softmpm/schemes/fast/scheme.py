@@ -13,6 +13,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import LONGEST, Footprint
 from softmpm.schemes.alarm_check import StartCheck
 from softmpm.schemes.capture import is_capturing, keep_alive
+from softmpm.schemes.carried import check_start
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import outgrown
 from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
@@ -22,6 +23,7 @@ from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacker
 from softmpm.schemes.graph_cache import GraphCache, Lease
 from softmpm.schemes.inputs import InputsAdj, Values
+from softmpm.schemes.surface_start import with_surface
 from softmpm.state import State
 
 
@@ -68,7 +70,9 @@ class FastRun:
         buffers = graph.buffers
         buffers.load(stream, chunk, start, values, frozen)
         graph.run(stream)
-        self.end = SortedState(pool.unpacker, buffers.base[-1], buffers.rows[-1], buffers.order, self._lease)
+        surface = None if buffers.contact is None else buffers.contact.end
+        packed = buffers.base[-1], buffers.rows[-1], buffers.order
+        self.end = SortedState(pool.unpacker, *packed, surface, self._lease)
         self.words = buffers.words
         self.outgrow: Callable[[], None] | None = pool.layout.outgrow
 
@@ -81,7 +85,9 @@ class FastRun:
             adjoint.run(stream)
             buffers.unload(stream, self.chunk, adj_inputs)
             adj, order = buffers.shared.adj, buffers.forward.order  # both are reused by other runs
-            return SortedAdj(self.pool.unpacker, adj.clone(), order.clone())
+            contact = buffers.shared.contact
+            surface = None if contact is None else contact.start(self.chunk)
+            return SortedAdj(self.pool.unpacker, adj.clone(), order.clone(), surface)
 
 
 class Fast:
@@ -117,12 +123,15 @@ class Fast:
         return FastRun(self._pool, updated, chunk, start, values, keep, frozen)
 
     def check_start(self, start: State, values: Values) -> Tensor:
-        if self._start_check is None or is_capturing(self.model):
+        check = self._start_check
+        if check is None or is_capturing(self.model):
             check = StartCheck(self.model)
-            if is_capturing(self.model):
-                return check(start, values)
-            self._start_check = check
-        return self._start_check(start, values)
+            if not is_capturing(self.model):
+                self._start_check = check
+        words = check(start, values)
+        if start.surface is not None:
+            check_start(self.model, start.surface.x, values, words)
+        return words
 
     def _provide_layout(self, start: State | SortedState, chunk: Chunk) -> bool:
         """Provide a valid particle layout; True if it was updated for this initial state."""
@@ -179,7 +188,8 @@ class Fast:
     particles = to_user
 
     def rest(self) -> State:
-        return self.model.rest()
+        state = self.model.rest()
+        return state if self.model.surface is None else with_surface(self.model, state, {})
 
     def _widen(self, run: FastRun) -> None:
         """After a particle left the window: centre it on the initial state the first time, enlarge it from then on."""

@@ -18,7 +18,7 @@ from softmpm.model import Model
 from softmpm.schemes.buffers import placeholder
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.launch import RebindableLaunch
-from softmpm.state import Low, State
+from softmpm.state import Low, State, SurfaceState
 
 
 class Unpacker:
@@ -55,10 +55,11 @@ class Sorted:
     Args:
         rows: Packed particles, see kernels/structs.py.
         order: Particle at each place, shape (world, particle), int32.
+        surface: Surface points, which are not sorted, or None.
     """
 
-    def __init__(self, unpacker: Unpacker, rows: Tensor, order: Tensor):
-        self._unpacker, self.rows, self.order = unpacker, rows, order
+    def __init__(self, unpacker: Unpacker, rows: Tensor, order: Tensor, surface: SurfaceState | None = None):
+        self._unpacker, self.rows, self.order, self.surface = unpacker, rows, order, surface
 
     @property
     def _stream(self) -> wp.Stream | None:
@@ -79,13 +80,22 @@ class SortedState(Sorted):
         owner: Lease of the buffers, which nothing else writes to while it is referenced. None if the state owns them.
     """
 
-    def __init__(self, unpacker: Unpacker, base: Tensor, rows: Tensor, order: Tensor, owner: object = None):
-        super().__init__(unpacker, rows, order)
+    def __init__(
+        self,
+        unpacker: Unpacker,
+        base: Tensor,
+        rows: Tensor,
+        order: Tensor,
+        surface: SurfaceState | None = None,
+        owner: object = None,
+    ):
+        super().__init__(unpacker, rows, order, surface)
         self.base, self._owner = base, owner
 
     def copy(self) -> "SortedState":
         """A copy in new buffers."""
-        return SortedState(self._unpacker, self.base.clone(), self.rows.clone(), self.order.clone())
+        surface = None if self.surface is None else self.surface.clone()
+        return SortedState(self._unpacker, self.base.clone(), self.rows.clone(), self.order.clone(), surface)
 
     @property
     def x(self) -> Tensor:
@@ -99,7 +109,8 @@ class SortedState(Sorted):
         rounds = self._unpacker.model.dtype == torch.float32
         x, v, C, F, *low = self._unpacker.fields(1, 1, 2, 2, *((1, 2) if rounds else ()))
         self._unpacker.leave(self._stream, self.order, self.base, self.rows, x, v, C, F, *low)
-        return State(x, v, C, F, Low(*low) if low else None)
+        surface = None if self.surface is None else self.surface.clone()
+        return State(x, v, C, F, Low(*low) if low else None, surface=surface)
 
 
 class SortedAdj(Sorted):
@@ -109,4 +120,4 @@ class SortedAdj(Sorted):
         """The same in the user's order, in new tensors."""
         x, v, C, F = self._unpacker.fields(1, 1, 2, 2)
         self._unpacker.leave_adj(self._stream, self.order, self.rows, x, v, C, F)
-        return State(x, v, C, F)
+        return State(x, v, C, F, surface=self.surface)

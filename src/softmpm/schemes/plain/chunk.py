@@ -3,24 +3,33 @@
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
-import warp as wp
+import torch
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
-from softmpm.kernels.structs import RequestedGrads
+from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.alarm_check import StartCheck, armed, check_end
 from softmpm.schemes.buffers import Motion, MotionAdj, clear, view
-from softmpm.schemes.device import stream_of
+from softmpm.schemes.carried import SurfaceContact, check_start
+from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, elapsed, grid_struct, particle_struct
-from softmpm.schemes.launch import KernelLauncher
 from softmpm.schemes.plain.footprint import PlainFootprint
 from softmpm.schemes.plain.substep import Substep
-from softmpm.schemes.plain.surface import SurfaceContact, SurfaceContactAdj, check_start
 from softmpm.schemes.surface_start import with_surface
 from softmpm.state import State
+
+
+def whole_grid(model: Model):
+    """The whole grid as a window."""
+    t = types(model.spec.dim, model.spec.dtype)
+    window = t.Window()
+    window.shape, window.count = t.ivec(*model.scene.grid.shape), model.node_count
+    origin = torch.zeros(model.worlds, model.dim, dtype=torch.int32, device=model.device)
+    window.origin = view(origin, t.ivec)
+    return window
 
 
 class PlainRun:
@@ -50,7 +59,8 @@ class PlainRun:
         self.structs = [self.states[i].struct(model) for i in range(len(self.states.base))]
         self.contact = None
         if start.surface is not None:
-            self.contact = SurfaceContact(model, chunk, keep, start.surface, self.step.launch)
+            self.contact = SurfaceContact(model, whole_grid(model), chunk, keep)
+            self.contact.load(chunk, start.surface)
         if frozen:
             self.step.words[list(frozen)] = FROZEN
         self.step.enter(start, self.structs[0])
@@ -62,8 +72,8 @@ class PlainRun:
         if armed(model):
             check_end(model, self.step.particle_inputs, self.end, self.step.words_array, chunk.length - 1)
         if self.contact is not None:
-            self.contact.check_end(self.step.grid_inputs, self.step.words_array)
-            self.end = self.end._replace(surface=self.contact.end())
+            self.contact.check_end(self.step.grid_inputs, self.step.words_array, self.step.launch)
+            self.end = self.end._replace(surface=self.contact.end.clone())
         self.words = self.step.words
         self.outgrow: Callable[[], None] | None = None
 
@@ -91,7 +101,8 @@ class PlainRun:
         then.H.copy_(adj_end.F)
         contact = None
         if self.contact is not None and adj_end.surface is not None:
-            contact = SurfaceContactAdj(self.contact, wanted, adj_end.surface)
+            contact = self.contact, SurfaceContactAdj(model, wanted, model.node_count)
+            contact[1].load(adj_end.surface)
         for s in reversed(range(chunk.length)):
             row = chunk.row(s)
             self._use_inputs(s, s + 1)
@@ -105,7 +116,7 @@ class PlainRun:
         adj_inputs.add_particles(found, chunk.rows)
         start = adjoints[0]
         adj = State(start.fx / model.scene.grid.spacing, start.v, start.C, start.H)
-        return adj if contact is None else adj._replace(surface=contact.start())
+        return adj if contact is None else adj._replace(surface=contact[1].start(chunk))
 
 
 class Plain:
@@ -131,14 +142,9 @@ class Plain:
         return PlainRun(self.model, chunk, start, values, keep, frozen)
 
     def check_start(self, start: State, values: Values) -> Tensor:
-        words, model = StartCheck(self.model)(start, values), self.model
+        words = StartCheck(self.model)(start, values)
         if start.surface is not None:
-            known = model.fixed | values
-            if model.spec.moving:
-                known["elapsed"] = elapsed(model, 0, 1, 1)
-            launch = KernelLauncher(model, stream_of(model.device))
-            about = (grid_struct(model, known), start.surface.x, view(words, wp.int64))
-            check_start(model, launch, *about)
+            check_start(self.model, start.surface.x, values, words)
         return words
 
     def accept(self, run: PlainRun, words: list[int]) -> bool:

@@ -1,10 +1,9 @@
 """Memory of the plain scheme: states in the user's order, and every node of the grid."""
 
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
-from softmpm.planning.memory import Buffers, Plan, Sizes, sizes_of, state_bytes
+from softmpm.planning.memory import Buffers, Plan, Sizes, sizes_of, state_bytes, stencil_bytes, surface_bytes
 
 
 class PlainFootprint:
@@ -26,22 +25,11 @@ class PlainFootprint:
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         inside, terms = model.sizes().inside, term_bytes(model)
-        if (
-            model.surface is not None
-        ):  # shares and base nodes of the points; free velocity and load of the nodes
-            d, real, points = model.dim, model.dtype.itemsize, model.worlds * model.surface.count
-            terms += points * (3**d * real + 4 * d) + model.worlds * model.node_count * (d + 1) * real
-        return Buffers(2 * inside + terms, 0, inside + terms)
-
-
-def surface_bytes(model) -> int:
-    """Bytes of the places and anchors of the surface points, if there are any."""
-    if model.surface is None:
-        return 0
-    return (
-        math.prod(model.anchor_shape) * model.dtype.itemsize
-        + 8 * model.worlds * model.surface.count * model.dim
-    )
+        number, contact = model.worlds * model.node_count * model.dtype.itemsize, stencil_bytes(model)
+        load, back = (
+            (number, (model.dim + 3) * number) if contact else (0, 0)
+        )  # load; its adjoint, v* and the adjoint of the mass
+        return Buffers(2 * inside + terms + contact + load, 0, inside + terms + 2 * contact + back)
 
 
 def term_bytes(model) -> int:

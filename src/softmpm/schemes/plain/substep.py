@@ -19,8 +19,9 @@ from softmpm.kernels.plain.transfer import transfer, transfer_adj
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.carried import Nodes, SurfaceContact
+from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.plain.surface import SurfaceContact, SurfaceContactAdj
 from softmpm.state import Low, State
 
 
@@ -55,9 +56,9 @@ class Substep:
     def _array(self, name: str) -> wp.array:
         """Warp's view of one of the grid buffers below, made once."""
         if name not in self._arrays:
-            self._arrays[name] = view(
-                getattr(self, name), self.types.node if name.endswith("node") else self.types.vec
-            )
+            t = self.types
+            kinds = {"node": t.node, "adj_node": t.node, "load": t.real, "contact_mass": t.real}
+            self._arrays[name] = view(getattr(self, name), kinds.get(name, t.vec))
         return self._arrays[name]
 
     @functools.cached_property
@@ -78,8 +79,23 @@ class Substep:
     def adj_velocity(self) -> Tensor:
         return self._grid(self.types.vec)
 
-    def launch(self, kernel, dim, *inputs) -> None:
-        launch(kernel, dim, inputs, device=self.model.wp_device, stream=self.stream)
+    @functools.cached_property
+    def load(self) -> Tensor:
+        """Areas of the surface points on each node, (world, node)."""
+        return torch.empty(self.nodes, dtype=self.model.dtype, device=self.model.device)
+
+    @functools.cached_property
+    def contact_mass(self) -> Tensor:
+        """What contact at surface points adds to the adjoint of the masses, (world, node)."""
+        return torch.empty_like(self.load)
+
+    @property
+    def _contact_nodes(self) -> Nodes:
+        """The nodes as contact at surface points takes them."""
+        return Nodes(self._array("node"), self._array("velocity"), self._array("load"))
+
+    def launch(self, kernel, dim, *inputs, **settings) -> None:
+        launch(kernel, dim, inputs, device=self.model.wp_device, stream=self.stream, **settings)
 
     def to_grid(self, now) -> None:
         """P2G and the grid stage: velocity of the nodes."""
@@ -94,9 +110,11 @@ class Substep:
         self.last = substep
         self.to_grid(now)
         if contact is not None:
-            nodes = self._array("node"), self._array("velocity"), self.words_array
-            contact.respond(substep, self.grid_inputs, *nodes)
-            contact.advance(substep, *nodes)
+            clear(self.load)
+            nodes = self._contact_nodes
+            contact.share(substep, nodes, None, self.words_array, self.launch)
+            contact.press(substep, self.grid_inputs, nodes, self.words_array, self.launch)
+            contact.carry(substep, nodes.velocity, self.launch)
         arguments = (self.model.constants, self.particle_inputs, substep, self._array("velocity"), now)
         self.launch(self.transfer.g2p, self.particles, *arguments, self.words_array, then)
 
@@ -109,28 +127,46 @@ class Substep:
         adj_now,
         adj_inputs: tuple,
         substep: int,
-        contact: SurfaceContactAdj | None = None,
+        contact: tuple[SurfaceContact, SurfaceContactAdj] | None = None,
     ) -> None:
         """Adjoint of :meth:`advance`. The grid is recomputed.
 
         Args:
             adj_now, adj_inputs: Added into; the latter are the structs of the inputs of particles and of nodes.
             substep: Number of the substep, counted backward.
+            contact: Contact of the chunk and its adjoint, which is updated.
         """
         adj_particle_inputs, adj_grid_inputs = adj_inputs
         self.to_grid(now)
-        nodes, s = (self._array("node"), self._array("velocity")), 0
-        if contact is not None:
-            s = contact.forward.chunk.length - 1 - substep
-            contact.forward.respond(s, self.grid_inputs, *nodes, self.words_array, again=True)
         clear(self.adj_velocity)
+        if contact is not None:
+            self._contact_again(*contact, substep)
         self.g2p_adj(wanted, now, then, adj_then, adj_now, adj_particle_inputs)
         if contact is not None:
-            contact.respond(s, self.grid_inputs, adj_grid_inputs, *nodes, self._array("adj_velocity"))
+            self._contact_adj(*contact, substep, adj_grid_inputs)
         self.grid_adj(wanted, adj_grid_inputs)
         if contact is not None:
-            self.adj_node[..., -1] += contact.mass
+            self.adj_node[..., -1] += self.contact_mass
         self.p2g_adj(wanted, now, adj_now, adj_particle_inputs, substep)
+
+    def _contact_again(self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int) -> None:
+        """Contact at surface points once more, and the adjoint of how it carries them."""
+        clear(self.load)
+        s, adj_velocity = contact.chunk.length - 1 - substep, self._array("adj_velocity")
+        arguments = (self.grid_inputs, self._contact_nodes, adj_velocity, self.words_array, self.launch)
+        back.again(contact, s, *arguments)
+
+    def _contact_adj(
+        self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int, adj_inputs
+    ) -> None:
+        """Adjoint of contact at surface points."""
+        clear(self.contact_mass)
+        s, adj_nodes = (
+            contact.chunk.length - 1 - substep,
+            (self._array("adj_velocity"), self._array("contact_mass")),
+        )
+        arguments = (self.grid_inputs, adj_inputs, self._contact_nodes, *adj_nodes, self.launch)
+        back.respond(contact, s, *arguments)
 
     def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs) -> None:
         arrays = (self._array("velocity"), now, then, adj_then, adj_inputs, self._array("adj_velocity"))

@@ -98,7 +98,7 @@ def test_more_numbers_than_indices_reach_take_the_plain_scheme():
     """Particles of all worlds, in whole warps, times the numbers of each must stay below 2³¹."""
     most = 2**31 // packed_rows(2).rows // WARP * WARP
     for worlds, scheme in ((most + 1, "plain"), (most, "fast")):
-        chosen, reason = choose_scheme(tiny((8, 8)), torch.float32, worlds, "auto", surface=False)
+        chosen, reason = choose_scheme(tiny((8, 8)), torch.float32, worlds, "auto", points_in_order=False)
         assert chosen == scheme
         assert scheme == "fast" or "32-bit indices" in reason
     with pytest.raises(ValueError, match="scheme must be 'auto', 'fast' or 'plain', got 'quick'"):

@@ -1,0 +1,1 @@
+"""Kernels of the surface points that the moving grid carries, for every scheme on it."""
