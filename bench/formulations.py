@@ -6,8 +6,8 @@ without what a call costs in any case. ``kept``: bytes that a gradient keeps for
 figure over that of the reference formulation.
 
 ``cube``: particles on a lattice, without walls, in one world or several. ``block`` has an outline; ``on a floor`` it also meets a wall
-with friction, at nodes in the moving and at surface points in the reference formulation, where the last row gives the times with the
-floor over those without.
+with friction, at nodes in the moving and at surface points in the reference formulation, of which a row gives the times with the
+floor over those without. The last rows are of the moving formulation with contact at surface points, and over that at nodes.
 
 On a CPU the reference formulation runs with each number of threads; ``gain`` is its time with the first over that with this number,
 and ``cores`` the processor time of a call without gradient over its duration: below ``threads`` if other processes had a part of the
@@ -76,11 +76,16 @@ def forward(model: softmpm.Model, substeps: int, repeats: int) -> tuple[float, f
 
 
 def figures(
-    scene: softmpm.Scene, formulation: str, worlds: int, substeps: int, args
+    scene: softmpm.Scene, formulation: str, worlds: int, substeps: int, args, contact: str = "auto"
 ) -> tuple[tuple[float, ...], float]:
     """In the order of :data:`FIGURES`, and the cores that were used."""
     model = softmpm.build(
-        scene, device=args.device, worlds=worlds, formulation=formulation, memory_budget=2**62
+        scene,
+        device=args.device,
+        worlds=worlds,
+        formulation=formulation,
+        contact=contact,
+        memory_budget=2**62,
     )
     ahead, back = measure(model, substeps, args.repeats)
     sizes, (alone, cores) = model.sizes(), forward(model, substeps, args.repeats)
@@ -116,6 +121,10 @@ def main():
             add("gain", threads, quotients(found[1], values))
         if name == "block on a floor":
             add("with over without", runs[1][1], quotients(found[1], before))
+            torch.set_num_threads(args.threads[0])
+            values, cores = figures(scene(), "moving", worlds, substeps, args, "surface")
+            add("moving, surface", args.threads[0], values, cores)
+            add("surface over nodes", args.threads[0], quotients(values, found[0]))
         before = found[1]
 
 

@@ -89,12 +89,12 @@ def point_share(dim: int, dtype: str) -> SimpleNamespace:
             moment += k * (position(o) - fx)
         if out.mass > real(0.0):
             out.mean = moment / out.mass
-            spread = real(SPREAD) * wp.identity(n=dim, dtype=real)
+            spread = mat()
             for n in range(count):
                 o = offset(n)
                 d = position(o) - fx - out.mean
-                spread += wp.outer((weight(w, o) * masses[n] / out.mass) * d, d)
-            out.inverse = wp.inverse(spread)
+                spread += wp.outer((weight(w, o) * masses[n]) * d, d)
+            out.inverse = wp.inverse(spread / out.mass + real(SPREAD) * wp.identity(n=dim, dtype=real))
             out.lean = out.inverse * out.mean
         return out
 
