@@ -78,6 +78,11 @@ def surface(spec: Spec) -> SimpleNamespace:
     left_window, lost, in_wall = int(Kind.LEFT_WINDOW), int(Kind.LOST), int(Kind.IN_WALL)
     module = unrolled(spec.module + ".surface")
 
+    @wp.struct
+    class Weighed:
+        base: ivec
+        weights: Table  # m b
+
     @wp.func
     def at_point(stencils: Stencils, field: wp.array2d(dtype=vec), world: int, p: int, shape: ivec) -> vec:
         """Σ m b a of a nodal field."""
@@ -102,31 +107,34 @@ def surface(spec: Spec) -> SimpleNamespace:
         words: wp.array(dtype=wp.int64),
         stencils: Stencils,
         load: wp.array2d(dtype=real),
-    ):
+    ) -> Weighed:
         """(K8), l and v of (K9)"""
+        area = outline.areas[p]
         at = place(x, constants.exact_spacing, constants.shape, window.origin[world], window.shape)
         masses = masses_of(node, world, at.base, window.shape)
         w = weights(at.fx)
         around = fit(masses, w, at.fx)
         held = at.valid and around.mass > real(0.0)
+        out = Weighed()
+        out.base = at.base
         shares = Table()
         v = vec()
         for n in range(size):
             if held:
                 shares[n] = share_of(around, w, at.fx, n)
-            i = node_index(at.base, offset(n), window.shape)
-            v += (masses[n] * shares[n]) * velocity[world, i]
+            out.weights[n] = masses[n] * shares[n]
+            v += out.weights[n] * velocity[world, node_index(at.base, offset(n), window.shape)]
         if not held and running(words, world):
             report(words, world, substep, wp.where(at.beyond, left_window, lost), p)
         stencils.base[world, p] = at.base
         stencils.velocity[world, p] = v
-        area = outline.areas[p]
         for n in range(size):
             stencils.shares[world, p, n] = shares[n]
-            stencils.weights[world, p, n] = masses[n] * shares[n]
+            stencils.weights[world, p, n] = out.weights[n]
             if held:
                 i = node_index(at.base, offset(n), window.shape)
                 wp.atomic_add(load, world, i, area * wp.abs(shares[n]))
+        return out
 
     @wp.func
     def meet(
@@ -207,6 +215,9 @@ def surface(spec: Spec) -> SimpleNamespace:
         base = stencils.base[world, p]
         at = x[world, p]
         v = stencils.velocity[world, p]
+        area = outline.areas[p]
+        newtons = rate[0] * outline.newtons[p]
+        deepest = outline.deepest[p]
         shares = Table()
         D = real(0.0)
         for n in range(size):
@@ -227,17 +238,17 @@ def surface(spec: Spec) -> SimpleNamespace:
             if anew == 1:
                 pushed = vec()
             if alive:
-                if wall.depth > outline.deepest[p]:
+                if wall.depth > deepest:
                     report(words, world, wp.max(substep - 1, 0), in_wall, q * x.shape[1] + p)
                 new_anchor[world, q, p] = found.anchor
-                force[world, q, p] = pushed + (rate[0] * outline.newtons[p]) * found.J
+                force[world, q, p] = pushed + newtons * found.J
             else:
                 new_anchor[world, q, p] = before
         if not alive:
             for n in range(size):
                 stencils.weights[world, p, n] = real(0.0)
         elif wp.dot(total, total) > real(0.0):
-            impulse = outline.areas[p] * total
+            impulse = area * total
             for n in range(size):
                 wp.atomic_add(velocity, world, node_index(base, offset(n), window.shape), shares[n] * impulse)
 

@@ -76,15 +76,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         world, p = wp.tid()
         adj = constants.dt * adj_x[world, p]
-        weigh(
+        found = weigh(
             constants, window, outline, substep, world, p, x[world, p], node, velocity, words, stencils, load
         )
-        base = stencils.base[world, p]
         for n in range(size):
-            i = node_index(base, offset(n), window.shape)
+            i = node_index(found.base, offset(n), window.shape)
             free[world, i] = velocity[world, i]
             adj_load[world, i] = real(0.0)
-            wp.atomic_add(adj_velocity, world, i, stencils.weights[world, p, n] * adj)
+            wp.atomic_add(adj_velocity, world, i, found.weights[n] * adj)
 
     @wp.kernel(module=module, enable_backward=False)
     def press_adj(
@@ -120,6 +119,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         base = stencils.base[world, p]
         at = places[world, p]
         v = stencils.velocity[world, p]
+        area = outline.areas[p]
+        newtons = rate[0] * outline.newtons[p]
+        adj_way = constants.dt * adj_x[world, p]
         masses = Table()
         shares = Table()
         loads = Table()
@@ -172,9 +174,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 outline.stiffness[p],
                 constants.dt,
                 smoothing,
-                outline.areas[p] * pull
-                + D * back_v
-                + (rate[0] * outline.newtons[p]) * adj_force[world, q, p],
+                area * pull + D * back_v + newtons * adj_force[world, q, p],
                 adj_anchor[world, q, p],
             )
             back_D += wp.dot(after - here, back_v) / D + adj.D
@@ -188,8 +188,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             if wp.static("friction" in wanted):
                 adj_inputs.friction[k, slot] = adj_inputs.friction[k, slot] + adj.friction
             after = here
-        impulse = outline.areas[p] * total
-        adj_way = constants.dt * adj_x[world, p]
+        impulse = area * total
         along = Table()
         gained = Table()
         for n in range(size):
