@@ -326,6 +326,20 @@ def test_a_block_rests_on_the_floor(settled):
     assert torch.equal(forces.points, state.surface.x)
 
 
+def test_forces_are_means_of_control_steps_of_any_length(monkeypatch):
+    """Those of 4 substeps are the means of those of 2 and 2, in calls that share their chunk graphs: ≤ 1e-13."""
+    monkeypatch.setattr(memory, "LONGEST", 2)
+    model = build(slab(), alarms=None)
+    start, found = model.rest(), {}
+    start = softmpm.simulate(model, start, None, model.params(), substeps=40)
+    for substeps in (4, 2):
+        found[substeps] = softmpm.simulate(model, start, None, model.params(), substeps=substeps)
+    second = softmpm.simulate(model, found[2], None, model.params(), substeps=2)
+    forces = [state.surface.force for state in (found[2], second)]
+    assert (forces[0] - forces[1]).abs().max() > 1e-3 * forces[0].abs().max() > 0
+    assert_relative((forces[0] + forces[1]) / 2, found[4].surface.force, 1e-13)
+
+
 @pytest.mark.parametrize("degrees", [3.0, -0.5])
 def test_a_block_on_an_incline(degrees, settled):
     """Above the angle of friction it slides as a rigid one, within 0.5 %; below it sticks."""

@@ -171,7 +171,7 @@ class Fast:
         self._pool = LayoutGraphs(self.model, layout, self._unpacker)
 
     def accept(self, run: FastRun, words: list[int]) -> bool:
-        """Update the staleness of the layout; False if a particle left the window."""
+        """Update the staleness of the layout; False if a particle or a surface point left the window."""
         *words, cells, near_edge = words
         if outgrown(words):
             self._widen(run)
