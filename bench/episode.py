@@ -23,18 +23,22 @@ from softmpm_learn.tasks.elephant import ElephantConf, elephant
 from softmpm_learn.tasks.task import Task
 
 ROBOTS = {"biped": (BipedConf, biped), "elephant": (ElephantConf, elephant)}
-VISCOUS = dict(retardation=4e-3)
+ELASTIC = dict(contact="nodes", retardation=0.0, safety=0.4)
+VISCOUS = ELASTIC | dict(retardation=4e-3)
+REFERENCE = VISCOUS | dict(formulation="reference", contact="surface")
 CASES = [
-    ("biped", 128, 0.0125, 2000, {}),
-    ("biped", 264, 0.0125, 2000, {}),
-    ("biped", 264, 0.004, 2000, {}),
+    ("biped", 128, 0.0125, 2000, ELASTIC),
+    ("biped", 264, 0.0125, 2000, ELASTIC),
+    ("biped", 264, 0.004, 2000, ELASTIC),
     ("biped", 128, 0.0125, 2000, VISCOUS),
-    ("biped", 128, 0.0125, 2000, VISCOUS | dict(formulation="reference", contact_width=0.01)),
+    ("biped", 128, 0.0125, 2000, REFERENCE),
     ("elephant", 128, 0.0125, 2000, VISCOUS),
-    ("elephant", 128, 0.0125, 2000, VISCOUS | dict(formulation="reference", contact_width=0.01)),
+    ("elephant", 128, 0.0125, 2000, REFERENCE),
+    ("biped", 128, 0.0125, 2000, {}),
+    ("elephant", 128, 0.0125, 2000, {}),
 ]
-"""Robot, cells per metre, seconds between two decisions, substeps of an episode, settings."""
-ON_A_CPU = [("biped", 80, 0.0125, 100, VISCOUS), ("biped", 80, 0.0125, 100, CASES[4][-1])]
+"""Robot, cells per metre, seconds between two decisions, substeps of an episode, settings; the last two cases are the defaults."""
+ON_A_CPU = [("biped", 80, 0.0125, 100, settings) for settings in (VISCOUS, REFERENCE, {})]
 
 
 def task_of(robot: str, cells: int, period: float, substeps: int, settings: dict) -> Task:
@@ -79,6 +83,7 @@ def main():
             {
                 "robot": task.name,
                 "formulation": model.formulation,
+                "contact": "nodes" if model.surface is None else "surface",
                 "viscous": model.spec.viscosity,
                 "particles": model.particle_count,
                 "control steps": task.control_steps,
