@@ -6,7 +6,8 @@ run is the contact and the grid that it was learned with, all others have the sa
 particle.
 
 ``later`` is the displacement from T to 3T over twice that until T, T the length of the episode: the policy goes on, in closed loop and
-on a longer track. A leap has 0, a walk that is under way from the start 1.
+on a longer track. A leap has 0, a walk that is under way from the start 1. ``stretch`` is the largest of a particle, ``dt / limit`` the
+ratio of dt and the stable step of such a particle if it were alone on the grid and its muscles fully active.
 """
 
 import argparse
@@ -101,11 +102,8 @@ def built(task: Task, run: Run, shift: float = 0.0) -> softmpm.Model:
     (body,), spacing = task.scene.bodies, task.scene.grid.spacing
     moved = dataclasses.replace(body, particles=body.particles.moved((shift * spacing, 0.0)))
     scene = dataclasses.replace(task.scene, bodies=[moved])
-    settings = (
-        dict(alarms=softmpm.Alarms(step=None))
-        | task.build
-        | dict(inputs=declared_inputs(run.settings.design))
-    )
+    settings = task.build | {"alarms": dataclasses.replace(task.build["alarms"], step=None)}
+    settings |= {"inputs": declared_inputs(run.settings.design)}
     return softmpm.build(scene, device=run.model.device, dtype=run.model.dtype, **settings)
 
 
@@ -126,43 +124,63 @@ def transferred(run: Run, task: Task) -> tuple[softmpm.Params, softmpm.Inputs]:
 
 
 @torch.no_grad()
-def replayed(run: Run, task: Task, activation: torch.Tensor) -> np.ndarray:
-    """Displacement at each position of the grid [m], NaN where a simulation stopped."""
+def replayed(run: Run, task: Task, activation: torch.Tensor) -> tuple[np.ndarray, float, float]:
+    """Displacement at each position of the grid [m], NaN where a simulation stopped; and of all control steps the largest stretch [-]
+    with dt over the stable step of a particle that is alone on the grid and as deformed [-]."""
     params, inputs = transferred(run, task)
-    found = np.full(len(SHIFTS), math.nan)
+    found, worst, F = np.full(len(SHIFTS), math.nan), 0.0, None
     for k, shift in enumerate(SHIFTS):
         model = built(task, run, shift)
+        state = model.rest()
         try:
-            end = softmpm.simulate(
-                model, model.rest(), activation, params, substeps=task.substeps, inputs=inputs
-            )
-            found[k] = travelled(model, params, end)
+            for row in activation:
+                state = softmpm.simulate(
+                    model, state, row[None], params, substeps=task.substeps, inputs=inputs
+                )
+                stretches = torch.linalg.svdvals(state.F[0].double())[:, 0]
+                if stretches.max() > worst:
+                    worst, most = stretches.max().item(), stretches.argmax()
+                    F = state.F[0, most].double().cpu()
+            found[k] = travelled(model, params, state)
         except softmpm.UnstableError as error:
             print(f"{task.name}, shift {shift}: {error}")
-    return found
+    return found, worst, task.scene.dt / softmpm.stable_dt(task.scene, stretch=F)
 
 
-def replays(table: Table, folder: Path, device: torch.device, finest: Resolution, out: Path) -> None:
+def replays(
+    table: Table,
+    folder: Path,
+    device: torch.device,
+    out: Path,
+    finest: Resolution,
+    safeties: list[float],
+) -> None:
     conf, run = learned(folder, device, out)
     activation, way = played(run, run.task, built(run.task, run))
-    later, own = lasting(run), conf.task.contact
-    cells = conf.task.resolution.value
-    for contact in dict.fromkeys((own, "surface")):
-        width = conf.task.contact_width if contact == own else None
-        for resolution in (r for r in Resolution if cells <= r.value <= finest.value):
-            changed = dataclasses.replace(
-                conf.task, contact=contact, contact_width=width, resolution=resolution
-            )
-            found = 1e3 * replayed(run, make_task(changed), activation)
-            row = {"run": folder.name, "η/μ ms": 1e3 * conf.task.retardation, "contact": contact}
-            row |= {"cells/m": resolution.value, "learned mm": 1e3 * way[-1], "replayed mm": found.mean()}
-            table.add(row | {"std": found.std(ddof=1), "later": later})
+    later, own, coarsest = lasting(run), conf.task, conf.task.resolution
+    cases: list[dict] = [{"safety": safety} for safety in safeties]
+    for contact in dict.fromkeys((own.contact, "surface")):
+        width = own.contact_width if contact == own.contact else None
+        for resolution in (r for r in Resolution if coarsest.value <= r.value <= finest.value):
+            cases.append({"contact": contact, "contact_width": width, "resolution": resolution})
+    for case in cases:
+        changed = dataclasses.replace(own, **case)
+        found, stretch, ratio = replayed(run, make_task(changed), activation)
+        row = {"run": folder.name, "η/μ ms": 1e3 * own.retardation, "contact": changed.contact}
+        row |= {"cells/m": changed.resolution.value, "safety": changed.safety}
+        row |= {
+            "learned mm": 1e3 * way[-1],
+            "replayed mm": 1e3 * found.mean(),
+            "std": 1e3 * found.std(ddof=1),
+        }
+        table.add(row | {"later": later, "stretch": stretch, "dt / limit": ratio})
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--finest", choices=[r.name for r in Resolution], default="standard")
+    parser.add_argument("--safety", type=float, nargs="*", default=[], help="also with these values of it")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--json", type=Path, default=None, help="also write the table to this file")
     args = parser.parse_args()
@@ -170,7 +188,7 @@ def main():
     table = Table("Best episode of a run on other grids", device, args.json)
     for folder in args.folders:
         with tempfile.TemporaryDirectory() as out:
-            replays(table, folder, device, Resolution[args.finest], Path(out))
+            replays(table, folder, device, Path(out), Resolution[args.finest], args.safety)
 
 
 if __name__ == "__main__":
