@@ -159,14 +159,14 @@ def replays(
     activation, way = played(run, run.task, built(run.task, run))
     later, own, coarsest = lasting(run), conf.task, conf.task.resolution
     cases: list[dict] = [{"safety": safety} for safety in safeties]
-    for contact in dict.fromkeys((own.contact, "surface")):
+    for contact in [own.contact] if own.on_surface else ["nodes", "surface"]:
         width = own.contact_width if contact == own.contact else None
         for resolution in (r for r in Resolution if coarsest.value <= r.value <= finest.value):
             cases.append({"contact": contact, "contact_width": width, "resolution": resolution})
     for case in cases:
         changed = dataclasses.replace(own, **case)
         found, stretch, ratio = replayed(run, make_task(changed), activation)
-        row = {"run": folder.name, "η/μ ms": 1e3 * own.retardation, "contact": changed.contact}
+        row = {"run": folder.name, "η/μ ms": 1e3 * own.retardation, "contact": changed.build["contact"]}
         row |= {"cells/m": changed.resolution.value, "safety": changed.safety}
         row |= {
             "learned mm": 1e3 * way[-1],

@@ -151,8 +151,6 @@ class WalkerConf(TaskConf):
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
-    safety: float = 0.3
-    """Substep over the largest stable one at rest: viscosity shortens the stable step by up to the fourth power of the stretch."""
 
     def __post_init__(self):
         super().__post_init__()
