@@ -1,9 +1,8 @@
 """Truth of a learned gait: `python bench/replay.py FOLDER … [--device cpu] [--json FILE]`; FOLDER is that of a run of a walker
 
 The activations of the best episode are replayed on other grids, with nodes or the surface on the floor: displacement of the centre of
-mass at the end [mm], mean and standard deviation over four positions of the grid, each a quarter of a cell further. The first row of a
-run is the contact and the grid that it was learned with, all others have the same material; a designed one is that of the nearest
-particle.
+mass at the end [mm], mean and standard deviation over four positions of the grid, each a quarter of a cell further, but for those that
+``stopped``. All rows of a run have the same material; a designed one is that of the nearest particle.
 
 ``later`` is the displacement from T to 3T over twice that until T, T the length of the episode: the policy goes on, in closed loop and
 on a longer track. A leap has 0, a walk that is under way from the start 1. ``stretch`` is the largest of a particle, ``dt / limit`` the
@@ -168,10 +167,12 @@ def replays(
         found, stretch, ratio = replayed(run, make_task(changed), activation)
         row = {"run": folder.name, "η/μ ms": 1e3 * own.retardation, "contact": changed.build["contact"]}
         row |= {"cells/m": changed.resolution.value, "safety": changed.safety}
+        going = 1e3 * found[~np.isnan(found)]
+        row |= {"learned mm": 1e3 * way[-1], "stopped": len(found) - len(going)}
+        several = len(going) > 1
         row |= {
-            "learned mm": 1e3 * way[-1],
-            "replayed mm": 1e3 * found.mean(),
-            "std": 1e3 * found.std(ddof=1),
+            "replayed mm": going.mean() if several else None,
+            "std": going.std(ddof=1) if several else None,
         }
         table.add(row | {"later": later, "stretch": stretch, "dt / limit": ratio})
 
