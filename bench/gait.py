@@ -71,7 +71,7 @@ class Walker(BipedConf):
 
 
 def walker(cells: int, **settings) -> Task:
-    conf = type("Walker", (Walker,), {"cells": cells})(**settings)
+    conf = type("Walker", (Walker,), {"cells": cells})(**dict(safety=0.4, contact_width=0.0) | settings)
     return biped(conf)
 
 
@@ -82,8 +82,10 @@ def replayed(
     (body,), spacing = task.scene.bodies, task.scene.grid.spacing
     moved = dataclasses.replace(body, particles=body.particles.moved((shift * spacing, 0.0)))
     scene = dataclasses.replace(task.scene, bodies=[moved])
-    alarms = softmpm.Alarms(step=None)  # the substeps were chosen for the rest state
-    model = softmpm.build(scene, device=device, dtype=dtype, alarms=alarms, **task.build)
+    settings = dict(
+        task.build, alarms=softmpm.Alarms(step=None)
+    )  # the substeps were chosen for the rest state
+    model = softmpm.build(scene, device=device, dtype=dtype, **settings)
     return model, torch.tensor(gait, dtype=dtype, device=device)[:, None]
 
 
@@ -99,7 +101,7 @@ def travelled(model: softmpm.Model, state: softmpm.State) -> torch.Tensor:
 
 @torch.no_grad()
 def walk(
-    cells: int, formulation: str, retardation: float, gait: np.ndarray, device, contact: str = "auto"
+    cells: int, formulation: str, retardation: float, gait: np.ndarray, device, contact: str
 ) -> tuple[np.ndarray, float]:
     """Displacements after each half of the gait, shape (shift, 2), NaN where a simulation stopped; and seconds of one run."""
     task = walker(cells, formulation=formulation, retardation=retardation, contact=contact)
@@ -119,7 +121,8 @@ def walk(
 def walks(table: Table, gaits: dict, device) -> None:
     for (name, gait), (retardation, grids) in itertools.product(gaits.items(), CELLS.items()):
         finest, next_finest = (
-            walk(cells, "reference", retardation, np.array(gait), device) for cells in grids["reference"][:2]
+            walk(cells, "reference", retardation, np.array(gait), device, "surface")
+            for cells in grids["reference"][:2]
         )
         limit = finest[0].mean(axis=0)
         doubt = np.hypot(
@@ -129,7 +132,10 @@ def walks(table: Table, gaits: dict, device) -> None:
         for formulation in grids:
             for cells in grids[formulation]:
                 known = done.get(cells) if formulation == "reference" else None
-                found, seconds = known or walk(cells, formulation, retardation, np.array(gait), device)
+                contact = {"reference": "surface", "moving": "nodes"}[formulation]
+                found, seconds = known or walk(
+                    cells, formulation, retardation, np.array(gait), device, contact
+                )
                 row = {
                     "gait": name,
                     "η/μ ms": 1e3 * retardation,

@@ -122,7 +122,7 @@ def gaits(table: Table, device: torch.device) -> None:
     swings = itertools.product((ElephantConf, ArmConf), (0.5, 1.0), range(3))
     cases += [(kind, f"swing {seed} at {part:g}", (seed, part)) for kind, part, seed in swings]
     for kind, name, gait in cases:
-        task = make_task(kind(formulation="reference", retardation=4e-3))
+        task = make_task(kind(formulation="reference", retardation=4e-3, contact_width=0.0, safety=0.4))
         if isinstance(gait, tuple):
             random, count = np.random.default_rng(gait[0]), len(task.scene.muscles)
             phase, rate = random.uniform(0, 2 * math.pi, count), random.uniform(2.0, 4.0, count)

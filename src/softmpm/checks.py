@@ -101,11 +101,11 @@ def _check_surface(model: Sizes, surface: SurfaceState) -> None:
 
 
 def check_carried(apart: Tensor, spacing: float) -> None:
-    """Surface points are near the particles, from whose outline they differ by this. Reads back once: a GPU has to wait."""
+    """Surface points are where the particles show them, but for this root mean square. Reads back once: a GPU has to wait."""
     need(
         not bool(apart > spacing),
-        "state.x or state.F was changed, but state.surface was not, from which a call continues: a surface point is "
-        f"{float(apart):.4g} m away from where its nearest particle shows it, at most a cell, {spacing:.4g} m, is allowed; take "
+        "state.x or state.F was changed, but state.surface was not, from which a call continues: in root mean square its points are "
+        f"{float(apart):.4g} m away from where their nearest particles show them, at most a cell, {spacing:.4g} m, is allowed; take "
         "state._replace(surface=None), whose points are computed from x and F.",
     )
 

@@ -371,7 +371,8 @@ def test_places_of_a_state_without_points_are_exact_for_affine_motion():
 
 
 def test_what_cannot_be_is_refused(settled):
-    """Fixed-point sums, `step`, a state whose particles were moved alone, one of another model; points that leave the grid."""
+    """Fixed-point sums, `step`, a state whose particles were moved alone (but not one with a single stray point), one of another model;
+    points that leave the grid."""
     model, state = settled
     with pytest.raises(ValueError, match="deterministic=True has no contact at surface points in the fast"):
         build(slab(), deterministic=True)
@@ -382,6 +383,9 @@ def test_what_cannot_be_is_refused(settled):
     args = (None, model.params())
     with pytest.raises(ValueError, match="state.surface was not"):
         softmpm.simulate(model, state._replace(x=state.x + 0.1), *args, substeps=1)
+    stray = state.surface.x.clone()
+    stray[0, 0, 0] += 1.5 * model.scene.grid.spacing
+    softmpm.simulate(model, state._replace(surface=state.surface._replace(x=stray)), *args, substeps=1)
     moved = softmpm.simulate(model, state._replace(x=state.x + 0.1, surface=None), *args, substeps=1)
     assert moved.surface is not None
     torch.testing.assert_close(moved.surface.x, state.surface.x + 0.1, rtol=0, atol=1e-3)

@@ -1,4 +1,5 @@
-"""Training in the reference formulation: each task from its settings to its pictures, and again from a checkpoint."""
+"""Training of each task in the reference formulation and of a walker on the moving grid, from the settings to the pictures, and again
+from a checkpoint."""
 
 import csv
 import math
@@ -27,9 +28,8 @@ SETTINGS = [
 def conf_of(task: str, *changes: str) -> RunConf:
     app.register()
     GlobalHydra.instance().clear()
-    width = [] if task == "arm" else ["task.contact_width=0.01"]
     with initialize_config_dir(conf_dir(), version_base="1.3"):
-        return to_run(compose("config", [f"task={task}", *SETTINGS, *width, *changes]))
+        return to_run(compose("config", [f"task={task}", *SETTINGS, *changes]))
 
 
 def metrics(folder) -> list[dict[str, str]]:
@@ -37,11 +37,14 @@ def metrics(folder) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_a_run_is_whole(task, tmp_path):
+@pytest.mark.parametrize(
+    ("task", "formulation"), [*((task, "reference") for task in TASKS), ("biped", "moving")]
+)
+def test_a_run_is_whole(task, formulation, tmp_path):
     """Finite gradients of policy and design in every iteration; the folder has the recording, the pictures and a configuration that
     gives the same model; a run of one iteration continued by a second equals one of two."""
-    experiment.run_experiment(conf_of(task), tmp_path / "whole")
+    chosen = (task, f"task.formulation={formulation}")
+    experiment.run_experiment(conf_of(*chosen), tmp_path / "whole")
     found = metrics(tmp_path / "whole")
     assert len(found) == 2
     for row in found:
@@ -52,10 +55,10 @@ def test_a_run_is_whole(task, tmp_path):
     with softmpm.Recording(tmp_path / "whole" / "run.h5") as recording:
         frames = recording.frames(recording.episodes[-1])
     assert len(frames["x"]) == 3 and np.abs(frames["x"][-1] - frames["x"][0]).max() > 1e-6
-    assert load(tmp_path / "whole").task == conf_of(task).task
+    assert load(tmp_path / "whole").task == conf_of(*chosen).task
 
-    experiment.run_experiment(conf_of(task, "train.iterations=1"), tmp_path / "parts")
-    experiment.run_experiment(conf_of(task), tmp_path / "parts")
+    experiment.run_experiment(conf_of(*chosen, "train.iterations=1"), tmp_path / "parts")
+    experiment.run_experiment(conf_of(*chosen), tmp_path / "parts")
     assert metrics(tmp_path / "parts") == found
     one, two = (checkpoint.load(tmp_path / name) for name in ("whole", "parts"))
     assert all(torch.equal(one["policy"][name], two["policy"][name]) for name in one["policy"])
@@ -67,19 +70,24 @@ def test_another_formulation_does_not_resume(tmp_path):
     experiment.run_experiment(conf_of("biped", "train.iterations=1"), tmp_path)
     for change, name in (
         (("task.contact_width=0.02",), "contact_width"),
-        (("task.contact=nodes", "task.contact_width=0"), "contact: "),
-        (("task.formulation=moving", "task.contact_width=0"), "formulation: reference then, None now"),
+        (("task.contact=nodes",), "contact: "),
+        (("task.formulation=moving",), "formulation: reference then, moving now"),
+        (("task.formulation=moving", "task.contact=nodes"), "formulation: reference then, None now"),
     ):
         with pytest.raises(SettingsError, match=name):
             experiment.run_experiment(conf_of("biped", *change), tmp_path)
 
 
 def test_a_contact_that_is_not_there_is_refused(tmp_path):
-    """The arm has no walls that separate, and by default nodes meet the walls in the moving formulation."""
+    """The arm has no walls that separate, and contact at nodes has no width."""
     for task, changes, message in (
         ("arm", ("task.contact=surface",), "needs a wall of the kind 'separate'"),
         ("arm", ("task.contact_width=0.01",), "contact_width is for contact at surface points"),
-        ("biped", ("task.formulation=moving",), "contact_width is for contact at surface points"),
+        (
+            "biped",
+            ("task.contact=nodes", "task.contact_width=0.01"),
+            "contact_width is for contact at surface points",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             experiment.run_experiment(conf_of(task, *changes), tmp_path / "refused")

@@ -21,7 +21,7 @@ def task(request):
 
 
 def simulate(task, activation, seconds):
-    model = softmpm.build(task.scene, device="cpu")
+    model = softmpm.build(task.scene, device="cpu", **task.build)
     steps = round(seconds / task.control_period)
     rows = torch.as_tensor(activation, dtype=torch.float32).expand(steps, 1, model.muscle_count)
     with torch.no_grad():
@@ -59,10 +59,10 @@ def test_a_pair_of_muscles_splits_a_limb(task):
 
 
 def test_legs_stand_on_the_floor():
-    """The soles of all legs are at the same height, half a cell above the floor's nodes, at every resolution."""
+    """The soles of all legs are at the same height, half a cell above the floor's nodes if those meet it, at every resolution."""
     for build, conf in ((elephant, ElephantConf), (biped, BipedConf)):
         for resolution in Resolution:
-            task = build(conf(resolution=resolution))
+            task = build(conf(resolution=resolution, contact="nodes"))
             scene, positions = task.scene, task.scene.bodies[0].particles.positions
             floor = scene.walls[0].offset
             legs = [region for name, region in task.regions.items() if name not in ("body", "trunk")]
@@ -77,14 +77,14 @@ def test_legs_stand_on_the_floor():
 def test_outlines_fit_their_robots(name, resolution):
     """The outline closes around the volume of the particles: to half a spacing of the lattice, to 5e-4 with cut cells."""
     conf, build = TASKS[name]
-    for formulation, tolerance in (("moving", 0.01), ("reference", 5e-4)):
-        task = build(conf(resolution=resolution, formulation=formulation))
+    for formulation, contact, tolerance in (("moving", "nodes", 0.01), ("reference", "auto", 5e-4)):
+        task = build(conf(resolution=resolution, formulation=formulation, contact=contact))
         particles, spacing = task.scene.bodies[0].particles, task.scene.grid.spacing / 2
         outline = particles.outline
         assert np.linalg.norm(outline.areas @ outline.normals) < 1e-12
         assert outline.enclosed_volume == pytest.approx(particles.volume.sum(), rel=tolerance)
         whole = bool(np.allclose(particles.volume, spacing**2, rtol=1e-9))
-        assert whole == (formulation == "moving")
+        assert whole == (contact == "nodes")
         assert particles.volume.min() > 0.35 * spacing**2
 
 
@@ -94,8 +94,13 @@ def test_soles_meet_the_floor_on_spline_knots(name, resolution):
     """With surface contact, soles and floor are at one height, in the middle between two rows of nodes, and are exactly level; nodes
     meet a floor that is half a cell lower."""
     conf, build = TASKS[name]
-    for contact, gap in (("auto", 0.0), ("surface", 0.0), ("nodes", 0.5)):
-        task = build(conf(resolution=resolution, formulation="reference", contact=contact))
+    for formulation, contact, gap in (
+        ("moving", "auto", 0.0),
+        ("reference", "auto", 0.0),
+        ("reference", "surface", 0.0),
+        ("reference", "nodes", 0.5),
+    ):
+        task = build(conf(resolution=resolution, formulation=formulation, contact=contact))
         scene, outline = task.scene, task.scene.bodies[0].particles.outline
         lowest = outline.points[:, 1].min()
         assert (lowest / scene.grid.spacing) % 1 == pytest.approx(0.5, abs=1e-9)
@@ -113,7 +118,24 @@ def test_retardation_is_viscosity_over_shear_modulus():
     """η = τ μ, and the step is smaller."""
     scene = biped(BipedConf(retardation=1e-3, young=5e4, poisson=0.25)).scene
     assert scene.bodies[0].material.viscosity == pytest.approx(20.0)
-    assert scene.dt < biped(BipedConf(young=5e4, poisson=0.25)).scene.dt
+    assert scene.dt < biped(BipedConf(retardation=0.0, young=5e4, poisson=0.25)).scene.dt
+
+
+def test_walkers_learn_with_contact_that_converges():
+    """By default they are viscous and stand on surface points with a smooth onset, and change to nodes by one setting; the arm, which
+    meets no floor, is elastic and has neither."""
+    surface = dict(
+        formulation="moving", contact="surface", contact_width=0.01, alarms=softmpm.Alarms(step=None)
+    )
+    nodes = dict(formulation="moving", contact="nodes", contact_width=0.0, alarms=softmpm.Alarms())
+    for conf in (ElephantConf, BipedConf):
+        task = make_task(conf())
+        material = task.scene.bodies[0].material
+        assert material.viscosity == pytest.approx(1e-3 * material.young / (2 * (1 + material.poisson)))
+        assert task.build == surface and conf(contact="nodes").build == nodes
+        assert conf(contact_width=0.0).build == surface | {"contact_width": 0.0}
+    task = make_task(ArmConf())
+    assert task.build == nodes and task.scene.bodies[0].material.viscosity == 0.0
 
 
 def test_limbs_may_pass_each_other_if_they_are_told_to():
@@ -179,6 +201,7 @@ def test_settings_reach_the_scene():
         poisson=0.25,
         density=900.0,
         viscosity=20.0,
+        retardation=0.0,
         strength=1e4,
         gravity=3.0,
         friction=0.3,
@@ -200,7 +223,9 @@ def test_settings_reach_the_scene():
         (ElephantConf, {"young": float("nan")}, "task.young must be > 0"),
         (ElephantConf, {"viscosity": -1.0}, "task.viscosity must be ≥ 0"),
         (ElephantConf, {"retardation": -1.0}, "task.retardation must be ≥ 0"),
-        (ElephantConf, {"retardation": 1e-3, "viscosity": 1.0}, "two names for one thing"),
+        (ElephantConf, {"safety": 1.1}, "task.safety must be at most 1"),
+        (ElephantConf, {"viscosity": 1.0}, "two names for one thing"),
+        (ElephantConf, {"contact_width": -0.1}, "task.contact_width must be ≥ 0"),
         (ArmConf, {"formulation": "auto"}, "task.formulation must be one of moving, reference; got 'auto'"),
         (
             ArmConf,

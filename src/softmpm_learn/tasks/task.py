@@ -14,6 +14,8 @@ from softmpm_learn.objective import Objective, Upright
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
+WIDTH = 0.01
+"""Distance over which surface contact sets in while a robot learns [cells]."""
 
 
 class Resolution(Enum):
@@ -62,10 +64,11 @@ class TaskConf:
     overlap: bool = False
     """reference: whether limbs may pass through each other; else the simulation stops by name where they do."""
     contact: str = "auto"
-    """What meets the floor: the surface of the robot, or the nodes around it. auto is the surface in the reference formulation, the
-    nodes in the moving one. A robot in the reference formulation or with a surface has cut cells."""
-    contact_width: float = 0.0
-    """Distance over which surface contact sets in [cells]; 0.01 to learn, 0 to evaluate."""
+    """What meets the walls that separate: the surface of the robot, or the nodes around it. auto is the surface for robots on legs, in
+    both formulations; the arm meets no such wall. A robot in the reference formulation or with a surface has cut cells."""
+    contact_width: float | None = None
+    """Distance over which surface contact sets in [cells]; 0 to evaluate. null is 0.01 where the surface meets the floor, with which
+    gradients were usable (docs/gait.md)."""
 
     def __post_init__(self):
         for name, known in (("formulation", FORMULATIONS), ("contact", CONTACTS)):
@@ -84,6 +87,12 @@ class TaskConf:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"task.{name} must be > 0, got {value}.")
         self.need_not_negative("viscosity", "retardation", "gravity", "damping", "effort")
+        if self.contact_width is not None:
+            self.need_not_negative("contact_width")
+        if self.safety > 1.0:
+            raise ValueError(
+                f"task.safety must be at most 1, with which the substep is the stable one, got {self.safety}."
+            )
         if self.control_period > self.seconds:
             raise ValueError(
                 f"task.control_period must be at most task.seconds = {self.seconds}, got {self.control_period}."
@@ -109,19 +118,31 @@ class TaskConf:
     @property
     def on_surface(self) -> bool:
         """True if the surface of the robot meets the walls that separate."""
-        return self.contact == "surface" or (self.contact == "auto" and self.formulation == "reference")
+        return self.contact == "surface"
 
     @property
     def build(self) -> dict[str, Any]:
         """Arguments of :func:`softmpm.build`."""
-        found = {name: getattr(self, name) for name in ("formulation", "contact", "contact_width")}
-        return found | ({"alarms": softmpm.Alarms(overlap=None)} if self.overlap else {})
+        width = self.contact_width
+        if width is None:
+            width = WIDTH if self.on_surface else 0.0
+        contact = "surface" if self.on_surface else "nodes"
+        found = {"formulation": self.formulation, "contact": contact, "contact_width": width}
+        return found | {"alarms": self.alarms}
+
+    @property
+    def alarms(self) -> softmpm.Alarms:
+        """Limits beyond which a simulation is stopped by name."""
+        return softmpm.Alarms(overlap=None) if self.overlap else softmpm.Alarms()
 
 
 @dataclass(kw_only=True)
 class WalkerConf(TaskConf):
-    """Settings that robots on legs have besides."""
+    """Settings that robots on legs have besides, and their own defaults: contact that converges (docs/gait.md)."""
 
+    retardation: float = 1e-3
+    """Retardation time η/μ of the material [s], instead of ``viscosity``; without it soles flutter. Good value in the reference
+    formulation: 4e-3."""
     strength: float = 6e3
     """Stress of a muscle at full activation [Pa]."""
     effort: float = 1e-2
@@ -134,6 +155,18 @@ class WalkerConf(TaskConf):
     def __post_init__(self):
         super().__post_init__()
         self.need_not_negative("friction", "upright")
+
+    @property
+    def on_surface(self) -> bool:
+        return self.contact != "nodes"
+
+    @property
+    def alarms(self) -> softmpm.Alarms:
+        """On the moving grid without the alarm on the step: single particles in the inner corners of the hips are beyond the limit of a
+        lone one, which falls with up to the fourth power of the stretch, and their neighbours are not (docs/gait.md)."""
+        alarms = super().alarms
+        carried = self.on_surface and self.formulation == "moving"
+        return dataclasses.replace(alarms, step=None) if carried else alarms
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
