@@ -35,6 +35,10 @@ class Nodes(NamedTuple):
 
 def outline_struct(model: Model):
     """Struct of the constants of the surface points."""
+    return model.workspace.get(outline_struct, lambda: _outline_struct(model))
+
+
+def _outline_struct(model: Model):
     t, points = types(model.spec.dim, model.spec.dtype), model.surface
     assert points is not None
     struct = point_types(model.spec.dim, model.spec.dtype).Outline()
