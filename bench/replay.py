@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from common import Table
+from gait import SHIFTS
 from scipy.spatial import cKDTree
 
 import softmpm
@@ -32,9 +33,8 @@ from softmpm_learn.run import Run
 from softmpm_learn.saved import load
 from softmpm_learn.tasks import Resolution, Task, make_task
 
-SHIFTS = (0.0, 0.25, 0.5, 0.75)
-"""Displacements of the robot against the grid in cells."""
 LONGER = 3
+"""Length of the continued walk over that of an episode."""
 
 
 class Onlooker(Observer):
