@@ -82,9 +82,8 @@ def replayed(
     (body,), spacing = task.scene.bodies, task.scene.grid.spacing
     moved = dataclasses.replace(body, particles=body.particles.moved((shift * spacing, 0.0)))
     scene = dataclasses.replace(task.scene, bodies=[moved])
-    settings = dict(
-        task.build, alarms=softmpm.Alarms(step=None)
-    )  # the substeps were chosen for the rest state
+    # The substeps were chosen for the rest state.
+    settings = dict(task.build, alarms=softmpm.Alarms(step=None))
     model = softmpm.build(scene, device=device, dtype=dtype, **settings)
     return model, torch.tensor(gait, dtype=dtype, device=device)[:, None]
 

@@ -59,9 +59,8 @@ class MirrorGrid:
         part = np.zeros((len(mirrors), self.count, scene.grid.dim))
         for k, one in enumerate(mirrors):
             reached = (one.side * (twice[:, one.axis] - one.twice) <= 0) & (mass > 0)
-            taking = np.append(reached, False)[members].any(
-                axis=1
-            )  # groups with nodes on the plane or behind it
+            # Groups with nodes on the plane or behind it:
+            taking = np.append(reached, False)[members].any(axis=1)
             part[k] = np.outer(taking, one.held)
         self.shares = torch.from_numpy(part / part.sum(axis=0).clip(min=1.0)).to(device)
         self.first = torch.from_numpy(first).to(device)

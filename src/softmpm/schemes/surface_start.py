@@ -21,9 +21,8 @@ def with_surface(model: Model, start: State, values: Values) -> State:
     if start.surface is not None:
         if not is_capturing(model):
             apart = start.surface.x.detach() - points.shown(start.detach())
-            distances = (
-                apart.square().sum(dim=-1).mean(dim=-1).sqrt()
-            )  # single points at sharp corners drift by a cell
+            # In root mean square: single points at sharp corners drift by a cell.
+            distances = apart.square().sum(dim=-1).mean(dim=-1).sqrt()
             check_carried(distances.max(), model.scene.grid.spacing)
         return start
     x = points.shown(start)

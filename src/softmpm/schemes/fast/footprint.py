@@ -58,9 +58,8 @@ class FastFootprint:
         small = graph + sizes.inside + 2 * sizes.nodes
         forward = small * _at_once(horizon, sizes.longest)
         passed = 2 * sizes.inside  # adjoints in the order of the previous chunk, and their copy
-        if (
-            model.surface is not None
-        ):  # stencils; nodal velocities without contact and the adjoint of the load
+        if model.surface is not None:
+            # Stencils; nodal velocities without contact and the adjoint of the load:
             passed += stencil_bytes(model) + sizes.nodes
         if chosen.keep_all:
             kept = model.calls * graph * len(horizon.chunks(chosen.longest))

@@ -146,7 +146,7 @@ class SharedAdjoint:
         self.held = max(self.model.rest_grid.count, self.model.anchor_shape[2])
         """Accumulators of each world for what acts on nodes or surface points."""
         vec = buffers.types.vec
-        self.u_array, self.v_array, self.f_array = (view(one, vec) for one in (self.u, self.v, self.f))
+        self.u_array, self.v_array = view(self.u, vec), view(self.v, vec)
         self.mass_array = view(self.mass, buffers.types.real)
         self.partial_arrays = [view(one, vec) for one in self.partials]
         self._accumulators: dict[int, Accumulators] = {}

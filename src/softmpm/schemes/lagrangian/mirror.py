@@ -115,9 +115,8 @@ class ReflectionAdj:
         launch(self._kernels.free_again, one.mass.shape, *arguments, self._free, part=NODE_PART)
         if self.contact is not None:
             launch(self._kernels.free_again, one.mass.shape, *arguments, self.contact.free, part=NODE_PART)
-            one.advance(
-                launch, self._words, u, self.contact.free, self._scratch
-            )  # its mean forces are not read
+            # Its mean forces are not read.
+            one.advance(launch, self._words, u, self.contact.free, self._scratch)
             self._reflect(launch, one.model.scene.dt, 0, new_v, adj_u, adj_v)
 
     def finish(self, launch: Callable[..., None], anew: int, adj_u: wp.array, adj_v: wp.array) -> None:

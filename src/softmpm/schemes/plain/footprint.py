@@ -26,9 +26,8 @@ class PlainFootprint:
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         inside, terms = model.sizes().inside, term_bytes(model)
         number, contact = model.worlds * model.node_count * model.dtype.itemsize, stencil_bytes(model)
-        load, back = (
-            (number, (model.dim + 3) * number) if contact else (0, 0)
-        )  # load; its adjoint, v* and the adjoint of the mass
+        # The load; its adjoint, v* and the adjoint of the mass:
+        load, back = (number, (model.dim + 3) * number) if contact else (0, 0)
         return Buffers(2 * inside + terms + contact + load, 0, inside + terms + 2 * contact + back)
 
 
