@@ -197,7 +197,7 @@ class _Call:
         """Number of the tensors of a state that are differentiable."""
         if self.model.formulation == "reference":
             return 5
-        return 4 if self.model.surface is None else 7
+        return 4 if self.model.surface is None else 6
 
     def rounding(self, state: Any) -> tuple:
         """What is not differentiable of a state: the shift, or in the moving formulation the low-order parts or None in their place."""

@@ -170,9 +170,9 @@ def on_surface(scene: Scene, formulation: str, contact: str, width: float) -> bo
             )
     wanted = contact == "surface" or (contact == "auto" and formulation == "reference")
     chosen = wanted and outlined and separating
-    if chosen:
+    if chosen and formulation == "reference":
         check_reach(scene)
-    elif width > 0:
+    if not chosen and width > 0:
         raise ValueError(
             f"contact_width is for contact at surface points, but nodes meet the walls here; got {width!r}, leave it out."
         )

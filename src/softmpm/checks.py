@@ -95,19 +95,8 @@ def _check_surface(model: Sizes, surface: SurfaceState) -> None:
             "state.surface must be None unless formulation='moving' and contact='surface'; take state._replace(surface=None)."
         )
     shape = model.anchor_shape
-    check_tensor(model, "state.surface.x", surface.x, (shape[0], *shape[2:]), torch.float64)
     for name in ("anchor", "force"):
         check_tensor(model, f"state.surface.{name}", getattr(surface, name), shape)
-
-
-def check_carried(apart: Tensor, spacing: float) -> None:
-    """Surface points are where the particles show them, but for this root mean square. Reads back once: a GPU has to wait."""
-    need(
-        not bool(apart > spacing),
-        "state.x or state.F was changed, but state.surface was not, from which a call continues: in root mean square its points are "
-        f"{float(apart):.4g} m away from where their nearest particles show them, at most a cell, {spacing:.4g} m, is allowed; take "
-        "state._replace(surface=None), whose points are computed from x and F.",
-    )
 
 
 def check_shown(state: State, shown: State) -> None:

@@ -33,8 +33,6 @@ class Kind(IntEnum):
     COLLAPSED = 8
     IN_WALL = 9
     OVERLAP = 10
-    LOST = 11
-    """A surface point off the grid, or without particles around it."""
 
 
 class UnstableError(RuntimeError):
@@ -43,10 +41,9 @@ class UnstableError(RuntimeError):
     Attributes:
         kind: One of ``start``, ``not_finite``, ``left_grid``, ``inverted`` (det F ≤ 0), ``collapsed`` (det F below its limit),
             ``torn`` (neighbours at rest too far apart), ``step`` (dt above the running stable step), ``in_wall`` (a surface point is
-            deep inside a wall), ``lost`` (a surface point is off the grid or away from its body), ``overlap`` (bodies, or parts of one,
-            pass through each other), ``gradient``.
-        world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite, for ``in_wall`` and ``lost`` the
-            one next to the surface point.
+            deep inside a wall), ``overlap`` (bodies, or parts of one, pass through each other), ``gradient``.
+        world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite, for ``in_wall`` the one next to
+            the surface point.
         substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.
         value: The offending value.
         limit: The limit that it violates.

@@ -7,7 +7,6 @@ from softmpm.checks import check_state
 from softmpm.compiling import opaque
 from softmpm.model import Model, check_model
 from softmpm.state import ContactForces, State
-from softmpm.surface_grid import SurfaceGrid
 
 
 def contact_forces(model: Model, state: State) -> ContactForces:
@@ -37,16 +36,15 @@ def _contact_forces(model: Model, state: State) -> ContactForces:
             "contact_forces needs contact at surface points, which this model has not; build it with contact='surface'."
         )
     if state.nodes is not None:
-        assert isinstance(surface, SurfaceGrid)
-        force, points = state.nodes.force, surface.places(state.nodes.u, state.nodes.shift)
+        force = state.nodes.force
     elif state.surface is not None:
-        force, points = state.surface.force, state.surface.x.to(state.x.dtype)
+        force = state.surface.force
     else:
         raise ValueError(
             "contact_forces needs a state that simulate returned, got one without nodes or surface points; simulate from it first."
         )
     traction = force / surface.areas.to(force.dtype)[:, None]
-    return ContactForces(force.sum(2), traction, points)
+    return ContactForces(force.sum(2), traction, surface.shown(state).to(force.dtype))
 
 
 def clamp_forces(model: Model, state: State) -> Tensor:

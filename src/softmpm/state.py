@@ -101,8 +101,6 @@ class Nodal(NamedTuple):
 class SurfaceState(NamedTuple):
     """State of the surface points in the moving formulation with ``contact="surface"`` (docs/formulations.md). Differentiable."""
 
-    x: Tensor
-    """Places [m], shape (world, point, dim), in float64 in every precision."""
     anchor: Tensor
     """Places on the walls where surface points adhere [m], shape (world, wall, point, dim), of the separating walls."""
     force: Tensor
@@ -121,9 +119,8 @@ class SurfaceState(NamedTuple):
         return SurfaceState(*(tensor.clone() for tensor in self))
 
     def to(self, *args: Any, **kwargs: Any) -> "SurfaceState":
-        """Every tensor on another device or in another precision, but for that of ``x``; arguments as for ``torch.Tensor.to``."""
-        anchor, force = (tensor.to(*args, **kwargs) for tensor in self[1:])
-        return SurfaceState(self.x.to(anchor.device), anchor, force)
+        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``."""
+        return SurfaceState(*(tensor.to(*args, **kwargs) for tensor in self))
 
 
 class State(NamedTuple):
@@ -145,8 +142,8 @@ class State(NamedTuple):
     """What the particles show, in the reference formulation; None in the moving one. A state with nodes continues without loss; for
     one without, the nodes are computed from the four tensors."""
     surface: SurfaceState | None = None
-    """Surface points in the moving formulation with contact at them, else None. A state with them continues without loss; for one
-    without, their places are computed from x and F."""
+    """Surface points in the moving formulation with contact at them, else None. A state with them continues without loss; in one
+    without, they adhere to the walls nowhere."""
 
     @staticmethod
     def of(tensors: Sequence[Tensor]) -> "State":

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from softmpm.rest_grid import RestGrid, flat, stencils
 from softmpm.scene.scene import MIRRORS, Scene
+from softmpm.state import State
 from softmpm.surface_points import SurfacePoints
 from softmpm.validate import need
 
@@ -78,6 +79,11 @@ class SurfaceGrid(SurfacePoints):
     def carried(self, nodes: Tensor) -> Tensor:
         """True for points with a weight on any of these nodes, shape (point,), from shape (node,)."""
         return (nodes[self.stencil.long()] & (self.weights != 0)).any(1)
+
+    def shown(self, state: State) -> Tensor:
+        """Places of the points in a state with nodes [m], shape (world, point, dim)."""
+        assert state.nodes is not None
+        return self.places(state.nodes.u, state.nodes.shift)
 
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""

@@ -35,12 +35,16 @@ class SurfacePoints:
         self.density, self.waves = self._tensor(density), self._tensor(np.sqrt(modulus / density))
         self.normals = self._tensor(normals)
 
+    def shown(self, state: State) -> Tensor:
+        """Places of the points in a state [m], shape (world, point, dim)."""
+        raise NotImplementedError
+
     def _tensor(self, values, dtype: type = np.float64) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, dtype=dtype)).to(self.device)
 
 
 class CarriedPoints(SurfacePoints):
-    """Surface points that the moving grid carries.
+    """Surface points that particles carry, on the moving grid.
 
     Attributes:
         nearest: The particle of the same body nearest at rest to each point, shape (point,), int64.
@@ -63,7 +67,7 @@ class CarriedPoints(SurfacePoints):
         self.arms = self._tensor(np.concatenate(arms))
 
     def shown(self, state: State) -> Tensor:
-        """Places of the points by x and F of the nearest particles [m], shape (world, point, dim), float64: exact for affine motion."""
+        """Places of the points in a state [m], shape (world, point, dim), float64: those of (K8)."""
         x, F = state.x.double(), state.F.double()
         if state.low is not None:
             x, F = x + state.low.x.double(), F + state.low.F.double()

@@ -10,12 +10,9 @@ from surface_scenes import G, block, slab, velocity
 
 import softmpm
 from softmpm import Inputs, reference_moving_contact
-from softmpm.errors import NEVER, Kind, decode
 from softmpm.inputs import QUANTITIES
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
-from softmpm.schemes.fast import particle_order
-from softmpm.schemes.fast.scheme import Fast
 from softmpm.surface_points import CarriedPoints
 
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
@@ -42,8 +39,8 @@ def points_of(model: softmpm.Model) -> CarriedPoints:
 
 
 def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
-    """Leaves of a body near rest, whose points are a little off and adhere somewhere, and of two walls that push into it as they turn
-    and slide, other ones in each world."""
+    """Leaves of a body near rest, whose points adhere somewhere, and of two walls that push into it as they turn and slide, other ones in
+    each world."""
     generator = torch.Generator().manual_seed(seed)
 
     def random(*shape: int) -> torch.Tensor:
@@ -61,7 +58,6 @@ def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
     normal = normal + 2e-3 * random(STEPS + 1, model.worlds, 3, model.dim)
     found |= {"wall_offset": 1.3 * offset, "wall_normal": 1.3 * normal}
     shape = model.anchor_shape
-    found["places"] = rest + 1e-3 * random(shape[0], *shape[2:])
     n = normal[0, :, :2]
     across = rest - torch.einsum("pd,wkd->wkp", rest, n)[..., None] * n[:, :, None]
     found["anchor"] = (across + 1e-3 * random(*shape)).to(model.dtype)
@@ -69,14 +65,14 @@ def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
 
 
 def start_of(leaves: dict[str, torch.Tensor]) -> softmpm.State:
-    if "places" not in leaves:
+    if "anchor" not in leaves:
         return softmpm.State(*(leaves[name] for name in "xvCF"))
-    surface = softmpm.SurfaceState(leaves["places"], leaves["anchor"], torch.zeros_like(leaves["anchor"]))
+    surface = softmpm.SurfaceState(leaves["anchor"], torch.zeros_like(leaves["anchor"]))
     return softmpm.State(*(leaves[name] for name in "xvCF"), surface=surface)
 
 
 def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=False) -> list[torch.Tensor]:
-    """x, v, C, F, places, anchors and forces at the end, by the model or by the reference."""
+    """x, v, C, F, anchors and forces at the end, by the model or by the reference."""
     start = start_of(leaves)
     params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
     inputs, activation = Inputs(**{name: leaves[name] for name in NAMES}), leaves["activation"]
@@ -91,7 +87,6 @@ def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=Fals
         substeps=SUBSTEPS,
         inputs=inputs,
         points=reference_moving_contact.surface_points(model.scene),
-        x=leaves.get("places"),
         anchor=leaves.get("anchor"),
         smoothing=model.contact_width * model.scene.grid.spacing,
     )
@@ -115,7 +110,7 @@ def loss_of(parts: list[torch.Tensor]) -> torch.Tensor:
     ids=["2d", "smooth", "plain", "3d", "single"],
 )
 def test_contact_is_that_of_the_reference(dim, dtype, width, scheme, limit, device):
-    """The state, the forces and the gradient of all of them with respect to every input and to places and anchors: points that stick,
+    """The state, the forces and the gradient of all of them with respect to every input and to anchors: points that stick,
     slip and hang free, some at two walls, which move."""
     settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact_width=width, scheme=scheme)
     model = build(pressed(dim), **settings)
@@ -126,36 +121,36 @@ def test_contact_is_that_of_the_reference(dim, dtype, width, scheme, limit, devi
     for tensors, exact in ((leaves, False), (copies, True)):
         parts = run(model, tensors, exact)
         found.append([*parts, *torch.autograd.grad(loss_of(parts), list(tensors.values()))])
-    force = found[1][6]
+    force = found[1][5]
     touches = (force != 0).any(-1)
     assert touches.any(2).any(0).all() and not touches.all() and (touches.all(1).any() or width == 0)
-    for name, got, want in zip([*"xvCF", "places", "anchor", "force", *leaves], *found, strict=True):
+    for name, got, want in zip([*"xvCF", "anchor", "force", *leaves], *found, strict=True):
         assert want.abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(got.detach().cpu().double(), want.detach(), limit, name)
 
 
 def test_a_state_without_points_has_gradients_too():
-    """Through the places that x and F show, and the anchors there on walls that turn: ≤ 1e-10."""
+    """Through the anchors, which are where x and F show the points, on walls that turn: ≤ 1e-10."""
     model = build(pressed(2), worlds=2, inputs=NAMES, contact_width=0.05)
-    leaves = {name: leaf for name, leaf in leaves_of(model).items() if name not in ("places", "anchor")}
+    leaves = {name: leaf for name, leaf in leaves_of(model).items() if name != "anchor"}
     names = ["x", "F", "wall_normal"]
     found = []
     for exact in (False, True):
         parts = run(model, leaves, exact)
         found.append([*parts, *torch.autograd.grad(loss_of(parts), [leaves[name] for name in names])])
-    for name, got, want in zip([*"xvCF", "places", "anchor", "force", *names], *found, strict=True):
+    for name, got, want in zip([*"xvCF", "anchor", "force", *names], *found, strict=True):
         assert_relative(got.detach(), want.detach(), 1e-10, name)
 
 
 def test_gradients_are_central_differences():
-    """Along one random direction of places, positions, masses and walls: ≤ 1e-6."""
+    """Along one random direction of positions, deformations, masses and walls: ≤ 1e-6."""
     model = build(pressed(2), worlds=2, inputs=NAMES)
     leaves = leaves_of(model)
-    names = ["places", "x", "v", "density", "friction", *WALLS]
+    names = ["x", "F", "v", "density", "friction", *WALLS]
     gradient = torch.autograd.grad(loss_of(run(model, leaves)), [leaves[name] for name in names])
     for name, slope in zip(names, gradient, strict=True):
         d = torch.randn(slope.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        h = 1e-8 if name in ("places", "x", "wall_offset", "wall_normal") else 1e-6
+        h = 1e-8 if name in ("x", "wall_offset", "wall_normal") else 1e-6
         with torch.no_grad():
             ends = [loss_of(run(model, leaves | {name: leaves[name] + sign * h * d})) for sign in (1, -1)]
         want = (ends[0] - ends[1]).item() / (2 * h)
@@ -163,7 +158,7 @@ def test_gradients_are_central_differences():
 
 
 def test_calls_in_turn_are_one_call(scheme, monkeypatch):
-    """Places, anchors and walls go on where they were, also where states are recomputed and where chunks end within control steps: the
+    """Anchors and walls go on where they were, also where states are recomputed and where chunks end within control steps: the
     same end but for the rounding of particles between calls, ≤ 1e-13, and the same gradient."""
     settings = dict(worlds=2, inputs=NAMES, contact_width=0.05, scheme=scheme)
     model = build(pressed(2), **settings)
@@ -222,10 +217,10 @@ def test_a_world_that_fails_does_not_touch_the_others(scheme):
         failures = softmpm.Failures(policy)
         end = softmpm.simulate(model, start, leaves["activation"], params, failures=failures, **settings)
         assert [error.world for error in failures.errors] == [1] and end.surface is not None
-        assert torch.isfinite(end.surface.x).all()
+        assert torch.isfinite(end.surface.anchor).all()
     assert end.surface is not None
     gradient = torch.autograd.grad(
-        dot(cotangent(end), end) + end.surface.x.sum(), [leaves["x"], leaves["places"]]
+        dot(cotangent(end), end) + end.surface.force.sum(), [leaves["x"], leaves["anchor"]]
     )
     for one in gradient:
         assert one[0].abs().max() > 0 and not one[1].any()
@@ -249,33 +244,6 @@ def test_a_captured_call_is_one_that_is_not():
     for _ in range(2):
         for got, one in zip(graph(), want, strict=True):
             assert_relative(got, one, 2e-3)
-
-
-def test_a_point_may_leave_the_window_before_the_particles(monkeypatch):
-    """A block slides by 8.1 cells in a chunk, so that points leave the window of 22 nodes, but no particle does: the chunk is repeated,
-    with the bits of a run in a wide window."""
-    grid = softmpm.Grid(shape=(40, 28), spacing=1 / 32)
-    seen, accept, made = [], Fast.accept, slab(gravity=(0.0, -1.0), grid=grid)
-
-    def watched(self, run, words):
-        seen.append(words[0])
-        return accept(self, run, words)
-
-    def slide() -> softmpm.State:
-        model = build(made)
-        v = torch.tensor([8.1 / 32 / (128 * made.dt), 0.0], dtype=torch.float64)
-        start = model.rest()
-        return softmpm.simulate(model, start._replace(v=v + start.v), None, model.params(), substeps=128)
-
-    monkeypatch.setattr(Fast, "accept", watched)
-    end = slide()
-    assert decode(seen[0])[1] is Kind.LEFT_WINDOW and seen[1:] == [NEVER]
-    assert end.surface is not None and end.surface.force.abs().max() > 0
-    assert [(x[..., 0].max() * 32 - 0.5).floor().item() for x in (end.x, end.surface.x)] == [19, 20]
-    monkeypatch.setattr(particle_order, "MARGIN", {2: 12})
-    for got, want in zip(end.differentiable(), slide().differentiable(), strict=True):
-        assert torch.equal(got, want)
-    assert seen[2:] == [NEVER]
 
 
 def test_a_window_has_room_for_every_point():
@@ -318,12 +286,11 @@ def test_a_block_rests_on_the_floor(settled):
     """Its sole is within 0.005 cells of the floor, half a cell with contact at nodes, and the floor bears its weight."""
     model, state = settled
     sole = points_of(model).points[:, 1] <= model.scene.walls[0].offset + 1e-9
-    gap = state.surface.x[0, sole, 1] - model.scene.walls[0].offset
-    assert gap.abs().max() < 0.005 * model.scene.grid.spacing
     forces = softmpm.contact_forces(model, state)
+    gap = forces.points[0, sole, 1] - model.scene.walls[0].offset
+    assert gap.abs().max() < 0.005 * model.scene.grid.spacing
     weight = (model.mass.sum() * G).item()
     assert forces.total[0, 0, 1].item() == pytest.approx(weight, rel=1e-4)
-    assert torch.equal(forces.points, state.surface.x)
 
 
 def test_forces_are_means_of_control_steps_of_any_length(monkeypatch):
@@ -355,7 +322,7 @@ def test_a_block_on_an_incline(degrees, settled):
         assert gained == pytest.approx(exact, rel=5e-3)
 
 
-def test_places_of_a_state_without_points_are_exact_for_affine_motion():
+def test_places_are_exact_for_affine_motion():
     """x = c + B X and F = B give c + B X_s, in float32 with the low-order parts too."""
     for dtype in (torch.float64, torch.float32):
         model = build(slab(), dtype=dtype, alarms=None)
@@ -371,8 +338,7 @@ def test_places_of_a_state_without_points_are_exact_for_affine_motion():
 
 
 def test_what_cannot_be_is_refused(settled):
-    """Fixed-point sums, `step`, a state whose particles were moved alone (but not one with a single stray point), one of another model;
-    points that leave the grid."""
+    """Fixed-point sums, `step`, and a state of another model."""
     model, state = settled
     with pytest.raises(ValueError, match="deterministic=True has no contact at surface points in the fast"):
         build(slab(), deterministic=True)
@@ -381,18 +347,6 @@ def test_what_cannot_be_is_refused(settled):
     with pytest.raises(ValueError, match="need contact='nodes' with formulation='moving'"):
         softmpm.warp_state(model)
     args = (None, model.params())
-    with pytest.raises(ValueError, match="state.surface was not"):
-        softmpm.simulate(model, state._replace(x=state.x + 0.1), *args, substeps=1)
-    stray = state.surface.x.clone()
-    stray[0, 0, 0] += 1.5 * model.scene.grid.spacing
-    softmpm.simulate(model, state._replace(surface=state.surface._replace(x=stray)), *args, substeps=1)
-    moved = softmpm.simulate(model, state._replace(x=state.x + 0.1, surface=None), *args, substeps=1)
-    assert moved.surface is not None
-    torch.testing.assert_close(moved.surface.x, state.surface.x + 0.1, rtol=0, atol=1e-3)
     at_nodes = softmpm.build(slab(), device="cpu", dtype=torch.float64)
     with pytest.raises(ValueError, match="state.surface must be None"):
         softmpm.simulate(at_nodes, state, *args, substeps=1)
-    gone = state._replace(v=state.v - torch.tensor([50.0, 0.0]))
-    with pytest.raises(softmpm.UnstableError, match="surface point .* off the grid") as raised:
-        softmpm.simulate(model, gone, *args, substeps=100)
-    assert raised.value.kind == "lost"

@@ -251,19 +251,8 @@ def input_bytes(model, control_steps: int) -> int:
 
 
 def surface_bytes(model) -> int:
-    """Bytes of the places and anchors of the surface points that the moving grid carries, if there are any."""
-    if model.surface is None:
-        return 0
-    anchors = math.prod(model.anchor_shape) * model.dtype.itemsize
-    return anchors + 8 * model.worlds * model.surface.count * model.dim
-
-
-def stencil_bytes(model) -> int:
-    """Bytes of what the nodes around each of them are to it in a substep."""
-    if model.surface is None:
-        return 0
-    d, real = model.dim, model.dtype.itemsize
-    return model.worlds * model.surface.count * (4 * d + real * (2 * 3**d + d))
+    """Bytes of the anchors of the surface points that particles carry on the moving grid, if there are any."""
+    return 0 if model.surface is None else math.prod(model.anchor_shape) * model.dtype.itemsize
 
 
 def adjoint_bytes(model, control_steps: int) -> int:

@@ -7,7 +7,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.carried.surface import point_types, surface
+from softmpm.kernels.carried.point import outline_type
+from softmpm.kernels.carried.surface import start_depth, surface
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
@@ -16,7 +17,8 @@ from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Values, elapsed, grid_struct
 from softmpm.schemes.launch import KernelLauncher
 from softmpm.schemes.penetration import deepest
-from softmpm.state import SurfaceState
+from softmpm.state import State, SurfaceState
+from softmpm.surface_points import CarriedPoints
 
 POINT_BLOCK = 32
 """Threads per block: few points are spread over as many multiprocessors as possible."""
@@ -27,10 +29,12 @@ class Nodes(NamedTuple):
 
     node: wp.array
     """Momentum and mass."""
+    free: wp.array
+    """Velocity before contact."""
     velocity: wp.array
-    """Velocity, before and after contact."""
+    """Velocity after contact; before :meth:`SurfaceContact.press` that before contact."""
     load: wp.array
-    """Sum of the areas of the points, each with its share; zero before :meth:`SurfaceContact.share`."""
+    """Sum of the areas of the points, each with its share."""
 
 
 def outline_struct(model: Model):
@@ -39,9 +43,9 @@ def outline_struct(model: Model):
 
 
 def _outline_struct(model: Model):
-    t, points = types(model.spec.dim, model.spec.dtype), model.surface
-    assert points is not None
-    struct = point_types(model.spec.dim, model.spec.dtype).Outline()
+    t, points = types(model.spec.dim, model.spec.dtype), points_of(model)
+    struct = outline_type(model.spec.dim, model.spec.dtype)()
+    struct.arms = view(points.arms.to(model.dtype), t.vec)
     struct.areas = view(points.areas.to(model.dtype), t.real)
     struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)
     struct.deepest = view(deepest(model).to(model.dtype), t.real)
@@ -49,18 +53,10 @@ def _outline_struct(model: Model):
     return struct
 
 
-def stencils_struct(model: Model):
-    """Struct on new buffers of what the nodes around each point are to it."""
-    t, points = types(model.spec.dim, model.spec.dtype), (model.worlds, model.anchor_shape[2])
-
-    def tensor(*size: int, dtype=model.dtype) -> Tensor:
-        return torch.empty(*points, *size, dtype=dtype, device=model.device)
-
-    struct = point_types(model.spec.dim, model.spec.dtype).Stencils()
-    struct.base = view(tensor(t.dim, dtype=torch.int32), t.ivec)
-    struct.shares, struct.weights = (view(tensor(3**t.dim), t.real) for _ in range(2))
-    struct.velocity = view(tensor(t.dim), t.vec)
-    return struct
+def points_of(model: Model) -> CarriedPoints:
+    """The surface points of a model of the moving formulation."""
+    assert isinstance(model.surface, CarriedPoints)
+    return model.surface
 
 
 class SurfaceContact:
@@ -70,44 +66,46 @@ class SurfaceContact:
         window: Struct of the nodes in memory.
         chunk: Substeps that it takes part in.
         keep: Whether all states are stored, for an adjoint.
+        packed: Whether particles are packed as in the fast scheme.
 
     Attributes:
-        x, anchor: Places and anchors of each stored state, shape (state, world, [wall,] point, dim); one, or one more than substeps.
+        owner: Number of the particle of each point or, packed, its place in memory; shape (world, point), int32.
+        anchor: Anchors of each stored state, shape (state, world, wall, point, dim); one, or one more than substeps.
         force: Mean forces in the control step so far [N], shape (world, wall, point, dim).
         rate: 1/T, T being the duration of a control step [1/s], shape (1,): calls whose chunks have one shape may differ in it.
     """
 
-    def __init__(self, model: Model, window: Any, chunk: Chunk, keep: bool):
-        self.model, self.window, self.chunk, self.keep = model, window, chunk, keep
+    def __init__(self, model: Model, window: Any, chunk: Chunk, keep: bool, packed: bool):
+        self.model, self.window, self.chunk, self.keep, self.packed = model, window, chunk, keep, packed
         t, stored = types(model.spec.dim, model.spec.dtype), chunk.length + 1 if keep else 1
-        self.kernels, self.outline, self.stencils = (
-            surface(model.spec),
-            outline_struct(model),
-            stencils_struct(model),
-        )
+        self.kernels, self.outline = surface(model.spec, packed), outline_struct(model)
         self.width = model.contact_width * model.scene.grid.spacing
         self.points = (model.worlds, model.anchor_shape[2])
 
-        def tensor(*size: int, dtype=model.dtype) -> Tensor:
-            return torch.empty(size, dtype=dtype, device=model.device)
+        def tensor(*size: int) -> Tensor:
+            return torch.empty(size, dtype=model.dtype, device=model.device)
 
-        self.x, self.anchor = (
-            tensor(stored, *self.points, t.dim, dtype=torch.float64),
-            tensor(stored, *model.anchor_shape),
-        )
-        self.force, self.rate = tensor(*model.anchor_shape), tensor(1)
-        self.places = [view(one, types(t.dim, "float64").vec) for one in self.x]
+        self.owner = points_of(model).nearest.int().expand(self.points).contiguous()
+        self.anchor, self.force = tensor(stored, *model.anchor_shape), tensor(*model.anchor_shape)
+        self.rate = tensor(1)
         self.anchors = [view(one, t.vec) for one in self.anchor]
         self.force_array, self.rate_array = view(self.force, t.vec), view(self.rate, t.real)
+        self.owner_array = view(self.owner, wp.int32)
 
     @property
     def bytes(self) -> int:
         """Bytes of the stored states."""
-        return self.x.nbytes + self.anchor.nbytes
+        return self.anchor.nbytes
+
+    def reorder(self, order: Tensor) -> None:
+        """Find the places of the points' particles in an order, shape (world, particle), int32."""
+        worlds, count = order.shape
+        here = torch.arange(worlds * count, dtype=order.dtype, device=order.device).view(worlds, count)
+        places = torch.empty_like(order).scatter_(1, order.long(), here)
+        self.owner.copy_(places[:, points_of(self.model).nearest])
 
     def load(self, chunk: Chunk, start: SurfaceState) -> None:
         """Copy the initial state of a chunk of this shape into the buffers."""
-        self.x[0].copy_(start.x.detach())
         self.anchor[0].copy_(start.anchor.detach())
         self.rate.fill_(1.0 / (chunk.substeps * self.model.scene.dt))
         if chunk.begins:
@@ -118,35 +116,22 @@ class SurfaceContact:
     @property
     def end(self) -> SurfaceState:
         """The final state, in the buffers."""
-        return SurfaceState(self.x[-1], self.anchor[-1], self.force)
+        return SurfaceState(self.anchor[-1], self.force)
 
     def stored(self, s: int) -> int:
         """Number of the stored state before substep ``s``."""
         return s if self.keep else 0
 
-    def share(
-        self,
-        s: int,
-        nodes: Nodes,
-        last: wp.array | None,
-        words: wp.array,
-        launch: Callable[..., None],
-    ) -> None:
-        """Shares of the points in the nodes of substep ``s``.
-
-        Args:
-            last: Nodal velocities of the substep before, with which the points are carried first; None if they have been.
-        """
-        before, there = self.places[self.stored(s if last is None else s - 1)], self.places[self.stored(s)]
-        parameters = (self.model.constants, self.window, self.outline, s, int(last is None), before)
-        velocities = (nodes.velocity if last is None else last, nodes.node, nodes.velocity)
-        arguments = (*parameters, *velocities, words, self.stencils, there, nodes.load)
-        launch(self.kernels.share, self.points, *arguments, block_dim=POINT_BLOCK)
+    def add_loads(self, now: Any, load: wp.array, launch: Callable[..., None]) -> None:
+        """Add up the areas on the nodes, of points on the particles ``now``."""
+        arguments = (self.model.constants, self.window, self.outline, self.owner_array, now, load)
+        launch(self.kernels.add_loads, self.points, *arguments, block_dim=POINT_BLOCK)
 
     def press(
         self,
         s: int,
         inputs: Any,
+        now: Any,
         nodes: Nodes,
         words: wp.array,
         launch: Callable[..., None],
@@ -154,35 +139,25 @@ class SurfaceContact:
     ) -> None:
         """Add what the walls give to the velocity of the nodes; ``out`` receives forces and anchors instead of the state."""
         parameters = (self.model.constants, inputs, self.window, self.outline, self.width, s)
-        about = (
-            self.rate_array,
-            self.chunk.anew(s),
-            self.places[self.stored(s)],
-            self.anchors[self.stored(s)],
-        )
+        about = (self.rate_array, self.chunk.anew(s), self.owner_array, now, self.anchors[self.stored(s)])
         force, anchor = (self.force_array, self.anchors[self.stored(s + 1)]) if out is None else out
-        arguments = (*parameters, *about, nodes.load, words, self.stencils, force, anchor, nodes.velocity)
-        launch(self.kernels.press, self.points, *arguments, block_dim=POINT_BLOCK)
+        arguments = (*about, nodes.node, nodes.free, nodes.load, words, force, anchor, nodes.velocity)
+        launch(self.kernels.press, self.points, *parameters, *arguments, block_dim=POINT_BLOCK)
 
-    def carry(self, s: int, velocity: wp.array, launch: Callable[..., None]) -> None:
-        """Carry the points with the velocity of the nodes after contact."""
-        places = [self.places[self.stored(k)] for k in (s, s + 1)]
-        arguments = (self.model.constants, self.window, places[0], velocity, self.stencils, places[1])
-        launch(self.kernels.carry, self.points, *arguments, block_dim=POINT_BLOCK)
-
-    def check_end(self, inputs: Any, words: wp.array, launch: Callable[..., None]) -> None:
-        """Check the depth of the points in the final state, with the inputs of the last substep."""
-        about = (self.model.scene.dt, self.chunk.length - 1, self.places[-1], words)
-        arguments = (self.model.constants, inputs, self.outline, *about)
-        launch(self.kernels.check_depth, self.points, *arguments, block_dim=POINT_BLOCK)
+    def check_end(self, inputs: Any, now: Any, words: wp.array, launch: Callable[..., None]) -> None:
+        """Check the depth of the points in the final state ``now``, with the inputs of the last substep."""
+        about = (self.outline, self.model.scene.dt, self.chunk.length - 1, self.owner_array, now, words)
+        arguments = (self.model.constants, inputs, self.window, *about)
+        launch(self.kernels.check_end, self.points, *arguments, block_dim=POINT_BLOCK)
 
 
-def check_start(model: Model, x: Tensor, values: Values, words: Tensor) -> None:
-    """Check the depth of the points at ``x`` in the initial state of a call, with the inputs of its first substep."""
+def check_start(model: Model, start: State, values: Values, words: Tensor) -> None:
+    """Check the depth of the points in the initial state of a call, with the inputs of its first substep."""
     known = model.fixed | values
     if model.spec.moving:
         known["elapsed"] = elapsed(model, 0, 1, 1)
-    places = view(x.detach().contiguous(), types(model.spec.dim, "float64").vec)
-    arguments = (model.constants, grid_struct(model, known), outline_struct(model), 0.0, 0, places)
-    launch, kernel = KernelLauncher(model, stream_of(model.device)), surface(model.spec).check_depth
-    launch(kernel, tuple(x.shape[:2]), *arguments, view(words, wp.int64), block_dim=POINT_BLOCK)
+    x = points_of(model).shown(start.detach()).contiguous()
+    places = view(x, types(model.spec.dim, "float64").vec)
+    arguments = (grid_struct(model, known), outline_struct(model), places, view(words, wp.int64))
+    launch, kernel = KernelLauncher(model, stream_of(model.device)), start_depth(model.spec)
+    launch(kernel, tuple(x.shape[:2]), *arguments, block_dim=POINT_BLOCK)

@@ -12,79 +12,78 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import view
-from softmpm.schemes.carried import POINT_BLOCK, Nodes, SurfaceContact, stencils_struct
+from softmpm.schemes.carried import POINT_BLOCK, Nodes, SurfaceContact
 from softmpm.state import SurfaceState
 
 
 class SurfaceContactAdj:
     """Adjoint buffers of contact, for all chunks on a window, one after the other.
 
-    Args:
-        count: Nodes of one world in memory.
-
     Attributes:
-        x, anchor, force: Adjoint of the state.
+        anchor, force: Adjoint of the state.
     """
 
-    def __init__(self, model: Model, wanted: RequestedGrads, count: int):
-        t, nodes = types(model.spec.dim, model.spec.dtype), (model.worlds, count)
-        self.kernels = surface_adj(model.spec, wanted)
+    def __init__(self, model: Model, wanted: RequestedGrads, packed: bool):
+        t = types(model.spec.dim, model.spec.dtype)
+        self.kernels = surface_adj(model.spec, wanted, packed)
 
         def tensor(*size: int) -> Tensor:
-            return torch.empty(size, dtype=model.dtype, device=model.device)
+            return torch.empty(*size, dtype=model.dtype, device=model.device)
 
-        self.x, self.anchor = tensor(model.worlds, model.anchor_shape[2], t.dim), tensor(*model.anchor_shape)
-        self.force = torch.empty_like(self.anchor)
-        self._x, self._anchor, self._force = (view(one, t.vec) for one in (self.x, self.anchor, self.force))
-        self._free, self._load = view(tensor(*nodes, t.dim), t.vec), view(tensor(*nodes), t.real)
-        self._stencils, scratch = stencils_struct(model), tensor(2, *model.anchor_shape)
+        self.anchor, self.force = tensor(*model.anchor_shape), tensor(*model.anchor_shape)
+        self._anchor, self._force = view(self.anchor, t.vec), view(self.force, t.vec)
+        scratch = tensor(2, *model.anchor_shape)
         self._scratch = view(scratch[0], t.vec), view(scratch[1], t.vec)
 
     def load(self, adj_end: SurfaceState) -> None:
         """Copy the adjoint of the final state of a chunk into the buffers."""
-        for own, given in zip((self.x, self.anchor, self.force), adj_end, strict=True):
+        for own, given in zip((self.anchor, self.force), adj_end, strict=True):
             own.copy_(given)
 
-    def again(
+    def press_again(
         self,
         forward: SurfaceContact,
         s: int,
         inputs: Any,
+        now: Any,
         nodes: Nodes,
-        adj_velocity: wp.array,
         words: wp.array,
         launch: Callable[..., None],
     ) -> None:
-        """Recompute the nodal velocities of substep ``s`` from those without contact; add what moves the points to their adjoint."""
-        one, place = forward, forward.places[forward.stored(s)]
-        parameters = (one.model.constants, one.window, one.outline, s, place, nodes.node, nodes.velocity)
-        out = (self._x, words, one.stencils, self._free, self._load, nodes.load, adj_velocity)
-        launch(self.kernels.share_again, one.points, *parameters, *out, block_dim=POINT_BLOCK)
-        one.press(s, inputs, nodes, words, launch, self._scratch)
+        """Recompute the nodal velocities of substep ``s`` from those without contact."""
+        forward.press(s, inputs, now, nodes, words, launch, self._scratch)
 
-    def respond(
+    def press_adj(
         self,
         forward: SurfaceContact,
         s: int,
         inputs: Any,
         adj_inputs: Any,
+        now: Any,
         nodes: Nodes,
         adj_velocity: wp.array,
-        adj_mass: wp.array,
+        adj_load: wp.array,
+        gained: wp.array,
+        adj_now: Any,
         launch: Callable[..., None],
     ) -> None:
-        """Turn the adjoint of the nodal velocities after contact, now complete, into that before; adds into the other adjoints."""
-        one, constants, k = forward, forward.model.constants, forward.stored(s)
-        parameters = (inputs, one.window, one.outline, one.width, one.rate_array, one.chunk.anew(s))
-        arrays = (one.places[k], one.anchors[k], nodes.node, nodes.velocity, self._free, nodes.load)
-        state = (one.stencils, adj_velocity, self._force, self._anchor, self._x, self._stencils)
-        arguments = (*parameters, *arrays, *state, self._load, adj_mass, adj_inputs)
-        launch(self.kernels.press_adj, one.points, constants, *arguments, block_dim=POINT_BLOCK)
-        arrays = (one.places[k], nodes.node, one.stencils, self._stencils, self._load)
-        arguments = (one.window, one.outline, *arrays, self._x, adj_velocity, adj_mass)
-        launch(self.kernels.share_adj, one.points, constants, *arguments, block_dim=POINT_BLOCK)
+        """Adjoint of all but the loads, from that of the nodal velocities after contact; adds into the last three and ``adj_load``."""
+        one = forward
+        parameters = (one.model.constants, inputs, one.window, one.outline, one.width, one.rate_array)
+        about = (one.chunk.anew(s), one.owner_array, now, one.anchors[one.stored(s)])
+        arrays = (nodes.node, nodes.free, nodes.load, adj_velocity, self._force, self._anchor)
+        arguments = (*parameters, *about, *arrays, adj_load, gained, adj_now, adj_inputs)
+        launch(self.kernels.press_adj, one.points, *arguments, block_dim=POINT_BLOCK)
+
+    def add_loads_adj(
+        self, forward: SurfaceContact, now: Any, adj_load: wp.array, adj_now: Any, launch: Callable[..., None]
+    ) -> None:
+        """Adjoint of the loads; adds into that of the particles."""
+        one = forward
+        arguments = (one.model.constants, one.window, one.outline, one.owner_array, now, adj_load, adj_now)
+        launch(self.kernels.add_loads_adj, one.points, *arguments, block_dim=POINT_BLOCK)
 
     def start(self, chunk: Chunk) -> SurfaceState:
         """Adjoint of the initial state of a chunk, in new tensors: the forces before a control step have none."""
         force = torch.zeros_like(self.force) if chunk.begins else self.force.clone()
-        return SurfaceState(self.x.to(torch.float64, copy=True), self.anchor.clone(), force)
+        return SurfaceState(self.anchor.clone(), force)

@@ -8,7 +8,7 @@ from softmpm.model import Model
 from softmpm.schemes.failure_messages import Case
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.overlap import Overlap
-from softmpm.schemes.penetration import Lost, Penetration
+from softmpm.schemes.penetration import Penetration
 from softmpm.state import State
 
 
@@ -78,9 +78,6 @@ def failure(
         )
     if kind is Kind.IN_WALL:
         case = Penetration(model, world, particle, end, values, time)
-        particle, where = case.particle, f"{case.where} of world {world}"
-    elif kind is Kind.LOST:
-        case = Lost(model, world, particle, end)
         particle, where = case.particle, f"{case.where} of world {world}"
     else:
         about = model, world, particle, end

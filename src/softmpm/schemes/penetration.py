@@ -1,4 +1,4 @@
-"""Failures of surface points in words, as those of particles in failure_messages.py: deep inside a wall, and away from its body."""
+"""The failure of a surface point in words, as those of particles in failure_messages.py: deep inside a wall."""
 
 import math
 
@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from softmpm.model import Model
-from softmpm.schemes.failure_messages import GENTLER, GRID
 from softmpm.schemes.inputs import Values
 from softmpm.state import State
-from softmpm.surface_grid import SurfaceGrid
 
 
 def deepest(model: Model) -> Tensor:
@@ -21,71 +19,35 @@ def deepest(model: Model) -> Tensor:
     return most * model.scene.dt * model.surface.waves + width
 
 
-class PointFailure:
-    """A surface point that failed.
-
-    Args:
-        point: Its number.
-        end: State in which its world stopped, with its nodes or surface points.
-
-    Attributes:
-        particle: Number of the particle next to the point at rest.
-    """
-
-    def __init__(self, model: Model, world: int, point: int, end: State):
-        assert model.surface is not None
-        self.model, self.world, self.point = model, world, point
-        at_rest = model.surface.points[point]
-        self.particle = int((model.positions.double() - at_rest).norm(dim=1).argmin())
-        if end.surface is not None:
-            places = end.surface.x.detach()
-        else:
-            assert isinstance(model.surface, SurfaceGrid) and end.nodes is not None
-            places = model.surface.places(end.nodes.u.detach().double(), end.nodes.shift)
-        self._place = places[world, point]
-
-    @property
-    def where(self) -> str:
-        body = int(self.model.body[self.particle])
-        return f"surface point {self.point} (body {body}, next to particle {self.particle})"
-
-    @property
-    def _at(self) -> str:
-        return f"is at ({', '.join(f'{c:.4g}' for c in self._place.tolist())}) m"
-
-
-class Lost(PointFailure):
-    """A surface point off the grid or without particles around it."""
-
-    def explain(self) -> tuple[str, str, str, str]:
-        """Kind of the failure, the value found, the limit and the remedy."""
-        grid = self.model.scene.grid
-        base = (self._place.cpu() / grid.spacing - 0.5).floor()
-        limit = "the nodes within one and a half cells of a surface point must be on the grid, and some must have mass"
-        if bool(((base >= 0) & (base <= torch.tensor(grid.shape) - 3)).all()):
-            advice = f"{GENTLER}; if x or F of its state were changed, take state._replace(surface=None)."
-            return "lost", f"{self._at}, without particles around it", limit, advice
-        return "lost", f"{self._at}, off the grid", limit, GRID
-
-
-class Penetration(PointFailure):
+class Penetration:
     """A surface point under a wall.
 
     Args:
         index: Number of the separating wall times the number of points, plus the point.
+        end: State in which its world stopped, with its nodes or surface points.
         values: Inputs of the call in one control step, if they are at hand.
         time: Of the state since the beginning of that control step [s].
 
     Attributes:
+        point: Its number.
         wall: Number of the wall in the scene.
+        particle: Number of the particle next to the point at rest.
     """
 
     def __init__(self, model: Model, world: int, index: int, end: State, values: Values | None, time: float):
         assert model.surface is not None
         number, point = divmod(index, model.surface.count)
-        super().__init__(model, world, point, end)
+        self.model, self.world, self.point = model, world, point
+        at_rest = model.surface.points[point]
+        self.particle = int((model.positions.double() - at_rest).norm(dim=1).argmin())
+        self._place = model.surface.shown(end.detach())[world, point].double()
         self.wall = model.spec.surface_walls[number]
         self._normal, self._offset = self._pose(values or {}, time)
+
+    @property
+    def where(self) -> str:
+        body = int(self.model.body[self.particle])
+        return f"surface point {self.point} (body {body}, next to particle {self.particle})"
 
     def _pose(self, values: Values, time: float) -> tuple[Tensor, Tensor]:
         """Normal and offset of the wall in that state (C4)."""
@@ -100,7 +62,8 @@ class Penetration(PointFailure):
         """Kind of the failure, the value found, the limit and the remedy."""
         depth = ((self._offset - self._normal @ self._place) / self._normal.norm()).item()
         dx, most = self.model.scene.grid.spacing, deepest(self.model)[self.point].item()
-        value = f"{self._at}, {depth:.4g} m ({depth / dx:.4g} cells) inside wall {self.wall}"
+        at = ", ".join(f"{c:.4g}" for c in self._place.tolist())
+        value = f"is at ({at}) m, {depth:.4g} m ({depth / dx:.4g} cells) inside wall {self.wall}"
         limit = f"at most {most:.4g} m are allowed, since contact pushes a point out within one substep"
         advice = (
             "Place body and wall so that they do not overlap, begin with the pose in which the last call ended, or move the wall more "

@@ -1,26 +1,22 @@
 """Adjoint of contact at surface points on the moving grid (surface.py). Derivation: docs/math/contact.md.
 
-    v̄'_i += Δt m_i b_si x̄'_s,  b̄_si = Δt m_i v'_i·x̄'_s,  m̄_i += Δt b_si v'_i·x̄'_s,  x̄_s = x̄'_s
-    J̄_s = A_s Σ b_si v̄'_i,  b̄_si += A_s J_s·v̄'_i,  v̄*_i = v̄'_i                                      (K10.adj)
+    J̄_s = A_s Σ W_si v̄'_i / m_i
     from the last wall to the first: J̄ += A_s f̄_s / T + D v̄_s,  D̄ += J·v̄_s, then (K4.adj), (K3.adj), (K6.adj)
-    v̄*_i += m_i b_si v̄_s,  b̄_si += m_i (v*_i·v̄_s ± l_i D̄_s),  m̄_i += b_si v*_i·v̄_s + |b_si| l_i D̄_s,
-    l̄_i += m_i |b_si| D̄_s,  b̄_si += ± A_s l̄_i,  with the sign of b_si                                (K9.adj)
-    z̄ = −Σ (w_i/M) b̄_i d_i,  q = K⁻¹ z̄,  h = z Σ (w_i/M) b̄_i + q
-    c_i = h·r_i − (z·d_i)(q·d_i),  k̄_i = (c_i − Σ k_j c_j / M − Σ b_j b̄_j) / M
-    w̄_i = b̄_i (1 − z·d_i) / M + m_i k̄_i,  m̄_i += w_i k̄_i,  x̄_s += (Σ w̄_i ∇w_i − q) / dx             (K8.adj)
+    v̄*_i = v̄'_i + Σ W_si v̄_s
+    m̄_i −= (|W_si| L_i D̄_s + W_si A_s J_s·v̄'_i) / m_i²,  L̄_i += |W_si| D̄_s / m_i
+    W̄_si = v*_i·v̄_s + A_s J_s·v̄'_i / m_i + σ (L_i D̄_s / m_i + A_s L̄_i),  σ = sign W_si           (K9.adj), (K10.adj)
 
-First ``share_again`` and ``press`` recompute v'_i; ``share_again`` stores v*_i, which ``press`` overwrites, of the nodes around the
-points, and adds Δt m_i b_si x̄'_s to v̄'_i. When G2P has added its part, ``press_adj`` is (K10.adj) to l̄_i, and ``share_adj`` the rest.
-The points add to velocities, loads and masses of the nodes atomically.
+and (K8.adj). ``press_adj`` is all but the part with L̄, which all points add to first; that is ``add_loads_adj``. Both add to the adjoint of
+the particles; press_adj adds v̄* − v̄' and m̄ into an array beside v̄', since points read that one.
 """
 
 from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.carried.surface import point_types, surface, unrolled
+from softmpm.kernels.carried.point import module_of, outline_type, surface_point
+from softmpm.kernels.carried.surface import surface
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.physics.point_share import point_share
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face, wall_face_adj
@@ -28,63 +24,69 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_
 
 
 @kernel_factory
-def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
-    dim, t, s, one = spec.dim, types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), surface(spec)
-    real, vec, node_vec, Constants, Window = t.real, t.vec, t.node, t.Constants, t.Window
-    exact_vec, GridInputs = types(dim, "float64").vec, input_types(spec).GridInputs
-    GridInputsAdj, structs = input_adj_types(spec, wanted).GridInputsAdj, point_types(dim, spec.dtype)
-    Outline, Stencils, shared = structs.Outline, structs.Stencils, point_share(dim, spec.dtype)
-    place, masses_of, fit, Table = shared.place, shared.masses_of, shared.fit, shared.Table
-    touch_adj, weigh, meet, number = (
-        surface_contact(dim, spec.dtype).touch_adj,
-        one.weigh,
-        one.meet,
-        one.number,
+def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
+    """Function of a point's part in L̄ (K9.adj)"""
+    t, s, point, Outline = (
+        types(dim, dtype),
+        spline(dim, dtype),
+        surface_point(dim, dtype, packed),
+        outline_type(dim, dtype),
     )
-    face, face_adj, friction_of = (
-        wall_face(spec).face,
-        wall_face_adj(spec, wanted),
-        wall_face(spec).friction_of,
-    )
-    weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
-    weight, weight_slope, node_index, size = s.weight, s.weight_slope, s.node_index, s.count
-    count = len(spec.surface_walls)
-    before_wall = wp.types.matrix((count, dim), real)
-    module = unrolled(adj_module(spec, wanted) + ".surface")
+    real, vec, Constants, Window = t.real, t.vec, t.Constants, t.Window
+    Particles, ParticlesAdj, Table = point.Particles, point.ParticlesAdj, point.Table
+    point_of, share, shares_adj = point.point_of, point.share, point.shares_adj
+    weights, slopes, offset, node_index, size = s.weights, s.slopes, s.offset, s.node_index, s.count
 
-    @wp.kernel(module=module, enable_backward=False)
-    def share_again(
-        # Parameters:
+    @wp.func
+    def add_load_adj(
         constants: Constants,
         window: Window,
         outline: Outline,
-        substep: int,
-        # In:
-        x: wp.array2d(dtype=exact_vec),
-        node: wp.array2d(dtype=node_vec),
-        velocity: wp.array2d(dtype=vec),
-        adj_x: wp.array2d(dtype=vec),
-        # In and out:
-        words: wp.array(dtype=wp.int64),
-        # Out:
-        stencils: Stencils,
-        free: wp.array2d(dtype=vec),  # v*
-        adj_load: wp.array2d(dtype=real),  # cleared
-        # Out, added into:
-        load: wp.array2d(dtype=real),
-        adj_velocity: wp.array2d(dtype=vec),
+        now: Particles,
+        world: int,
+        p: int,
+        owner: int,
+        adj_load: wp.array2d(dtype=real),
+        adj: ParticlesAdj,
     ):
-        world, p = wp.tid()
-        adj = constants.dt * adj_x[world, p]
-        weigh(
-            constants, window, outline, substep, world, p, x[world, p], node, velocity, words, stencils, load
-        )
-        base = stencils.base[world, p]
+        at = point_of(constants, window, outline, now, world, p, owner)
+        w = weights(at.fx)
+        area = outline.areas[p]
+        adj_shares = Table()
         for n in range(size):
-            i = node_index(base, offset(n), window.shape)
-            free[world, i] = velocity[world, i]
-            adj_load[world, i] = real(0.0)
-            wp.atomic_add(adj_velocity, world, i, stencils.weights[world, p, n] * adj)
+            i = node_index(at.base, offset(n), window.shape)
+            adj_shares[n] = wp.sign(share(at, w, n)) * area * adj_load[world, i]
+        slope = slopes(at.fx)
+        shares_adj(constants, outline, at, w, slope, adj_shares, vec(), world, p, owner, adj)
+
+    return add_load_adj
+
+
+@kernel_factory
+def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNamespace:
+    """Kernels on particles that are ``packed`` as in the fast scheme, or not."""
+    dim, t, s, one = (
+        spec.dim,
+        types(spec.dim, spec.dtype),
+        spline(spec.dim, spec.dtype),
+        surface(spec, packed),
+    )
+    real, vec, node_vec, Constants, Window, pack = t.real, t.vec, t.node, t.Constants, t.Window, s.pack
+    point, Outline = surface_point(dim, spec.dtype, packed), outline_type(dim, spec.dtype)
+    Particles, ParticlesAdj, Table = point.Particles, point.ParticlesAdj, point.Table
+    point_of, share, shares_adj = point.point_of, point.share, point.shares_adj
+    GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
+    touch_adj, meet, number = surface_contact(dim, spec.dtype).touch_adj, one.meet, one.number
+    face, friction_of, face_adj = (
+        wall_face(spec).face,
+        wall_face(spec).friction_of,
+        wall_face_adj(spec, wanted),
+    )
+    weights, slopes, offset, node_index, size = s.weights, s.slopes, s.offset, s.node_index, s.count
+    add_load_adj = loads_adj(dim, spec.dtype, packed)
+    count = len(spec.surface_walls)
+    before_wall = wp.types.matrix((count, dim), real)
+    module = module_of(adj_module(spec, wanted) + ".surface", packed)
 
     @wp.kernel(module=module, enable_backward=False)
     def press_adj(
@@ -96,46 +98,40 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         smoothing: real,
         rate: wp.array(dtype=real),  # 1/T
         anew: int,  # 1 at the beginning of a control step
+        owner: wp.array2d(dtype=wp.int32),
         # In:
-        places: wp.array2d(dtype=exact_vec),
+        now: Particles,
         anchor: wp.array3d(dtype=vec),
         node: wp.array2d(dtype=node_vec),
-        velocity: wp.array2d(dtype=vec),
         free: wp.array2d(dtype=vec),
         load: wp.array2d(dtype=real),
-        stencils: Stencils,
-        adj_velocity: wp.array2d(dtype=vec),
+        adj_velocity: wp.array2d(dtype=vec),  # v̄'
         # In and out:
         adj_force: wp.array3d(dtype=vec),
         adj_anchor: wp.array3d(dtype=vec),
-        adj_x: wp.array2d(dtype=vec),
-        # Out:
-        adj_stencils: Stencils,  # adjoints of shares and velocity
         # Out, added into:
         adj_load: wp.array2d(dtype=real),
-        adj_mass: wp.array2d(dtype=real),
+        gained: wp.array2d(dtype=node_vec),  # v̄* − v̄' and m̄
+        adj: ParticlesAdj,
         adj_inputs: GridInputsAdj,
     ):
         world, p = wp.tid()
-        base = stencils.base[world, p]
-        at = places[world, p]
-        v = stencils.velocity[world, p]
-        masses = Table()
-        shares = Table()
-        loads = Table()
+        at = point_of(constants, window, outline, now, world, p, owner[world, p])
+        w = weights(at.fx)
+        lightness = Table()  # 1/m, or zero
+        v = vec()
         D = real(0.0)
         pull = vec()
         for n in range(size):
-            i = node_index(base, offset(n), window.shape)
-            masses[n] = node[world, i][dim]
-            shares[n] = stencils.shares[world, p, n]
-            loads[n] = load[world, i]
-            D += masses[n] * wp.abs(shares[n]) * loads[n]
-            pull += shares[n] * adj_velocity[world, i]
+            i = node_index(at.base, offset(n), window.shape)
+            m = node[world, i][dim]
+            b = share(at, w, n)
+            v += b * free[world, i]
+            if m > real(0.0):
+                lightness[n] = real(1.0) / m
+                D += wp.abs(b) * load[world, i] / m
+                pull += (b / m) * adj_velocity[world, i]
         if not D > real(0.0):  # a point of a world that failed
-            adj_stencils.velocity[world, p] = vec()
-            for n in range(size):
-                adj_stencils.shares[world, p, n] = real(0.0)
             return
         reached = before_wall()
         total = vec()
@@ -143,9 +139,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             for axis in range(dim):
                 reached[q, axis] = v[axis]
             k = number[q]
-            wall = face(constants, inputs, world, k, at, anchor[world, q, p])
+            wall = face(constants, inputs, world, k, at.x, anchor[world, q, p])
             found = meet(
-                constants, inputs, outline, smoothing, world, k, p, wall.n, wall.y, at, v, wall.anchor, D
+                constants, inputs, outline, smoothing, world, k, p, wall.n, wall.y, at.x, v, wall.anchor, D
             )
             v += D * found.J
             total += found.J
@@ -160,11 +156,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             here = vec()
             for axis in range(dim):
                 here[axis] = reached[q, axis]
-            wall = face(constants, inputs, world, k, at, anchor[world, q, p])
-            adj = touch_adj(
+            wall = face(constants, inputs, world, k, at.x, anchor[world, q, p])
+            adj_J = (
+                outline.areas[p] * pull + D * back_v + (rate[0] * outline.newtons[p]) * adj_force[world, q, p]
+            )
+            more = touch_adj(
                 wall.n,
                 wall.y,
-                vec(at),
+                vec(at.x),
                 here,
                 wall.anchor,
                 D,
@@ -172,104 +171,57 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 outline.stiffness[p],
                 constants.dt,
                 smoothing,
-                outline.areas[p] * pull
-                + D * back_v
-                + (rate[0] * outline.newtons[p]) * adj_force[world, q, p],
+                adj_J,
                 adj_anchor[world, q, p],
             )
-            back_D += wp.dot(after - here, back_v) / D + adj.D
-            back_v += adj.v
-            back_x += adj.x
+            back_D += wp.dot(after - here, back_v) / D + more.D
+            back_v += more.v
+            back_x += more.x
             adj_anchor[world, q, p] = face_adj(
-                constants, inputs, world, k, anchor[world, q, p], adj.n, adj.y, adj.anchor, slot, adj_inputs
+                constants,
+                inputs,
+                world,
+                k,
+                anchor[world, q, p],
+                more.n,
+                more.y,
+                more.anchor,
+                slot,
+                adj_inputs,
             )
             if anew == 1:  # the mean before is dropped
                 adj_force[world, q, p] = vec()
             if wp.static("friction" in wanted):
-                adj_inputs.friction[k, slot] = adj_inputs.friction[k, slot] + adj.friction
+                adj_inputs.friction[k, slot] = adj_inputs.friction[k, slot] + more.friction
             after = here
         impulse = outline.areas[p] * total
-        adj_way = constants.dt * adj_x[world, p]
-        along = Table()
-        gained = Table()
+        adj_shares = Table()
         for n in range(size):
-            i = node_index(base, offset(n), window.shape)
-            along[n] = wp.dot(velocity[world, i], adj_way) + wp.dot(free[world, i], back_v)
-            gained[n] = wp.dot(impulse, adj_velocity[world, i])
-        adj_stencils.velocity[world, p] = back_v
-        adj_x[world, p] = adj_x[world, p] + back_x
-        for n in range(size):
-            i = node_index(base, offset(n), window.shape)
-            b = shares[n]
-            weighed = loads[n] * back_D
-            adj_stencils.shares[world, p, n] = gained[n] + masses[n] * (along[n] + wp.sign(b) * weighed)
-            wp.atomic_add(adj_load, world, i, masses[n] * wp.abs(b) * back_D)
-            wp.atomic_add(adj_mass, world, i, b * along[n] + wp.abs(b) * weighed)
+            i = node_index(at.base, offset(n), window.shape)
+            b = share(at, w, n)
+            along = lightness[n] * wp.dot(impulse, adj_velocity[world, i])
+            loaded = lightness[n] * back_D * load[world, i]
+            adj_shares[n] = wp.dot(free[world, i], back_v) + along + wp.sign(b) * loaded
+            wp.atomic_add(adj_load, world, i, wp.abs(b) * lightness[n] * back_D)
+            adj_m = -lightness[n] * (wp.abs(b) * loaded + b * along)
+            wp.atomic_add(gained, world, i, pack(b * back_v, adj_m))
+        slope = slopes(at.fx)
+        shares_adj(constants, outline, at, w, slope, adj_shares, back_x, world, p, owner[world, p], adj)
 
     @wp.kernel(module=module, enable_backward=False)
-    def share_adj(
+    def add_loads_adj(
         # Parameters:
         constants: Constants,
         window: Window,
         outline: Outline,
+        owner: wp.array2d(dtype=wp.int32),
         # In:
-        places: wp.array2d(dtype=exact_vec),
-        node: wp.array2d(dtype=node_vec),
-        stencils: Stencils,
-        adj_stencils: Stencils,
+        now: Particles,
         adj_load: wp.array2d(dtype=real),
-        # In and out:
-        adj_x: wp.array2d(dtype=vec),
         # Out, added into:
-        adj_velocity: wp.array2d(dtype=vec),
-        adj_mass: wp.array2d(dtype=real),
+        adj: ParticlesAdj,
     ):
-        """v̄* of (K9.adj), (K8.adj)"""
         world, p = wp.tid()
-        x = places[world, p]
-        at = place(x, constants.exact_spacing, constants.shape, window.origin[world], window.shape)
-        masses = masses_of(node, world, at.base, window.shape)
-        w = weights(at.fx)
-        slope = slopes(at.fx)
-        around = fit(masses, w, at.fx)
-        if not (at.valid and around.mass > real(0.0)):
-            return
-        adj_v = adj_stencils.velocity[world, p]
-        area = outline.areas[p]
-        z = around.lean
-        shares = Table()
-        adj = Table()
-        sum_b = real(0.0)  # Σ b b̄
-        sum_w = real(0.0)  # Σ w b̄
-        adj_z = vec()
-        for n in range(size):
-            o = offset(n)
-            i = node_index(at.base, o, window.shape)
-            shares[n] = stencils.shares[world, p, n]
-            adj[n] = adj_stencils.shares[world, p, n] + wp.sign(shares[n]) * area * adj_load[world, i]
-            sum_b += shares[n] * adj[n]
-            sum_w += weight(w, o) * adj[n]
-            adj_z -= (weight(w, o) * adj[n] / around.mass) * (position(o) - at.fx - around.mean)
-        q = around.inverse * adj_z
-        h = (sum_w / around.mass) * z + q
-        bent = Table()  # c
-        mean = real(0.0)  # Σ k c / M
-        for n in range(size):
-            o = offset(n)
-            r = position(o) - at.fx
-            d = r - around.mean
-            bent[n] = wp.dot(h, r) - wp.dot(z, d) * wp.dot(q, d)
-            mean += weight(w, o) * masses[n] / around.mass * bent[n]
-        adj_fx = -q
-        for n in range(size):
-            o = offset(n)
-            d = position(o) - at.fx - around.mean
-            adj_k = (bent[n] - mean - sum_b) / around.mass
-            adj_w = adj[n] * (real(1.0) - wp.dot(z, d)) / around.mass + masses[n] * adj_k
-            adj_fx += adj_w * weight_slope(w, slope, o)
-            i = node_index(at.base, o, window.shape)
-            wp.atomic_add(adj_mass, world, i, weight(w, o) * adj_k)
-            wp.atomic_add(adj_velocity, world, i, (masses[n] * shares[n]) * adj_v)
-        adj_x[world, p] = adj_x[world, p] + adj_fx / constants.spacing
+        add_load_adj(constants, window, outline, now, world, p, owner[world, p], adj_load, adj)
 
-    return SimpleNamespace(share_again=share_again, press_adj=press_adj, share_adj=share_adj)
+    return SimpleNamespace(press_adj=press_adj, add_loads_adj=add_loads_adj)

@@ -28,20 +28,6 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_
 
 
 @kernel_factory
-def stored_beside(dim: int, dtype: str) -> wp.Function:
-    """Store the adjoint of a node, beside whose velocity lies what contact at surface points adds to that of its mass."""
-    node_vec, store_node = types(dim, dtype).aligned, native(dim, dtype).store_node
-
-    @wp.func
-    def leave(adj: wp.array(dtype=node_vec), i: int, value: node_vec):
-        whole = value
-        whole[dim] = value[dim] + adj[i][dim]
-        store_node(adj, i, whole)
-
-    return leave
-
-
-@kernel_factory
 def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one, adjoint = types(spec.dim, spec.dtype), particle(spec), particle_adj(spec, wanted)
     real, vec, mat, node_vec = t.real, t.vec, t.mat, t.aligned
@@ -65,7 +51,6 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     row_fx, row_v, row_H, row_C = t.row_fx, t.row_v, t.row_h, t.row_c
     exact, give = spec.deterministic, fixed(dim).give
     take, leave = (fixed(dim).take, fixed(dim).leave) if exact else (load_node, store_node)
-    leave = stored_beside(spec.dim, spec.dtype) if spec.surface else leave
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     module = native_module(adj_module(spec, wanted) + ".fused")
 

@@ -10,6 +10,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
+from softmpm.schemes.fast.contact_views import packed_nodes
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.sorted_state import SortedAdj
 from softmpm.schemes.inputs import Accumulators, InputsAdj
@@ -24,8 +25,10 @@ class SharedAdjoint:
     Attributes:
         adj: Packed adjoint of the state.
         nodes: Adjoints of mass and momentum of the nodes, of two successive substeps.
-        velocity: Recomputed nodal velocities.
+        velocity: Recomputed nodal velocities; with contact at surface points those before contact as well.
         contact: Adjoint of contact at surface points, or None.
+        gained: What contact adds to the adjoints of velocities and masses.
+        adj_loads: Adjoint of the loads, of two successive substeps.
         exact: Fixed-point sums of a deterministic model.
     """
 
@@ -38,14 +41,19 @@ class SharedAdjoint:
         self.model, self.wanted = model, wanted
         self.adj = tensor(buffers.rows.shape[1])
         self.nodes = tensor(2, buffers.held, 4)
-        self.velocity = tensor(buffers.held, 4)
+        self.velocity = torch.empty_like(buffers.velocity)
         self.adj_array = view(self.adj, t.real)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
-        self.velocity_array = view(self.velocity, t.aligned)
+        self.velocity_arrays = [view(velocity, t.aligned) for velocity in self.velocity]
+        self.velocity_array = self.velocity_arrays[0]
         self._accumulators: dict[int, Accumulators] = {}
         self.contact = None
         if model.surface is not None:
-            self.contact = SurfaceContactAdj(model, wanted, buffers.held // model.worlds)
+            self.contact = SurfaceContactAdj(model, wanted, packed=True)
+            self.gained, self.adj_loads = tensor(buffers.held, 4), torch.empty_like(buffers.loads)
+            self.gained_array = view(self.gained, t.aligned)
+            self.gained_view = packed_nodes(model, self.gained)
+            self.adj_load_arrays = [view(load, t.real) for load in self.adj_loads]
         self.exact = None
         if model.spec.deterministic:
             self.exact = FixedPointAccumulator(model, self.adj_array, self.node_arrays)
@@ -53,7 +61,7 @@ class SharedAdjoint:
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""
         if rows not in self._accumulators:
-            nodes = len(self.velocity) // self.model.worlds
+            nodes = self.velocity.shape[1] // self.model.worlds
             self._accumulators[rows] = Accumulators(self.model, self.wanted, rows, nodes)
         return self._accumulators[rows]
 

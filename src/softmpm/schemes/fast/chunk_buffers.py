@@ -42,8 +42,9 @@ class ChunkBuffers:
         inputs: Inputs in this order.
         base, rows: Packed states, one or, if ``keep``, one more than substeps; the last one is the final state.
         nodes: Mass and momentum of the window's nodes, two or, if ``keep``, one for each substep.
-        velocity: Nodal velocities of the present substep; with contact at surface points those of the substep before as well.
+        velocity: Nodal velocities of the present substep; with contact at surface points those before contact as well.
         contact: Contact at surface points, or None.
+        loads: Sums of its areas on the nodes, of two successive substeps.
         exact: Fixed-point sums of a deterministic model.
     """
 
@@ -76,7 +77,11 @@ class ChunkBuffers:
         if model.spec.deterministic:
             sums = view(tensor(places * t.rows), t.real)
             self.exact = FixedPointAccumulator(model, sums, self.node_arrays)
-        self.contact = None if model.surface is None else SurfaceContact(model, self.window, chunk, keep)
+        self.contact = None
+        if model.surface is not None:
+            self.contact = SurfaceContact(model, self.window, chunk, keep, packed=True)
+            self.loads = tensor(2, model.worlds, layout.node_count)
+            self.load_arrays = [view(load, t.real) for load in self.loads]
         self._prepare_loading(places)
 
     def _view(self) -> None:
@@ -90,6 +95,7 @@ class ChunkBuffers:
             self.packed.append(packed)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_arrays = [view(velocity, t.aligned) for velocity in self.velocity]
+        self.velocity_array = self.velocity_arrays[0]
         self.order_array = view(self.order, wp.int32)
         self.order_flat = view(self.order.view(-1), wp.int32)
         self.words_array = view(self.words, wp.int64)
@@ -128,14 +134,13 @@ class ChunkBuffers:
             tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums)
         )
 
-    def velocity_array(self, s: int) -> wp.array:
-        """Nodal velocities of substep ``s``, as long as no later one needs their place."""
-        return self.velocity_arrays[s % len(self.velocity)]
+    def packed_at(self, s: int):
+        """Packed state before substep ``s``."""
+        return self.packed[s if self.keep else 0]
 
     def contact_nodes(self, s: int) -> Nodes:
         """Nodes of substep ``s`` as contact at surface points takes them."""
-        nodes, velocities = self.nodes, self.velocity
-        return contact_nodes(self.model, nodes[s % len(nodes)], velocities[s % len(velocities)])
+        return contact_nodes(self.model, self.nodes[s % len(self.nodes)], self.velocity, self.loads[s % 2])
 
     def reset_status(self) -> None:
         """Reset all status words."""
@@ -161,6 +166,8 @@ class ChunkBuffers:
             self._version = -1  # until the inputs are in this order too
             self.order.copy_(self.layout.order)
             self.origin.copy_(self.layout.origin)
+            if self.contact is not None:
+                self.contact.reorder(self.order)
             self.layout.place_neighbours()
         self.reset_status()
         if frozen:

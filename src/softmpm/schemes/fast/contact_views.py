@@ -1,8 +1,4 @@
-"""Nodes of the fast scheme as contact at surface points takes them: views of the four numbers of each node, (x, y[, z], further).
-
-Beside the velocity lies the load, which the grid stage clears with it; beside the adjoint of the velocity lies what contact adds to
-that of the mass, which the adjoint of the grid stage takes up.
-"""
+"""Nodes of the fast scheme as contact at surface points takes them: views of the four numbers of each node, (x, y[, z], further)."""
 
 import warp as wp
 from torch import Tensor
@@ -13,17 +9,23 @@ from softmpm.schemes.buffers import view
 from softmpm.schemes.carried import Nodes
 
 
-def contact_nodes(model: Model, node: Tensor, velocity: Tensor) -> Nodes:
-    """Views of mass and momentum, and of velocity and load; shapes (node of all worlds, 4)."""
+def contact_nodes(model: Model, node: Tensor, velocities: Tensor, load: Tensor) -> Nodes:
+    """Views of mass and momentum, of the velocities after and before contact, and of the loads."""
+    velocity, free = (vectors(model, one) for one in velocities)
+    return Nodes(packed_nodes(model, node), free, velocity, view(load, types(2, model.spec.dtype).real))
+
+
+def packed_nodes(model: Model, nodes: Tensor) -> wp.array:
+    """View (world, node) of the vector and the number at each node."""
     t = types(model.spec.dim, model.spec.dtype)
-    return Nodes(view(by_world(model, node)[..., : t.dim + 1], t.node), *vector_and_number(model, velocity))
+    return view(_by_world(model, nodes)[..., : t.dim + 1], t.node)
 
 
-def vector_and_number(model: Model, nodes: Tensor) -> tuple[wp.array, wp.array]:
-    """Views (world, node) of the vector at each node and of the number beside it."""
-    t, nodes = types(model.spec.dim, model.spec.dtype), by_world(model, nodes)
-    return view(nodes[..., : t.dim], t.vec), view(nodes[..., t.dim], t.real)
+def vectors(model: Model, nodes: Tensor) -> wp.array:
+    """View (world, node) of the vector at each node."""
+    t = types(model.spec.dim, model.spec.dtype)
+    return view(_by_world(model, nodes)[..., : t.dim], t.vec)
 
 
-def by_world(model: Model, nodes: Tensor) -> Tensor:
+def _by_world(model: Model, nodes: Tensor) -> Tensor:
     return nodes.view(model.worlds, -1, 4)

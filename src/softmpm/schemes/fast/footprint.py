@@ -15,7 +15,6 @@ from softmpm.planning.memory import (
     Sizes,
     input_bytes,
     sizes_of,
-    stencil_bytes,
     surface_bytes,
     window_shape,
 )
@@ -53,14 +52,15 @@ class FastFootprint:
         sizes = model.sizes()
         material = input_bytes(model, 1)
         fixed_point = 2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0
-        second = 0 if model.surface is None else sizes.nodes  # velocities of the substep before
-        graph = material + sizes.nodes + fixed_point + second + stencil_bytes(model)
+        second = 0 if model.surface is None else 3 * sizes.nodes // 2  # velocities before contact, and loads
+        graph = material + sizes.nodes + fixed_point + second
         small = graph + sizes.inside + 2 * sizes.nodes
         forward = small * _at_once(horizon, sizes.longest)
         passed = 2 * sizes.inside  # adjoints in the order of the previous chunk, and their copy
         if model.surface is not None:
-            # Stencils; nodal velocities without contact and the adjoint of the load:
-            passed += stencil_bytes(model) + sizes.nodes
+            passed += (
+                second + sizes.nodes
+            )  # the same again, and what contact adds to the adjoints of the nodes
         if chosen.keep_all:
             kept = model.calls * graph * len(horizon.chunks(chosen.longest))
             return Buffers(forward, kept, passed)

@@ -1,6 +1,9 @@
 """Launches of a chunk of the fast scheme, in their order: P2G, then for each substep the grid and G2P with the next P2G."""
 
+import math
+
 from softmpm.kernels.fast.alarms import packed_alarms
+from softmpm.kernels.fast.contact import contact_stage
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.native import BLOCK
 from softmpm.kernels.fast.sorting import sorting
@@ -12,20 +15,25 @@ from softmpm.schemes.launch import KernelLauncher
 
 def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     """Advance the first packed state by all substeps of the chunk, then check the last one."""
-    cleared = [*buffers.velocity_arrays, *([buffers.node_arrays[0]] if buffers.exact is None else [])]
+    spec, cleared = buffers.model.spec, [*buffers.velocity_arrays]
+    cleared += [buffers.node_arrays[0]] if buffers.exact is None else []
     for nodes in cleared:
-        launch(fused(buffers.model.spec).clear, buffers.held, nodes, block_dim=BLOCK)
+        launch(fused(spec).clear, buffers.held, nodes, block_dim=BLOCK)
+    if buffers.contact is not None:
+        launch(contact_stage(spec).clear, buffers.loads.shape[1:], *buffers.load_arrays, block_dim=BLOCK)
     _p2g_first(buffers, launch)
     for s in range(buffers.chunk.length):
-        _grid(buffers, s, launch)
-        if buffers.contact is not None:
+        if buffers.contact is None:
+            _grid(buffers, s, launch)
+        else:
             _contact(buffers, buffers.contact, s, launch)
         _g2p2g(buffers, s, launch)
     _survey(buffers, launch)
     if armed(buffers.model):
         _check(buffers, launch)
-    if buffers.contact is not None:
-        _end_contact(buffers, buffers.contact, launch)
+    if buffers.contact is not None and buffers.model.alarms.depth is not None:
+        inputs = buffers.inputs.grid_struct(buffers.chunk.length - 1)
+        buffers.contact.check_end(inputs, buffers.packed[-1], buffers.words_array, launch)
 
 
 def _p2g_first(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
@@ -49,15 +57,29 @@ def _grid(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     if buffers.exact is not None:
         now, then = buffers.exact.sums(s), buffers.nothing
     inputs = buffers.inputs.grid_struct(s)
-    arguments = (model.constants, inputs, buffers.window, now, buffers.velocity_array(s), then)
+    arguments = (model.constants, inputs, buffers.window, now, buffers.velocity_array, then)
     launch(fused(model.spec).grid_velocity, buffers.held, *arguments, block_dim=BLOCK)
 
 
 def _contact(buffers: ChunkBuffers, contact: SurfaceContact, s: int, launch: KernelLauncher) -> None:
-    """Contact at surface points in substep ``s``, after they are carried with the velocities of the substep before."""
-    nodes, last = buffers.contact_nodes(s), buffers.contact_nodes(s - 1).velocity if s > 0 else None
-    contact.share(s, nodes, last, buffers.words_array, launch)
-    contact.press(s, buffers.inputs.grid_struct(s), nodes, buffers.words_array, launch)
+    """Nodal velocities of substep ``s``, with contact at surface points."""
+    model, nodes, last = buffers.model, buffers.node_arrays, s + 1 == buffers.chunk.length
+    now, then = nodes[s % len(nodes)], buffers.nothing if last else nodes[(s + 1) % len(nodes)]
+    inputs, packed, loads = buffers.inputs.grid_struct(s), buffers.packed_at(s), buffers.load_arrays
+    velocity, free = buffers.velocity_arrays
+    first, threads = point_threads(buffers)
+    parameters = (model.constants, inputs, buffers.window, contact.outline, first, contact.owner_array)
+    out = (free, velocity, then, loads[(s + 1) % 2], loads[s % 2])
+    kernel = contact_stage(model.spec).grid_and_loads
+    launch(kernel, threads, *parameters, packed, now, *out, block_dim=BLOCK)
+    contact.press(s, inputs, packed, buffers.contact_nodes(s), buffers.words_array, launch)
+
+
+def point_threads(buffers: ChunkBuffers) -> tuple[int, int]:
+    """Number of the first thread of a point, in a block of its own after those of the nodes, and of all threads."""
+    assert buffers.contact is not None
+    first = -(-buffers.held // BLOCK) * BLOCK
+    return first, first + math.prod(buffers.contact.points)
 
 
 def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
@@ -75,7 +97,7 @@ def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
         size.per_warp,
     )
     sizes = (model.particle_count, size.particles, buffers.order_flat)
-    arguments = (*parameters, *sizes, buffers.velocity_array(s), now, buffers.words_array, then, sink)
+    arguments = (*parameters, *sizes, buffers.velocity_array, now, buffers.words_array, then, sink)
     launch(fused(model.spec).g2p2g[size.few], size.threads, *arguments, block_dim=size.block)
     if exact is not None and not last:
         exact.accumulate(buffers, s + 1, then, buffers.mass, launch)
@@ -97,11 +119,3 @@ def _check(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     arguments = (model.constants, inputs, buffers.layout.neighbours, *sizes)
     kernel = packed_alarms(model.spec).check
     launch(kernel, total, *arguments, buffers.packed[-1], buffers.words_array)
-
-
-def _end_contact(buffers: ChunkBuffers, contact: SurfaceContact, launch: KernelLauncher) -> None:
-    """Carry the surface points to the final state, and check their depth there."""
-    last = buffers.chunk.length - 1
-    contact.carry(last, buffers.contact_nodes(last).velocity, launch)
-    if buffers.model.alarms.depth is not None:
-        contact.check_end(buffers.inputs.grid_struct(last), buffers.words_array, launch)

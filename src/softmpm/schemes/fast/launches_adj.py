@@ -2,25 +2,33 @@
 
 import warp as wp
 
+from softmpm.kernels.fast.contact import contact_stage, contact_stage_adj
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK
 from softmpm.schemes.carried import Nodes
 from softmpm.schemes.fast.adjoint_buffers import ChunkAdjoint
-from softmpm.schemes.fast.contact_views import contact_nodes, vector_and_number
+from softmpm.schemes.fast.contact_views import contact_nodes, vectors
+from softmpm.schemes.fast.launches import point_threads
 from softmpm.schemes.launch import KernelLauncher
 
 
 def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     """Turn the packed adjoint of the final state into that of the initial state, and accumulate the adjoints of the inputs."""
-    shared, chunk = adjoint.shared, adjoint.forward.chunk
-    launch(fused(adjoint.model.spec).clear, len(shared.velocity), shared.velocity_array, block_dim=BLOCK)
+    forward, shared, chunk = adjoint.forward, adjoint.shared, adjoint.forward.chunk
+    contact = forward.contact is not None
+    for nodes in [*shared.velocity_arrays, *([shared.gained_array] if contact else [])]:
+        launch(fused(adjoint.model.spec).clear, forward.held, nodes, block_dim=BLOCK)
+    if contact:
+        for loads in (forward.load_arrays, shared.adj_load_arrays):
+            launch(contact_stage(adjoint.model.spec).clear, forward.loads.shape[1:], *loads, block_dim=BLOCK)
     for s in range(chunk.length, -1, -1):
-        _grid(adjoint, s, launch)
-        if s > 0:
-            _contact_again(adjoint, s - 1, launch)
+        if contact:
+            _grid_with_contact(adjoint, s, launch)
+        else:
+            _grid(adjoint, s, launch)
         _particles(adjoint, s, launch)
-        if s > 0:
+        if contact and s > 0:
             _contact(adjoint, s - 1, launch)
         if s == 0 or (s < chunk.length and chunk.row(s - 1) != chunk.row(s)):
             adjoint.found.collect(chunk.row(s), adjoint.forward.inputs.values, launch)
@@ -45,35 +53,55 @@ def _grid(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         )
         grids = (now, then, here, shared.velocity_array, before)
         arguments = (model.constants, inputs, forward.window, *grids, adj_inputs)
-        launch(kernel, len(shared.velocity), *arguments, block_dim=BLOCK)
+        launch(kernel, forward.held, *arguments, block_dim=BLOCK)
 
 
-def _contact_again(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
-    """Contact at surface points in substep ``s`` once more, and the adjoint of how it carries them."""
-    forward, back = adjoint.forward, adjoint.shared.contact
-    if forward.contact is not None and back is not None:
-        inputs, nodes = forward.inputs.grid_struct(s), _contact_nodes(adjoint, s)
-        adj_velocity, _ = _adj_contact_nodes(adjoint, s)
-        back.again(forward.contact, s, inputs, nodes, adj_velocity, forward.words_array, launch)
+def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
+    """The same with contact at surface points: the adjoint of its loads, and contact in substep ``s - 1`` once more."""
+    forward, shared, (here, before) = adjoint.forward, adjoint.shared, _adj_nodes(adjoint, s)
+    model, nodes, nothing, contact = forward.model, forward.node_arrays, forward.nothing, forward.contact
+    assert contact is not None and shared.contact is not None
+    last, first = s == forward.chunk.length, s == 0
+    stages = [
+        (max(s - 1, 0) if last else s, nothing if last else nodes[s], nothing if first else nodes[s - 1])
+    ]
+    if model.spec.moving and not (last or first):  # the walls have another pose in each
+        stages = [(s, nodes[s], nothing), (s - 1, nothing, nodes[s - 1])]
+    velocity, free = shared.velocity_arrays
+    loads, adj_loads = forward.load_arrays, shared.adj_load_arrays
+    point, threads = point_threads(forward)
+    for k, now, then in stages:
+        inputs = forward.inputs.grid_struct(k)
+        parameters = (model.constants, inputs, forward.window, contact.outline, point, contact.owner_array)
+        states = (now, then, forward.packed[s], forward.packed[max(s - 1, 0)], adj_loads[s % 2])
+        out = (here, shared.gained_array, free, velocity, before, loads[s % 2], adj_loads[(s + 1) % 2])
+        sums = (loads[(s + 1) % 2], shared.adj_array, adjoint.found.grid_struct(forward.chunk.row(k)))
+        kernel = contact_stage_adj(model.spec, adjoint.wanted)
+        launch(kernel, threads, *parameters, *states, *out, *sums, block_dim=BLOCK)
+    if not first:
+        inputs, states = forward.inputs.grid_struct(s - 1), forward.packed[s - 1]
+        about = (states, _contact_nodes(adjoint, s - 1), forward.words_array, launch)
+        shared.contact.press_again(contact, s - 1, inputs, *about)
 
 
 def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
-    """Adjoint of contact at surface points in substep ``s``."""
-    forward, back = adjoint.forward, adjoint.shared.contact
-    if forward.contact is not None and back is not None:
-        inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
-        nodes, adj_nodes = _contact_nodes(adjoint, s), _adj_contact_nodes(adjoint, s)
-        back.respond(forward.contact, s, inputs, adj_inputs, nodes, *adj_nodes, launch)
+    """Adjoint of contact at surface points in substep ``s``, but for that of its loads."""
+    forward, shared = adjoint.forward, adjoint.shared
+    assert forward.contact is not None and shared.contact is not None
+    inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
+    states = (inputs, adj_inputs, forward.packed[s], _contact_nodes(adjoint, s))
+    adj_nodes = (
+        vectors(adjoint.model, shared.nodes[s % 2]),
+        shared.adj_load_arrays[s % 2],
+        shared.gained_view,
+    )
+    shared.contact.press_adj(forward.contact, s, *states, *adj_nodes, shared.adj_array, launch)
 
 
 def _contact_nodes(adjoint: ChunkAdjoint, s: int) -> Nodes:
     """Nodes of substep ``s`` as contact takes them."""
-    return contact_nodes(adjoint.model, adjoint.forward.nodes[s], adjoint.shared.velocity)
-
-
-def _adj_contact_nodes(adjoint: ChunkAdjoint, s: int) -> tuple[wp.array, wp.array]:
-    """Adjoints of the nodes' velocities in substep ``s``, and what contact adds to those of the masses."""
-    return vector_and_number(adjoint.model, adjoint.shared.nodes[s % 2])
+    forward = adjoint.forward
+    return contact_nodes(adjoint.model, forward.nodes[s], adjoint.shared.velocity, forward.loads[s % 2])
 
 
 def _adj_nodes(adjoint: ChunkAdjoint, s: int) -> tuple[wp.array, wp.array]:

@@ -130,7 +130,7 @@ class Fast:
                 self._start_check = check
         words = check(start, values)
         if start.surface is not None:
-            check_start(self.model, start.surface.x, values, words)
+            check_start(self.model, start, values, words)
         return words
 
     def _provide_layout(self, start: State | SortedState, chunk: Chunk) -> bool:

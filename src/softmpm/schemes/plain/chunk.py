@@ -59,7 +59,7 @@ class PlainRun:
         self.structs = [self.states[i].struct(model) for i in range(len(self.states.base))]
         self.contact = None
         if start.surface is not None:
-            self.contact = SurfaceContact(model, whole_grid(model), chunk, keep)
+            self.contact = SurfaceContact(model, whole_grid(model), chunk, keep, packed=False)
             self.contact.load(chunk, start.surface)
         if frozen:
             self.step.words[list(frozen)] = FROZEN
@@ -72,7 +72,8 @@ class PlainRun:
         if armed(model):
             check_end(model, self.step.particle_inputs, self.end, self.step.words_array, chunk.length - 1)
         if self.contact is not None:
-            self.contact.check_end(self.step.grid_inputs, self.step.words_array, self.step.launch)
+            now = self.structs[chunk.length if keep else chunk.length % 2]
+            self.contact.check_end(self.step.grid_inputs, now, self.step.words_array, self.step.launch)
             self.end = self.end._replace(surface=self.contact.end.clone())
         self.words = self.step.words
         self.outgrow: Callable[[], None] | None = None
@@ -101,7 +102,7 @@ class PlainRun:
         then.H.copy_(adj_end.F)
         contact = None
         if self.contact is not None and adj_end.surface is not None:
-            contact = self.contact, SurfaceContactAdj(model, wanted, model.node_count)
+            contact = self.contact, SurfaceContactAdj(model, wanted, packed=False)
             contact[1].load(adj_end.surface)
         for s in reversed(range(chunk.length)):
             row = chunk.row(s)
@@ -144,7 +145,7 @@ class Plain:
     def check_start(self, start: State, values: Values) -> Tensor:
         words = StartCheck(self.model)(start, values)
         if start.surface is not None:
-            check_start(self.model, start.surface.x, values, words)
+            check_start(self.model, start, values, words)
         return words
 
     def accept(self, run: PlainRun, words: list[int]) -> bool:

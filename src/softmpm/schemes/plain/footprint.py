@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import ClassVar
 
-from softmpm.planning.memory import Buffers, Plan, Sizes, sizes_of, state_bytes, stencil_bytes, surface_bytes
+from softmpm.planning.memory import Buffers, Plan, Sizes, sizes_of, state_bytes, surface_bytes
 
 
 class PlainFootprint:
@@ -25,10 +25,10 @@ class PlainFootprint:
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         inside, terms = model.sizes().inside, term_bytes(model)
-        number, contact = model.worlds * model.node_count * model.dtype.itemsize, stencil_bytes(model)
-        # The load; its adjoint, v* and the adjoint of the mass:
-        load, back = (number, (model.dim + 3) * number) if contact else (0, 0)
-        return Buffers(2 * inside + terms + contact + load, 0, inside + terms + 2 * contact + back)
+        number = 0 if model.surface is None else model.worlds * model.node_count * model.dtype.itemsize
+        # Velocities before contact, and loads; their adjoint, and what contact adds to those of velocities and masses:
+        contact, back = (model.dim + 1) * number, (model.dim + 2) * number
+        return Buffers(2 * inside + terms + contact, 0, inside + terms + back)
 
 
 def term_bytes(model) -> int:

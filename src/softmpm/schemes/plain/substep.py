@@ -57,7 +57,8 @@ class Substep:
         """Warp's view of one of the grid buffers below, made once."""
         if name not in self._arrays:
             t = self.types
-            kinds = {"node": t.node, "adj_node": t.node, "load": t.real, "contact_mass": t.real}
+            kinds = dict.fromkeys(("node", "adj_node", "gained"), t.node)
+            kinds |= {"load": t.real, "adj_load": t.real}
             self._arrays[name] = view(getattr(self, name), kinds.get(name, t.vec))
         return self._arrays[name]
 
@@ -85,14 +86,23 @@ class Substep:
         return torch.empty(self.nodes, dtype=self.model.dtype, device=self.model.device)
 
     @functools.cached_property
-    def contact_mass(self) -> Tensor:
-        """What contact at surface points adds to the adjoint of the masses, (world, node)."""
+    def adj_load(self) -> Tensor:
         return torch.empty_like(self.load)
+
+    @functools.cached_property
+    def free(self) -> Tensor:
+        """Velocity before contact at surface points, (world, node, dim)."""
+        return torch.empty_like(self.velocity)
+
+    @functools.cached_property
+    def gained(self) -> Tensor:
+        """What contact at surface points adds to the adjoints of velocity and mass, (world, node, dim + 1)."""
+        return torch.empty_like(self.node)
 
     @property
     def _contact_nodes(self) -> Nodes:
         """The nodes as contact at surface points takes them."""
-        return Nodes(self._array("node"), self._array("velocity"), self._array("load"))
+        return Nodes(*(self._array(name) for name in ("node", "free", "velocity", "load")))
 
     def launch(self, kernel, dim, *inputs, **settings) -> None:
         launch(kernel, dim, inputs, device=self.model.wp_device, stream=self.stream, **settings)
@@ -110,11 +120,8 @@ class Substep:
         self.last = substep
         self.to_grid(now)
         if contact is not None:
-            clear(self.load)
-            nodes = self._contact_nodes
-            contact.share(substep, nodes, None, self.words_array, self.launch)
-            contact.press(substep, self.grid_inputs, nodes, self.words_array, self.launch)
-            contact.carry(substep, nodes.velocity, self.launch)
+            self._add_loads(contact, now)
+            contact.press(substep, self.grid_inputs, now, self._contact_nodes, self.words_array, self.launch)
         arguments = (self.model.constants, self.particle_inputs, substep, self._array("velocity"), now)
         self.launch(self.transfer.g2p, self.particles, *arguments, self.words_array, then)
 
@@ -140,33 +147,40 @@ class Substep:
         self.to_grid(now)
         clear(self.adj_velocity)
         if contact is not None:
-            self._contact_again(*contact, substep)
+            self._contact_again(*contact, substep, now)
         self.g2p_adj(wanted, now, then, adj_then, adj_now, adj_particle_inputs)
         if contact is not None:
-            self._contact_adj(*contact, substep, adj_grid_inputs)
+            self._contact_adj(*contact, substep, now, adj_now, adj_grid_inputs)
         self.grid_adj(wanted, adj_grid_inputs)
         if contact is not None:
-            self.adj_node[..., -1] += self.contact_mass
+            self.adj_node[..., -1] += self.gained[..., -1]
         self.p2g_adj(wanted, now, adj_now, adj_particle_inputs, substep)
 
-    def _contact_again(self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int) -> None:
-        """Contact at surface points once more, and the adjoint of how it carries them."""
+    def _add_loads(self, contact: SurfaceContact, now) -> None:
+        """What contact at surface points begins with: the areas on the nodes, and a copy of their velocity."""
         clear(self.load)
-        s, adj_velocity = contact.chunk.length - 1 - substep, self._array("adj_velocity")
-        arguments = (self.grid_inputs, self._contact_nodes, adj_velocity, self.words_array, self.launch)
-        back.again(contact, s, *arguments)
+        contact.add_loads(now, self._array("load"), self.launch)
+        self.free.copy_(self.velocity)
+
+    def _contact_again(self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int, now) -> None:
+        """Contact at surface points once more."""
+        self._add_loads(contact, now)
+        s = contact.chunk.length - 1 - substep
+        arguments = (self.grid_inputs, now, self._contact_nodes, self.words_array, self.launch)
+        back.press_again(contact, s, *arguments)
 
     def _contact_adj(
-        self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int, adj_inputs
+        self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int, now, adj_now, adj_inputs
     ) -> None:
         """Adjoint of contact at surface points."""
-        clear(self.contact_mass)
-        s, adj_nodes = (
-            contact.chunk.length - 1 - substep,
-            (self._array("adj_velocity"), self._array("contact_mass")),
-        )
-        arguments = (self.grid_inputs, adj_inputs, self._contact_nodes, *adj_nodes, self.launch)
-        back.respond(contact, s, *arguments)
+        clear(self.adj_load)
+        clear(self.gained)
+        s, adj_load = contact.chunk.length - 1 - substep, self._array("adj_load")
+        adj_nodes = (self._array("adj_velocity"), adj_load, self._array("gained"))
+        inputs = (self.grid_inputs, adj_inputs, now)
+        back.press_adj(contact, s, *inputs, self._contact_nodes, *adj_nodes, adj_now, self.launch)
+        back.add_loads_adj(contact, now, adj_load, adj_now, self.launch)
+        self.adj_velocity += self.gained[..., :-1]
 
     def g2p_adj(self, wanted: RequestedGrads, now, then, adj_then, adj_now, adj_inputs) -> None:
         arrays = (self._array("velocity"), now, then, adj_then, adj_inputs, self._array("adj_velocity"))

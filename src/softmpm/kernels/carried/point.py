@@ -1,0 +1,187 @@
+"""Surface points on the moving grid: each belongs to a particle, which gives it its place and its weights. Derivation: docs/math/contact.md.
+
+With the arm X_s − X_p at rest, a = F_p (X_s − X_p) / dx, and r_i the distance of node i from the particle, both in cells,
+
+    x_s = x_p + dx a,  W_si = w_i (1 + 4 r_i·a)                                                      (K8)
+
+    x̄_p += x̄_s + Σ W̄_si [(1 + 4 r_i·a) ∇w_i − 4 w_i a / dx]
+    F̄_p += (x̄_s + Σ W̄_si 4 w_i r_i / dx) (X_s − X_p)ᵀ                                                (K8.adj)
+
+Places are in float64 in every precision: a point moves by 1e-5 of a cell in a substep.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.fast.gather import stencil
+from softmpm.kernels.fast.native import WARP, native, native_module
+from softmpm.kernels.physics.spline import spline
+from softmpm.kernels.structs import types
+
+
+@kernel_factory
+def outline_type(dim: int, dtype: str):
+    """Struct of the constants of the surface points."""
+    t = types(dim, dtype)
+
+    class Outline:
+        """See :class:`softmpm.surface_points.SurfacePoints`."""
+
+        arms: wp.array(dtype=t.vec)  # X_s − X_p [m]
+        areas: wp.array(dtype=t.real)
+        newtons: wp.array(dtype=t.real)  # areas in the units of force
+        deepest: wp.array(dtype=t.real)
+        stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
+
+    return wp.struct(Outline, module=f"softmpm.types.d{dim}.{dtype}.outline")
+
+
+def module_of(name: str, packed: bool) -> str:
+    """Set the options of the Warp module of this name, with loops over the nodes of a stencil written out; returns the name."""
+    name = native_module(name + ".packed") if packed else name
+    wp.set_module_options({"max_unroll": 27}, module=wp.get_module(name))
+    return name
+
+
+@kernel_factory
+def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
+    """Functions of a surface point.
+
+    Args:
+        packed: Whether particles are packed as in the fast scheme; ``owner`` then is the place of a point's particle, else its number.
+    """
+    t, s = types(dim, dtype), spline(dim, dtype)
+    real, vec, mat, ivec, Constants, Window = t.real, t.vec, t.mat, t.ivec, t.Constants, t.Window
+    offset, position, weight, weight_slope = s.offset, s.position, s.weight, s.weight_slope
+    exact_vec, Outline, size = types(dim, "float64").vec, outline_type(dim, dtype), s.count
+    table = wp.types.matrix((3, dim), real)
+    Table = wp.types.vector(size, real)  # one number for each node
+    Particles = t.Packed if packed else t.Motion
+    ParticlesAdj = wp.array(dtype=real) if packed else t.MotionAdj
+
+    @wp.struct
+    class Point:
+        base: ivec  # first node of the particle's stencil, counted from the first of the window
+        fx: vec
+        arm: vec  # a
+        x: exact_vec
+
+    @wp.func
+    def put(
+        constants: Constants, window: Window, world: int, base: ivec, fx: vec, low: vec, arm: vec
+    ) -> Point:
+        """The point with this arm [m] of a particle."""
+        out = Point()
+        out.fx = fx
+        out.arm = arm / constants.spacing
+        for axis in range(dim):
+            out.base[axis] = base[axis] - window.origin[world][axis]
+            cells = wp.float64(base[axis]) + wp.float64(fx[axis]) + wp.float64(low[axis])
+            out.x[axis] = constants.exact_spacing * cells + wp.float64(arm[axis])
+        return out
+
+    if packed:
+        n, unpack_base, row_fx, row_low, row_H = (
+            native(dim, dtype),
+            stencil(dim, dtype).unpack_base,
+            t.row_fx,
+            t.row_low,
+            t.row_h,
+        )
+        load_vec, load_mat, rows = n.load_vec, n.load_mat, t.rows
+
+        @wp.func
+        def point_of(
+            constants: Constants,
+            window: Window,
+            outline: Outline,
+            now: Particles,
+            world: int,
+            p: int,
+            owner: int,
+        ) -> Point:
+            """Point ``p`` of a world (K8)."""
+            arm = outline.arms[p]
+            H = load_mat(now.rows, owner, row_H)
+            fx = load_vec(now.rows, owner, row_fx)
+            low = load_vec(now.rows, owner, row_low)
+            return put(constants, window, world, unpack_base(now.base[owner]), fx, low, arm + H * arm)
+
+        @wp.func
+        def add_adj(adj: ParticlesAdj, world: int, owner: int, fx: vec, H: mat):
+            """Add to the adjoint of a particle."""
+            first = (owner / WARP * rows) * WARP + owner % WARP
+            for i in range(dim):
+                wp.atomic_add(adj, first + (row_fx + i) * WARP, fx[i])
+                for j in range(dim):
+                    wp.atomic_add(adj, first + (row_H + i * dim + j) * WARP, H[i, j])
+    else:
+        rounds = dtype == "float32"
+
+        @wp.func
+        def point_of(
+            constants: Constants,
+            window: Window,
+            outline: Outline,
+            now: Particles,
+            world: int,
+            p: int,
+            owner: int,
+        ) -> Point:
+            """Point ``p`` of a world (K8)."""
+            arm = outline.arms[p]
+            low = vec()
+            if wp.static(rounds):
+                low = now.fx_low[world, owner]
+            arm += now.H[world, owner] * arm
+            return put(constants, window, world, now.base[world, owner], now.fx[world, owner], low, arm)
+
+        @wp.func
+        def add_adj(adj: ParticlesAdj, world: int, owner: int, fx: vec, H: mat):
+            """Add to the adjoint of a particle."""
+            wp.atomic_add(adj.fx, world, owner, fx)
+            wp.atomic_add(adj.H, world, owner, H)
+
+    @wp.func
+    def share(at: Point, w: table, n: int) -> real:
+        """W of node ``n`` (K8)"""
+        o = offset(n)
+        return weight(w, o) * (real(1.0) + real(4.0) * wp.dot(position(o) - at.fx, at.arm))
+
+    @wp.func
+    def shares_adj(
+        constants: Constants,
+        outline: Outline,
+        at: Point,
+        w: table,
+        slope: table,
+        adj_shares: Table,
+        adj_x: vec,
+        world: int,
+        p: int,
+        owner: int,
+        adj: ParticlesAdj,
+    ):
+        """(K8.adj)"""
+        adj_fx = constants.spacing * adj_x
+        adj_arm = vec()
+        for n in range(size):
+            o = offset(n)
+            r = position(o) - at.fx
+            lean = real(4.0) * adj_shares[n] * weight(w, o)
+            adj_fx += adj_shares[n] * (real(1.0) + real(4.0) * wp.dot(r, at.arm)) * weight_slope(w, slope, o)
+            adj_fx -= lean * at.arm
+            adj_arm += lean * r
+        add_adj(adj, world, owner, adj_fx, wp.outer(adj_x + adj_arm / constants.spacing, outline.arms[p]))
+
+    return SimpleNamespace(
+        Point=Point,
+        Table=Table,
+        Particles=Particles,
+        ParticlesAdj=ParticlesAdj,
+        point_of=point_of,
+        share=share,
+        shares_adj=shares_adj,
+    )

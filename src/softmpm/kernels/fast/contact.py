@@ -1,0 +1,163 @@
+"""Grid stage of the fast scheme with contact at surface points: further threads add up the areas of the points. Derivation: docs/math/contact.md.
+
+    grid      nodes: V ← (G1), (G2) of M, twice,  next M ← 0;   points: L of (K9)
+    press     points: impulses into one of the V (kernels/carried/surface.py)
+    backward
+    grid_adj  nodes: M̄ ← (G1.adj) of V̄ and of what the points gave;  both V ← (G1), (G2) of the M before;
+              points: the part of L̄ in their adjoints (K9.adj), L of the substep before
+    press, g2p2g_adj, press_adj
+
+Sums of two successive substeps have two buffers: one is added to while the other is cleared.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.carried.point import module_of, outline_type, surface_point
+from softmpm.kernels.carried.surface import surface
+from softmpm.kernels.carried.surface_adj import loads_adj
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.fast.gather import stencil
+from softmpm.kernels.fast.native import native
+from softmpm.kernels.physics.grid import grid, grid_adj
+from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+
+
+@kernel_factory
+def contact_stage(spec: Spec) -> SimpleNamespace:
+    """``grid`` of the table above, and a kernel that clears sums."""
+    dim, t, s = spec.dim, types(spec.dim, spec.dtype), stencil(spec.dim, spec.dtype)
+    real, node_vec, Constants, Window = t.real, t.aligned, t.Constants, t.Window
+    Outline, GridInputs = outline_type(dim, spec.dtype), input_types(spec).GridInputs
+    Particles, add_load = surface_point(dim, spec.dtype, True).Particles, surface(spec, True).add_load
+    place_of, node_velocity = fused(spec).place_of, grid(spec).node_velocity
+    aligned, head, world_of = s.aligned, s.head, s.world_of
+    load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
+
+    @wp.kernel(module=module_of(spec.module + ".surface", packed=True), enable_backward=False)
+    def clear(one: wp.array2d(dtype=real), other: wp.array2d(dtype=real)):
+        world, i = wp.tid()
+        one[world, i] = real(0.0)
+        other[world, i] = real(0.0)
+
+    @wp.kernel(module=module_of(spec.module + ".surface", packed=True), enable_backward=False)
+    def grid_and_loads(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        window: Window,
+        outline: Outline,
+        first: int,  # thread of the first point
+        owner: wp.array2d(dtype=wp.int32),
+        # In:
+        now: Particles,
+        node: wp.array(dtype=node_vec),
+        # Out:
+        free: wp.array(dtype=node_vec),
+        velocity: wp.array(dtype=node_vec),
+        cleared: wp.array(dtype=node_vec),
+        cleared_load: wp.array2d(dtype=real),
+        # Out, added into:
+        load: wp.array2d(dtype=real),
+    ):
+        i = wp.tid()
+        if i < node.shape[0]:
+            world = world_of(i, window.count, node.shape[0])
+            place = place_of(constants, window, world, i)
+            here = load_node(node, i)
+            if here[dim] > real(0.0):
+                v = aligned(node_velocity(constants, inputs, world, place, head(here), here[dim]), real(0.0))
+                store_node(free, i, v)
+                store_node(velocity, i, v)
+            if i < cleared.shape[0]:
+                store_node(cleared, i, node_vec())
+            cleared_load[world, i - world * window.count] = real(0.0)
+        elif i >= first:
+            world = (i - first) / owner.shape[1]
+            p = i - first - world * owner.shape[1]
+            add_load(constants, window, outline, now, world, p, owner[world, p], load)
+
+    return SimpleNamespace(clear=clear, grid_and_loads=grid_and_loads)
+
+
+@kernel_factory
+def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
+    """``grid_adj`` of the table above."""
+    dim, t, s = spec.dim, types(spec.dim, spec.dtype), stencil(spec.dim, spec.dtype)
+    real, node_vec, Constants, Window = t.real, t.aligned, t.Constants, t.Window
+    Outline, point = outline_type(dim, spec.dtype), surface_point(dim, spec.dtype, True)
+    GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
+    Particles, ParticlesAdj, add_load = point.Particles, point.ParticlesAdj, surface(spec, True).add_load
+    place_of, node_velocity = fused(spec).place_of, grid(spec).node_velocity
+    node_velocity_adj, add_load_adj = (
+        grid_adj(spec, wanted).node_velocity_adj,
+        loads_adj(dim, spec.dtype, True),
+    )
+    aligned, head, world_of = s.aligned, s.head, s.world_of
+    load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
+
+    @wp.kernel(module=module_of(adj_module(spec, wanted) + ".surface", packed=True), enable_backward=False)
+    def grid_and_loads_adj(
+        # Parameters:
+        constants: Constants,
+        inputs: GridInputs,
+        window: Window,
+        outline: Outline,
+        first: int,  # thread of the first point
+        owner: wp.array2d(dtype=wp.int32),
+        # In:
+        node: wp.array(dtype=node_vec),  # of this substep; empty after the last
+        node_before: wp.array(dtype=node_vec),  # of the substep before; empty in the first
+        now: Particles,  # of this substep
+        before: Particles,  # of the substep before
+        adj_load: wp.array2d(dtype=real),
+        # In and out:
+        adj_node: wp.array(dtype=node_vec),  # adjoint of the velocity, then of momentum and mass
+        gained: wp.array(dtype=node_vec),  # added to it, then cleared
+        # Out:
+        free: wp.array(dtype=node_vec),  # of the substep before
+        velocity: wp.array(dtype=node_vec),
+        cleared: wp.array(dtype=node_vec),
+        cleared_load: wp.array2d(dtype=real),
+        cleared_adj_load: wp.array2d(dtype=real),
+        # Out, added into:
+        load: wp.array2d(dtype=real),
+        adj: ParticlesAdj,  # of the particles of this substep
+        adj_inputs: GridInputsAdj,
+    ):
+        i = wp.tid()
+        if i < velocity.shape[0]:
+            world = world_of(i, window.count, velocity.shape[0])
+            place = place_of(constants, window, world, i)
+            if i < node.shape[0]:
+                here = load_node(node, i)
+                more = load_node(gained, i)
+                adj_v = head(load_node(adj_node, i)) + head(more)
+                if here[dim] > real(0.0):
+                    back = node_velocity_adj(
+                        constants, inputs, world, place, head(here), here[dim], adj_v, i, adj_inputs
+                    )
+                    store_node(adj_node, i, aligned(back.p, back.m + more[dim]))
+                store_node(gained, i, node_vec())
+            if i < node_before.shape[0]:
+                there = load_node(node_before, i)
+                if there[dim] > real(0.0):
+                    v = aligned(
+                        node_velocity(constants, inputs, world, place, head(there), there[dim]), real(0.0)
+                    )
+                    store_node(free, i, v)
+                    store_node(velocity, i, v)
+                store_node(cleared, i, node_vec())
+                cleared_load[world, i - world * window.count] = real(0.0)
+                cleared_adj_load[world, i - world * window.count] = real(0.0)
+        elif i >= first:
+            world = (i - first) / owner.shape[1]
+            p = i - first - world * owner.shape[1]
+            if node.shape[0] > 0:
+                add_load_adj(constants, window, outline, now, world, p, owner[world, p], adj_load, adj)
+            if node_before.shape[0] > 0:
+                add_load(constants, window, outline, before, world, p, owner[world, p], load)
+
+    return grid_and_loads_adj
