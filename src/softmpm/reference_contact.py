@@ -58,10 +58,10 @@ def delassus(scene: Scene, surface: Surface, mass: Tensor) -> Tensor:
     w = surface.w.abs()
     load = w.new_zeros(math.prod(scene.grid.shape))
     load = load.index_add(0, surface.node.flatten(), (w * surface.area[:, None]).flatten())
-    return (w * _per_mass(load.expand_as(mass), mass)[:, surface.node]).sum(-1)
+    return (w * per_mass(load.expand_as(mass), mass)[:, surface.node]).sum(-1)
 
 
-def _per_mass(values: Tensor, mass: Tensor) -> Tensor:
+def per_mass(values: Tensor, mass: Tensor) -> Tensor:
     """Values divided by the mass of the nodes, zero where there is none."""
     return torch.where(mass > 0, values / torch.where(mass > 0, mass, torch.ones_like(mass)), 0.0)
 
@@ -100,7 +100,7 @@ def contact(
     J = J * torch.as_tensor(surface.free, dtype=v.dtype)[..., None]
     share = (surface.w * surface.area[:, None])[..., None] * J.sum(1)[:, :, None]
     sums = torch.zeros_like(v).index_add(1, surface.node.flatten(), share.flatten(1, 2))
-    return v + _per_mass(sums, mass[..., None]), anchors, J
+    return v + per_mass(sums, mass[..., None]), anchors, J
 
 
 def meet_walls(
