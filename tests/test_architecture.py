@@ -21,7 +21,8 @@ LAYERS = """
     reference reference_step kernels.physics
     reference_contact reference_driven reference_overlap reference_mirror
     stability kernels.convert reference_lagrangian reference_moving_contact
-    kernels.rasterize kernels.carried kernels.plain kernels.fast kernels.lagrangian
+    kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
+    kernels.carried
     rest_grid
     surface_points
     surface_grid mirror_grid overlap_grid

@@ -39,7 +39,7 @@ def points_of(model: softmpm.Model) -> CarriedPoints:
 
 
 def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
-    """Leaves of a body near rest, whose points adhere somewhere, and of two walls that push into it as they turn and slide, other ones in
+    """Leaves of a body near rest, whose points adhere somewhere, and of two walls that turn and slide as they push into it, others in
     each world."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -294,7 +294,8 @@ def test_a_block_rests_on_the_floor(settled):
 
 
 def test_forces_are_means_of_control_steps_of_any_length(monkeypatch):
-    """Those of 4 substeps are the means of those of 2 and 2, in calls that share their chunk graphs: ≤ 1e-13."""
+    """Those of 4 substeps are the means of those of 2 and 2, in calls that share their chunk graphs, but for the rounding of x between
+    calls, 1e-16 m where a point is 1e-7 m inside the floor: ≤ 1e-11."""
     monkeypatch.setattr(memory, "LONGEST", 2)
     model = build(slab(), alarms=None)
     start, found = model.rest(), {}
@@ -304,7 +305,7 @@ def test_forces_are_means_of_control_steps_of_any_length(monkeypatch):
     second = softmpm.simulate(model, found[2], None, model.params(), substeps=2)
     forces = [state.surface.force for state in (found[2], second)]
     assert (forces[0] - forces[1]).abs().max() > 1e-3 * forces[0].abs().max() > 0
-    assert_relative((forces[0] + forces[1]) / 2, found[4].surface.force, 1e-13)
+    assert_relative((forces[0] + forces[1]) / 2, found[4].surface.force, 1e-11)
 
 
 @pytest.mark.parametrize("degrees", [3.0, -0.5])

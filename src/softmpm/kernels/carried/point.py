@@ -1,4 +1,4 @@
-"""Surface points on the moving grid: each belongs to a particle, which gives it its place and its weights. Derivation: docs/math/contact.md.
+"""Surface points on the moving grid: each has its place and its weights from a particle. Derivation: docs/math/contact.md.
 
 With the arm X_s − X_p at rest, a = F_p (X_s − X_p) / dx, and r_i the distance of node i from the particle, both in cells,
 

@@ -5,9 +5,9 @@
     f_s += A_s J / T, the mean force of a wall on a point in a control step of T                     (K7)
     v'_i = v*_i + (1/m_i) Σ W_si A_s J                                                               (K10)
 
-``add_loads`` is L, ``press`` the rest. Nodes are those of a window, the whole grid in the plain scheme. Arrays of them may have strides:
-the fast scheme has several quantities in one. v* and v' are two arrays, since points read the one while others add to the other. A GPU
-waits for a load only where its value is used, so all loads of a stencil precede the sums. The adjoint is in surface_adj.py.
+``add_loads`` is L, ``press`` the rest. Nodes are those of a window, the whole grid in the plain scheme. Their arrays may have strides:
+the fast scheme has several quantities in one. v* and v' are two arrays, since points read the one while others add to the other. The
+adjoint is in surface_adj.py.
 """
 
 from types import SimpleNamespace

@@ -6,8 +6,8 @@
     m̄_i −= (|W_si| L_i D̄_s + W_si A_s J_s·v̄'_i) / m_i²,  L̄_i += |W_si| D̄_s / m_i
     W̄_si = v*_i·v̄_s + A_s J_s·v̄'_i / m_i + σ (L_i D̄_s / m_i + A_s L̄_i),  σ = sign W_si           (K9.adj), (K10.adj)
 
-and (K8.adj). ``press_adj`` is all but the part with L̄, which all points add to first; that is ``add_loads_adj``. Both add to the adjoint of
-the particles; press_adj adds v̄* − v̄' and m̄ into an array beside v̄', since points read that one.
+and (K8.adj). ``press_adj`` is all but the part with L̄, which all points add to first; that is ``add_loads_adj``. Both add to the
+adjoint of the particles. v̄* − v̄' and m̄ have an array beside v̄', since points read that one.
 """
 
 from types import SimpleNamespace

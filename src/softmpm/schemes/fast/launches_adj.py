@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from softmpm.kernels.fast.contact import contact_stage, contact_stage_adj
+from softmpm.kernels.carried.grid_stage import contact_stage, contact_stage_adj
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK

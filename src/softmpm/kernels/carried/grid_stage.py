@@ -1,4 +1,4 @@
-"""Grid stage of the fast scheme with contact at surface points: further threads add up the areas of the points. Derivation: docs/math/contact.md.
+"""Grid stage of the fast scheme with contact: further threads have the surface points. Derivation: docs/math/contact.md.
 
     grid      nodes: V ← (G1), (G2) of M, twice,  next M ← 0;   points: L of (K9)
     press     points: impulses into one of the V (kernels/carried/surface.py)
