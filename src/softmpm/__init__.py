@@ -18,6 +18,7 @@ from softmpm.model import Model
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
+from softmpm.scene import presets
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.outline import Outline
 from softmpm.scene.polygons import inside
@@ -75,6 +76,7 @@ __all__ = [
     "inside",
     "mesh",
     "polygons",
+    "presets",
     "rasterize",
     "simulate",
     "stable_dt",

@@ -8,7 +8,10 @@ from softmpm.validate import need, store_numbers
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Material:
-    """Isotropic elastic solid, with Kelvin-Voigt viscosity if it has any. Use one of its laws, the subclasses below."""
+    """Isotropic elastic solid, with Kelvin-Voigt viscosity if it has any. Use one of its laws, the subclasses below.
+
+    ``softmpm.presets`` has the constants of silicones and muscle with their sources (docs/materials.md).
+    """
 
     survives_inversion: ClassVar[bool] = False
     """True if the stress is defined where det F ≤ 0."""
