@@ -48,7 +48,7 @@ def build(
             taken once at rest; see docs/formulations.md. "auto": the reference formulation if the scene states ``body_contact=False``
             and it has all that is asked for; ``describe`` gives the reason.
         contact: What meets the separating walls: "nodes", "surface" (the points of the outlines, :class:`softmpm.Outline`), or "auto":
-            in the reference formulation the surface if every body has an outline, in the moving one nodes.
+            the surface if every body has an outline.
         contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
@@ -168,8 +168,7 @@ def on_surface(scene: Scene, formulation: str, contact: str, width: float) -> bo
             raise ValueError(
                 "contact='surface' needs a wall of the kind 'separate', and the scene has none; leave contact out."
             )
-    wanted = contact == "surface" or (contact == "auto" and formulation == "reference")
-    chosen = wanted and outlined and separating
+    chosen = contact != "nodes" and outlined and separating
     if chosen and formulation == "reference":
         check_reach(scene)
     if not chosen and width > 0:

@@ -74,7 +74,8 @@ def _advance(model: Model, state_in: Any, state_out: Any, solid: WarpSolid, subs
     if isinstance(work, NodalStep):
         work.advance(state_in.nodal(), state_out.nodal(), solid.values(), substep)
     else:
-        work.advance(state_in.struct(model), state_out.struct(model), substep)
+        states = (state_in.struct(model), state_out.struct(model))
+        work.step(*states, state_in.surface(), state_out.surface(), substep)
 
 
 @on_its_gpu
@@ -102,7 +103,12 @@ def _adjoint_of_particles(
     found, adj_inputs = Accumulators(model, wanted, 1, model.node_count), InputsAdj(model, wanted, 1)
     now, then = state_in.struct(model), state_out.struct(model)
     structs = found.particle_struct(), found.grid_struct()
-    work.adjoint(wanted, now, then, state_out.adj_struct(model), state_in.adj_struct(model), structs, substep)
+    particles = (now, then, state_out.adj_struct(model), state_in.adj_struct(model))
+    surface = state_in.surface(), state_out.adj_surface()
+    adj_surface = work.step_adj(wanted, particles, structs, *surface, substep)
+    if adj_surface is not None:
+        for grad, adj in zip(state_in.adj_surface() or (), adj_surface, strict=True):
+            grad += adj
     found.collect(0, model.fixed, work.launch)
     adj_inputs.add(found, slice(0, 1))
     adj_inputs.add_particles(found, slice(0, 1))

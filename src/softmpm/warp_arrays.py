@@ -21,7 +21,8 @@ from softmpm.schemes.failure_report import raise_failure
 from softmpm.schemes.inputs import Values, grid_struct, particle_struct, shape_of
 from softmpm.schemes.lagrangian.nodal import particles_of, start_of
 from softmpm.schemes.lagrangian.nodal_step import NodalStep
-from softmpm.schemes.plain.substep import Substep
+from softmpm.schemes.plain.particle_step import ParticleStep
+from softmpm.schemes.surface_start import with_surface
 from softmpm.state import Params, State
 from softmpm.warp_nodal import WarpNodal, check_array, owned, warp_nodal
 from softmpm.warp_particles import WarpState, torch_particles, warp_particles
@@ -46,7 +47,7 @@ class WarpSolid:
     """Activation times strength [Pa], (world, muscle); None without muscles."""
     others: Mapping[str, wp.array] = field(default_factory=dict)
     """The other inputs that the kernels take, by their names in softmpm/inputs.py."""
-    work: Substep | NodalStep = field(init=False)
+    work: ParticleStep | NodalStep = field(init=False)
 
     def __post_init__(self):
         model, arrays, given = self.model, self.arrays(), {}
@@ -57,7 +58,7 @@ class WarpSolid:
         if model.formulation == "reference":
             work = NodalStep(model)
         else:
-            work = Substep(model)
+            work = ParticleStep(model)
             _bind(work, given)
         object.__setattr__(self, "work", work)
 
@@ -92,7 +93,7 @@ class WarpSolid:
         _raise_failure(model, state, self.work, self.values())
 
 
-def _bind(work: Substep, given: Mapping[Input, wp.array]) -> None:
+def _bind(work: ParticleStep, given: Mapping[Input, wp.array]) -> None:
     """Set the structs of the inputs of a substep of the moving formulation."""
     model = work.model
     work.particle_inputs, work.grid_inputs = particle_struct(model, model.fixed), grid_struct(model, {})
@@ -104,7 +105,7 @@ def _bind(work: Substep, given: Mapping[Input, wp.array]) -> None:
 
 @on_its_gpu
 def _raise_failure(
-    model: Model, state: WarpState | WarpNodal, work: Substep | NodalStep, values: Values
+    model: Model, state: WarpState | WarpNodal, work: ParticleStep | NodalStep, values: Values
 ) -> None:
     if isinstance(work, NodalStep):
         assert isinstance(state, WarpNodal)
@@ -116,17 +117,8 @@ def _raise_failure(
     end = work.leave(state.struct(model))
     if armed(model):
         check_end(model, work.particle_inputs, end, work.words_array, work.last)
-    raise_failure(model, work.words.tolist(), end, values=values)
-
-
-def check_steps(model: Model, wants: str) -> None:
-    """Raise unless this is a model whose substeps can be recorded on a tape."""
-    check_model(model, wants)
-    if model.formulation == "moving" and model.surface is not None:
-        raise ValueError(
-            f"{wants} and softmpm.step need contact='nodes' with formulation='moving', got a model with contact='surface'; take "
-            "softmpm.simulate."
-        )
+    work.check_depth(state.struct(model))
+    raise_failure(model, work.words.tolist(), end, values=values, time=model.scene.dt)
 
 
 def check_own(model: Model, wants: str, **given: WarpState | WarpNodal | WarpSolid) -> None:
@@ -155,14 +147,14 @@ def warp_state(
     """A :class:`WarpState` that holds ``state``, or the rest state if None; in the reference formulation a :class:`WarpNodal`.
 
     Args:
-        solid: In the reference formulation the masses and walls by which nodes are computed from a state without any; None takes the
-            scene's. The moving formulation does not need them.
+        solid: Masses and walls by which nodes, in the reference formulation, or anchors of surface points are computed from a state
+            without any; None takes the scene's.
 
     Raises:
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model and the state.
         UnstableError: A particle is off the grid.
     """
-    check_steps(model, "warp_state")
+    check_model(model, "warp_state")
     if state is not None:
         check_state(model, state)
         if not is_capturing(model):
@@ -172,7 +164,9 @@ def warp_state(
     start = model.rest() if state is None else state
     if model.formulation == "reference":
         return _warp_nodal(model, start, solid, requires_grad)
-    return warp_particles(model, start, requires_grad)
+    if model.surface is not None:
+        start = with_surface(model, start, {} if solid is None else solid.values())
+    return warp_particles(model, start.detach(), requires_grad)
 
 
 @torch.no_grad()
@@ -210,7 +204,7 @@ def warp_solid(
     Raises:
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model, the material, the activation and the inputs.
     """
-    check_steps(model, "warp_solid")
+    check_model(model, "warp_solid")
     params = model.params() if params is None else params
     check_params(model, params)
     check_row(model, activation)

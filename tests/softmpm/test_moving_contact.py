@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from helpers import assert_relative, busy_inputs, cotangent, dot, given, little_memory
 from surface_scenes import G, block, slab, velocity
 
 import softmpm
 from softmpm import Inputs, reference_moving_contact
 from softmpm.inputs import QUANTITIES
+from softmpm.kernels.structs import types
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
 from softmpm.surface_points import CarriedPoints
@@ -155,6 +157,50 @@ def test_gradients_are_central_differences():
             ends = [loss_of(run(model, leaves | {name: leaves[name] + sign * h * d})) for sign in (1, -1)]
         want = (ends[0] - ends[1]).item() / (2 * h)
         assert (slope * d).sum().item() == pytest.approx(want, rel=1e-6), name
+
+
+def test_a_tape_gives_the_gradients_of_simulate(device):
+    """The end and the gradients of steps, each of which is a control step, with walls that move: ≤ 1e-12."""
+    model = build(pressed(2), device=device, worlds=2, inputs=NAMES, contact_width=0.05, scheme="plain")
+    leaves = {name: leaf.detach() for name, leaf in leaves_of(model).items()}
+    leaves |= {name: leaves[name].requires_grad_() for name in ("x", "anchor", "friction", "viscosity")}
+    given = {name: leaves[name][:2] for name in WALLS[:2]} | {"wall_velocity": leaves["wall_velocity"][:1]}
+    given |= {name: leaves[name] for name in ("gravity", "friction", "viscosity")}
+    params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
+    row, t = leaves["activation"][:1], types(2, "float64")
+    end = softmpm.simulate(model, start_of(leaves), row, params, substeps=1, inputs=Inputs(**given))
+    weights = [
+        cotangent(softmpm.State(*4 * [part]), seed=k)[0] for k, part in enumerate(end.differentiable())
+    ]
+    names = ("x", "anchor", "friction", "viscosity")
+    want = torch.autograd.grad(end.differentiable(), [leaves[name] for name in names], weights)
+
+    still = Inputs(**{name: value.detach() for name, value in given.items()})
+    solid = softmpm.warp_solid(model, params, row[0], still, requires_grad=True)
+    start = start_of({name: leaf.detach() for name, leaf in leaves.items()})
+    first = softmpm.warp_state(model, start, requires_grad=True)
+    second, tape = softmpm.warp_state(model, requires_grad=True), wp.Tape()
+    softmpm.step(model, first, second, solid, tape=tape)
+    for got, one in zip(
+        softmpm.torch_state(model, second).differentiable(), end.differentiable(), strict=True
+    ):
+        assert_relative(got, one.detach(), 1e-12)
+    assert second.anchor is not None and second.force is not None
+    weights[0] *= model.scene.grid.spacing
+    arrays = zip((second.fx, second.v, second.C, second.H, second.anchor, second.force), weights, strict=True)
+    kinds = (t.vec, t.vec, t.mat, t.mat, t.vec, t.vec)
+    tape.backward(
+        grads={
+            array: wp.from_torch(weight.contiguous(), dtype=kind)
+            for (array, weight), kind in zip(arrays, kinds, strict=True)
+        }
+    )
+    assert first.anchor is not None
+    found = (first.fx, first.anchor, solid.others["friction"], solid.others["viscosity"])
+    for name, array, one in zip(names, found, want, strict=True):
+        got = wp.to_torch(array.grad) / (model.scene.grid.spacing if name == "x" else 1.0)
+        assert_relative(got, one, 1e-12, name)
+    solid.raise_failure(model, second)
 
 
 def test_calls_in_turn_are_one_call(scheme, monkeypatch):
@@ -339,14 +385,12 @@ def test_places_are_exact_for_affine_motion():
 
 
 def test_what_cannot_be_is_refused(settled):
-    """Fixed-point sums, `step`, and a state of another model."""
+    """Fixed-point sums, and a state of another model."""
     model, state = settled
     with pytest.raises(ValueError, match="deterministic=True has no contact at surface points in the fast"):
         build(slab(), deterministic=True)
     ordered = build(slab(), dtype=torch.float32, deterministic=True, scheme="auto")
     assert "plain: deterministic contact at surface points" in ordered.describe()
-    with pytest.raises(ValueError, match="need contact='nodes' with formulation='moving'"):
-        softmpm.warp_state(model)
     args = (None, model.params())
     at_nodes = softmpm.build(slab(), device="cpu", dtype=torch.float64)
     with pytest.raises(ValueError, match="state.surface must be None"):

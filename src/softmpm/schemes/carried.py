@@ -151,6 +151,16 @@ class SurfaceContact:
         launch(self.kernels.check_end, self.points, *arguments, block_dim=POINT_BLOCK)
 
 
+def contact_on_grid(model: Model, chunk: Chunk, keep: bool) -> SurfaceContact:
+    """Contact of points on particles in the user's order, whose nodes are those of the whole grid."""
+    t = types(model.spec.dim, model.spec.dtype)
+    window = t.Window()
+    window.shape, window.count = t.ivec(*model.scene.grid.shape), model.node_count
+    origin = torch.zeros(model.worlds, model.dim, dtype=torch.int32, device=model.device)
+    window.origin = view(origin, t.ivec)
+    return SurfaceContact(model, window, chunk, keep, packed=False)
+
+
 def check_start(model: Model, start: State, values: Values, words: Tensor) -> None:
     """Check the depth of the points in the initial state of a call, with the inputs of its first substep."""
     known = model.fixed | values

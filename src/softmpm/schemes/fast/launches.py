@@ -2,8 +2,8 @@
 
 import math
 
-from softmpm.kernels.fast.alarms import packed_alarms
 from softmpm.kernels.carried.grid_stage import contact_stage
+from softmpm.kernels.fast.alarms import packed_alarms
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.native import BLOCK
 from softmpm.kernels.fast.sorting import sorting

@@ -3,33 +3,22 @@
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
-from softmpm.kernels.structs import RequestedGrads, types
+from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.alarm_check import StartCheck, armed, check_end
-from softmpm.schemes.buffers import Motion, MotionAdj, clear, view
-from softmpm.schemes.carried import SurfaceContact, check_start
+from softmpm.schemes.buffers import Motion, MotionAdj, clear
+from softmpm.schemes.carried import check_start, contact_on_grid
 from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values, elapsed, grid_struct, particle_struct
 from softmpm.schemes.plain.footprint import PlainFootprint
 from softmpm.schemes.plain.substep import Substep
 from softmpm.schemes.surface_start import with_surface
 from softmpm.state import State
-
-
-def whole_grid(model: Model):
-    """The whole grid as a window."""
-    t = types(model.spec.dim, model.spec.dtype)
-    window = t.Window()
-    window.shape, window.count = t.ivec(*model.scene.grid.shape), model.node_count
-    origin = torch.zeros(model.worlds, model.dim, dtype=torch.int32, device=model.device)
-    window.origin = view(origin, t.ivec)
-    return window
 
 
 class PlainRun:
@@ -59,7 +48,7 @@ class PlainRun:
         self.structs = [self.states[i].struct(model) for i in range(len(self.states.base))]
         self.contact = None
         if start.surface is not None:
-            self.contact = SurfaceContact(model, whole_grid(model), chunk, keep, packed=False)
+            self.contact = contact_on_grid(model, chunk, keep)
             self.contact.load(chunk, start.surface)
         if frozen:
             self.step.words[list(frozen)] = FROZEN
@@ -110,7 +99,8 @@ class PlainRun:
             clear(adjoints[s % 2].flat)
             states = self.structs[s], self.structs[s + 1], structs[(s + 1) % 2], structs[s % 2]
             inputs = found.particle_struct(row, row), found.grid_struct(row)
-            step.adjoint(wanted, *states, inputs, chunk.length - 1 - s, contact)
+            at = None if contact is None else (*contact, s)
+            step.adjoint(wanted, *states, inputs, chunk.length - 1 - s, at)
             if s == 0 or row != chunk.row(s - 1):
                 found.collect(row, model.fixed, step.launch)
         adj_inputs.add(found, chunk.rows)

@@ -134,23 +134,23 @@ class Substep:
         adj_now,
         adj_inputs: tuple,
         substep: int,
-        contact: tuple[SurfaceContact, SurfaceContactAdj] | None = None,
+        contact: tuple[SurfaceContact, SurfaceContactAdj, int] | None = None,
     ) -> None:
         """Adjoint of :meth:`advance`. The grid is recomputed.
 
         Args:
             adj_now, adj_inputs: Added into; the latter are the structs of the inputs of particles and of nodes.
             substep: Number of the substep, counted backward.
-            contact: Contact of the chunk and its adjoint, which is updated.
+            contact: Contact of the chunk, its adjoint, which is updated, and the number of the substep in the chunk.
         """
         adj_particle_inputs, adj_grid_inputs = adj_inputs
         self.to_grid(now)
         clear(self.adj_velocity)
         if contact is not None:
-            self._contact_again(*contact, substep, now)
+            self._contact_again(*contact, now)
         self.g2p_adj(wanted, now, then, adj_then, adj_now, adj_particle_inputs)
         if contact is not None:
-            self._contact_adj(*contact, substep, now, adj_now, adj_grid_inputs)
+            self._contact_adj(*contact, now, adj_now, adj_grid_inputs)
         self.grid_adj(wanted, adj_grid_inputs)
         if contact is not None:
             self.adj_node[..., -1] += self.gained[..., -1]
@@ -162,20 +162,19 @@ class Substep:
         contact.add_loads(now, self._array("load"), self.launch)
         self.free.copy_(self.velocity)
 
-    def _contact_again(self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int, now) -> None:
+    def _contact_again(self, contact: SurfaceContact, back: SurfaceContactAdj, s: int, now) -> None:
         """Contact at surface points once more."""
         self._add_loads(contact, now)
-        s = contact.chunk.length - 1 - substep
         arguments = (self.grid_inputs, now, self._contact_nodes, self.words_array, self.launch)
         back.press_again(contact, s, *arguments)
 
     def _contact_adj(
-        self, contact: SurfaceContact, back: SurfaceContactAdj, substep: int, now, adj_now, adj_inputs
+        self, contact: SurfaceContact, back: SurfaceContactAdj, s: int, now, adj_now, adj_inputs
     ) -> None:
         """Adjoint of contact at surface points."""
         clear(self.adj_load)
         clear(self.gained)
-        s, adj_load = contact.chunk.length - 1 - substep, self._array("adj_load")
+        adj_load = self._array("adj_load")
         adj_nodes = (self._array("adj_velocity"), adj_load, self._array("gained"))
         inputs = (self.grid_inputs, adj_inputs, now)
         back.press_adj(contact, s, *inputs, self._contact_nodes, *adj_nodes, adj_now, self.launch)
