@@ -7,7 +7,8 @@
               points: the part of L̄ in their adjoints (K9.adj), L of the substep before
     press, g2p2g_adj, press_adj
 
-Sums of two successive substeps have two buffers: one is added to while the other is cleared.
+Sums of two successive substeps have two buffers: one is added to while the other is cleared. The kernels have modules of their own,
+since a GPU compiles a module for each number of threads in a block.
 """
 
 from types import SimpleNamespace
@@ -36,13 +37,13 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 
-    @wp.kernel(module=module_of(spec.module + ".surface", packed=True), enable_backward=False)
+    @wp.kernel(module=module_of(spec.module + ".surface.grid", packed=True), enable_backward=False)
     def clear(one: wp.array2d(dtype=real), other: wp.array2d(dtype=real)):
         world, i = wp.tid()
         one[world, i] = real(0.0)
         other[world, i] = real(0.0)
 
-    @wp.kernel(module=module_of(spec.module + ".surface", packed=True), enable_backward=False)
+    @wp.kernel(module=module_of(spec.module + ".surface.grid", packed=True), enable_backward=False)
     def grid_and_loads(
         # Parameters:
         constants: Constants,
@@ -98,7 +99,9 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 
-    @wp.kernel(module=module_of(adj_module(spec, wanted) + ".surface", packed=True), enable_backward=False)
+    @wp.kernel(
+        module=module_of(adj_module(spec, wanted) + ".surface.grid", packed=True), enable_backward=False
+    )
     def grid_and_loads_adj(
         # Parameters:
         constants: Constants,
