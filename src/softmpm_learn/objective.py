@@ -1,7 +1,23 @@
-"""Objectives: a loss of the final state of a simulation, and running costs of its control steps. Smaller is better."""
+"""Objectives: sums of terms, each a number that a motion should make small, in a window of time. Users add terms of their own.
+
+objective = Objective(
+    Progress(begin=1.0),                             # minus the distance from 1 s on
+    Effort(weight=1e-2),
+    AtMost(Upright(front=front, back=back, rest=rest), most=0.1, weight=10.0),
+)
+
+A term of one's own is a frozen dataclass, so that a resumed run can tell whether it is the same, with a method ``value``:
+
+@dataclass(frozen=True, kw_only=True)
+class Spin(Term):
+    def value(self, path: Path) -> Tensor:
+        return path.C[self.window(path)].diagonal(dim1=-2, dim2=-1).sum(-1).square().mean(dim=(0, 2))
+"""
 
 import functools
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +25,37 @@ import torch
 from torch import Tensor
 
 from softmpm import State
+
+
+class Path:
+    """Motion in an episode, as terms see it: states at the beginning and at the end of every control step.
+
+    Attributes:
+        times: Of the states [s].
+        states: The states. Differentiable.
+        activation: Activations during the control steps [-], shape (step, world, muscle). Differentiable.
+        goal: Goal of each world [m], shape (world, dim), or None if it is the task's own.
+    """
+
+    def __init__(
+        self, times: Sequence[float], states: Sequence[State], activation: Tensor, goal: Tensor | None = None
+    ):
+        self.times, self.states, self.activation, self.goal = list(times), list(states), activation, goal
+
+    @functools.cached_property
+    def x(self) -> Tensor:
+        """Positions [m], shape (state, world, particle, dim)."""
+        return torch.stack([state.x for state in self.states])
+
+    @functools.cached_property
+    def v(self) -> Tensor:
+        """Velocities [m/s], shape (state, world, particle, dim)."""
+        return torch.stack([state.v for state in self.states])
+
+    @functools.cached_property
+    def C(self) -> Tensor:
+        """Affine velocities [1/s], shape (state, world, particle, dim, dim)."""
+        return torch.stack([state.C for state in self.states])
 
 
 class Placed:
@@ -27,48 +74,134 @@ class Placed:
         return self._placed[key]
 
 
-class Running(Placed, ABC):
-    """A term that is averaged over the control steps of an episode."""
+@dataclass(frozen=True, kw_only=True)
+class Term(Placed, ABC):
+    """A term of an objective: its weight times its value. Smaller is better."""
+
+    weight: float = 1.0
+    begin: float = 0.0
+    """The window begins here [s]; the state of that time counts."""
+    end: float = math.inf
+    """The window ends here [s]; the state of that time counts."""
 
     @abstractmethod
-    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
-        """Cost of control steps, shape (..., world), from the positions [m] after them, (..., world, particle, dim), and the
-        activations during them, (..., world, muscle)."""
+    def value(self, path: Path) -> Tensor:
+        """Value of each world, shape (world,). Differentiable."""
+
+    @property
+    def name(self) -> str:
+        """Column of metrics.csv."""
+        return type(self).__name__.lower()
+
+    def window(self, path: Path) -> slice:
+        """The states of the window.
+
+        Raises:
+            ValueError: There is none.
+        """
+        near = 1e-6 * path.times[-1]
+        inside = [k for k, time in enumerate(path.times) if self.begin - near <= time <= self.end + near]
+        if not inside:
+            raise ValueError(
+                f"the objective's term {self.name} has a window from {self.begin:g} to {self.end:g} s without a state; the episode "
+                f"ends at {path.times[-1]:g} s."
+            )
+        return slice(inside[0], inside[-1] + 1)
+
+    def steps(self, path: Path) -> slice:
+        """The control steps that end in the window, but for one that begins before it."""
+        states = self.window(path)
+        return slice(states.start, max(states.stop - 1, states.start + 1))
+
+    def outcome(self, x: np.ndarray, body_length: float) -> str:
+        """What became of it in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
+        return ""
 
 
-@dataclass(frozen=True)
-class Effort(Running):
-    """Mean squared activation (Spielberg et al. 2021 use weights of about 1e-6)."""
+@dataclass(frozen=True, kw_only=True)
+class Progress(Term):
+    """Go far: minus the distance [m] that the mean position travels along an axis within the window."""
 
-    weight: float
+    axis: int = 0
+    particles: np.ndarray | None = None
+    """Indices of the particles that count, None for all."""
 
-    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
-        return self.weight * activation.square().mean(dim=-1)
+    def value(self, path: Path) -> Tensor:
+        states = self.window(path)
+        moved = (path.states[states.stop - 1].x - path.states[states.start].x)[..., self.axis]
+        return -(moved if self.particles is None else moved[:, self.on("particles", moved)]).mean(dim=-1)
+
+    def outcome(self, x: np.ndarray, body_length: float) -> str:
+        moved = float((x[-1] - x[0])[:, self.axis].mean())
+        return f"it travelled {moved:.3f} m, {moved / body_length:.2f} of its length"
 
 
-@dataclass(frozen=True)
-class Height(Running):
-    """Do not fall: weight · max(0, lowest − height)², of the particles' mean height and ``lowest`` [m]."""
+@dataclass(frozen=True, kw_only=True)
+class Reach(Term):
+    """Bring a part to a place and hold it there: mean squared distance [m²] of its mean position from the place."""
 
-    weight: float
+    particles: np.ndarray
+    """Indices of the particles that should get there."""
+    target: np.ndarray
+    """Target position [m], shape (dim,); the goal of an episode, if it has one, takes its place."""
+
+    def value(self, path: Path) -> Tensor:
+        x = path.x[self.window(path)]
+        place = self.on("target", x) if path.goal is None else path.goal
+        return (x[..., self.on("particles", x), :].mean(dim=-2) - place).square().sum(dim=-1).mean(dim=0)
+
+    def outcome(self, x: np.ndarray, body_length: float) -> str:
+        away = float(np.linalg.norm(x[-1, self.particles].mean(axis=0) - self.target))
+        return f"it ended {1000 * away:.0f} mm from the goal"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Still(Term):
+    """Come to rest: mean squared speed [m²/s²] of the mean of some particles."""
+
+    particles: np.ndarray
+    """Indices of the particles."""
+
+    def value(self, path: Path) -> Tensor:
+        v = path.v[self.window(path)]
+        return v[..., self.on("particles", v), :].mean(dim=-2).square().sum(dim=-1).mean(dim=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort(Term):
+    """Mean squared activation [-] (Spielberg et al. 2021 use weights of about 1e-6)."""
+
+    def value(self, path: Path) -> Tensor:
+        return path.activation[self.steps(path)].square().mean(dim=(0, -1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Low(Term):
+    """Do not fall: mean of max(0, lowest − height)² [m²], of the particles' mean height."""
+
     lowest: float
-    axis: int = 1
+    """Height that costs nothing [m]."""
+    up: int = 1
     """Vertical axis."""
 
-    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
-        return self.weight * (self.lowest - x[..., self.axis].mean(dim=-1)).clamp(min=0.0).square()
+    def value(self, path: Path) -> Tensor:
+        height = path.x[self.window(path)][..., self.up].mean(dim=-1)
+        return (self.lowest - height).clamp(min=0.0).square().mean(dim=0)
 
 
-@dataclass(frozen=True)
-class Upright(Running):
-    """Keep level: weight · (slope − slope at rest)², the slope that from the hind part of the robot to its front part."""
+@dataclass(frozen=True, kw_only=True)
+class Tilt(Term):
+    """Keep level: mean squared change of the slope from the hind part of the robot to its front part since rest [-]."""
 
-    weight: float
     front: np.ndarray
     back: np.ndarray
     """Indices of the particles of either part."""
     rest: np.ndarray
     """Rest positions of all particles [m], shape (particle, dim)."""
+    along: int = 0
+    """Axis from back to front."""
+    up: int = 1
+    """Vertical axis."""
 
     @functools.cached_property
     def lever(self) -> np.ndarray:
@@ -76,52 +209,55 @@ class Upright(Running):
         share = np.zeros(len(self.rest))
         share[self.front] += 1 / len(self.front)
         share[self.back] -= 1 / len(self.back)
-        return share / (share @ self.rest[:, 0])
+        return share / (share @ self.rest[:, self.along])
 
-    def __call__(self, x: Tensor, activation: Tensor) -> Tensor:
-        slope = x[..., 1] @ self.on("lever", x)
-        return self.weight * (slope - float(self.lever @ self.rest[:, 1])).square()
-
-
-class Objective(Placed, ABC):
-    """A final loss and running terms."""
-
-    terms: tuple[Running, ...] = ()
-
-    @abstractmethod
-    def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
-        """Loss of each world, shape (world,). ``goal`` [m] of shape (world, dim) if the episode has one of its own."""
-
-    def running(self, x: Tensor, activation: Tensor) -> Tensor:
-        """Cost of control steps, shape (..., world); arguments as of :class:`Running`."""
-        nothing = activation.new_zeros(activation.shape[:-1])
-        return sum((term(x, activation) for term in self.terms), nothing)
+    def value(self, path: Path) -> Tensor:
+        x = path.x[self.window(path)]
+        slope = x[..., self.up] @ self.on("lever", x)
+        return (slope - float(self.lever @ self.rest[:, self.up])).square().mean(dim=0)
 
 
-@dataclass(frozen=True)
-class Progress(Objective):
-    """Go far: minus the distance [m] that the mean position travels along an axis."""
+@dataclass(frozen=True, kw_only=True)
+class AtMost(Term):
+    """The constraint that another term's value is at most ``most``, as a penalty: the square of what is beyond it."""
 
-    axis: int = 0
-    particles: np.ndarray | None = None
-    """Indices of the particles that count, None for all."""
-    terms: tuple[Running, ...] = ()
+    term: Term
+    """Its own window counts, its weight does not."""
+    most: float
 
-    def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
-        moved = end.x[..., self.axis] - start.x[..., self.axis]
-        return -(moved if self.particles is None else moved[:, self.on("particles", moved)]).mean(dim=-1)
+    def value(self, path: Path) -> Tensor:
+        return (self.term.value(path) - self.most).clamp(min=0.0).square()
+
+    @property
+    def name(self) -> str:
+        return f"{self.term.name}_beyond"
 
 
-@dataclass(frozen=True)
-class Reach(Objective):
-    """Bring a part to a place: squared distance [m²] between the mean position of the particles and the place."""
+@dataclass(frozen=True, init=False)
+class Objective:
+    """The sum of terms."""
 
-    particles: np.ndarray
-    """Indices of the particles that should get there."""
-    target: np.ndarray
-    """Target position [m], shape (dim,); the goal of an episode, if it has one, takes its place."""
-    terms: tuple[Running, ...] = ()
+    terms: tuple[Term, ...]
 
-    def final(self, start: State, end: State, goal: Tensor | None) -> Tensor:
-        place = self.on("target", end.x) if goal is None else goal
-        return (end.x[:, self.on("particles", end.x)].mean(dim=1) - place).square().sum(dim=-1)
+    def __init__(self, *terms: Term):
+        object.__setattr__(self, "terms", terms)
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each term; a second one of a name has a number."""
+        names = [term.name for term in self.terms]
+        count = {name: 0 for name in names}
+        for k, name in enumerate(names):
+            count[name] += 1
+            names[k] = f"{name}_{count[name]}" if count[name] > 1 else name
+        return names
+
+    def __call__(self, path: Path) -> dict[str, Tensor]:
+        """Each term with its weight, shape (world,), by its name; the loss is their sum."""
+        return {
+            name: term.weight * term.value(path) for name, term in zip(self.names, self.terms, strict=True)
+        }
+
+    def outcome(self, x: np.ndarray, body_length: float) -> str:
+        """What became of the first term that tells, in words."""
+        return next(filter(None, (term.outcome(x, body_length) for term in self.terms)), "")

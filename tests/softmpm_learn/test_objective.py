@@ -1,77 +1,123 @@
+"""Terms of objectives: values by hand, windows, names, and one that a user writes."""
+
+import math
+from dataclasses import dataclass
+
 import numpy as np
+import pytest
 import torch
+from torch import Tensor
 
 from softmpm import State
-from softmpm_learn.objective import Effort, Height, Progress, Reach, Upright
-
-GENERATOR = torch.Generator().manual_seed(0)
+from softmpm_learn.objective import AtMost, Effort, Low, Objective, Path, Progress, Reach, Still, Term, Tilt
 
 
-def states() -> tuple[State, State]:
-    start, end = (
-        State(x, 0 * x, *(torch.zeros(2, 5, 2, 2) for _ in "CF"))
-        for x in torch.rand(2, 2, 5, 2, generator=GENERATOR)
-    )
-    return start, end
+@pytest.fixture
+def path() -> Path:
+    """Five states, 0.5 s apart, of two worlds of five particles, at random."""
+    random = torch.Generator().manual_seed(0)
+
+    def state() -> State:
+        x, v = torch.rand(2, 2, 5, 2, generator=random)
+        return State(x, v, torch.zeros(2, 5, 2, 2), torch.zeros(2, 5, 2, 2))
+
+    times = [0.0, 0.5, 1.0, 1.5, 2.0]
+    return Path(times, [state() for _ in times], torch.rand(4, 2, 3, generator=random))
 
 
-def test_progress_is_minus_the_way_of_the_mean_position():
-    """Shifting the end by d along the axis lowers the loss by d, in that world only; other axes do not count."""
-    start, end = states()
-    moved = end._replace(x=end.x + torch.tensor([[[0.25, 9.0]], [[0.0, 9.0]]]))
-    change = Progress().final(start, moved, None) - Progress().final(start, end, None)
-    torch.testing.assert_close(change, torch.tensor([-0.25, 0.0]))
-    torch.testing.assert_close(Progress().final(start, start, None), torch.zeros(2))
+def test_progress_is_minus_the_way_of_the_mean_position(path):
+    """From the first state of the window to its last one, of the particles and along the axis that are named."""
+    x = path.x
+    torch.testing.assert_close(Progress().value(path), (x[0] - x[4])[..., 0].mean(dim=1))
+    some = Progress(axis=1, particles=np.array([1, 3]), begin=0.5, end=1.5)
+    torch.testing.assert_close(some.value(path), (x[1] - x[3])[:, [1, 3], 1].mean(dim=1))
 
 
-def test_progress_of_some_particles():
-    """Only the named particles count."""
-    start, end = states()
-    want = -(end.x - start.x)[:, [1, 3], 1].mean(dim=1)
-    torch.testing.assert_close(Progress(axis=1, particles=np.array([1, 3])).final(start, end, None), want)
+def test_reach_is_the_mean_squared_distance_in_the_window(path):
+    """From the target or, where an episode has one, from its own goal; at the end alone if the window begins there."""
+    centre = path.x[:, :, [0, 2]].mean(dim=2)
+    reach = Reach(particles=np.array([0, 2]), target=np.array([0.3, 0.4]), begin=1.0)
+    away = (centre[2:] - torch.tensor([0.3, 0.4])).square().sum(dim=-1)
+    torch.testing.assert_close(reach.value(path), away.mean(dim=0))
+    last = Reach(particles=np.array([0, 2]), target=np.zeros(2), begin=2.0)
+    there = Path(path.times, path.states, path.activation, goal=centre[4] + torch.tensor([0.3, 0.4]))
+    torch.testing.assert_close(last.value(there), torch.full((2,), 0.25))
 
 
-def test_reach_is_zero_at_the_place():
-    """The loss is the squared distance, to the episode's own goal where it has one."""
-    start, end = states()
-    centre = end.x[:, [0, 2]].mean(dim=1)
-    reach = Reach(particles=np.array([0, 2]), target=centre[0].double().numpy() + [0.3, 0.4])
-    torch.testing.assert_close(reach.final(start, end, None)[0], torch.tensor(0.25))
-    torch.testing.assert_close(reach.final(start, end, centre), torch.zeros(2))
+def test_still_is_the_mean_squared_speed_of_the_mean(path):
+    """Particles that move against each other are still."""
+    still = Still(particles=np.array([1, 4]), begin=1.5)
+    want = path.v[3:, :, [1, 4]].mean(dim=2).square().sum(dim=-1).mean(dim=0)
+    torch.testing.assert_close(still.value(path), want)
 
 
-def test_running_terms_add_up():
-    """Effort is the mean squared activation, Height the squared gap below the lowest height; both weighted."""
-    _, state = states()
-    activation = torch.tensor([[0.5, -0.5], [1.0, 0.0]])
-    height = state.x[..., 1].mean(dim=1)
-    lowest = height.max().item() + 0.1
-    got = Progress(terms=(Effort(2.0), Height(3.0, lowest))).running(state.x, activation)
-    torch.testing.assert_close(got, 2 * torch.tensor([0.25, 0.5]) + 3 * (lowest - height) ** 2)
-    torch.testing.assert_close(
-        Progress(terms=(Height(3.0, -9.0),)).running(state.x, activation), torch.zeros(2)
-    )
-    torch.testing.assert_close(Progress().running(state.x, activation), torch.zeros(2))
+def test_effort_counts_the_control_steps_of_the_window(path):
+    """Those that begin and end in it."""
+    torch.testing.assert_close(Effort().value(path), path.activation.square().mean(dim=(0, 2)))
+    late = Effort(begin=1.0, end=2.0)
+    torch.testing.assert_close(late.value(path), path.activation[2:].square().mean(dim=(0, 2)))
 
 
-def test_upright_is_the_squared_slope():
-    """Of the line from the mean of the back to that of the front, beyond its slope at rest."""
-    start, state = states()
-    front, back, rest = np.array([0, 3]), np.array([1, 2, 4]), start.x[0].double().numpy()
+def test_low_and_tilt(path):
+    """The squared gap below the lowest height, and the squared change of slope from back to front, in the mean of the window."""
+    height = path.x[..., 1].mean(dim=2)
+    lowest = float(height.median())
+    gap = (lowest - height).clamp(min=0).square().mean(dim=0)
+    torch.testing.assert_close(Low(lowest=lowest).value(path), gap)
+    assert gap.max() > 0
+    front, back, rest = np.array([0, 3]), np.array([1, 2, 4]), path.x[0, 0].double().numpy()
     apart = rest[front].mean(axis=0) - rest[back].mean(axis=0)
-    y = state.x[..., 1].double().numpy()
-    rise = y[:, front].mean(axis=1) - y[:, back].mean(axis=1)
-    want = 3 * torch.from_numpy(((rise - apart[1]) / apart[0]) ** 2).float()
-    upright = Upright(3.0, front, back, rest)
-    torch.testing.assert_close(upright(state.x, torch.zeros(2, 1)), want)
-    torch.testing.assert_close(upright(start.x, torch.zeros(2, 1))[0], torch.tensor(0.0))
+    y = path.x[2:, ..., 1].double().numpy()
+    rise = y[..., front].mean(axis=-1) - y[..., back].mean(axis=-1)
+    tilt = Tilt(front=front, back=back, rest=rest, begin=1.0)
+    want = torch.from_numpy(((rise - apart[1]) / apart[0]) ** 2).float().mean(dim=0)
+    torch.testing.assert_close(tilt.value(path), want)
+    at_rest = Tilt(front=front, back=back, rest=rest, end=0.0)
+    torch.testing.assert_close(at_rest.value(path)[0], torch.tensor(0.0))
 
 
-def test_running_costs_of_many_control_steps_are_each_alone():
-    """A first axis of control steps gives one."""
-    generator = torch.Generator().manual_seed(0)
-    x, activation = torch.rand(3, 2, 5, 2, generator=generator), torch.rand(3, 2, 4, generator=generator)
-    upright = Upright(1.0, np.array([0]), np.array([4]), x[0, 0].numpy())
-    objective = Progress(terms=(Effort(2.0), Height(3.0, 0.5), upright))
-    each = torch.stack([objective.running(*step) for step in zip(x, activation, strict=True)])
-    torch.testing.assert_close(objective.running(x, activation), each)
+def test_a_constraint_costs_what_is_beyond_it(path):
+    """The square of the excess; nothing, and no gradient, within the limit."""
+    effort = Effort(weight=7.0).value(path)
+    most = float(effort.mean())
+    constraint = AtMost(term=Effort(weight=7.0), most=most, weight=3.0)
+    (got,) = Objective(constraint)(path).values()
+    torch.testing.assert_close(got, 3.0 * (effort - most).clamp(min=0.0).square())
+    assert (got > 0).sum() == 1 and constraint.name == "effort_beyond"
+
+
+def test_an_objective_is_the_sum_of_its_terms(path):
+    """Weighted and by name; a second term of a name has a number."""
+    objective = Objective(Progress(), Effort(weight=2.0), Progress(axis=1, weight=0.5))
+    parts = objective(path)
+    assert list(parts) == objective.names == ["progress", "effort", "progress_2"]
+    torch.testing.assert_close(parts["effort"], 2.0 * Effort().value(path))
+    torch.testing.assert_close(parts["progress_2"], 0.5 * Progress(axis=1).value(path))
+
+
+def test_a_term_of_a_user(path):
+    """A frozen dataclass with a value."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Spread(Term):
+        def value(self, path: Path) -> Tensor:
+            return path.x[self.window(path)].var(dim=2).sum(dim=-1).mean(dim=0)
+
+    (got,) = Objective(Spread(weight=2.0, begin=1.5))(path).values()
+    torch.testing.assert_close(got, 2.0 * path.x[3:].var(dim=2).sum(dim=-1).mean(dim=0))
+
+
+def test_a_window_without_states_is_refused(path):
+    """The message has the window and the end of the episode."""
+    with pytest.raises(ValueError, match="window from 2.5 to inf s without a state; the episode ends at 2 s"):
+        Effort(begin=2.5).value(path)
+
+
+def test_outcomes_in_words():
+    """Of the first term that has one."""
+    x = np.zeros((2, 3, 2))
+    x[1, :, 0] = 0.6
+    reach = Reach(particles=np.array([0]), target=np.array([0.6, 0.004]))
+    assert Objective(Effort(), Progress()).outcome(x, 0.3) == "it travelled 0.600 m, 2.00 of its length"
+    assert Objective(reach).outcome(x, math.nan) == "it ended 4 mm from the goal"
+    assert Objective(Effort()).outcome(x, 0.3) == ""
