@@ -34,11 +34,11 @@ class Learner:
         return [self.autoencoder] if self.target is None else [self.autoencoder, self.target]
 
     def add_observations(self, first: int, observations: Tensor) -> None:
-        """Add the simulations of all worlds, shape (frame, world, dim, *nodes), to the replay buffer, numbered from ``first`` on.
+        """Add the simulations of an iteration, shape (frame, world, dim, *nodes), to the replay buffer, numbered from ``first`` on.
 
-        If they exceed the capacity of the buffer, only the last ones are written.
+        Of many worlds only the first are written, see :attr:`softmpm_learn.replay.Replay.per_iteration`.
         """
-        for world in range(observations.shape[1])[-self.replay.simulations :]:
+        for world in range(observations.shape[1])[: self.replay.per_iteration]:
             self.replay.add(first + world, observations[:, world])
 
     def learn(self, generator: torch.Generator) -> dict[str, float]:

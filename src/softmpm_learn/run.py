@@ -90,6 +90,7 @@ class Run:
             simulations=learning.simulations if learning.replay else since_last,
             megabytes=learning.megabytes,
             validation=learning.validation,
+            worlds=self.settings.train.worlds,
         )
         self.learner = Learner(learning, autoencoder.to(model.device, model.dtype), replay)
         return Latent(picture, self.learner.encoder, size)

@@ -184,15 +184,15 @@ class LearningConf:
     kl: float = 1e-4
     """Weight of the Kullback-Leibler term of the variational autoencoder; the value of later work of the authors."""
     early_stopping: bool = True
-    """Refinement 1: stop when the loss on simulations held out stops falling, and keep the best weights."""
+    """Refinement 1: stop when the loss on iterations held out stops falling, and keep the best weights."""
     patience: int = 5
     """Epochs without a better validation loss before stopping."""
     validation: float = 0.2
-    """Share of the simulations that are held out for validation."""
+    """Share of the iterations that are held out for validation, in blocks; their neighbours are used for neither."""
     replay: bool = True
     """Refinement 2: learn from many past simulations; False learns from those since the last learning phase."""
     simulations: int = 50
-    """Most simulations in the replay buffer; the oldest go first."""
+    """Most simulations in the replay buffer; the oldest go first. Of many worlds it takes a fifteenth of this in each iteration."""
     megabytes: float = 256.0
     """Most memory of the replay buffer [MB]; the oldest simulations go first."""
     frame_every: int = 2

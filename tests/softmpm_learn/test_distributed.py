@@ -138,7 +138,8 @@ def assert_same(folder: Path, other: Path) -> None:
     for part in ("autoencoder", "target"):
         torch.testing.assert_close(now["learner"][part], want["learner"][part], rtol=SAME, atol=SAME)
     assert torch.equal(now["generator"], want["generator"]) and now["iteration"] == want["iteration"] == 3
-    assert list(now["learner"]["replay"]) == list(want["learner"]["replay"]) == list(range(12))
+    held = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # three worlds of each iteration
+    assert list(now["learner"]["replay"]) == list(want["learner"]["replay"]) == held
 
 
 def assert_in_step(out: Path, name: str) -> None:

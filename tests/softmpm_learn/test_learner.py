@@ -49,7 +49,7 @@ def test_features_are_standardised(tmp_path):
     assert z.mean(dim=0).abs().max() < 0.7 and (z.std(dim=0) - 1).abs().max() < 0.5
 
 
-def test_validation_needs_a_second_simulation(tmp_path):
+def test_validation_needs_an_iteration_held_out(tmp_path):
     """With one simulation there is no validation loss; with both splits filled there is one."""
     _, figures = taught(tmp_path / "one", simulations=1)
     assert figures["validation_loss"] != figures["validation_loss"]
@@ -63,12 +63,14 @@ def test_without_replay_the_past_is_forgotten(tmp_path):
     assert taught(tmp_path / "with")[0].replay.ids == [0, 1, 2, 3]
 
 
-def test_what_cannot_be_kept_is_not_written(tmp_path):
-    """Of more worlds than the buffer holds simulations, the last are kept, and no file is made of the others."""
+def test_of_many_worlds_only_the_first_are_written(tmp_path):
+    """Their numbers are those of the worlds, and no file is made of the others."""
     subject, pictures = learner(tmp_path), torch.cat([seen(number) for number in range(10)], dim=1)
-    subject.add_observations(20, pictures)
-    assert subject.replay.ids == list(range(22, 30)) and len(list(tmp_path.iterdir())) == 8
-    torch.testing.assert_close(torch.cat(subject.replay.split("training")[:1]), pictures[:, 2])
+    subject.replay.simulations, subject.replay.worlds = 45, 10
+    for iteration in range(2):
+        subject.add_observations(10 * iteration, pictures)
+    assert subject.replay.ids == [0, 1, 2, 10, 11, 12] and len(list(tmp_path.iterdir())) == 6
+    torch.testing.assert_close(torch.cat(subject.replay.split("training")[3:4]), pictures[:, 0])
 
 
 def test_goes_on_from_its_state(tmp_path):
