@@ -38,6 +38,7 @@ DESIGN = {
 """Title and unit of each quantity in robot.png."""
 CURVES = {
     "loss": "loss",
+    "evaluation": "loss at the evaluation goals",
     "validation_loss": "validation loss of the autoencoder",
     "effort": "activation, root mean square",
     "young_change": "mean change of Young's modulus",

@@ -12,6 +12,7 @@ from torch import Tensor
 import softmpm
 from softmpm_learn.distributed import OtherProcessError, in_full
 from softmpm_learn.episode import Episode
+from softmpm_learn.evaluation import due, evaluate
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger
 
@@ -52,8 +53,11 @@ def optimise(
             run.backtrack()
             retries += 1
     row |= {f"{name}_change": change for name, change in run.design.change().items()}
-    if row["loss"] < run.best["loss"]:
-        run.best = {"loss": row["loss"], "iteration": run.iteration, **run.policy_snapshot()}
+    value = row["loss"]
+    if run.random_goals:  # the loss is that of the goals drawn
+        value = row["evaluation"] = evaluate(run) if due(run) else math.nan
+    if value < run.best["loss"]:
+        run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
     run.snapshot()
     run.optimizer.step()
     return row | {"retries": retries, "best": run.best["loss"]}, episode.observations
@@ -67,24 +71,9 @@ def attempt(run: Run, goal, run_logger: RunLogger | None, seconds) -> tuple[Epis
         else contextlib.nullcontext()
     )
     with clock(seconds, "episode"):
-        with _all_worlds(run), recorded as on_frame:
+        with run.failing_together(), recorded as on_frame:
             episode, gradients = run.loop(goal, on_frame)
         return episode, take_gradient(run, episode, gradients)
-
-
-@contextlib.contextmanager
-def _all_worlds(run: Run) -> Iterator[None]:
-    """A simulation that fails in one process fails in every one; the message has the world's number among all worlds."""
-    with run.group.fail_together(softmpm.UnstableError):
-        try:
-            yield
-        except softmpm.UnstableError as error:
-            if run.group.size > 1:
-                world = run.worlds[error.world]
-                error.add_note(
-                    f"This was in process {run.group.rank}, whose world {error.world} is world {world} of the run."
-                )
-            raise
 
 
 def take_gradient(run: Run, episode: Episode, gradients: Sequence[Tensor]) -> dict[str, float]:

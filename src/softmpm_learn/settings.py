@@ -219,18 +219,24 @@ class TrainConf:
     iterations: int = 100
     """Gradient steps, each after one simulation; the paper's experiments take 100."""
     seed: int = 0
-    """Everything random follows from it: on a CPU, the same seed gives the same run to the last bit."""
+    """Everything random follows from it, in a stream of its own for each part: on a CPU, the same seed gives the same run to the last
+    bit, and runs that differ in one part share the random numbers of the others."""
     worlds: int = 1
     """Simulations side by side in each step, of all processes together; useful with random goals."""
     goal_spread: list[float] = field(default_factory=list)
     """Half widths [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
+    evaluate_every: int = 10
+    """Random goals: iterations between two evaluations at fixed goals, by which the best policy is chosen; each takes the time of a few
+    simulations without gradient."""
+    evaluation_goals: int = 8
+    """Random goals: least number of fixed goals in the box, the same in every run; rounded up to fill all worlds."""
     record_every: int = 10
     """Record the first, every such, the last and the best episode to run.h5; 0 records nothing."""
     frame_every: int = 1
     """Control steps between two recorded frames."""
 
     def __post_init__(self):
-        _positive("train", self, "iterations", "worlds", "frame_every")
+        _positive("train", self, "iterations", "worlds", "frame_every", "evaluate_every", "evaluation_goals")
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
         if any(not (math.isfinite(s) and s >= 0) for s in self.goal_spread):

@@ -165,9 +165,8 @@ def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
             run.learner.add_observations(run.iteration * run.settings.train.worlds, pictures)
     row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
-        row |= run.group.once(run.learner.learn, run.generator) or {}
+        row |= run.group.once(run.learner.learn) or {}
         run.group.broadcast_(t for network in run.learner.networks for t in network.state_dict().values())
-        run.generator.set_state(run.group.broadcast(run.generator.get_state()))
     return row
 
 

@@ -50,10 +50,13 @@ def unbroken(task, model, settings, tmp_path) -> Path:
 
 
 def assert_same(folder: Path, unbroken: Path) -> None:
-    """Metrics equal to the byte, and final weights, replay and generator to the bit."""
+    """Metrics equal to the byte, and final weights, replay and random streams to the bit."""
     assert (folder / "metrics.csv").read_bytes() == (unbroken / "metrics.csv").read_bytes()
     a, b = (checkpoint.load(f) for f in (folder, unbroken))
-    assert torch.equal(a["generator"], b["generator"]) and a["learner"]["replay"] == b["learner"]["replay"]
+    assert torch.equal(a["goals"], b["goals"]) and a["learner"]["replay"] == b["learner"]["replay"]
+    assert all(
+        torch.equal(a["learner"]["streams"][k], b["learner"]["streams"][k]) for k in ("minibatches", "noise")
+    )
     for part in ("policy", "design"):
         assert all(torch.equal(a[part][k], b[part][k]) for k in a[part])
     for part in ("autoencoder", "target"):
@@ -308,7 +311,7 @@ def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
     train.train(task, model, conf, tmp_path)
     result = train.train(task, model, copy_of(conf, train=dict(iterations=6)), tmp_path)
     found = rows(tmp_path)
-    assert result.finished and list(found[0])[10:15] == [
+    assert result.finished and list(found[0])[11:16] == [
         f"{n}_change" for n in ("young", "poisson", "density", "strength")
     ] + ["epochs"]
     assert float(found[0]["strength_change"]) == 0 < float(found[-1]["strength_change"])
