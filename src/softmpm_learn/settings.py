@@ -171,8 +171,8 @@ class LearningConf:
 
     every: int = 5
     """Optimisation steps between two learning phases."""
-    epochs: int = 20
-    """Most epochs in a learning phase."""
+    epochs: int = 100
+    """Most epochs in a learning phase. Early stopping ends most phases before; the first takes about fifty."""
     batches: int = 8
     """Minibatches in an epoch."""
     batch: int = 32
@@ -186,7 +186,10 @@ class LearningConf:
     early_stopping: bool = True
     """Refinement 1: stop when the loss on iterations held out stops falling, and keep the best weights."""
     patience: int = 5
-    """Epochs without a better validation loss before stopping."""
+    """Epochs without a validation loss that is better by ``improvement`` before stopping."""
+    improvement: float = 0.01
+    """Share by which the validation loss must fall to count as better. Our choice: in a run of the biped every phase then stopped by
+    itself, at a loss at most 11 % above the lowest of 60 epochs; with 0 most phases ran on for ever smaller gains."""
     validation: float = 0.2
     """Share of the iterations that are held out for validation, in blocks; their neighbours are used for neither."""
     replay: bool = True
@@ -206,6 +209,8 @@ class LearningConf:
         _positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")
         _positive("learning", self, "simulations", "megabytes", "frame_every")
         _share("learning", self, "target_rate")
+        if not 0.0 <= self.improvement < 1.0:
+            raise ValueError(f"learning.improvement must lie in [0, 1), got {self.improvement}.")
         if not 0.0 < self.validation <= 0.5:
             raise ValueError(f"learning.validation must lie in (0, 0.5], got {self.validation}.")
         if not (math.isfinite(self.kl) and self.kl >= 0):
