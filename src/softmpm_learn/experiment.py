@@ -204,6 +204,10 @@ def farewell(result: Result, task: Task, out: Path) -> str:
         lines.append(
             f"Best loss {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}."
         )
+    if count := result.run.fallback.count:
+        lines.append(
+            f"It fell far below its best and went back to it: {count} time{'s' if count > 1 else ''}."
+        )
     shown = _relative(out)
     if not result.finished:
         lines.append(f"Stopped after {result.run.iteration} iterations.")

@@ -58,9 +58,23 @@ def optimise(
         value = row["evaluation"] = evaluate(run) if due(run) else math.nan
     if value < run.best["loss"]:
         run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
-    run.snapshot()
-    run.optimizer.step()
-    return row | {"retries": retries, "best": run.best["loss"]}, episode.observations
+    row |= {"retries": retries, "best": run.best["loss"], "fallbacks": int(step_or_fall_back(run, value))}
+    return row, episode.observations
+
+
+def step_or_fall_back(run: Run, loss: float) -> bool:
+    """Take the step along the gradient, or go back to the best; True for the latter."""
+    conf = run.settings.optimizer
+    if not run.fallback.is_due(loss, run.best["loss"], conf):
+        run.snapshot()
+        run.optimizer.step()
+        return False
+    run.fall_back()
+    logger.warning(
+        "Iteration %d: for %d iterations the progress was below %g of the best; going back to iteration %d, with rates times %g.",
+        *(run.iteration, conf.fallback_after, conf.fallback_share, run.best["iteration"], conf.fallback_rate),
+    )
+    return True
 
 
 def attempt(run: Run, goal, run_logger: RunLogger | None, seconds) -> tuple[Episode, dict[str, float]]:

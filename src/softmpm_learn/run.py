@@ -1,6 +1,7 @@
 """Components of a run: observer, policy, design, optimiser and learner, built from settings, saved and restored together."""
 
 import contextlib
+import dataclasses
 import json
 import math
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.fallback import Fallback
 from softmpm_learn.identity import identity, identity_of_settings
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Centroids, Latent, Observer, VelocityImage, clusters
@@ -44,6 +46,7 @@ class Run:
         goals: Random stream of the goals.
         safe: Values of policy and design in the last simulation that did not fail.
         best: The lowest loss so far, at the evaluation goals if goals are drawn at random, and what gave it.
+        fallback: Decides when the run goes back to its best.
         loop: Simulates and differentiates what is above as it is.
     """
 
@@ -57,6 +60,7 @@ class Run:
             )
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
+        self.fallback = Fallback()
         self.goals = stream(settings.train.seed, "goals")
         self.learner: Learner | None = None
         self.observer = self._make_observer(out)
@@ -134,6 +138,14 @@ class Run:
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
 
+    def fall_back(self) -> None:
+        """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments."""
+        self.load_policy(self.best)
+        self.optimizer.state.clear()
+        for group in self.optimizer.param_groups:
+            group["lr"] *= self.settings.optimizer.fallback_rate
+        self.snapshot()
+
     def draw_goals(self) -> Tensor | None:
         """A goal for each world [m], shape (world, dim), or None for the task's own.
 
@@ -188,13 +200,23 @@ class Run:
         return None if self._goal is None else self._goal.centre.expand(self.model.worlds, -1)
 
     def policy_snapshot(self) -> dict:
-        """Copies of what decides how the robot moves: policy, design and what the policy sees through."""
-        parts = {"observer": self.observer, "policy": self.policy, "design": self.design}
-        return {name: {k: t.clone() for k, t in part.state_dict().items()} for name, part in parts.items()}
+        """Copies of what decides how the robot moves, policy, design and what the policy sees through, and of the autoencoder."""
+        return {
+            name: {k: t.clone() for k, t in part.state_dict().items()} for name, part in self._moving.items()
+        }
 
     def load_policy(self, snapshot: dict) -> None:
-        for name in ("observer", "policy", "design"):
-            getattr(self, name).load_state_dict(snapshot[name])
+        for name, part in self._moving.items():
+            part.load_state_dict(snapshot[name])
+
+    @property
+    def _moving(self) -> dict[str, nn.Module]:
+        parts: dict[str, nn.Module] = {
+            "observer": self.observer,
+            "policy": self.policy,
+            "design": self.design,
+        }
+        return parts if self.learner is None else parts | {"autoencoder": self.learner.autoencoder}
 
     def state_dict(self) -> dict:
         return {
@@ -207,6 +229,7 @@ class Run:
             "learner": None if self.learner is None else self.learner.state_dict(),
             "safe": self.safe,
             "best": self.best,
+            "fallback": dataclasses.asdict(self.fallback),
         }
 
     def load_state_dict(self, content: dict) -> None:
@@ -230,6 +253,7 @@ class Run:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, self.best = content["iteration"], content["best"]
+        self.fallback = Fallback(**content["fallback"])
         self._check_shapes()
 
     def _check_shapes(self) -> None:

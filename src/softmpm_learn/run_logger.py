@@ -27,7 +27,7 @@ def metrics(run: Run) -> list[str]:
     """Columns of metrics.csv; nothing in it depends on the clock."""
     return [
         *("loss", "final", "running", "evaluation", "best", "effort"),
-        *("gradient_policy", "gradient_design", "clipped", "retries"),
+        *("gradient_policy", "gradient_design", "clipped", "retries", "fallbacks"),
         *(f"{name}_change" for name in run.design.change()),
         *("epochs", "training_loss", "validation_loss", "replay"),
     ]
