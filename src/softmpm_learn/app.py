@@ -30,10 +30,10 @@ from softmpm_learn.checkpoint import LockedError
 from softmpm_learn.config import RunConf, conf_dir, to_run, unknown_key
 from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
 from softmpm_learn.experiment import run_experiment
+from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.saved import load
 from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import TASKS
-from softmpm_learn.train import TrainingError
 
 CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "device")
 """Settings that may differ when a run is resumed: its length, the recorded episodes and the device."""

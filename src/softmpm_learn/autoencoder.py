@@ -7,6 +7,7 @@ Kingma & Welling 2014, "Auto-encoding variational Bayes". Layers and channels ar
 
 import copy
 import itertools
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from softmpm_learn.settings import LearningConf
+
+logger = logging.getLogger("softmpm_learn")
 
 QUIET = 0.1
 """A latent that deviates less than this, in units of the prior, is not blown up to deviation 1: it says next to nothing."""
@@ -146,9 +149,9 @@ class Learned:
     epochs: int
     """Epochs that were run."""
     training: float
-    """Mean loss of the last epoch."""
+    """Mean loss of the last epoch; nan if it was undone because of such a loss."""
     validation: float
-    """Loss of the final weights on held-out simulations; nan if there are none yet."""
+    """Loss of the final weights on held-out iterations; nan if there are none yet."""
 
 
 def train_autoencoder(
@@ -159,22 +162,27 @@ def train_autoencoder(
     conf: LearningConf,
     generator: torch.Generator,
 ) -> Learned:
-    """Train on minibatches from ``sample``; with early stopping restore the weights of lowest validation loss, even the initial ones.
+    """Train on minibatches from ``sample``.
+
+    Early stopping ends where the validation loss has not fallen by ``conf.improvement`` for ``conf.patience`` epochs, and restores the
+    weights of the lowest one, even the initial ones, with the optimiser as it was there. An epoch after which a weight or a moment is
+    not finite ends the phase too, and is undone.
 
     Args:
         sample: Gives a minibatch of velocities [m/s], shape (batch, dim, *nodes).
-        validation: Velocity images of other simulations, or None; without them there is no early stopping.
+        validation: Velocity images of other iterations, or None; without them there is no early stopping.
         generator: Source of the variational noise.
     """
     kl = conf.kl if conf.variational else None
-    best_loss, best, training, waited, epochs = float("inf"), None, float("nan"), 0, 0
+    stops = conf.early_stopping and validation is not None
+    training, waited, epochs = float("nan"), 0, 0
 
-    def validation_loss(pictures: Tensor) -> float:
+    def validation_loss() -> float:
         with torch.no_grad():
-            return autoencoder.loss(pictures, kl).item()
+            return float("nan") if validation is None else autoencoder.loss(validation, kl).item()
 
-    if validation is not None:
-        best_loss, best = validation_loss(validation), copy.deepcopy(autoencoder.state_dict())
+    best = level = validation_loss()
+    kept = _copied(autoencoder, optimizer)
     while epochs < conf.epochs and waited < conf.patience:
         losses = []
         for _ in range(conf.batches):
@@ -184,14 +192,29 @@ def train_autoencoder(
             optimizer.step()
             losses.append(loss.detach())
         training, epochs = torch.stack(losses).mean().item(), epochs + 1
-        if validation is None:
-            continue
-        now = validation_loss(validation)
-        if now < best_loss or not conf.early_stopping:
-            best_loss, best, waited = now, copy.deepcopy(autoencoder.state_dict()), 0
-        else:
+        if not _is_finite(autoencoder, optimizer):
+            logger.warning("The autoencoder's weights are not finite after epoch %d; going back.", epochs)
+            break
+        now = validation_loss()
+        if not stops or now < best:
+            best, kept = now, _copied(autoencoder, optimizer)
+        if stops and now < (1 - conf.improvement) * level:
+            level, waited = now, 0
+        elif stops:
             waited += 1
-    if best is None:
-        return Learned(epochs, training, float("nan"))
-    autoencoder.load_state_dict(best)
-    return Learned(epochs, training, best_loss)
+    autoencoder.load_state_dict(kept["autoencoder"])
+    optimizer.load_state_dict(kept["optimizer"])
+    return Learned(epochs, training, best)
+
+
+def _copied(autoencoder: Autoencoder, optimizer: torch.optim.Optimizer) -> dict[str, dict]:
+    return copy.deepcopy({"autoencoder": autoencoder.state_dict(), "optimizer": optimizer.state_dict()})
+
+
+def _is_finite(autoencoder: Autoencoder, optimizer: torch.optim.Optimizer) -> bool:
+    moments = (value for state in optimizer.state.values() for value in state.values())
+    tensors = [
+        *autoencoder.parameters(),
+        *(value for value in moments if isinstance(value, Tensor) and value.dim()),
+    ]
+    return bool(torch.stack([tensor.isfinite().all() for tensor in tensors]).all())

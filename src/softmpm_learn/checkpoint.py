@@ -20,7 +20,7 @@ from torch import Tensor
 from softmpm_learn import files
 
 NAME, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-FORMAT = 2
+FORMAT = 3
 _MARK = b"sha256="
 _FOOTER = len(_MARK) + 64
 

@@ -1,7 +1,8 @@
 """Several processes, one for each GPU, that share the worlds of one run. Started by torchrun; a single process is a group of one.
 
-Every process holds the same policy, design and generator and simulates its share of the worlds. Gradients and figures are averaged, so
-that all take the same step. What is not the same everywhere belongs to the first process: files, the learning phase, the log.
+Every process holds the same policy, design and stream of goals and simulates its share of the worlds. Gradients and figures are
+averaged, so that all take the same step. What is not the same everywhere belongs to the first process: files, the learning phase, the
+log.
 
 No process waits for one that has failed: what may fail in one of them stands in :meth:`Group.fail_together`.
 """

@@ -38,6 +38,7 @@ DESIGN = {
 """Title and unit of each quantity in robot.png."""
 CURVES = {
     "loss": "loss",
+    "evaluation": "loss at the evaluation goals",
     "validation_loss": "validation loss of the autoencoder",
     "effort": "activation, root mean square",
     "young_change": "mean change of Young's modulus",
@@ -202,6 +203,10 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     if math.isfinite(result.best_loss):
         lines.append(
             f"Best loss {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}."
+        )
+    if count := result.run.fallback.count:
+        lines.append(
+            f"It fell far below its best and went back to it: {count} time{'s' if count > 1 else ''}."
         )
     shown = _relative(out)
     if not result.finished:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from softmpm_learn.autoencoder import Autoencoder, train_autoencoder
 from softmpm_learn.replay import Replay
+from softmpm_learn.seeding import stream
 from softmpm_learn.settings import LearningConf
 from softmpm_learn.target import TargetNetwork
 
@@ -18,8 +19,9 @@ MANY = 512
 class Learner:
     """Learns to encode images of grid velocity; the policy uses :attr:`encoder`."""
 
-    def __init__(self, conf: LearningConf, autoencoder: Autoencoder, replay: Replay):
+    def __init__(self, conf: LearningConf, autoencoder: Autoencoder, replay: Replay, seed: int = 0):
         self.conf, self.autoencoder, self.replay = conf, autoencoder, replay
+        self.streams = {name: stream(seed, name) for name in ("minibatches", "noise")}
         self.optimizer = torch.optim.Adam(autoencoder.parameters(), lr=conf.rate)
         self.target = TargetNetwork(autoencoder.encoder) if conf.target_network else None
         self.phases = 0
@@ -34,14 +36,14 @@ class Learner:
         return [self.autoencoder] if self.target is None else [self.autoencoder, self.target]
 
     def add_observations(self, first: int, observations: Tensor) -> None:
-        """Add the simulations of all worlds, shape (frame, world, dim, *nodes), to the replay buffer, numbered from ``first`` on.
+        """Add the simulations of an iteration, shape (frame, world, dim, *nodes), to the replay buffer, numbered from ``first`` on.
 
-        If they exceed the capacity of the buffer, only the last ones are written.
+        Of many worlds only the first are written, see :attr:`softmpm_learn.replay.Replay.per_iteration`.
         """
-        for world in range(observations.shape[1])[-self.replay.simulations :]:
+        for world in range(observations.shape[1])[: self.replay.per_iteration]:
             self.replay.add(first + world, observations[:, world])
 
-    def learn(self, generator: torch.Generator) -> dict[str, float]:
+    def learn(self) -> dict[str, float]:
         """One learning phase; its figures for metrics.csv."""
         training, validation = self.replay.split("training"), self.replay.split("validation")
         if not training:
@@ -52,10 +54,10 @@ class Learner:
         learned = train_autoencoder(
             self.autoencoder,
             self.optimizer,
-            lambda: self.replay.sample(generator, self.conf.batch).to(scale),
+            lambda: self.replay.sample(self.streams["minibatches"], self.conf.batch).to(scale),
             _some(torch.cat(validation)).to(scale) if validation else None,
             self.conf,
-            generator,
+            self.streams["noise"],
         )
         self.autoencoder.standardise(pictures)
         if self.target is not None:
@@ -77,6 +79,7 @@ class Learner:
             "target": None if self.target is None else self.target.state_dict(),
             "replay": self.replay.seal,
             "phases": self.phases,
+            "streams": {name: generator.get_state() for name, generator in self.streams.items()},
         }
 
     def load_state_dict(self, content: dict) -> None:
@@ -86,6 +89,8 @@ class Learner:
             self.target.load_state_dict(content["target"])
         self.replay.load(content["replay"])
         self.phases = content["phases"]
+        for name, generator in self.streams.items():
+            generator.set_state(content["streams"][name])
 
 
 def _some(pictures: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
-"""Replay: grid velocity of many past simulations, bounded in memory, kept on disk, split by simulation.
+"""Replay: grid velocity of many past simulations, bounded in memory, kept on disk, split by iteration.
 
-Whole simulations are held out for validation: neighbouring pictures of one motion are too alike to test on. Each simulation is
-one HDF5 file that is written once and never changed, so a checkpoint need only name its simulations, each with the SHA-256 of
-its file.
+Blocks of iterations are held out for validation, with all their worlds, and the iterations beside a block are used for neither: the
+motions of one iteration, and of two in a row, are too alike to test on. Each simulation is one HDF5 file that is written once and
+never changed, so a checkpoint need only name its simulations, each with the SHA-256 of its file.
 """
 
 import hashlib
@@ -19,6 +19,23 @@ from torch import Tensor
 from softmpm_learn import files
 
 SPLITS = ("training", "validation")
+CYCLE = 15
+"""Iterations after which the split repeats. Our choice: a buffer of 50 simulations has three blocks of either kind."""
+FIRST = 3
+"""Iteration of a cycle with which the held-out block begins: there are pictures to learn from before and, of the newest, after it."""
+
+
+def split_of(iteration: int, validation: float) -> str | None:
+    """Split that the simulations of an iteration belong to, for good; None beside a held-out block.
+
+    Args:
+        validation: Share of the iterations held out, rounded to at least one in a cycle.
+    """
+    block = range(FIRST, FIRST + max(1, round(validation * CYCLE)))
+    if iteration % CYCLE in block:
+        return "validation"
+    beside = (iteration - 1) % CYCLE in block or (iteration + 1) % CYCLE in block
+    return None if beside else "training"
 
 
 class ReplayError(ValueError):
@@ -33,7 +50,8 @@ class Replay:
         shape: That of the pictures of a simulation, (frame, dim, *nodes).
         simulations: Most simulations.
         megabytes: Most memory [MB]; at least the newest simulation stays.
-        validation: Share of the simulations held out: every ⌈1/validation⌉-th, by its number, for good.
+        validation: Share of the iterations held out, see :func:`split_of`.
+        worlds: Simulations of an iteration: number n is of iteration n // worlds.
     """
 
     def __init__(
@@ -44,14 +62,21 @@ class Replay:
         simulations: int,
         megabytes: float = math.inf,
         validation: float = 0.2,
+        worlds: int = 1,
     ):
         self.folder, self.shape = folder, shape
         self.simulations, self.megabytes = simulations, megabytes
-        self.hold_out = round(1 / validation)
+        self.validation, self.worlds = validation, worlds
         self._pictures: dict[int, Tensor] = {}
         self._sha256: dict[int, str] = {}
         with files.named("make the folder", folder):
             folder.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def per_iteration(self) -> int:
+        """Most simulations of an iteration, so that the buffer spans a cycle of the split and has both kinds."""
+        room = 1e6 * self.megabytes / (4 * math.prod(self.shape))
+        return max(1, int(min(self.simulations, room)) // CYCLE)
 
     @property
     def ids(self) -> list[int]:
@@ -89,11 +114,10 @@ class Replay:
         """Pictures of each simulation of ``training`` or ``validation``, (frame, dim, *nodes) each."""
         if name not in SPLITS:
             raise ValueError(f"split must be training or validation, got {name!r}.")
-        last, validation = self.hold_out - 1, name == "validation"
         return [
             pictures
             for number, pictures in self._pictures.items()
-            if (number % self.hold_out == last) == validation
+            if split_of(number // self.worlds, self.validation) == name
         ]
 
     def sample(self, generator: torch.Generator, batch: int, split: str = "training") -> Tensor:

@@ -1,7 +1,10 @@
 """Components of a run: observer, policy, design, optimiser and learner, built from settings, saved and restored together."""
 
+import contextlib
+import dataclasses
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,17 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from softmpm import Model
+from softmpm import Model, UnstableError
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.fallback import Fallback
 from softmpm_learn.identity import identity, identity_of_settings
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Centroids, Latent, Observer, VelocityImage, clusters
 from softmpm_learn.policy import Goal, make_policy
 from softmpm_learn.replay import Replay
-from softmpm_learn.seeding import seeded
+from softmpm_learn.seeding import seeded, stream, stream_seed
 from softmpm_learn.settings import Settings
 
 if TYPE_CHECKING:
@@ -39,9 +43,10 @@ class Run:
         iteration: Iterations done.
         observer, policy, design, optimizer: What is optimised, and how.
         learner: The learning phase, None unless the observer is learned.
-        generator: The only source of randomness after the first weights.
+        goals: Random stream of the goals.
         safe: Values of policy and design in the last simulation that did not fail.
-        best: The lowest loss so far and what gave it.
+        best: The lowest loss so far, at the evaluation goals if goals are drawn at random, and what gave it.
+        fallback: Decides when the run goes back to its best.
         loop: Simulates and differentiates what is above as it is.
     """
 
@@ -55,13 +60,15 @@ class Run:
             )
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
-        self.generator = torch.Generator().manual_seed(settings.train.seed)
+        self.fallback = Fallback()
+        self.goals = stream(settings.train.seed, "goals")
         self.learner: Learner | None = None
         self.observer = self._make_observer(out)
         self._goal = self._make_goal()
         seconds = task.control_steps * task.substeps * model.scene.dt
+        seed = stream_seed(settings.train.seed, "policy")
         policy = make_policy(
-            settings.policy, self.observer.size, model.muscle_count, seconds, settings.train.seed, self._goal
+            settings.policy, self.observer.size, model.muscle_count, seconds, seed, self._goal
         )
         self.policy: nn.Module = policy.to(model.device, model.dtype)
         self.design = Design(settings.design, model, task.regions)
@@ -79,7 +86,8 @@ class Run:
             found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
             return Centroids(model, found, task.body_length)
         picture = VelocityImage(model, conf.nodes, conf.follow)
-        with seeded(self.settings.train.seed):
+        seed = self.settings.train.seed
+        with seeded(stream_seed(seed, "autoencoder")):
             size, channels = conf.latent_size, list(conf.channels)
             autoencoder = Autoencoder(model.dim, picture.shape, size, channels, scale=task.body_length)
         learning = self.settings.learning
@@ -90,8 +98,9 @@ class Run:
             simulations=learning.simulations if learning.replay else since_last,
             megabytes=learning.megabytes,
             validation=learning.validation,
+            worlds=self.settings.train.worlds,
         )
-        self.learner = Learner(learning, autoencoder.to(model.device, model.dtype), replay)
+        self.learner = Learner(learning, autoencoder.to(model.device, model.dtype), replay, seed)
         return Latent(picture, self.learner.encoder, size)
 
     def _make_goal(self) -> Goal | None:
@@ -129,6 +138,14 @@ class Run:
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
 
+    def fall_back(self) -> None:
+        """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments."""
+        self.load_policy(self.best)
+        self.optimizer.state.clear()
+        for group in self.optimizer.param_groups:
+            group["lr"] *= self.settings.optimizer.fallback_rate
+        self.snapshot()
+
     def draw_goals(self) -> Tensor | None:
         """A goal for each world [m], shape (world, dim), or None for the task's own.
 
@@ -136,23 +153,70 @@ class Run:
         """
         if self._goal is None:
             return None
-        conf, mine = self.settings.train, self.worlds
-        spread = torch.tensor(list(conf.goal_spread)).to(self._goal.centre)
-        place = torch.rand(conf.worlds, self.model.dim, generator=self.generator, dtype=spread.dtype)
-        return self._goal.centre + spread * (2 * place[mine.start : mine.stop].to(spread.device) - 1)
+        size = self.settings.train.worlds, self.model.dim
+        return self._goals_at(self._goal, torch.rand(size, generator=self.goals, dtype=self.model.dtype))
+
+    def evaluation_goals(self) -> list[Tensor]:
+        """Goals to evaluate at, as :meth:`draw_goals`, one tensor for each simulation of all worlds.
+
+        The points of a Sobol sequence: they fill the box evenly, begin with its middle, and are the same in every run.
+        """
+        if self._goal is None:
+            return []
+        conf = self.settings.train
+        rounds = math.ceil(conf.evaluation_goals / conf.worlds)
+        sobol = torch.quasirandom.SobolEngine(self.model.dim)
+        sobol.fast_forward(1)  # past the corner
+        places = sobol.draw(rounds * conf.worlds, dtype=self.model.dtype)
+        return [self._goals_at(self._goal, place) for place in places.split(conf.worlds)]
+
+    def _goals_at(self, goal: Goal, place: Tensor) -> Tensor:
+        """Goals of this process's worlds at places in the box, shape (world, dim), each in [0, 1]."""
+        spread = torch.tensor(list(self.settings.train.goal_spread)).to(goal.centre)
+        mine = place[self.worlds.start : self.worlds.stop].to(spread.device)
+        return goal.centre + spread * (2 * mine - 1)
+
+    @property
+    def random_goals(self) -> bool:
+        """True if every simulation draws its own goal."""
+        return self._goal is not None
+
+    @contextlib.contextmanager
+    def failing_together(self) -> Iterator[None]:
+        """A simulation that fails in one process fails in every one; the message has the world's number among all worlds."""
+        with self.group.fail_together(UnstableError):
+            try:
+                yield
+            except UnstableError as error:
+                if self.group.size > 1:
+                    world = self.worlds[error.world]
+                    error.add_note(
+                        f"This was in process {self.group.rank}, whose world {error.world} is world {world} of the run."
+                    )
+                raise
 
     def middle_goals(self) -> Tensor | None:
         """As :meth:`draw_goals`, without chance: the middle of the box."""
         return None if self._goal is None else self._goal.centre.expand(self.model.worlds, -1)
 
     def policy_snapshot(self) -> dict:
-        """Copies of what decides how the robot moves: policy, design and what the policy sees through."""
-        parts = {"observer": self.observer, "policy": self.policy, "design": self.design}
-        return {name: {k: t.clone() for k, t in part.state_dict().items()} for name, part in parts.items()}
+        """Copies of what decides how the robot moves, policy, design and what the policy sees through, and of the autoencoder."""
+        return {
+            name: {k: t.clone() for k, t in part.state_dict().items()} for name, part in self._moving.items()
+        }
 
     def load_policy(self, snapshot: dict) -> None:
-        for name in ("observer", "policy", "design"):
-            getattr(self, name).load_state_dict(snapshot[name])
+        for name, part in self._moving.items():
+            part.load_state_dict(snapshot[name])
+
+    @property
+    def _moving(self) -> dict[str, nn.Module]:
+        parts: dict[str, nn.Module] = {
+            "observer": self.observer,
+            "policy": self.policy,
+            "design": self.design,
+        }
+        return parts if self.learner is None else parts | {"autoencoder": self.learner.autoencoder}
 
     def state_dict(self) -> dict:
         return {
@@ -161,10 +225,11 @@ class Run:
             "policy": self.policy.state_dict(),
             "design": self.design.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
+            "goals": self.goals.get_state(),
             "learner": None if self.learner is None else self.learner.state_dict(),
             "safe": self.safe,
             "best": self.best,
+            "fallback": dataclasses.asdict(self.fallback),
         }
 
     def load_state_dict(self, content: dict) -> None:
@@ -183,11 +248,12 @@ class Run:
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])
-        self.generator.set_state(content["generator"])
+        self.goals.set_state(content["goals"])
         if self.learner is not None:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, self.best = content["iteration"], content["best"]
+        self.fallback = Fallback(**content["fallback"])
         self._check_shapes()
 
     def _check_shapes(self) -> None:

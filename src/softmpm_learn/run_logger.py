@@ -26,8 +26,8 @@ TIMING = ["episode", "learn", "save"]
 def metrics(run: Run) -> list[str]:
     """Columns of metrics.csv; nothing in it depends on the clock."""
     return [
-        *("loss", "final", "running", "best", "effort"),
-        *("gradient_policy", "gradient_design", "clipped", "retries"),
+        *("loss", "final", "running", "evaluation", "best", "effort"),
+        *("gradient_policy", "gradient_design", "clipped", "retries", "fallbacks"),
         *(f"{name}_change" for name in run.design.change()),
         *("epochs", "training_loss", "validation_loss", "replay"),
     ]

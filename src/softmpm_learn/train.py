@@ -13,37 +13,24 @@ all, and saves. To learn the same everywhere would take a replay buffer in each 
 
 import contextlib
 import logging
-import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-import softmpm
 from softmpm import Model
 from softmpm_learn import checkpoint, files
-from softmpm_learn.distributed import Group, OtherProcessError, in_full
-from softmpm_learn.episode import Episode, run_episode
+from softmpm_learn.distributed import Group
+from softmpm_learn.episode import run_episode
+from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.replay import ReplayError
 from softmpm_learn.run import Run, SettingsError
 from softmpm_learn.run_logger import TIMING, RunLogger
 from softmpm_learn.settings import Settings
 
 logger = logging.getLogger("softmpm_learn")
-
-
-class TrainingError(RuntimeError):
-    """A simulation failed or a gradient is not finite; the checkpoint of the iterations before is on the disk."""
-
-    def __init__(self, iteration: int, problem: str):
-        super().__init__(
-            f"iteration {iteration}: {problem} The run up to there is saved; what helps is a smaller time step "
-            "(task.safety), smaller learning rates, tighter bounds of the design, or optimizer.max_norm."
-        )
-        self.iteration = iteration
 
 
 @dataclass(frozen=True)
@@ -83,7 +70,7 @@ def train(
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
 
     Raises:
-        TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
+        softmpm_learn.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
         softmpm_learn.distributed.OtherProcessError: The first process cannot go on, and says why.
         ValueError: Settings that do not go together, or with the checkpoint; a file in ``out`` that is a link, damaged or of another
             run.
@@ -149,13 +136,13 @@ def _loop(run: Run, run_logger: RunLogger | None, progress, stop) -> Result:
     while run.iteration < last and not group.any(stop()):
         k = run.iteration
         row, observations = optimise(run, run_logger, seconds)
-        with _clock(seconds, "learn"):
+        with clock(seconds, "learn"):
             row |= learn(run, observations)
         with group.fail_together():
             if run_logger:
                 run_logger.add(k, row, seconds)
         run.iteration += 1
-        with _clock(seconds, "save"), group.fail_together():
+        with clock(seconds, "save"), group.fail_together():
             if run_logger:
                 run_logger.save()
         if progress and group.first:
@@ -163,95 +150,6 @@ def _loop(run: Run, run_logger: RunLogger | None, progress, stop) -> Result:
     if run.iteration >= last and run_logger and run.best["iteration"] >= 0:
         play_best(run, run_logger)
     return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"])
-
-
-def optimise(
-    run: Run, run_logger: RunLogger | None, seconds: dict[str, float]
-) -> tuple[dict[str, float], Tensor | None]:
-    """One optimisation step: simulate, differentiate, update policy and design. Returns a row of metrics.csv and the observations."""
-    goal, retries = run.draw_goals(), 0
-    while True:
-        try:
-            episode, row = attempt(run, goal, run_logger, seconds)
-            break
-        except (softmpm.UnstableError, OtherProcessError) as error:
-            if not run.safe or retries == run.settings.optimizer.retries:
-                raise TrainingError(run.iteration, in_full(error)) from error
-            logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
-            run.backtrack()
-            retries += 1
-    row |= {f"{name}_change": change for name, change in run.design.change().items()}
-    if row["loss"] < run.best["loss"]:
-        run.best = {"loss": row["loss"], "iteration": run.iteration, **run.policy_snapshot()}
-    run.snapshot()
-    run.optimizer.step()
-    return row | {"retries": retries, "best": run.best["loss"]}, episode.observations
-
-
-def attempt(run: Run, goal, run_logger: RunLogger | None, seconds) -> tuple[Episode, dict[str, float]]:
-    """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
-    recorded = (
-        run_logger.record(run.iteration)
-        if run_logger and run_logger.due(run.iteration)
-        else contextlib.nullcontext()
-    )
-    with _clock(seconds, "episode"):
-        with _all_worlds(run), recorded as on_frame:
-            episode, gradients = run.loop(goal, on_frame)
-        return episode, take_gradient(run, episode, gradients)
-
-
-@contextlib.contextmanager
-def _all_worlds(run: Run) -> Iterator[None]:
-    """A simulation that fails in one process fails in every one; the message has the world's number among all worlds."""
-    with run.group.fail_together(softmpm.UnstableError):
-        try:
-            yield
-        except softmpm.UnstableError as error:
-            if run.group.size > 1:
-                world = run.worlds[error.world]
-                error.add_note(
-                    f"This was in process {run.group.rank}, whose world {error.world} is world {world} of the run."
-                )
-            raise
-
-
-def take_gradient(run: Run, episode: Episode, gradients: Sequence[Tensor]) -> dict[str, float]:
-    """Put the mean gradient of all worlds into ``.grad`` of policy and design; gives its length and the losses.
-
-    The encoder is left out: it learns from pictures, not from the loss.
-    """
-    policy, design = list(run.policy.parameters()), list(run.design.parameters())
-    gradients = run.group.average(gradients)
-    for parameter, gradient in zip(policy + design, gradients, strict=True):
-        parameter.grad = gradient
-    lengths = {
-        "gradient_policy": _length(gradients[: len(policy)]),
-        "gradient_design": _length(gradients[len(policy) :]),
-    }
-    losses = _losses(run, episode)
-    if not all(math.isfinite(value) for value in (losses["loss"], *lengths.values())):
-        raise TrainingError(
-            run.iteration, f"the loss or its gradient is not finite: {losses['loss']:g}, {lengths}."
-        )
-    limit, clipped = run.settings.optimizer.max_norm, 0
-    if limit is not None and math.hypot(*lengths.values()) > limit:
-        torch.nn.utils.clip_grad_norm_(policy + design, limit)
-        clipped = 1
-    return losses | lengths | {"clipped": clipped}
-
-
-def _losses(run: Run, episode: Episode) -> dict[str, float]:
-    """Means over all worlds; the effort is a root mean square."""
-    means = {"loss": episode.loss.mean(), "final": episode.final.mean(), "running": episode.running.mean()}
-    *losses, square = run.group.average([*means.values(), episode.effort])
-    return {name: loss.item() for name, loss in zip(means, losses, strict=True)} | {
-        "effort": square.sqrt().item()
-    }
-
-
-def _length(gradients: Sequence[Tensor]) -> float:
-    return math.sqrt(sum(g.double().square().sum().item() for g in gradients))
 
 
 def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
@@ -267,9 +165,8 @@ def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
             run.learner.add_observations(run.iteration * run.settings.train.worlds, pictures)
     row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
     if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
-        row |= run.group.once(run.learner.learn, run.generator) or {}
+        row |= run.group.once(run.learner.learn) or {}
         run.group.broadcast_(t for network in run.learner.networks for t in network.state_dict().values())
-        run.generator.set_state(run.group.broadcast(run.generator.get_state()))
     return row
 
 
@@ -291,10 +188,3 @@ def play_best(run: Run, run_logger: RunLogger) -> None:
             on_frame=on_frame,
         )
     run.load_policy(now)
-
-
-@contextlib.contextmanager
-def _clock(seconds: dict[str, float], name: str) -> Iterator[None]:
-    begin = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - begin

@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 import torch
 
@@ -94,6 +96,75 @@ def test_early_stopping_keeps_the_best_weights():
     assert learned.epochs == 8 and other.loss(held_out, None).item() == pytest.approx(
         learned.validation, rel=1e-6
     )
+
+
+def trained(autoencoder, sample, conf, held_out=None):
+    """Train with a new Adam; gives it and the result."""
+    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=conf.rate)
+    generator = torch.Generator().manual_seed(0)
+    return optimizer, train_autoencoder(autoencoder, optimizer, sample, held_out, conf, generator)
+
+
+@pytest.mark.parametrize("improvement, epochs", [(0.01, 4), (0.0, 30)])
+def test_early_stopping_ends_where_progress_is_slow(improvement, epochs):
+    """A validation loss that falls in every epoch, but by less than the improvement, ends the phase at the lowest loss."""
+    autoencoder, pictures = make(), waves(16)
+    conf = LearningConf(
+        epochs=30, batches=1, rate=1e-5, patience=4, variational=False, improvement=improvement
+    )
+    before = autoencoder.loss(pictures, None).item()
+    _, learned = trained(autoencoder, lambda: pictures, conf, pictures)
+    assert learned.epochs == epochs
+    assert 0.99 * before < learned.validation < before
+    assert autoencoder.loss(pictures, None).item() == pytest.approx(learned.validation, rel=1e-6)
+
+
+def test_progress_that_adds_up_is_no_standstill():
+    """Epochs that are slow one by one, but not over the patience, go on to the cap."""
+    autoencoder, pictures, losses = make(), waves(16), iter([1.0 * 0.995**k for k in range(99)])
+    real = autoencoder.loss
+    autoencoder.loss = lambda p, kl, generator=None: (
+        real(p, kl, generator) if generator else torch.tensor(next(losses))
+    )
+    conf = LearningConf(epochs=20, batches=1, patience=4, variational=False)
+    _, learned = trained(autoencoder, lambda: pictures, conf, pictures)
+    assert learned.epochs == 20 and learned.validation == pytest.approx(0.995**20)
+
+
+def test_the_optimiser_goes_back_with_the_weights():
+    """Its moments are those of the best epoch, so that the next phase goes on from there."""
+    held_out = torch.zeros(4, 2, 11, 6)
+    conf = LearningConf(batches=2, rate=1e-2, patience=3, variational=False)
+    generator = torch.Generator().manual_seed(0)
+    sample = lambda: 5 * torch.randn(8, 2, 11, 6, generator=generator)  # noqa: E731
+    autoencoder = make()
+    optimizer, learned = trained(autoencoder, sample, conf, held_out)
+    best = learned.epochs - conf.patience
+    steps = {int(state["step"]) for state in optimizer.state.values()}
+    assert best * conf.batches == (steps.pop() if steps else 0) and learned.epochs < conf.epochs
+
+
+@pytest.mark.parametrize("validated", [True, False])
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_a_gradient_that_is_not_finite_is_undone(validated, where, caplog):
+    """The epoch ends the phase; weights and moments are those after the epoch before, and the log says so."""
+    autoencoder, pictures, calls = make(), waves(16), itertools.count()
+
+    def sample():
+        bad = next(calls) == 7  # the second of the fourth epoch
+        if bad and where == "gradient":
+            autoencoder.decoder.tail.bias.register_hook(lambda gradient: gradient * float("inf"))
+        return pictures * float("nan") if bad and where == "loss" else pictures
+
+    conf = LearningConf(epochs=9, batches=2, rate=1e-2, variational=False)
+    optimizer, learned = trained(autoencoder, sample, conf, pictures if validated else None)
+    assert learned.epochs == 4 and "not finite after epoch 4" in caplog.text
+    other = make()
+    short = LearningConf(epochs=3, batches=2, rate=1e-2, variational=False)
+    want, _ = trained(other, lambda: pictures, short, pictures if validated else None)
+    for one, two in zip(autoencoder.parameters(), other.parameters(), strict=True):
+        assert torch.equal(one, two)
+        assert all(torch.equal(optimizer.state[one][k], want.state[two][k]) for k in want.state[two])
 
 
 def test_global_randomness_is_left_alone():

@@ -105,7 +105,7 @@ def test_other_formats_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "FORMAT", 99)
     path = checkpoint.save(tmp_path, content(1.0))
     monkeypatch.undo()
-    with pytest.raises(checkpoint.CheckpointError, match="format 99, this version reads 2"):
+    with pytest.raises(checkpoint.CheckpointError, match="format 99, this version reads 3"):
         checkpoint.read(path)
 
 

@@ -33,8 +33,10 @@ ARM = [
 
 
 def shared(settings: Settings, **changes) -> Settings:
-    """Four worlds with goals of their own, three iterations, each with a learning phase but the last."""
-    conf = dict(worlds=4, iterations=3, goal_spread=[0.1, 0.05]) | changes
+    """Four worlds with goals of their own, three iterations, each with a learning phase and an evaluation but the last."""
+    conf = (
+        dict(worlds=4, iterations=3, goal_spread=[0.1, 0.05], evaluate_every=2, evaluation_goals=4) | changes
+    )
     optimizer = dataclasses.replace(settings.optimizer, retries=1, max_norm=CLIPPED)
     return dataclasses.replace(
         settings, train=dataclasses.replace(settings.train, **conf), optimizer=optimizer
@@ -42,7 +44,7 @@ def shared(settings: Settings, **changes) -> Settings:
 
 
 def fails(real, at):
-    """``simulate`` that reports an inverted particle in its world 1 at some of its calls; an iteration has six."""
+    """``simulate`` that reports an inverted particle in its world 1 at some of its calls; an iteration has six, an evaluation too."""
     calls = itertools.count()
 
     def simulate(*args, **kwargs):
@@ -85,7 +87,7 @@ def one_of_two(out: Path, group: Group) -> None:
     ended = iter([False] if not first else itertools.repeat(False))
     go("stopped", stop=lambda: next(ended, True))
     go("resumed", into="stopped")
-    for name, at in (("retried", {8}), ("failed", range(8, 999))):
+    for name, at in (("retried", {14}), ("failed", range(14, 999))):
         softmpm.simulate = simulate if first else fails(simulate, at)
         go(name)
     softmpm.simulate = simulate
@@ -129,7 +131,7 @@ def figures(folder: Path) -> list[dict[str, float]]:
 
 
 def assert_same(folder: Path, other: Path) -> None:
-    """Every metric is equal, and so are the weights, the policy's encoder and the random generator of the checkpoint."""
+    """Every metric is equal, and so are the weights, the policy's encoder and the random stream of the goals in the checkpoint."""
     for row, want in zip(figures(folder), figures(other), strict=True):
         assert row == pytest.approx(want, rel=SAME, nan_ok=True)
     now, want = checkpoint.load(folder), checkpoint.load(other)
@@ -137,8 +139,9 @@ def assert_same(folder: Path, other: Path) -> None:
         torch.testing.assert_close(now[part], want[part], rtol=SAME, atol=SAME)
     for part in ("autoencoder", "target"):
         torch.testing.assert_close(now["learner"][part], want["learner"][part], rtol=SAME, atol=SAME)
-    assert torch.equal(now["generator"], want["generator"]) and now["iteration"] == want["iteration"] == 3
-    assert list(now["learner"]["replay"]) == list(want["learner"]["replay"]) == list(range(12))
+    assert torch.equal(now["goals"], want["goals"]) and now["iteration"] == want["iteration"] == 3
+    held = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # three worlds of each iteration
+    assert list(now["learner"]["replay"]) == list(want["learner"]["replay"]) == held
 
 
 def assert_in_step(out: Path, name: str) -> None:
@@ -173,7 +176,7 @@ def test_a_wish_of_one_process_stops_both(both):
 def test_a_failure_in_one_process_is_a_retry_in_both(task, four, settings, both, tmp_path, monkeypatch):
     """Both go halfway back together, as one process would, and are still in step."""
     out, *_ = both
-    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, {8}))
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, {14}))
     train.train(task, four, shared(settings), tmp_path)
     assert [row["retries"] for row in figures(out / "retried")] == [0, 1, 0]
     assert_same(out / "retried", tmp_path)

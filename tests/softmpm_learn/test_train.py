@@ -18,6 +18,7 @@ from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
 from softmpm_learn.experiment import design
 from softmpm_learn.objective import Effort, Progress
+from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 
 HERE = Path(__file__).parent
@@ -49,10 +50,13 @@ def unbroken(task, model, settings, tmp_path) -> Path:
 
 
 def assert_same(folder: Path, unbroken: Path) -> None:
-    """Metrics equal to the byte, and final weights, replay and generator to the bit."""
+    """Metrics equal to the byte, and final weights, replay and random streams to the bit."""
     assert (folder / "metrics.csv").read_bytes() == (unbroken / "metrics.csv").read_bytes()
     a, b = (checkpoint.load(f) for f in (folder, unbroken))
-    assert torch.equal(a["generator"], b["generator"]) and a["learner"]["replay"] == b["learner"]["replay"]
+    assert torch.equal(a["goals"], b["goals"]) and a["learner"]["replay"] == b["learner"]["replay"]
+    assert all(
+        torch.equal(a["learner"]["streams"][k], b["learner"]["streams"][k]) for k in ("minibatches", "noise")
+    )
     for part in ("policy", "design"):
         assert all(torch.equal(a[part][k], b[part][k]) for k in a[part])
     for part in ("autoencoder", "target"):
@@ -307,7 +311,7 @@ def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
     train.train(task, model, conf, tmp_path)
     result = train.train(task, model, copy_of(conf, train=dict(iterations=6)), tmp_path)
     found = rows(tmp_path)
-    assert result.finished and list(found[0])[10:15] == [
+    assert result.finished and list(found[0])[12:17] == [
         f"{n}_change" for n in ("young", "poisson", "density", "strength")
     ] + ["epochs"]
     assert float(found[0]["strength_change"]) == 0 < float(found[-1]["strength_change"])
@@ -404,7 +408,7 @@ def test_a_run_that_cannot_go_on_names_the_iteration(
     conf = copy_of(settings, optimizer=dict(retries=1))
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at))
     with pytest.raises(
-        train.TrainingError, match=f"iteration {iteration}: particle 3 is inverted. In control"
+        TrainingError, match=f"iteration {iteration}: particle 3 is inverted. In control"
     ) as caught:
         train.train(task, model, conf, tmp_path)
     assert caught.value.iteration == iteration == checkpoint.load(tmp_path)["iteration"]
@@ -416,9 +420,36 @@ def test_a_gradient_that_is_not_finite_ends_the_run(task, model, settings, tmp_p
     """No step is taken along nan: the error names the iteration and the weights are finite."""
     real = torch.autograd.grad
     monkeypatch.setattr(torch.autograd, "grad", lambda *a, **k: [g * float("nan") for g in real(*a, **k)])
-    with pytest.raises(train.TrainingError, match="iteration 0: the loss or its gradient is not finite"):
+    with pytest.raises(
+        TrainingError, match="iteration 0: the loss or the norm of its gradient is not finite"
+    ):
         train.train(task, model, settings, tmp_path)
     assert all(t.isfinite().all() for t in checkpoint.load(tmp_path)["policy"].values())
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_gradient_that_is_not_finite_is_tried_again_from_halfway_back(
+    task, model, settings, tmp_path, monkeypatch, caplog, value
+):
+    """As a simulation that fails: counted and logged, the step is halved, and the optimiser never sees such a gradient."""
+    conf = copy_of(settings, observer=dict(name="centroids"), train=dict(iterations=2))
+    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    halfway = [(p + s) / 2 for p, s in zip(first.parameters, first.safe, strict=True)]
+    real, calls = torch.autograd.grad, itertools.count()
+
+    def spoilt(*args, **kwargs):
+        factor = value if next(calls) == 2 else 1.0  # an attempt has two: of the simulation, of the policy
+        return [gradient * factor for gradient in real(*args, **kwargs)]
+
+    monkeypatch.setattr(torch.autograd, "grad", spoilt)
+    second = train.train(task, model, conf, tmp_path / "two").run
+    assert next(calls) == 6
+    for now, want in zip(second.safe, halfway, strict=True):
+        torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
+    assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"]
+    assert "not finite" in caplog.text and "Going halfway back" in caplog.text
+    moments = [v for state in second.optimizer.state.values() for v in state.values()]
+    assert all(p.isfinite().all() for p in [*second.parameters, *moments])
 
 
 def test_clipping_is_counted(task, model, settings, tmp_path):

@@ -1,0 +1,40 @@
+"""Fallback: a run that stays far below its best goes on from there, with smaller steps.
+
+Where contact changes, a step of the usual length may lead to a gait that is much worse, from which gradients do not lead back.
+"""
+
+import math
+from dataclasses import dataclass
+
+from softmpm_learn.settings import OptimizerConf
+
+
+@dataclass
+class Fallback:
+    """Counts iterations in a row whose progress, the first loss minus the present one, is below a share of the best progress."""
+
+    first: float = math.nan
+    """First loss of the run."""
+    below: int = 0
+    """Iterations in a row, up to the present one."""
+    count: int = 0
+    """Fallbacks so far."""
+
+    def is_due(self, loss: float, best: float, conf: OptimizerConf) -> bool:
+        """True if the run should fall back after an iteration; then a new count begins.
+
+        Args:
+            loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing.
+            best: The lowest so far.
+        """
+        if math.isnan(loss):
+            self.below += self.below > 0
+            return False
+        if math.isnan(self.first):
+            self.first = loss
+        low = self.first - loss < conf.fallback_share * (self.first - best)
+        self.below = self.below + 1 if low else 0
+        if conf.fallback_share == 0 or self.below < conf.fallback_after:
+            return False
+        self.below, self.count = 0, self.count + 1
+        return True
