@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 import softmpm
 from softmpm import Inputs, Model, Params, State
+from softmpm_learn.objective import Path
 from softmpm_learn.observe import Observer
 
 if TYPE_CHECKING:
@@ -33,10 +34,8 @@ class Frame:
 class Episode:
     """One simulation of every world."""
 
-    final: Tensor
-    """Final loss, shape (world,). Differentiable."""
-    running: Tensor
-    """Mean cost of the control steps, shape (world,). Differentiable."""
+    terms: dict[str, Tensor]
+    """Terms of the objective by their names, shape (world,) each. Differentiable."""
     end: State
     observations: Tensor | None
     """Observations at regular control steps, shape (frame, world, ...), detached; None if not requested."""
@@ -46,13 +45,13 @@ class Episode:
 
     @property
     def loss(self) -> Tensor:
-        """Final loss and running cost together, shape (world,)."""
-        return self.final + self.running
+        """The sum of the terms, shape (world,)."""
+        return torch.stack(list(self.terms.values())).sum(dim=0)
 
     def detach(self) -> "Episode":
         """The episode without its autograd graph and without the decisions."""
-        final, running = self.final.detach(), self.running.detach()
-        return replace(self, final=final, running=running, end=self.end.detach(), decisions=Decisions())
+        terms = {name: term.detach() for name, term in self.terms.items()}
+        return replace(self, terms=terms, end=self.end.detach(), decisions=Decisions())
 
 
 @dataclass(frozen=True)
@@ -88,9 +87,9 @@ def run_episode(
     Raises:
         softmpm.UnstableError: With a note that names the control step.
     """
-    start = state = model.rest()
+    state = model.rest()
     period, times = task.control_period, _times(task, model)
-    made, path, observations = Decisions(), [], []
+    made, states, observations = Decisions(), [state], []
     for step in range(task.control_steps):
         observation = observer.observe(model, state)
         if keep_every and step % keep_every == 0:
@@ -111,14 +110,14 @@ def run_episode(
             raise
         made.features.append(features)
         made.activations.append(activation)
-        path.append(state.x)
+        states.append(state)
     if on_frame:
         with torch.no_grad():
             on_frame(Frame(task.control_steps * period, state, observer(model, state), None))
     activations = torch.stack(made.activations)
+    path = Path([period * k for k in range(len(states))], states, activations, goal)
     return Episode(
-        final=task.objective.final(start, state, goal),
-        running=task.objective.running(torch.stack(path), activations).mean(dim=0),
+        terms=task.objective(path),
         end=state,
         observations=torch.stack(observations) if observations else None,
         effort=activations.detach().square().mean(),

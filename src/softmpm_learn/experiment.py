@@ -18,7 +18,6 @@ from softmpm_learn.config import RunConf
 from softmpm_learn.design import DESIGNABLE, declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
-from softmpm_learn.objective import Progress, Reach
 from softmpm_learn.progress import ProgressBar
 from softmpm_learn.run import Run
 from softmpm_learn.saved import save
@@ -40,7 +39,7 @@ CURVES = {
     "loss": "loss",
     "evaluation": "loss at the evaluation goals",
     "validation_loss": "validation loss of the autoencoder",
-    "effort": "activation, root mean square",
+    "activation": "activation, root mean square",
     "young_change": "mean change of Young's modulus",
 }
 """Columns of metrics.csv in loss.png; those without numbers are left out."""
@@ -221,18 +220,12 @@ def farewell(result: Result, task: Task, out: Path) -> str:
 
 
 def outcome(task: Task, out: Path) -> str:
-    """Distance that the robot of the last recorded simulation travelled, in words."""
+    """What the robot achieved in the last recorded simulation, in words."""
     episode = last_episode(out / "run.h5")
     if episode is None:
         return ""
-    start, end = episode[1]["x"][0], episode[1]["x"][-1]
-    if isinstance(task.objective, Progress):
-        moved = float((end - start)[:, task.objective.axis].mean())
-        return f"; it travelled {moved:.3f} m, {moved / task.body_length:.2f} of its length"
-    if isinstance(task.objective, Reach) and task.goal is not None:
-        away = float(np.linalg.norm(end[task.objective.particles].mean(axis=0) - task.goal))
-        return f"; it ended {1000 * away:.0f} mm from the goal"
-    return ""
+    words = task.objective.outcome(episode[1]["x"], task.body_length)
+    return f"; {words}" if words else ""
 
 
 def convert(out: Path) -> str:

@@ -246,7 +246,7 @@ class Objective:
     def names(self) -> list[str]:
         """Name of each term; a second one of a name has a number."""
         names = [term.name for term in self.terms]
-        count = {name: 0 for name in names}
+        count = dict.fromkeys(names, 0)
         for k, name in enumerate(names):
             count[name] += 1
             names[k] = f"{name}_{count[name]}" if count[name] > 1 else name

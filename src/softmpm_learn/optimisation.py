@@ -118,11 +118,11 @@ def take_gradient(run: Run, episode: Episode, gradients: Sequence[Tensor]) -> di
 
 
 def _losses(run: Run, episode: Episode) -> dict[str, float]:
-    """Means over all worlds; the effort is a root mean square."""
-    means = {"loss": episode.loss.mean(), "final": episode.final.mean(), "running": episode.running.mean()}
+    """Means over all worlds; the activation is a root mean square."""
+    means = {name: term.mean() for name, term in ({"loss": episode.loss} | episode.terms).items()}
     *losses, square = run.group.average([*means.values(), episode.effort])
     return {name: loss.item() for name, loss in zip(means, losses, strict=True)} | {
-        "effort": square.sqrt().item()
+        "activation": square.sqrt().item()
     }
 
 

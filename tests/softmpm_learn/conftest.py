@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import softmpm
-from softmpm_learn.objective import Effort, Progress
+from softmpm_learn.objective import Effort, Objective, Progress
 from softmpm_learn.settings import LearningConf, ObserverConf, PolicyConf, Settings, TrainConf
 from softmpm_learn.tasks.task import Task
 
@@ -41,7 +41,7 @@ def task() -> Task:
         control_steps=6,
         substeps=4,
         regions={"left": np.arange(12), "right": np.arange(16, 32)},  # 12 to 15 are in no region
-        objective=Progress(terms=(Effort(1e-3),)),
+        objective=Objective(Progress(), Effort(weight=1e-3)),
         body_length=0.4,
         goal=np.array([0.6, 0.3]),
     )

@@ -281,7 +281,7 @@ def test_the_objective_is_part_of_a_run(monkeypatch, capsys, tmp_path, finished)
     path = tmp_path / "run" / "config.yaml"
     path.write_text(path.read_text().replace("effort: 0.001", "effort: 0.5"))
     said = refusal(monkeypatch, capsys, f"resume={tmp_path}/run")
-    assert "task.objective.terms[0].weight: 0.001 then, 0.5 now" in said
+    assert "task.objective.terms[2].weight: 0.001 then, 0.5 now" in said
 
 
 def test_the_log_follows_the_run(monkeypatch, tmp_path, finished):

@@ -8,7 +8,7 @@ from torch import nn
 import softmpm
 from softmpm_learn.design import Design
 from softmpm_learn.episode import ClosedLoop, run_episode
-from softmpm_learn.objective import Effort, Progress
+from softmpm_learn.objective import Objective, Progress
 from softmpm_learn.observe import Centroids, Latent, VelocityImage
 from softmpm_learn.policy import make_policy
 from softmpm_learn.seeding import seeded
@@ -35,9 +35,9 @@ def test_equals_one_call_of_simulate(task, model):
     end = softmpm.simulate(model, start, activation, model.params(), substeps=task.substeps)
     for got, want in zip(episode.end[:4], end[:4], strict=True):
         torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(episode.final, Progress().final(start, end, None))
-    torch.testing.assert_close(episode.running, torch.full((1,), 1e-3 * (0.25 + 0.09) / 2))
-    torch.testing.assert_close(episode.loss, episode.final + episode.running)
+    torch.testing.assert_close(episode.terms["progress"], (start.x - end.x)[..., 0].mean(dim=1))
+    torch.testing.assert_close(episode.terms["effort"], torch.full((1,), 1e-3 * (0.25 + 0.09) / 2))
+    torch.testing.assert_close(episode.loss, episode.terms["progress"] + episode.terms["effort"])
     assert episode.effort.item() == pytest.approx((0.25 + 0.09) / 2) and episode.observations is None
 
 
@@ -119,7 +119,7 @@ def test_frames_and_pictures(task, model):
 
 def test_a_failure_names_the_control_step(task, model):
     """An unstable simulation says in which control step; a fast throw out of the grid is one."""
-    thrown = dataclasses.replace(task, substeps=400, objective=Progress(terms=(Effort(0.0),)))
+    thrown = dataclasses.replace(task, substeps=400, objective=Objective(Progress()))
     observer = Centroids(model, [np.arange(4)], 1.0)
     with pytest.raises(softmpm.UnstableError) as caught:
         run_episode(thrown, model, observer, Constant([40.0, -40.0]), model.params())

@@ -11,7 +11,7 @@ import torch
 
 import softmpm
 from softmpm_learn import evaluation, optimisation
-from softmpm_learn.objective import Reach
+from softmpm_learn.objective import Objective, Reach
 from softmpm_learn.run import Run
 from softmpm_learn.train import train
 
@@ -19,7 +19,9 @@ from softmpm_learn.train import train
 @pytest.fixture
 def reaching(task):
     """The block brings its right end to a goal."""
-    return dataclasses.replace(task, objective=Reach(np.arange(28, 32), task.goal))
+    return dataclasses.replace(
+        task, objective=Objective(Reach(particles=np.arange(28, 32), target=task.goal, begin=task.seconds))
+    )
 
 
 @pytest.fixture

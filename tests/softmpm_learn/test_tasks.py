@@ -167,7 +167,7 @@ def test_the_walkers_stand_without_activation():
 def test_the_arm_is_clamped_and_bends_to_the_side_that_pulls():
     """Pulling with the muscles on the right brings the tip to the right; the clamped foot stays."""
     task = arm(ArmConf())
-    tip = task.objective.particles
+    tip = task.objective.terms[0].particles
     for side, sign in ((0, -1), (1, 1)):  # muscles come in pairs, left and right
         activation = torch.zeros(len(task.scene.muscles))
         activation[side::2] = 1.0

@@ -17,7 +17,7 @@ import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
 from softmpm_learn.experiment import design
-from softmpm_learn.objective import Effort, Progress
+from softmpm_learn.objective import Effort, Objective, Progress
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 
@@ -220,7 +220,7 @@ def test_a_recording_outlives_a_part_that_records_nothing(task, model, settings,
 def test_another_task_does_not_resume(task, model, settings, unbroken, change):
     """Whatever of a task reaches the numbers is part of the run, not its scene alone."""
     other = {
-        "objective": Progress(terms=(Effort(0.5),)),
+        "objective": Objective(Progress(), Effort(weight=0.5)),
         "regions": task.regions | {"left": np.arange(11)},
         "body_length": 0.5,
         "goal": None,

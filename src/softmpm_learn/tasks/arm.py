@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softmpm import Body, Grid, Muscle, Scene, Wall
-from softmpm_learn.objective import Effort, Reach
+from softmpm_learn.objective import Effort, Objective, Reach, Still
 from softmpm_learn.tasks.outline import Limb
 from softmpm_learn.tasks.task import Task, TaskConf, clock, filled, neo_hookean
 
@@ -33,10 +33,17 @@ class ArmConf(TaskConf):
     strength: float = 4e3
     """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
-    """Goal of the tip at the end of the episode: x and y [m]; at rest it is at (0.45, 0.41)."""
+    """Goal of the tip: x and y [m]; at rest it is at (0.45, 0.41)."""
+    hold: float = 0.3
+    """Time at the end of the episode during which the tip should stay at the goal [s]."""
+    still: float = 1e-2
+    """Weight of the tip's mean squared speed during that time in the loss [s²]."""
 
     def __post_init__(self):
         super().__post_init__()
+        self.need_not_negative("hold", "still")
+        if self.hold > self.seconds:
+            raise ValueError(f"task.hold must be at most task.seconds = {self.seconds}, got {self.hold}.")
         if len(self.goal) != 2 or not all(math.isfinite(c) for c in self.goal):
             raise ValueError(
                 f"task.goal must be two numbers, x and y, such as task.goal=[0.6,0.35], got {self.goal}."
@@ -79,14 +86,18 @@ def arm(conf: ArmConf) -> Task:
         dt=conf.control_period,
     )
     scene, control_steps, substeps = clock(conf, scene)
-    goal = np.array(conf.goal, dtype=float)
+    goal, tip, held = np.array(conf.goal, dtype=float), limb.part(rest, TIP, 1.01), conf.seconds - conf.hold
     return Task(
         name="arm",
         scene=scene,
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Reach(limb.part(rest, TIP, 1.01), goal, terms=(Effort(conf.effort),)),
+        objective=Objective(
+            Reach(particles=tip, target=goal, begin=held),
+            Still(particles=tip, weight=conf.still, begin=held),
+            Effort(weight=conf.effort),
+        ),
         body_length=LENGTH,
         goal=goal,
         build=conf.build,

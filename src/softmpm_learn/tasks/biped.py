@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle, Scene
-from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, smooth
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, level, neo_hookean, track
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, neo_hookean, track, walking
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -48,7 +47,7 @@ def biped(conf: BipedConf) -> Task:
         for side in (1, -1)
     ]
     regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
-    grid, walls, height = track(conf, conf.friction)
+    grid, walls, height = track(conf)
     scene = Scene(
         grid=grid,
         bodies=[Body(shape.moved((0.2, height)), neo_hookean(conf))],
@@ -65,7 +64,7 @@ def biped(conf: BipedConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(terms=(Effort(conf.effort), level(conf.upright, rest, regions["body"]))),
+        objective=walking(conf, rest, regions["body"]),
         body_length=float(np.ptp(rest[:, 0])),
         build=conf.build,
     )

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle, Scene
-from softmpm_learn.objective import Effort, Progress
 from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, level, neo_hookean, track
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, neo_hookean, track, walking
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -75,7 +74,7 @@ def elephant(conf: ElephantConf) -> Task:
     shape = filled(conf, [LENGTH * outline for outline in outlines])
     rest = shape.positions
     regions, muscles = actuate(rest, limbs, conf.strength)
-    grid, walls, height = track(conf, conf.friction)
+    grid, walls, height = track(conf)
     scene = Scene(
         grid=grid,
         bodies=[Body(shape.moved((0.22, height)), neo_hookean(conf))],
@@ -92,7 +91,7 @@ def elephant(conf: ElephantConf) -> Task:
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=Progress(terms=(Effort(conf.effort), level(conf.upright, rest, regions["body"]))),
+        objective=walking(conf, rest, regions["body"]),
         body_length=float(np.ptp(rest[:, 0])),
         build=conf.build,
     )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import softmpm
-from softmpm_learn.objective import Objective, Upright
+from softmpm_learn.objective import Effort, Objective, Progress, Tilt
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
@@ -151,10 +151,20 @@ class WalkerConf(TaskConf):
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
+    lead: float = 0.0
+    """Time before the distance counts [s]."""
+    track: float = 1.5
+    """Length of the track [m]."""
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("friction", "upright")
+        self.need_not_negative("friction", "upright", "lead")
+        if self.lead >= self.seconds:
+            raise ValueError(
+                f"task.lead must be below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
+            )
+        if not (math.isfinite(self.track) and self.track >= 1.0):
+            raise ValueError(f"task.track must be at least 1 m, got {self.track}.")
 
     @property
     def on_surface(self) -> bool:
@@ -222,26 +232,28 @@ def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:
     return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=cut)
 
 
-def level(weight: float, rest: np.ndarray, torso: np.ndarray) -> Upright:
-    """The hind and the front quarter of the torso stay level."""
+def walking(conf: "WalkerConf", rest: np.ndarray, torso: np.ndarray) -> Objective:
+    """Go far, without effort, while the hind and the front quarter of the torso stay level."""
     low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
-    return Upright(weight, torso[rest[torso, 0] > high], torso[rest[torso, 0] < low], rest)
+    front, back = torso[rest[torso, 0] > high], torso[rest[torso, 0] < low]
+    tilt = Tilt(weight=conf.upright, front=front, back=back, rest=rest)
+    return Objective(Progress(begin=conf.lead), Effort(weight=conf.effort), tilt)
 
 
-def track(conf: TaskConf, friction: float) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
-    """Grid and walls of a walker, 1.5 m long, 0.5 m high, a floor with friction first, smooth ends; and the height of the soles [m].
+def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
+    """Grid and walls of a walker, 0.5 m high, a floor with friction first, smooth ends; and the height of the soles [m].
 
     The soles lie on spline knots, half a cell above a row of nodes. The floor is at the soles if surface points meet it, and at the
     nodes otherwise.
     """
-    length, height, margin, nodes, spacing = 1.5, 0.5, 0.05, conf.cells, conf.spacing
+    length, height, margin, nodes, spacing = conf.track, 0.5, 0.05, conf.cells, conf.spacing
     floor = math.floor(0.0625 * nodes) * spacing
     soles = floor + 0.5 * spacing
     if conf.on_surface:
         floor = soles
     grid = softmpm.Grid(shape=(round(length * nodes), round(height * nodes)), spacing=spacing)
     walls = [
-        softmpm.Wall(normal=(0.0, 1.0), offset=floor, friction=friction),
+        softmpm.Wall(normal=(0.0, 1.0), offset=floor, friction=conf.friction),
         softmpm.Wall(normal=(1.0, 0.0), offset=margin),
         softmpm.Wall(normal=(-1.0, 0.0), offset=margin - length),
     ]
