@@ -35,7 +35,7 @@ from softmpm_learn.saved import load
 from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import TASKS
 
-CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "device")
+CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "train.examine", "device")
 """Settings that may differ when a run is resumed: its length, the recorded episodes and the device."""
 EXPECTED = (
     ValueError,

@@ -73,21 +73,23 @@ def run_episode(
     *,
     inputs: Inputs | None = None,
     goal: Tensor | None = None,
+    start: State | None = None,
     keep_every: int = 0,
     on_frame: Callable[[Frame], None] | None = None,
 ) -> Episode:
-    """Simulate a task from rest under a policy. Under ``torch.no_grad`` it keeps nothing for a gradient.
+    """Simulate a task under a policy. Under ``torch.no_grad`` it keeps nothing for a gradient.
 
     Args:
         params, inputs: Material of the robot and what else is not the scene's, see :class:`softmpm_learn.design.Design`.
         goal: Goal of each world [m], shape (world, dim), where it is not the task's own.
+        start: Initial state, None for rest.
         keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
 
     Raises:
         softmpm.UnstableError: With a note that names the control step.
     """
-    state = model.rest()
+    state = model.rest() if start is None else start
     period, times = task.control_period, _times(task, model)
     made, states, observations = Decisions(), [state], []
     for step in range(task.control_steps):

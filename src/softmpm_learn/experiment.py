@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import logging
 import math
 import os
@@ -22,7 +23,7 @@ from softmpm_learn.progress import ProgressBar
 from softmpm_learn.run import Run
 from softmpm_learn.saved import save
 from softmpm_learn.stop import Signals
-from softmpm_learn.tasks import Task, make_task
+from softmpm_learn.tasks import Resolution, Task, TaskConf, make_task
 from softmpm_learn.train import Result, train
 
 PICTURES = 4
@@ -87,11 +88,20 @@ def run_experiment(
             stop=stop,
             begin=begun,
             group=group,
+            finer=finer(conf.task) if conf.train.examine else None,
         )
     if group.first:
         draw(result, task, out)
         logger.info("%s", farewell(result, task, out))
         signals.advice = f"The run had ended; everything is in {out}."
+
+
+def finer(conf: TaskConf) -> Task | None:
+    """The same task on the next finer grid, None if there is none."""
+    known = list(Resolution)
+    if conf.resolution is known[-1]:
+        return None
+    return make_task(dataclasses.replace(conf, resolution=known[known.index(conf.resolution) + 1]))
 
 
 def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
@@ -207,6 +217,8 @@ def farewell(result: Result, task: Task, out: Path) -> str:
         lines.append(
             f"It fell far below its best and went back to it: {count} time{'s' if count > 1 else ''}."
         )
+    if result.examination:
+        lines.append(f"Examined: {examined(result.examination)}.")
     shown = _relative(out)
     if not result.finished:
         lines.append(f"Stopped after {result.run.iteration} iterations.")
@@ -217,6 +229,14 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     if not result.finished:
         lines.append(f"To go on: python -m softmpm_learn resume={shown}")
     return "\n".join(lines)
+
+
+def examined(examination: dict[str, float]) -> str:
+    """What was found at the end of a run, in words; see examination.py."""
+    return ", ".join(
+        f"{name} failed" if math.isnan(value) else f"{name} {value:.3g}"
+        for name, value in examination.items()
+    )
 
 
 def outcome(task: Task, out: Path) -> str:

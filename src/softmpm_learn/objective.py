@@ -113,6 +113,18 @@ class Term(Placed, ABC):
         states = self.window(path)
         return slice(states.start, max(states.stop - 1, states.start + 1))
 
+    def rate(self, path: Path) -> float:
+        """Value that windows of different lengths can be compared by, in the mean of the worlds."""
+        return self.value(path).mean().item()
+
+    def verdict(self, own: float, other: float) -> float:
+        """How another :meth:`rate` compares with that of the episode: their quotient, 1 if they agree."""
+        return other / own if own else math.nan
+
+    def worst(self, verdicts: Sequence[float]) -> float:
+        """The worst of several; nan if one is."""
+        return math.nan if any(math.isnan(one) for one in verdicts) else max(verdicts)
+
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         """What became of it in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
         return ""
@@ -130,6 +142,14 @@ class Progress(Term):
         states = self.window(path)
         moved = (path.states[states.stop - 1].x - path.states[states.start].x)[..., self.axis]
         return -(moved if self.particles is None else moved[:, self.on("particles", moved)]).mean(dim=-1)
+
+    def rate(self, path: Path) -> float:
+        """Minus the mean speed [m/s]."""
+        states = self.window(path)
+        return super().rate(path) / (path.times[states.stop - 1] - path.times[states.start])
+
+    def worst(self, verdicts: Sequence[float]) -> float:
+        return -super().worst([-one for one in verdicts])
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         moved = float((x[-1] - x[0])[:, self.axis].mean())
@@ -149,6 +169,10 @@ class Reach(Term):
         x = path.x[self.window(path)]
         place = self.on("target", x) if path.goal is None else path.goal
         return (x[..., self.on("particles", x), :].mean(dim=-2) - place).square().sum(dim=-1).mean(dim=0)
+
+    def verdict(self, own: float, other: float) -> float:
+        """The distance from the place, root mean square [m]."""
+        return math.sqrt(other)
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         away = float(np.linalg.norm(x[-1, self.particles].mean(axis=0) - self.target))
@@ -212,9 +236,16 @@ class Tilt(Term):
         return share / (share @ self.rest[:, self.along])
 
     def value(self, path: Path) -> Tensor:
+        return self._change(path).square().mean(dim=0)
+
+    def degrees(self, path: Path) -> float:
+        """The largest tilt of any world in the window."""
+        return math.degrees(math.atan(self._change(path).abs().max().item()))
+
+    def _change(self, path: Path) -> Tensor:
+        """Change of the slope, shape (state, world)."""
         x = path.x[self.window(path)]
-        slope = x[..., self.up] @ self.on("lever", x)
-        return (slope - float(self.lever @ self.rest[:, self.up])).square().mean(dim=0)
+        return x[..., self.up] @ self.on("lever", x) - float(self.lever @ self.rest[:, self.up])
 
 
 @dataclass(frozen=True, kw_only=True)

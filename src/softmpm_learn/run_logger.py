@@ -13,6 +13,7 @@ import softmpm
 from softmpm_learn import checkpoint
 from softmpm_learn.csv_log import Table
 from softmpm_learn.episode import Frame
+from softmpm_learn.examination import NAMES
 from softmpm_learn.run import Run
 
 logger = logging.getLogger("softmpm_learn")
@@ -30,6 +31,7 @@ def metrics(run: Run) -> list[str]:
         *("gradient_policy", "gradient_design", "clipped", "retries", "fallbacks"),
         *(f"{name}_change" for name in run.design.change()),
         *("epochs", "training_loss", "validation_loss", "replay"),
+        *NAMES,
     ]
 
 

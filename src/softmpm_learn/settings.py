@@ -250,6 +250,8 @@ class TrainConf:
     """Record the first, every such, the last and the best episode to run.h5; 0 records nothing."""
     frame_every: int = 1
     """Control steps between two recorded frames."""
+    examine: bool = True
+    """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid."""
 
     def __post_init__(self):
         _positive("train", self, "iterations", "worlds", "frame_every", "evaluate_every", "evaluation_goals")

@@ -24,6 +24,7 @@ from softmpm import Model
 from softmpm_learn import checkpoint, files
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
+from softmpm_learn.examination import examine
 from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.replay import ReplayError
 from softmpm_learn.run import Run, SettingsError
@@ -43,6 +44,8 @@ class Result:
     """False if it was stopped before the last iteration."""
     best_loss: float
     best_iteration: int
+    examination: dict[str, float]
+    """What :func:`softmpm_learn.examination.examine` found, in the first process once the run is finished."""
 
 
 def train(
@@ -55,6 +58,7 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     begin: Callable[[], None] = lambda: None,
     group: Group | None = None,
+    finer=None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
 
@@ -68,6 +72,7 @@ def train(
         stop: Asked after each iteration; once it says True in any process the run ends, ready to resume.
         begin: Called once, in the first process only, when the folder is locked and what is in it was found to be of this run.
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
+        finer: The task on the next finer grid, on which the motion is examined; None leaves that out.
 
     Raises:
         softmpm_learn.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
@@ -85,7 +90,7 @@ def train(
             run = Run(task, model, settings, out, group)
         seals = _resume(run, out)
         run_logger = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin)))
-        return _loop(run, run_logger, progress, stop)
+        return _loop(run, run_logger, progress, stop, finer)
 
 
 @contextlib.contextmanager
@@ -131,8 +136,9 @@ def _restore(run: Run, content: dict, out: Path) -> dict:
         ) from error
 
 
-def _loop(run: Run, run_logger: RunLogger | None, progress, stop) -> Result:
+def _loop(run: Run, run_logger: RunLogger | None, progress, stop, finer) -> Result:
     group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
+    examination: dict[str, float] = {}
     while run.iteration < last and not group.any(stop()):
         k = run.iteration
         row, observations = optimise(run, run_logger, seconds)
@@ -148,8 +154,8 @@ def _loop(run: Run, run_logger: RunLogger | None, progress, stop) -> Result:
         if progress and group.first:
             progress(k, row)
     if run.iteration >= last and run_logger and run.best["iteration"] >= 0:
-        play_best(run, run_logger)
-    return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"])
+        examination = finish(run, run_logger, finer)
+    return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"], examination)
 
 
 def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
@@ -171,9 +177,9 @@ def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
 
 
 @torch.no_grad()
-def play_best(run: Run, run_logger: RunLogger) -> None:
-    """Record the best policy and design once more, as the episode after the last."""
-    now = run.policy_snapshot()
+def finish(run: Run, run_logger: RunLogger, finer) -> dict[str, float]:
+    """Record the best policy and design once more, as the episode after the last, and examine them."""
+    now, found = run.policy_snapshot(), {}
     run.load_policy(run.best)
     params, inputs = run.design()
     with run_logger.record(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
@@ -187,4 +193,8 @@ def play_best(run: Run, run_logger: RunLogger) -> None:
             goal=run.middle_goals(),
             on_frame=on_frame,
         )
+    if run.settings.train.examine:
+        found = examine(run, finer)
+        run_logger.add(run.iteration, found, {})
     run.load_policy(now)
+    return found
