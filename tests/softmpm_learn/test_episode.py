@@ -105,6 +105,19 @@ def test_the_loop_gives_the_gradient_of_all_parameters(task, name):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())
 
 
+@pytest.mark.parametrize("dtype, deterministic", [("float32", False), ("float64", False), ("float64", True)])
+def test_sums_in_order_are_not_captured(task, dtype, deterministic):
+    """They wait for the device, which a CUDA graph cannot; every other loop goes through the graph."""
+    model = softmpm.build(task.scene, device="cpu", dtype=getattr(torch, dtype), deterministic=deterministic)
+    observer = Centroids(model, list(task.regions.values()), task.body_length)
+    policy = make_policy(PolicyConf(name="linear"), observer.size, 2, 0.1, seed=0).to(model.dtype)
+    loop = ClosedLoop(task, model, observer, policy, lambda: (model.params(), softmpm.Inputs()), [])
+    work, calls = loop._graph, []
+    loop._graph = lambda: calls.append(1) or work()
+    loop(None)
+    assert len(calls) == (0 if deterministic else 1)
+
+
 def test_frames_and_pictures(task, model):
     """A frame at every control step and one at the end; every second look is kept, and keeps no graph."""
     picture = VelocityImage(model)
