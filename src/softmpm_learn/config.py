@@ -38,6 +38,9 @@ class DeviceConf:
     """CPU threads of PyTorch; the same number gives the same run to the last bit."""
     memory: float | None = None
     """Most memory that one simulation may keep for its gradient, in each process [MB]; null for a sensible choice."""
+    deterministic: bool = False
+    """The same bits in every run on one kind of GPU, as on a CPU anyway; slower. On a GPU walkers need task.formulation=reference
+    or task.contact=nodes."""
 
     def __post_init__(self):
         for name, value, known in (("name", self.name, DEVICES), ("dtype", self.dtype, DTYPES)):

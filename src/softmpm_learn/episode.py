@@ -133,7 +133,8 @@ def _times(task: "Task", model: Model) -> Tensor:
 
 
 class ClosedLoop:
-    """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one captured graph.
+    """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one captured graph, where
+    the model allows it.
 
     Args:
         design: Gives the material and the inputs, see :class:`softmpm_learn.design.Design`.
@@ -154,6 +155,10 @@ class ClosedLoop:
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
         self.design, self.free, self.keep_every = design, free, keep_every
         self._goal: Tensor | None = None
+        # Sums in the order of the particles wait for the device, see docs/conventions.md:
+        self._captures = not (
+            model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64)
+        )
         loop = weakref.proxy(self)  # or the graph would hold what holds it
         self._graph = softmpm.Graph(lambda: loop._work(), model.device)
 
@@ -168,7 +173,7 @@ class ClosedLoop:
         """
         if goal is not None:
             self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
-        return self._work(on_frame) if on_frame else self._graph()
+        return self._graph() if self._captures and not on_frame else self._work(on_frame)
 
     def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
         params, inputs = self.design()

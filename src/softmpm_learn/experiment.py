@@ -66,6 +66,7 @@ def run_experiment(
     group, signals = group or Group(), signals or Signals()
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(conf.device.threads)
+    need_determinism(conf.device.deterministic)
     with group.fail_together():
         task = make_task(conf.task)
         model = make_model(task, conf, group)
@@ -104,6 +105,13 @@ def finer(conf: TaskConf) -> Task | None:
     return make_task(dataclasses.replace(conf, resolution=known[known.index(conf.resolution) + 1]))
 
 
+def need_determinism(needed: bool) -> None:
+    """Whether PyTorch must give the same bits in every run; an operation that cannot then raises a RuntimeError that names it."""
+    if needed:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it is first used
+    torch.use_deterministic_algorithms(needed)
+
+
 def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
     """The task's scene on the device of the settings, with this process's share of the worlds."""
     device, memory = group.device(conf.device.name), conf.device.memory
@@ -117,6 +125,7 @@ def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
         memory_budget=None if memory is None else round(1e6 * memory),
         inputs=declared_inputs(conf.design),
         calls=task.control_steps,
+        deterministic=conf.device.deterministic,
         **task.build,
     )
 

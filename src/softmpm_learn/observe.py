@@ -19,6 +19,8 @@ from softmpm import Model, State
 THIN = 0.01
 """A node with this share of a full node's mass shows half its velocity. Otherwise what is seen would jump, and the gradient
 miss the jump, whenever a node gains or loses its last particle. Our choice."""
+STRETCH = 1.25
+"""Stretch of the robot that the window of a learned observer has room for, in any direction. Our choice."""
 POSTURE = 0.1
 """Regions typically move by this much of a body length against each other; makes features of order one."""
 
@@ -92,22 +94,30 @@ class VelocityImage:
     """Grid velocity as a learned observer sees it: averaged over blocks of nodes, components first.
 
     Args:
-        model: Whose grid.
-        nodes: Most nodes of the picture along the longest axis, None for 64 in 2D and 32 in 3D.
-        follow: Move the robot's centroid to the middle of the picture first.
+        model: Whose grid and robot.
+        nodes: Most nodes of the picture along the longest axis, None for 32 in 2D and 16 in 3D if it follows, else for twice as many.
+        follow: See a window around the robot, with its centroid on a node: the picture depends neither on the place nor on the size of
+            the grid, so that what learned on one track can be used on another. False shows the whole grid as it is.
     """
 
     def __init__(self, model: Model, nodes: int | None = None, follow: bool = True):
         grid = model.scene.grid
-        self.block = math.ceil(max(grid.shape) / (nodes or (64 if model.dim == 2 else 32)))
-        self.shape = tuple(math.ceil(n / self.block) for n in grid.shape)
-        """Nodes of the picture."""
         self.follow = follow
+        window = (_window(model),) * model.dim if follow else grid.shape
+        usual = (32 if model.dim == 2 else 16) * (1 if follow else 2)
+        self.block = math.ceil(max(window) / (nodes or usual))
+        self.shape = tuple(math.ceil(n / self.block) for n in window)
+        """Nodes of the picture."""
         mass = (model.params().density * model.volume).sum() / model.volume.sum() * grid.spacing**model.dim
         self._thin = THIN * mass.item()
-        last = torch.tensor(grid.shape, dtype=model.dtype, device=model.device) - 1
+        place = {"dtype": model.dtype, "device": model.device}
+        last = torch.tensor(grid.shape, **place) - 1
         self._low, self._high = torch.full_like(last, grid.spacing), (last - 1) * grid.spacing
-        self._middle = last * grid.spacing / 2
+        middle = [(n - 1) // 2 for n in grid.shape]
+        self._middle = torch.tensor(middle, **place) * grid.spacing
+        first = [m - w // 2 for m, w in zip(middle, window, strict=True)] if follow else [0] * model.dim
+        ends = [(-f, f + w - n) for f, w, n in zip(first, window, grid.shape, strict=True)]
+        self._pad = [pad for pair in reversed(ends) for pad in pair]
 
     def __call__(self, model: Model, state: State) -> Tensor:
         """Velocity [m/s], shape (world, dim, *shape)."""
@@ -116,9 +126,19 @@ class VelocityImage:
             state = state._replace(x=x.clamp(self._low, self._high))
         field = softmpm.rasterize(model, state)
         velocity = field.velocity * (field.mass / (field.mass + self._thin))[..., None]
+        seen = functional.pad(velocity.movedim(-1, 1), self._pad)  # negative where the window is smaller
         pool, size = functional.avg_pool2d if model.dim == 2 else functional.avg_pool3d, self.block
-        # The blocks at the far ends reach beyond the grid, where there is nothing:
-        return pool(velocity.movedim(-1, 1), size, ceil_mode=True, divisor_override=size**model.dim)
+        # The blocks at the far ends reach beyond the window, where there is nothing:
+        return pool(seen, size, ceil_mode=True, divisor_override=size**model.dim)
+
+
+def _window(model: Model) -> int:
+    """Nodes along each side of a cube around a node that holds the robot in any direction, stretched by :data:`STRETCH`."""
+    away = (model.positions - model.positions.mean(dim=0)).norm(dim=-1).max().item()
+    half = (
+        round(STRETCH * away / model.scene.grid.spacing) + 2
+    )  # a particle reaches nodes up to 1.5 cells away
+    return 2 * half + 1
 
 
 class Latent(Observer):

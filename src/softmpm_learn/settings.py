@@ -47,9 +47,10 @@ class ObserverConf:
     channels: list[int] = field(default_factory=lambda: [8, 16, 32])
     """latent: channels of the encoder's convolutions, each halving the picture; the decoder mirrors them."""
     nodes: int | None = None
-    """latent: most nodes of the picture along its longest axis, coarser than the grid by averaging; null: 64 in 2D, 32 in 3D."""
+    """latent: most nodes of the picture along its longest axis, coarser than the grid by averaging; null: 32 in 2D, 16 in 3D, twice as
+    many with follow=False."""
     follow: bool = True
-    """latent: the velocity image is centred on the robot and does not depend on its position; False shows the grid unchanged."""
+    """latent: the velocity image is a window around the robot, the same on any track; False shows the whole grid unchanged."""
 
     def __post_init__(self):
         _one_of("observer.name", self.name, OBSERVERS)

@@ -301,6 +301,51 @@ def test_memory_is_for_a_whole_simulation():
     assert (model.budget, model.calls) == (1_000_000, 2)
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_determinism_reaches_simulator_and_networks(wanted):
+    """``device.deterministic`` is that of the model, and of PyTorch while the run lasts."""
+    conf = to_run(composed(*TINY, f"device.deterministic={wanted}"))
+    assert experiment.make_model(make_task(conf.task), conf, Group()).deterministic is wanted
+    before = torch.are_deterministic_algorithms_enabled()
+    try:
+        experiment.need_determinism(conf.device.deterministic)
+        assert torch.are_deterministic_algorithms_enabled() is wanted
+        assert not wanted or os.environ["CUBLAS_WORKSPACE_CONFIG"]
+    finally:
+        torch.use_deterministic_algorithms(before)
+
+
+def test_a_deterministic_run_repeats_itself(monkeypatch, tmp_path):
+    """A run with all parts takes no operation that PyTorch refuses, and gives the same metrics again."""
+    try:
+        for name in ("one", "two"):
+            words = ("device.deterministic=true", "train.record_every=0", f"hydra.run.dir={tmp_path}/{name}")
+            main(monkeypatch, *TINY, *words)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    one, two = (rows(tmp_path / name / "metrics.csv") for name in ("one", "two"))
+    assert one == two and load(tmp_path / "one").device.deterministic
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_deterministic_run_repeats_itself_on_a_gpu(monkeypatch, tmp_path, dtype):
+    """Where sums are otherwise taken in any order; in float64 no graph is captured."""
+    try:
+        for name in ("one", "two"):
+            words = (
+                "device=cuda",
+                "device.deterministic=true",
+                f"device.dtype={dtype}",
+                "train.iterations=4",
+            )
+            main(monkeypatch, *TINY, *words, f"hydra.run.dir={tmp_path}/{name}")
+    finally:
+        torch.use_deterministic_algorithms(False)
+    one, two = (rows(tmp_path / name / "metrics.csv") for name in ("one", "two"))
+    assert one == two
+
+
 def test_resume_changes_nothing_but_what_may_change(tmp_path):
     """Iterations, recording and device may differ; another key is refused by name."""
     old = RunConf(task=ArmConf(young=4e4))

@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -54,8 +55,9 @@ def test_gradient_of_policy_and_design(task):
     task = viscous(task)
     model = softmpm.build(task.scene, device="cpu", dtype=torch.float64, worlds=2)
     with seeded(0):
-        net = nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3), nn.Tanh()).double()
-    observer = Latent(VelocityImage(model), net, size=3)
+        picture = VelocityImage(model)
+        net = nn.Sequential(nn.Flatten(), nn.Linear(2 * math.prod(picture.shape), 3), nn.Tanh()).double()
+    observer = Latent(picture, net, size=3)
     policy = make_policy(PolicyConf(name="linear"), 3, 2, 0.1, seed=0).double()
     design = Design(DesignConf(strength=True, viscosity=True), model, task.regions)
     variables = [*policy.parameters(), *design.parameters()]
@@ -103,16 +105,31 @@ def test_the_loop_gives_the_gradient_of_all_parameters(task, name):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())
 
 
+@pytest.mark.parametrize("dtype, deterministic", [("float32", False), ("float64", False), ("float64", True)])
+def test_sums_in_order_are_not_captured(task, dtype, deterministic):
+    """They wait for the device, which a CUDA graph cannot; every other loop goes through the graph."""
+    model = softmpm.build(task.scene, device="cpu", dtype=getattr(torch, dtype), deterministic=deterministic)
+    observer = Centroids(model, list(task.regions.values()), task.body_length)
+    policy = make_policy(PolicyConf(name="linear"), observer.size, 2, 0.1, seed=0).to(model.dtype)
+    loop = ClosedLoop(task, model, observer, policy, lambda: (model.params(), softmpm.Inputs()), [])
+    work, calls = loop._graph, []
+    loop._graph = lambda: calls.append(1) or work()
+    loop(None)
+    assert len(calls) == (0 if deterministic else 1)
+
+
 def test_frames_and_pictures(task, model):
     """A frame at every control step and one at the end; every second look is kept, and keeps no graph."""
-    observer = Latent(VelocityImage(model), nn.Sequential(nn.Flatten(), nn.Linear(2 * 13 * 9, 3)), size=3)
+    picture = VelocityImage(model)
+    encoder = nn.Sequential(nn.Flatten(), nn.Linear(2 * math.prod(picture.shape), 3))
+    observer = Latent(picture, encoder, size=3)
     frames = []
     episode = run_episode(
         task, model, observer, Constant([0.5, 0.5]), model.params(), keep_every=2, on_frame=frames.append
     )
     assert len(frames) == task.control_steps + 1 and frames[-1].activation is None
     np.testing.assert_allclose([f.time for f in frames], 0.016 * np.arange(7))
-    assert episode.observations.shape == (3, 1, 2, 13, 9) and not episode.observations.requires_grad
+    assert episode.observations.shape == (3, 1, 2, *picture.shape) and not episode.observations.requires_grad
     torch.testing.assert_close(episode.observations[1], observer.observe(model, frames[2].state))
     assert torch.equal(frames[-1].state.x, episode.end.x)
 

@@ -1,3 +1,6 @@
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -66,6 +69,51 @@ def test_picture_follows_the_robot(exact):
     assert follow(exact, wide).isfinite().all()
 
 
+def build(make_block, shape, away=(0.0, 0.0)):
+    """The block on a grid of another shape, at another place, in float64."""
+    scene = make_block()
+    block = scene.bodies[0]
+    body = dataclasses.replace(block, particles=block.particles.moved(away))
+    grid = dataclasses.replace(scene.grid, shape=shape)
+    scene = dataclasses.replace(scene, grid=grid, bodies=[body])
+    return softmpm.build(scene, device="cpu", dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    "shape, away", [((13, 9), (0.3, 0.0)), ((40, 9), (2.5, 0.0)), ((14, 22), (0.03, 1.12))]
+)
+def test_a_track_of_any_size_gives_the_same_picture(make_block, shape, away):
+    """Longer, higher, with odd and even nodes: the same motion elsewhere is the same picture, for the same encoder."""
+    here, there = build(make_block, (13, 9)), build(make_block, shape, away)
+    state = moving(here)
+    moved = state._replace(x=state.x + torch.tensor(away, dtype=torch.float64))
+    near, far = VelocityImage(here), VelocityImage(there)
+    assert near.shape == far.shape
+    torch.testing.assert_close(far(there, moved), near(here, state), rtol=1e-9, atol=1e-12)
+    assert near(here, state).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("nodes", [5, None])
+def test_the_window_holds_the_robot_in_any_direction(make_block, nodes):
+    """Turned and stretched, it shows all of the velocity on a grid that is large enough; three times as long, it does not."""
+    model = build(make_block, (31, 31), (0.9, 1.0))
+    picture, full = VelocityImage(model, nodes), VelocityImage(model, nodes=31, follow=False)
+    middle = torch.tensor([1.5, 1.5]).double()  # a node, as in the window
+
+    def share(angle: float, stretch: float) -> float:
+        turn = torch.tensor(
+            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        ).double()
+        rest = model.rest()
+        x = middle + stretch * (model.positions - model.positions.mean(dim=0)) @ turn.T
+        state = rest._replace(x=x[None], v=torch.ones_like(rest.v))
+        return (picture.block**2 * picture(model, state).sum() / full(model, state).sum()).item()
+
+    for angle in np.linspace(0, np.pi, 7):
+        assert share(angle, 1.0) == pytest.approx(1.0, rel=1e-9), angle
+    assert share(0.0, 1.2) == pytest.approx(1.0, rel=1e-9) and share(0.0, 3.0) < 0.8
+
+
 def test_picture_in_three_dimensions():
     """A 3D grid gives a 3D picture, components first, with the velocity of a uniform motion where the robot is."""
     model = softmpm.build(busy_scene(3), device="cpu", worlds=2)
@@ -84,10 +132,10 @@ def test_features_are_differentiable(exact, kind):
     if kind == "centroids":
         observer = Centroids(exact, [np.arange(12)], body_length=0.4)
     else:
-        net = torch.nn.Sequential(
-            torch.nn.Flatten(), torch.nn.Linear(2 * 13 * 9, 3), torch.nn.Tanh()
-        ).double()
-        observer = Latent(VelocityImage(exact), net, size=3)
+        picture = VelocityImage(exact)
+        linear = torch.nn.Linear(2 * math.prod(picture.shape), 3)
+        net = torch.nn.Sequential(torch.nn.Flatten(), linear, torch.nn.Tanh()).double()
+        observer = Latent(picture, net, size=3)
     state, direction = moving(exact), [torch.randn_like(t) for t in exact.rest()[:4]]
     leaves = [t.clone().requires_grad_() for t in state[:4]]
     weight = torch.randn(2, observer.size, dtype=torch.float64)
