@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from softmpm_learn.train import Result, train
 
 PICTURES = 4
 """Moments of the best episode in robot.png, the first and the last among them."""
+PAUSE = 60.0
+"""Least time between pictures while a run goes on [s]."""
 DESIGN = {
     "young": ("Young's modulus", "Pa"),
     "poisson": ("Poisson's ratio", ""),
@@ -90,6 +93,7 @@ def run_experiment(
             begin=begun,
             group=group,
             finer=finer(conf.task) if conf.train.examine else None,
+            sketch=Sketches(task, out),
         )
     if group.first:
         draw(result, task, out)
@@ -137,19 +141,33 @@ def draw(result: Result, task: Task, out: Path) -> None:
         latent_figure(out / "latent.png", decoded(result.run))
     episode = last_episode(out / "run.h5")
     if episode is not None:
-        iteration, frames = episode
-        moments = np.linspace(0, len(frames["time"]) - 1, PICTURES).round().astype(int)
-        active = frames["activation"][:-1]  # the last frame has none
-        pictures = [
-            (
-                f"iteration {iteration}, {frames['time'][k]:.2f} s",
-                frames["x"][k],
-                active[min(k, len(active) - 1)],
-            )
-            for k in moments
-        ]
-        goal = None if any(result.run.settings.train.goal_spread) else task.goal
-        robot_figure(out / "robot.png", task.scene, pictures, design(result.run), goal=goal)
+        draw_robot(result.run, task, out, *episode)
+
+
+def draw_robot(run: Run, task: Task, out: Path, iteration: int, frames: dict[str, np.ndarray]) -> None:
+    """Leave robot.png: some moments of an episode, and the materials."""
+    moments = np.linspace(0, len(frames["time"]) - 1, PICTURES).round().astype(int)
+    active = frames["activation"][:-1]  # the last frame has none
+    pictures = [
+        (f"iteration {iteration}, {frames['time'][k]:.2f} s", frames["x"][k], active[min(k, len(active) - 1)])
+        for k in moments
+    ]
+    goal = None if any(run.settings.train.goal_spread) else task.goal
+    robot_figure(out / "robot.png", task.scene, pictures, design(run), goal=goal)
+
+
+class Sketches:
+    """Pictures while a run goes on: of the first recorded episode, and then of such as come a while after the last picture."""
+
+    def __init__(self, task: Task, out: Path):
+        self.task, self.out, self._drawn = task, out, -math.inf
+
+    def __call__(self, run: Run, iteration: int, frames: dict[str, np.ndarray]) -> None:
+        """Draw, if it is time; arguments as of :func:`draw_robot`."""
+        if time.monotonic() - self._drawn > PAUSE:
+            loss_figure(self.out / "loss.png", curves(self.out / "metrics.csv"))
+            draw_robot(run, self.task, self.out, iteration, frames)
+            self._drawn = time.monotonic()
 
 
 def curves(path: Path) -> dict[str, tuple[list[float], list[float]]]:

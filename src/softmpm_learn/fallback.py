@@ -19,6 +19,8 @@ class Fallback:
     """Iterations in a row, up to the present one."""
     count: int = 0
     """Fallbacks so far."""
+    iterations: int = 0
+    """Iterations so far."""
 
     def is_due(self, loss: float, best: float, conf: OptimizerConf) -> bool:
         """True if the run should fall back after an iteration; then a new count begins.
@@ -27,12 +29,14 @@ class Fallback:
             loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing.
             best: The lowest so far.
         """
+        self.iterations += 1
         if math.isnan(loss):
             self.below += self.below > 0
             return False
         if math.isnan(self.first):
             self.first = loss
-        low = self.first - loss < conf.fallback_share * (self.first - best)
+        early = self.iterations <= conf.fallback_from
+        low = not early and self.first - loss < conf.fallback_share * (self.first - best)
         self.below = self.below + 1 if low else 0
         if conf.fallback_share == 0 or self.below < conf.fallback_after:
             return False

@@ -17,6 +17,8 @@ VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Values of each latent feature in ``latent_figure``, the others being 0."""
 STILL = 0.1
 """Nodes that never move at this share of the highest speed are cut off around a latent picture."""
+AROUND = 0.3
+"""Margin around the places where a robot comes, over the height of the picture."""
 SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
@@ -125,7 +127,10 @@ def robot_figure(
         design: Of each material its value on each particle (particle,) and its unit; drawn at rest.
         goal: Where the robot should go, drawn as a cross.
     """
-    low, high = _window(scene)
+    way = np.concatenate(
+        [positions[:, 0] for _, positions, _ in frames] + ([goal[:1]] if goal is not None else [])
+    )
+    low, high = _window(scene, way)
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     columns = 1 if ratio < 0.45 else 2  # a high world is drawn half as wide
     rows = -(-len(frames) // columns)
@@ -134,7 +139,7 @@ def robot_figure(
     parts = figure.subfigures(2, 1, height_ratios=[above, below]) if design else np.array([figure])
     panels = parts[0].subplots(rows, columns, squeeze=False).ravel()
     for panel, (title, positions, activation) in zip(panels, frames, strict=False):
-        _draw_robot(panel, scene, positions, activation, inches=7.4 / columns)
+        _draw_robot(panel, scene, positions, activation, (low, high), inches=7.4 / columns)
         if goal is not None:
             panel.plot(goal[0], goal[1], marker="x", color="#c0392b", markersize=8, markeredgewidth=2)
         panel.set_title(title, fontsize=8, loc="left")
@@ -158,8 +163,13 @@ def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]
         part.colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax.tick_params(labelsize=6)
 
 
-def _window(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros(2), (np.array(scene.grid.shape[:2]) - 1) * scene.grid.spacing
+def _window(scene: Scene, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the part of the world that is drawn: all of its height and, of its length, these places with a margin."""
+    high = (np.array(scene.grid.shape[:2]) - 1) * scene.grid.spacing
+    margin = AROUND * high[1]
+    return np.array([max(0.0, way.min() - margin), 0.0]), np.array(
+        [min(high[0], way.max() + margin), high[1]]
+    )
 
 
 def _dot(scene: Scene, positions: np.ndarray, inches: float) -> float:
@@ -169,10 +179,16 @@ def _dot(scene: Scene, positions: np.ndarray, inches: float) -> float:
 
 
 def _draw_robot(
-    panel, scene: Scene, positions: np.ndarray, activation: np.ndarray | None, *, inches: float
+    panel,
+    scene: Scene,
+    positions: np.ndarray,
+    activation: np.ndarray | None,
+    window: tuple[np.ndarray, np.ndarray],
+    *,
+    inches: float,
 ) -> None:
     """Particles in grey, muscles red where they pull and blue where they push, walls hatched."""
-    low, high = _window(scene)
+    low, high = window
     value = np.zeros(len(positions))
     if activation is not None:
         for muscle, a in zip(scene.muscles, activation, strict=True):

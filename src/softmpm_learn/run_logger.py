@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
 import torch
+from torch import Tensor
 
 import softmpm
 from softmpm_learn import checkpoint
@@ -45,6 +47,9 @@ class RunLogger:
         seals: What the checkpoint knows of the other files, see :attr:`seals`; empty for a new run.
         begin: Called once they are found to be those of the run, before the first checkpoint.
 
+    Attributes:
+        frames: Time, positions and activation of the first world in the episode that was recorded last, until they are taken.
+
     Raises:
         ValueError: A file is not the one that the checkpoint knows.
     """
@@ -56,6 +61,7 @@ class RunLogger:
         self._timing = Table(out / "timing.csv", TIMING, seals.get("timing.csv"))
         self._recorded = seals.get("run.h5")
         self._recorder = self._open_recorder() if run.settings.train.record_every else None
+        self.frames: list[tuple[float, Tensor, Tensor | None]] = []
         begin()
         if run.iteration == 0:
             self.save()
@@ -132,8 +138,22 @@ class RunLogger:
                     if state.surface is not None or (model.surface is not None and state.nodes is not None):
                         forces = softmpm.contact_forces(model, state)
                     episode.frame(frame.time, state, frame.activation, velocity, frame.features, forces)
+                activation = None if frame.activation is None else frame.activation[0].detach()
+                self.frames.append((frame.time, state.x[0].detach(), activation))
 
+            self.frames.clear()
             yield on_frame
+
+    def take_frames(self) -> dict[str, np.ndarray]:
+        """Time [s], positions [m] and activation [-] of each of these frames, by the names of a recording."""
+        (time, x, activation), self.frames = zip(*self.frames, strict=True), []
+        nothing = torch.full_like(next(a for a in activation if a is not None), math.nan)
+        active = [nothing if a is None else a for a in activation]
+        return {
+            "time": np.array(time),
+            "x": torch.stack(x).cpu().numpy(),
+            "activation": torch.stack(active).cpu().numpy(),
+        }
 
     def __enter__(self) -> "RunLogger":
         return self

@@ -161,6 +161,8 @@ class OptimizerConf:
     fallback_after: int = 5
     """Iterations in a row below that share before the run goes back. Our choice: of twelve runs in docs/results none that was so long
     below a half came to a better one within its 100 iterations."""
+    fallback_from: int = 20
+    """First iterations, which do not count: progress is small by then, and the best of it is chance."""
     fallback_rate: float = 0.5
     """Factor of both learning rates at each fallback."""
 
@@ -169,8 +171,9 @@ class OptimizerConf:
         _positive("optimizer", self, "policy_rate", "design_rate")
         if self.max_norm is not None:
             _positive("optimizer", self, "max_norm")
-        if self.retries < 0:
-            raise ValueError(f"optimizer.retries must be ≥ 0, got {self.retries}.")
+        for name in ("retries", "fallback_from"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"optimizer.{name} must be ≥ 0, got {getattr(self, name)}.")
         _positive("optimizer", self, "fallback_after")
         _share("optimizer", self, "fallback_rate")
         if not 0.0 <= self.fallback_share < 1.0:

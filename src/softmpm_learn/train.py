@@ -59,6 +59,7 @@ def train(
     begin: Callable[[], None] = lambda: None,
     group: Group | None = None,
     finer=None,
+    sketch: Callable[[Run, int, dict], None] = lambda run, iteration, frames: None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
 
@@ -73,6 +74,7 @@ def train(
         begin: Called once, in the first process only, when the folder is locked and what is in it was found to be of this run.
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
         finer: The task on the next finer grid, on which the motion is examined; None leaves that out.
+        sketch: Called in the first process after an iteration whose episode was recorded, with its number and the frames.
 
     Raises:
         softmpm_learn.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
@@ -90,7 +92,7 @@ def train(
             run = Run(task, model, settings, out, group)
         seals = _resume(run, out)
         run_logger = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin)))
-        return _loop(run, run_logger, progress, stop, finer)
+        return _loop(run, run_logger, progress, stop, finer, sketch)
 
 
 @contextlib.contextmanager
@@ -136,7 +138,7 @@ def _restore(run: Run, content: dict, out: Path) -> dict:
         ) from error
 
 
-def _loop(run: Run, run_logger: RunLogger | None, progress, stop, finer) -> Result:
+def _loop(run: Run, run_logger: RunLogger | None, progress, stop, finer, sketch) -> Result:
     group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
     examination: dict[str, float] = {}
     while run.iteration < last and not group.any(stop()):
@@ -153,6 +155,8 @@ def _loop(run: Run, run_logger: RunLogger | None, progress, stop, finer) -> Resu
                 run_logger.save()
         if progress and group.first:
             progress(k, row)
+        if run_logger and run_logger.frames:
+            sketch(run, k, run_logger.take_frames())
     if run.iteration >= last and run_logger and run.best["iteration"] >= 0:
         examination = finish(run, run_logger, finer)
     return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"], examination)

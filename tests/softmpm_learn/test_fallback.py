@@ -22,7 +22,7 @@ def due(losses: list[float], **conf) -> list[int]:
     fallback, best, found = Fallback(), math.inf, []
     for k, loss in enumerate(losses):
         best = min(best, loss) if not math.isnan(loss) else best
-        if fallback.is_due(loss, best, OptimizerConf(**conf)):
+        if fallback.is_due(loss, best, OptimizerConf(**dict(fallback_from=0) | conf)):
             found.append(k)
     assert fallback.count == len(found)
     return found
@@ -34,6 +34,12 @@ def test_progress_counts_from_the_first_loss():
     assert due([-loss for loss in LOSSES], fallback_after=9) == []
     assert due(LOSSES, fallback_after=4) == [] == due(LOSSES, fallback_after=3, fallback_share=0.3)
     assert due(LOSSES, fallback_after=1, fallback_share=0.0) == []
+
+
+def test_the_first_iterations_do_not_count():
+    """Where they would be the ones below the share."""
+    assert due(LOSSES, fallback_after=3, fallback_from=3) == [5]
+    assert due(LOSSES, fallback_after=3, fallback_from=4) == []
 
 
 def test_only_iterations_in_a_row_count():
@@ -69,7 +75,7 @@ def scripted(monkeypatch):
 
 @pytest.fixture
 def falling(settings):
-    optimizer = dataclasses.replace(settings.optimizer, fallback_after=3)
+    optimizer = dataclasses.replace(settings.optimizer, fallback_after=3, fallback_from=0)
     learning = dataclasses.replace(settings.learning, every=2)
     conf = dataclasses.replace(settings.train, iterations=len(LOSSES))
     return dataclasses.replace(settings, optimizer=optimizer, learning=learning, train=conf)

@@ -532,3 +532,19 @@ def test_a_run_that_nobody_uses_is_freed(task, settings, tmp_path):
         assert not [thing for ref in seen if (thing := ref()) is not None]
     finally:
         gc.enable()
+
+
+def test_pictures_can_be_drawn_while_a_run_goes_on(task, model, settings, tmp_path):
+    """After each recorded episode there is what it showed, of the first world: the frames of the recording."""
+    settings.train.record_every, seen = 2, []
+
+    def sketch(run, iteration, frames):
+        seen.append((iteration, frames))
+
+    train.train(task, model, settings, tmp_path, sketch=sketch)
+    assert [iteration for iteration, _ in seen] == [0, 2, 4]
+    with softmpm.Recording(tmp_path / "run.h5") as recording:
+        for row, (_, frames) in zip(recording.episodes, seen, strict=False):
+            kept = recording.frames(row)
+            for name in ("time", "x", "activation"):
+                np.testing.assert_allclose(frames[name], kept[name], rtol=1e-6)

@@ -151,10 +151,12 @@ class WalkerConf(TaskConf):
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
-    lead: float = 0.0
-    """Time before the distance counts [s]."""
-    track: float = 1.5
-    """Length of the track [m]."""
+    seconds: float = 2.0
+    """Length of an episode [s]: four steps or five, so that what walks at its end goes on walking."""
+    lead: float = 0.5
+    """Time before the distance counts [s], to get under way."""
+    track: float = 4.0
+    """Length of the track [m], for three episodes."""
 
     def __post_init__(self):
         super().__post_init__()
