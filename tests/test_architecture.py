@@ -17,7 +17,7 @@ LAYERS = """
     scene planning alarms kernels.structs
     checks
     check_inputs
-    reference_stress reference_transfer reference_walls
+    energy_density reference_stress reference_transfer reference_walls
     reference reference_step kernels.physics
     reference_contact reference_driven reference_overlap reference_mirror
     stability kernels.convert reference_lagrangian reference_moving_contact
@@ -34,7 +34,7 @@ LAYERS = """
     schemes.registry
     kernel_inputs
     building runner rasterization cuda_graph
-    rollout forces warp_nodal
+    rollout forces quantities warp_nodal
     autograd warp_particles
     warp_arrays
     warp_api __main__

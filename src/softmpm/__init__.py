@@ -15,6 +15,18 @@ from softmpm.errors import UnstableError
 from softmpm.forces import clamp_forces, contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
+from softmpm.quantities import (
+    body_mean,
+    center_of_mass,
+    displacement,
+    elastic_energy,
+    gravitational_energy,
+    green_strain,
+    kinetic_energy,
+    mean_velocity,
+    momentum,
+    von_mises_strain,
+)
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
@@ -68,13 +80,22 @@ __all__ = [
     "WarpSolid",
     "WarpState",
     "ball",
+    "body_mean",
     "box",
     "build",
+    "center_of_mass",
     "clamp_forces",
     "contact_forces",
+    "displacement",
+    "elastic_energy",
+    "gravitational_energy",
+    "green_strain",
     "image",
     "inside",
+    "kinetic_energy",
+    "mean_velocity",
     "mesh",
+    "momentum",
     "polygons",
     "presets",
     "rasterize",
@@ -83,6 +104,7 @@ __all__ = [
     "step",
     "to_rerun",
     "torch_state",
+    "von_mises_strain",
     "warp_solid",
     "warp_state",
 ]
