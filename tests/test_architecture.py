@@ -36,7 +36,7 @@ LAYERS = """
     building runner rasterization cuda_graph
     rollout forces quantities warp_nodal
     autograd warp_particles
-    warp_arrays
+    warp_arrays trajectories
     warp_api __main__
 """
 """From the ground up. Each word is a module or a package; those of one line do not import each other."""

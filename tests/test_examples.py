@@ -46,3 +46,6 @@ def test_the_code_on_quantities_runs():
     fallen = softmpm.body_mean(model, softmpm.displacement(model, end))[0, 0]
     assert abs(fallen[1].item() / (-9.8 * 100 * 101 / 2 * 4e-4**2) - 1) < 1e-4
     assert softmpm.von_mises_strain(end).max() < 1e-4
+    frames = names["way"].frames
+    assert frames.shape == (10, 1, 2)
+    assert abs(frames[-1] - softmpm.center_of_mass(model, end, names["params"])).max() < 1e-6

@@ -38,6 +38,7 @@ from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, 
 from softmpm.scene.shapes import ball, box, image, mesh, polygons
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State, SurfaceState
+from softmpm.trajectories import Trajectory, trajectory
 from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 from softmpm.warp_nodal import WarpNodal
@@ -74,6 +75,7 @@ __all__ = [
     "StableNeoHookean",
     "State",
     "SurfaceState",
+    "Trajectory",
     "UnstableError",
     "Wall",
     "WarpNodal",
@@ -104,6 +106,7 @@ __all__ = [
     "step",
     "to_rerun",
     "torch_state",
+    "trajectory",
     "von_mises_strain",
     "warp_solid",
     "warp_state",
