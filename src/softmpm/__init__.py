@@ -31,6 +31,7 @@ from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
 from softmpm.scene import presets
+from softmpm.scene.file import load_scene, save_scene
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.outline import Outline
 from softmpm.scene.polygons import inside
@@ -95,12 +96,14 @@ __all__ = [
     "image",
     "inside",
     "kinetic_energy",
+    "load_scene",
     "mean_velocity",
     "mesh",
     "momentum",
     "polygons",
     "presets",
     "rasterize",
+    "save_scene",
     "simulate",
     "stable_dt",
     "step",
