@@ -17,7 +17,7 @@ LAYERS = """
     scene planning alarms kernels.structs
     checks
     check_inputs
-    reference_stress reference_transfer reference_walls
+    energy_density reference_stress reference_transfer reference_walls
     reference reference_step kernels.physics
     reference_contact reference_driven reference_overlap reference_mirror
     stability kernels.convert reference_lagrangian reference_moving_contact
@@ -34,9 +34,9 @@ LAYERS = """
     schemes.registry
     kernel_inputs
     building runner rasterization cuda_graph
-    rollout forces warp_nodal
+    rollout forces quantities warp_nodal
     autograd warp_particles
-    warp_arrays
+    warp_arrays trajectories
     warp_api __main__
 """
 """From the ground up. Each word is a module or a package; those of one line do not import each other."""

@@ -15,10 +15,23 @@ from softmpm.errors import UnstableError
 from softmpm.forces import clamp_forces, contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
+from softmpm.quantities import (
+    body_mean,
+    center_of_mass,
+    displacement,
+    elastic_energy,
+    gravitational_energy,
+    green_strain,
+    kinetic_energy,
+    mean_velocity,
+    momentum,
+    von_mises_strain,
+)
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
 from softmpm.scene import presets
+from softmpm.scene.file import load_scene, save_scene
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.outline import Outline
 from softmpm.scene.polygons import inside
@@ -26,6 +39,7 @@ from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, 
 from softmpm.scene.shapes import ball, box, image, mesh, polygons
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State, SurfaceState
+from softmpm.trajectories import Trajectory, trajectory
 from softmpm.warp_api import step
 from softmpm.warp_arrays import WarpSolid, WarpState, torch_state, warp_solid, warp_state
 from softmpm.warp_nodal import WarpNodal
@@ -62,27 +76,41 @@ __all__ = [
     "StableNeoHookean",
     "State",
     "SurfaceState",
+    "Trajectory",
     "UnstableError",
     "Wall",
     "WarpNodal",
     "WarpSolid",
     "WarpState",
     "ball",
+    "body_mean",
     "box",
     "build",
+    "center_of_mass",
     "clamp_forces",
     "contact_forces",
+    "displacement",
+    "elastic_energy",
+    "gravitational_energy",
+    "green_strain",
     "image",
     "inside",
+    "kinetic_energy",
+    "load_scene",
+    "mean_velocity",
     "mesh",
+    "momentum",
     "polygons",
     "presets",
     "rasterize",
+    "save_scene",
     "simulate",
     "stable_dt",
     "step",
     "to_rerun",
     "torch_state",
+    "trajectory",
+    "von_mises_strain",
     "warp_solid",
     "warp_state",
 ]

@@ -26,7 +26,7 @@ def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
         )
         dtype = torch.float64 if QUANTITIES[name].double else model.dtype
         check_tensor(model, f"inputs.{name}", value, dtype=dtype)
-        axes, steps = QUANTITIES[name].axes, _steps(name, value)
+        axes, steps = QUANTITIES[name].axes, steps_of(name, value)
         want = model.shape_of(name, 1 if steps is None else steps)
         shape = tuple(value.shape)
         pairs = list(zip(reversed(shape), reversed(want), reversed(axes), strict=False))
@@ -53,7 +53,7 @@ def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
     return given
 
 
-def _steps(name: str, value: Tensor) -> int | None:
+def steps_of(name: str, value: Tensor) -> int | None:
     """Control steps that an input tells; None if it serves any number."""
     axes = QUANTITIES[name].axes
     if value.ndim < len(axes) or len(value) == 1 or axes[0] not in ("pose", "control_step"):
@@ -67,7 +67,7 @@ def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
         return activation.shape[0]
     told = {} if activation is None else {"activation": len(activation)}
     for name, value in given.items():
-        if (steps := _steps(name, value)) is not None:
+        if (steps := steps_of(name, value)) is not None:
             told[f"inputs.{name}"] = steps
     need(
         len(set(told.values())) <= 1,

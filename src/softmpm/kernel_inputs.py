@@ -42,7 +42,7 @@ def derive(
     found: Values = dict(zip(("mu", "lam", "mass"), material(model, params), strict=True))
     if model.spec.muscle_slots:
         found["active_stress"] = _active_stress(model, activation, given.get("strength"), horizon)
-    full = {name: _expanded(model, name, value, horizon) for name, value in (model.defaults | given).items()}
+    full = {name: expanded(model, name, value, horizon) for name, value in (model.defaults | given).items()}
     for name, value in full.items():
         if name == "direction":
             found["fibre"] = value / value.norm(dim=-1, keepdim=True)
@@ -51,8 +51,7 @@ def derive(
         elif name == "force":
             found["force"] = value / model.mass_unit
         elif name == "position":
-            before = torch.cat([start.x[None, :, model.driven], value[:-1]])
-            found["velocity"] = (value - before) / (horizon.substeps * model.scene.dt)
+            found["velocity"] = velocity_to(model, start, value, horizon)
         elif name == "wall_velocity":
             found["surface_velocity"] = value
         elif name not in ("strength", "wall_offset", "wall_normal"):
@@ -64,12 +63,18 @@ def derive(
     return {name: found[name] for name in model.derived}
 
 
-def _expanded(model: Model, name: str, value: Tensor, horizon: Horizon) -> Tensor:
+def expanded(model: Model, name: str, value: Tensor, horizon: Horizon) -> Tensor:
     """The input expanded to all of its axes; a wall at rest retains its single pose."""
     shape = model.shape_of(name, horizon.control_steps)
     if name in ("wall_offset", "wall_normal") and value.ndim == len(shape):
         shape = (len(value), *shape[1:])
     return value.expand(shape)
+
+
+def velocity_to(model: Model, start: State, position: Tensor, horizon: Horizon) -> Tensor:
+    """Velocities at which driven particles reach their positions, shape (control_step, world, driven, dim)."""
+    before = torch.cat([start.x[None, :, model.driven], position[:-1]])
+    return (position - before) / (horizon.substeps * model.scene.dt)
 
 
 def _active_stress(

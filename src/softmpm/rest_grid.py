@@ -5,13 +5,14 @@ as in MLS-MPM (Hu et al. 2018). Derivation: docs/math/lagrangian.md.
 """
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from softmpm.kernels.lagrangian.bricks import LARGEST_LATTICE, bricks_for
-from softmpm.scene.scene import Scene
+from softmpm.scene.scene import Grid, Scene
 
 
 class RestGrid:
@@ -111,6 +112,27 @@ class RestGrid:
         self.weight = torch.from_numpy(share).to(device)
         away = np.linalg.norm(self.nodes.cpu().numpy() * grid.spacing - positions.mean(axis=0), axis=1)
         self.middle = int(np.where(share > 0.5 * share.max(), away, np.inf).argmin())
+
+
+def nodes_around(rest: RestGrid, places: Tensor, grid: Grid) -> Iterator[tuple[Tensor, Tensor]]:
+    """Number and B-spline weight of each of the 3^dim nodes around the particles at rest, one node after the other.
+
+    Args:
+        places: Rest positions [m], shape (particle, dim), float64.
+
+    Returns:
+        Pairs of shape (particle,): numbers of nodes, int64, and weights, float64.
+    """
+    places = places / grid.spacing
+    base = torch.floor(places - 0.5 + SAME)
+    f = places - base
+    splines = 0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2
+    index, number = rest.index.sort()
+    for offset in itertools.product(range(3), repeat=len(grid.shape)):
+        at, weight = torch.zeros_like(base[:, 0]), torch.ones_like(f[:, 0])
+        for axis, k in enumerate(offset):
+            at, weight = at * grid.shape[axis] + base[:, axis] + k, weight * splines[k][:, axis]
+        yield number[torch.searchsorted(index, at.long())], weight
 
 
 def lattice_of(base: np.ndarray, fraction: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -76,11 +76,17 @@ def restore(owner: Any, values: Sequence[Any]) -> None:
         object.__setattr__(owner, field.name, read_only(value) if isinstance(value, np.ndarray) else value)
 
 
+UNIT = 1e-15
+"""Lengths within this of one are one: rounding alone, which a further division would only move."""
+
+
 def unit(name: str, vector: Sequence[float]) -> tuple[tuple[float, ...], float]:
-    """A vector divided by its length, and that length."""
+    """A vector divided by its length, and that length; a unit vector as it is, and 1."""
     given = numbers(name, vector)
     length = math.hypot(*given)
     need(length > 0, f"{name} must not be zero, got {given}.")
+    if abs(length - 1.0) <= UNIT:
+        return given, 1.0
     return tuple(number / length for number in given), length
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm.validate import array, need, read_only, restore
+from softmpm.validate import UNIT, array, need, read_only, restore
 
-UNIT = 1e-6
+NEARLY_UNIT = 1e-6
 """A normal's length may differ from one by this much, which float32 normals do."""
 
 
@@ -49,7 +49,7 @@ class Outline:
         length = np.linalg.norm(normals, axis=1)
         off = np.abs(length - 1.0)
         need(
-            bool((off <= UNIT).all()),
+            bool((off <= NEARLY_UNIT).all()),
             f"outline normals must have length 1, got {length[off.argmax()]:.6g} at point {off.argmax()}; "
             "divide them by np.linalg.norm(normals, axis=1, keepdims=True).",
         )
@@ -57,7 +57,8 @@ class Outline:
             bool((areas > 0).all()),
             f"outline areas must be > 0, got {areas.min()} at point {areas.argmin()}; leave out points without area.",
         )
-        for name, values in zip(_FIELDS, (points, normals / length[:, None], areas), strict=True):
+        unit = np.where(off[:, None] <= UNIT, normals, normals / length[:, None])
+        for name, values in zip(_FIELDS, (points, unit, areas), strict=True):
             object.__setattr__(self, name, read_only(values))
 
     @property

@@ -223,8 +223,7 @@ class Wall:
             f"a {self.contact} wall has no friction, got {self.friction}; use contact='separate'.",
         )
         normal, length = unit("wall normal", self.normal)
-        if abs(length - 1.0) > 1e-15:  # a unit normal leaves the offset as it was written
-            object.__setattr__(self, "offset", self.offset / length)
+        object.__setattr__(self, "offset", self.offset / length)
         object.__setattr__(self, "normal", normal)
 
 
