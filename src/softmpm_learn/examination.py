@@ -141,17 +141,18 @@ def built(task: Task, run: Run, worlds: int = 1) -> Model:
 
 def transferred(run: Run, task: Task) -> tuple[softmpm.Params, softmpm.Inputs]:
     """The design of a run on the particles of a task of the same robot: values of the particle at the nearest place in the robot."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     places = [
         np.concatenate([body.particles.positions for body in scene.bodies])
         for scene in (run.task.scene, task.scene)
     ]
     old, new = ((place - place.min(axis=0)) / np.ptp(place, axis=0) for place in places)
-    nearest = torch.as_tensor(cKDTree(old).query(new)[1], device=run.model.device)
+    nearest = torch.as_tensor(KDTree(old).query(new)[1], device=run.model.device)
     params, inputs = run.design()
     found = {}
     for name, value in inputs._asdict().items():
-        of_particles = value is not None and value.shape[-1] == run.model.particle_count
-        found[name] = value[..., nearest] if of_particles else value
+        if value is not None and value.shape[-1] == run.model.particle_count:
+            value = value[..., nearest]
+        found[name] = value
     return softmpm.Params(*(value[..., nearest] for value in params)), softmpm.Inputs(**found)

@@ -102,8 +102,12 @@ class RunLogger:
 
     def add(self, iteration: int, row: dict[str, float], seconds: dict[str, float]) -> None:
         """A row of either table, and the figures to the recording."""
-        self._metrics.append(iteration, row)
         self._timing.append(iteration, seconds)
+        self.add_figures(iteration, row)
+
+    def add_figures(self, iteration: int, row: dict[str, float]) -> None:
+        """A row of metrics.csv alone, and its figures to the recording."""
+        self._metrics.append(iteration, row)
         if self._recorder:
             known = {name: value for name, value in row.items() if math.isfinite(value)}
             self._recorder.scalars(iteration, known)

@@ -199,6 +199,6 @@ def finish(run: Run, run_logger: RunLogger, finer) -> dict[str, float]:
         )
     if run.settings.train.examine:
         found = examine(run, finer)
-        run_logger.add(run.iteration, found, {})
+        run_logger.add_figures(run.iteration, found)
     run.load_policy(now)
     return found

@@ -69,6 +69,6 @@ def test_what_has_no_contact_forces_is_refused():
     model = made(slab())
     with pytest.raises(ValueError, match="got one without nodes or surface points; simulate from it first"):
         softmpm.contact_forces(model, model.rest())
-    for other in (made(slab(), contact="nodes"), softmpm.build(slab(), device="cpu")):
+    for other in (made(slab(), contact="nodes"), softmpm.build(slab(), device="cpu", contact="nodes")):
         with pytest.raises(ValueError, match="build it with contact='surface'"):
             softmpm.contact_forces(other, other.rest())

@@ -25,7 +25,7 @@ from softmpm_learn.tasks import TASKS, ArmConf, Resolution, make_task
 ROOT = Path(__file__).parents[2]
 TINY = [  # the smallest run that has every phase
     *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
-    *("learning.epochs=1", "learning.batches=1", "train.iterations=2"),
+    *("learning.epochs=1", "learning.batches=1", "train.iterations=2", "train.examine=false"),
 ]
 LEFT = (
     *("config.yaml", "metrics.csv", "timing.csv", "run.h5", "run.rrd", "checkpoint.pt"),

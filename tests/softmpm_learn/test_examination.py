@@ -96,7 +96,7 @@ def test_a_simulation_that_fails_has_no_answer(run, monkeypatch, caplog):
 
 def test_a_run_ends_with_its_examination(task, model, settings, tmp_path):
     """In the result, and in a last row of metrics.csv, for the episode after the last; not if it is switched off."""
-    settings.observer.name = "centroids"
+    settings.observer.name, settings.train.examine = "centroids", True
     result = train(task, model, settings, tmp_path / "run")
     with open(tmp_path / "run" / "metrics.csv", newline="") as file:
         *rows, last = csv.DictReader(file)

@@ -20,7 +20,7 @@ from softmpm_learn.tasks import TASKS
 SETTINGS = [
     *("experiment=smoke", "device=cpu", "task.seconds=0.05", "task.control_period=0.025"),
     *("task.formulation=reference", "task.retardation=1e-3", "design.viscosity=true", "design.strength=true"),
-    *("learning.epochs=1", "learning.batches=1", "train.iterations=2"),
+    *("learning.epochs=1", "learning.batches=1", "train.iterations=2", "train.examine=false"),
 ]
 """The smallest run that has every phase, with all that may be designed."""
 

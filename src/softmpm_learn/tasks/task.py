@@ -153,17 +153,17 @@ class WalkerConf(TaskConf):
     """Coulomb friction of the floor [-]."""
     seconds: float = 2.0
     """Length of an episode [s]: four steps or five, so that what walks at its end goes on walking."""
-    lead: float = 0.5
-    """Time before the distance counts [s], to get under way."""
+    lead: float | None = None
+    """Time before the distance counts, to get under way [s]; null is a quarter of the episode."""
     track: float = 4.0
     """Length of the track [m], for three episodes."""
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("friction", "upright", "lead")
-        if self.lead >= self.seconds:
+        self.need_not_negative("friction", "upright")
+        if self.lead is not None and not 0 <= self.lead < self.seconds:
             raise ValueError(
-                f"task.lead must be below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
+                f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
             )
         if not (math.isfinite(self.track) and self.track >= 1.0):
             raise ValueError(f"task.track must be at least 1 m, got {self.track}.")
@@ -239,7 +239,8 @@ def walking(conf: "WalkerConf", rest: np.ndarray, torso: np.ndarray) -> Objectiv
     low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
     front, back = torso[rest[torso, 0] > high], torso[rest[torso, 0] < low]
     tilt = Tilt(weight=conf.upright, front=front, back=back, rest=rest)
-    return Objective(Progress(begin=conf.lead), Effort(weight=conf.effort), tilt)
+    lead = conf.seconds / 4 if conf.lead is None else conf.lead
+    return Objective(Progress(begin=lead), Effort(weight=conf.effort), tilt)
 
 
 def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:

@@ -45,7 +45,7 @@ class ParticleStep(Substep):
     def step_adj(
         self,
         wanted: RequestedGrads,
-        particles: tuple,
+        particles: tuple[Any, Any, Any, Any],
         adj_inputs: tuple,
         surface: SurfaceState | None,
         adj_end: SurfaceState | None,
