@@ -1,4 +1,4 @@
-"""Tasks as gymnasium environments: the interface, the agreement of worlds with single environments, rewards, gradients, failures."""
+"""Tasks as gymnasium environments: the interface, the agreement of worlds with single environments, rewards and gradients."""
 
 import re
 import subprocess
@@ -21,8 +21,6 @@ from softmpm_learn.tasks import TASKS
 ROOT = Path(__file__).parents[2]
 SHORT = dict(seconds=0.05, device="cpu")
 """Four control steps."""
-FAILING = dict(seconds=0.1, device="cpu", strength=1e5, safety=1.0)
-"""An arm whose muscles are too strong for its time step as soon as they pull."""
 UNBOUNDED = "ignore:.*A Box observation space m..imum value is -?infinity"
 
 
@@ -195,51 +193,6 @@ def test_windows_and_episodes_cut_the_gradient(task):
         observation, _ = env.step_torch(row)
     (gradient,) = torch.autograd.grad(observation.sum(), rows)
     assert not gradient[:-1].any() and gradient[-1].any()
-
-
-def test_a_world_that_fails_ends_alone():
-    """It is terminated with the reason and charged as if it had stood still; the others have the bits that they have beside a healthy
-    world, and the next episode of the failed one is that of a new environment."""
-    env, calm = (make_vec("arm", 3, kick=0.01, **FAILING) for _ in range(2))
-    rows = np.zeros((8, 3, 6), dtype=np.float32)
-    rows[:, 1:] = 0.003 * actions(env, 8)[:, 1:]
-    for one in (env, calm):
-        one.reset(seed=2)
-    for step, row in enumerate(rows):
-        wild = row.copy()
-        wild[0] = 1.0 if step == 1 else 0.0
-        got, want = env.step(wild), calm.step(row)
-        np.testing.assert_array_equal(got[0][1:], want[0][1:])
-        np.testing.assert_array_equal(got[1][1:], want[1][1:])
-        assert got[2].tolist() == [step == 1, False, False]
-        if step == 1:
-            info, value = got[4], float(env.worlds.loss[0])
-            assert info["failure"][0] == "step" and "stable step" in info["message"][0]
-            assert info["failure"][1] is None and info["_failure"].tolist() == [True, False, False]
-            effort = 1e-3 / 8  # of the one step with full activation
-            left = got[1][0] * 8 / 7 + effort * 8 / 7  # seven of the eight steps, the failed one included
-            assert value == pytest.approx(-left + effort, rel=1e-3)
-        if step == 2:
-            assert got[1][0] == 0.0
-            fresh = env.worlds.shown.x[0] - env.worlds.model.positions
-            assert not fresh.any()
-
-
-def test_a_failed_world_has_no_gradient():
-    """The gradients of the others are finite and those that they have without it."""
-    env = make_vec("arm", 2, **FAILING)
-    found = []
-    for wild in (1.0, 0.0):
-        env.reset(seed=0)
-        row = torch.full((2, 6), 0.003)
-        row[0] = wild
-        row.requires_grad_()
-        observation, reward = env.step_torch(row)
-        assert env.terminated.tolist() == [wild == 1.0, False]
-        found.append(torch.autograd.grad(observation.sum() + reward.sum(), row)[0])
-    assert torch.isfinite(found[0]).all()
-    torch.testing.assert_close(found[0][1], found[1][1], rtol=0.0, atol=0.0)
-    assert found[0][0].abs().max() < 1e-3 * found[1][0].abs().max()  # only its effort
 
 
 def test_pictures_show_the_robot():
