@@ -152,7 +152,14 @@ def train_skrl(minutes: float, steps: int = 10**9, worlds: int = WORLDS, **setti
         device=wrapped.device,
     )
     trainer = SequentialTrainer(
-        cfg={"timesteps": steps, "headless": True, "disable_progressbar": True}, env=wrapped, agents=agent
+        cfg={
+            "timesteps": steps,
+            "headless": True,
+            "disable_progressbar": True,
+            "close_environment_at_exit": False,
+        },
+        env=wrapped,
+        agents=agent,
     )
     with contextlib.suppress(BudgetError):
         trainer.train()
