@@ -19,6 +19,7 @@ IMPORTED_AS = {
     "hydra-core": "hydra",
     "pillow": "PIL",
     "charset-normalizer": "trimesh",
+    "stable-baselines3": "stable_baselines3",
 }
 
 

@@ -1,0 +1,86 @@
+"""Environments by name: ``softmpm/Elephant-v0`` and the others in gymnasium's registry."""
+
+import dataclasses
+from typing import Any, cast
+
+import gymnasium
+
+from softmpm_learn.gym.env import SoftRobotEnv
+from softmpm_learn.gym.vector import SoftRobotVectorEnv
+from softmpm_learn.gym.worlds import EnvConf
+from softmpm_learn.tasks import TASKS, Resolution, Task, make_task
+
+
+def identifier(name: str) -> str:
+    """Name of a task in gymnasium's registry."""
+    if name not in TASKS:
+        raise ValueError(f"task must be one of {', '.join(TASKS)}, got {name!r}.")
+    return f"softmpm/{name.title().replace('_', '')}-v0"
+
+
+def register() -> None:
+    """Register every task."""
+    for name in TASKS:
+        if identifier(name) not in gymnasium.registry:
+            gymnasium.register(
+                identifier(name),
+                entry_point=make_single,
+                vector_entry_point=make_vector,
+                kwargs={"task": name},
+            )
+
+
+def make(name: str, **settings: Any) -> SoftRobotEnv:
+    """Environment of a task, without wrappers.
+
+    Args:
+        name: elephant, arm or biped.
+        settings: ``render_mode``, fields of :class:`EnvConf` and of the task's own settings, such as ``seconds=0.5``; ``resolution``
+            may be a string.
+    """
+    return cast(
+        SoftRobotEnv, gymnasium.make(identifier(name), disable_env_checker=True, **settings).unwrapped
+    )
+
+
+def make_vec(name: str, num_envs: int = 1, **settings: Any) -> SoftRobotVectorEnv:
+    """Environment of ``num_envs`` worlds of a task; settings as of :func:`make`, and ``autoreset_mode``."""
+    return cast(SoftRobotVectorEnv, gymnasium.make_vec(identifier(name), num_envs=num_envs, **settings))
+
+
+def make_single(task: str, render_mode: str | None = None, **settings: Any) -> SoftRobotEnv:
+    """Entry point of gymnasium for one world."""
+    return SoftRobotEnv(*parts(task, settings), render_mode=render_mode)
+
+
+def make_vector(
+    task: str,
+    num_envs: int,
+    render_mode: str | None = None,
+    autoreset_mode: str = "NextStep",
+    **settings: Any,
+) -> SoftRobotVectorEnv:
+    """Entry point of gymnasium for many worlds."""
+    built, conf = parts(task, settings)
+    return SoftRobotVectorEnv(built, num_envs, conf, render_mode, autoreset_mode)
+
+
+def parts(name: str, settings: dict[str, Any]) -> tuple[Task, EnvConf]:
+    """Task and settings of the environment from one set of keywords.
+
+    Raises:
+        ValueError: A keyword is a setting of neither.
+    """
+    kind, _ = TASKS[name]
+    own = [field.name for field in dataclasses.fields(EnvConf)]
+    theirs = [field.name for field in dataclasses.fields(kind) if field.name != "name"]
+    unknown = [key for key in settings if key not in (*own, *theirs)]
+    if unknown:
+        raise ValueError(
+            f"there is no setting {unknown[0]}; known are render_mode, {', '.join([*own, *theirs])}."
+        )
+    chosen = {key: value for key, value in settings.items() if key in theirs}
+    if isinstance(chosen.get("resolution"), str):
+        chosen["resolution"] = Resolution[chosen["resolution"]]
+    conf = EnvConf(**{key: value for key, value in settings.items() if key in own})
+    return make_task(kind(**chosen)), conf

@@ -1,0 +1,250 @@
+"""Episodes of a task in the worlds of one model, each with a clock of its own: reset, step, observation and reward.
+
+Reward of control step t of N, from the loss f of the state after it and the running cost c (:mod:`softmpm_learn.objective`):
+
+    progress    f(sₜ) − f(sₜ₊₁) − cₜ / N      its sum over an episode is f(s₀) − f(s_N) − mean c
+    closeness   −(f(sₜ₊₁) + cₜ) / N           its sum over an episode is −(mean f + mean c)
+
+A world that fails ends its episode and is charged as if it stood still in its last state until the horizon, so that neither sum
+rewards failing.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import softmpm
+from softmpm import Failures, Model, State, UnstableError
+from softmpm_learn.observe import Centroids, Observer
+from softmpm_learn.tasks import Task
+
+Tree = TypeVar("Tree")
+REWARDS = ("progress", "closeness")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConf:
+    """Settings of an environment besides those of its task."""
+
+    observer: Callable[[Task, Model], Observer] | None = None
+    """Builds the observer; None takes the centroids of the task's regions."""
+    reward: Literal["progress", "closeness"] | None = None
+    """Kind of reward; None is closeness for a task with a goal, otherwise progress."""
+    kick: float = 0.0
+    """Standard deviation of each component of the robot's velocity when an episode begins [m/s]; 0 starts at rest."""
+    goal_spread: Sequence[float] = ()
+    """Half widths [m] of the box around the task's goal from which each episode draws its own; empty: fixed goal."""
+    device: str | None = None
+    """Device of the simulation, None for CUDA if there is one."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of the simulation, of the observations and of the actions."""
+
+    def __post_init__(self):
+        if self.reward not in (None, *REWARDS):
+            raise ValueError(f"reward must be one of {', '.join(REWARDS)} or None, got {self.reward!r}.")
+        if self.dtype not in ("float32", "float64"):
+            raise ValueError(f"dtype must be 'float32' or 'float64', got {self.dtype!r}.")
+        if not all(math.isfinite(value) and value >= 0 for value in (self.kick, *self.goal_spread)):
+            raise ValueError(
+                f"kick and goal_spread must be ≥ 0, got {self.kick} and {list(self.goal_spread)}."
+            )
+
+
+class Outcome(NamedTuple):
+    """Result of one control step of every world."""
+
+    observation: Tensor
+    """Observation after it, shape (world, size). Differentiable."""
+    reward: Tensor
+    """Reward, shape (world,). Differentiable."""
+    terminated: np.ndarray
+    """Worlds whose simulation failed, shape (world,)."""
+    truncated: np.ndarray
+    """Worlds that reached the horizon, shape (world,)."""
+    failures: dict[int, UnstableError]
+    """Failures by world."""
+
+    @property
+    def ended(self) -> np.ndarray:
+        """Worlds whose episode ended, shape (world,)."""
+        return self.terminated | self.truncated
+
+
+class Worlds:
+    """Episodes of a task in ``count`` worlds.
+
+    Attributes:
+        model: Model of all worlds.
+        size: Numbers in an observation.
+        loss: Loss of the episode so far, as the learner defines it, shape (world,), detached; of a complete episode it is the ``loss``
+            of a gradient-based run.
+    """
+
+    def __init__(self, task: Task, count: int, conf: EnvConf):
+        self.task, self.count, self.conf = task, count, conf
+        dtype = torch.float64 if conf.dtype == "float64" else torch.float32
+        self.model = softmpm.build(
+            task.scene,
+            device=conf.device,
+            dtype=dtype,
+            worlds=count,
+            calls=task.control_steps,
+            **task.build,
+        )
+        self.params = self.model.params()
+        self.observer = (conf.observer or centroids)(task, self.model)
+        self.reward = conf.reward or ("progress" if task.goal is None else "closeness")
+        self._spread = self._tensor(self._checked_spread())
+        self._centre = self._tensor([] if task.goal is None else task.goal)
+        self.goal = self._centre.expand(count, -1).clone() if conf.goal_spread else None
+        self.size = self.observer.size + len(self._spread)
+        self.origin: State = self.model.rest()
+        self.state: State = self.model.rest()
+        self.steps = np.zeros(count, dtype=int)
+        self.activation = self._tensor(np.zeros((count, self.model.muscle_count)))
+        self._fresh = np.ones(count, dtype=bool)
+        self._cost = self._tensor(np.zeros(count))
+        self._value = self._final(self.origin)
+
+    def _checked_spread(self) -> list[float]:
+        spread = list(self.conf.goal_spread)
+        if spread and (self.task.goal is None or len(spread) != self.model.dim):
+            raise ValueError(
+                f"goal_spread needs a task with a goal and {self.model.dim} lengths; "
+                f"task {self.task.name} has goal {self.task.goal}, goal_spread is {spread}."
+            )
+        return spread
+
+    def _tensor(self, values: Any) -> Tensor:
+        return torch.as_tensor(np.asarray(values), device=self.model.device).to(self.model.dtype)
+
+    @property
+    def loss(self) -> Tensor:
+        return self._value.detach() + self._cost
+
+    def begin(self, worlds: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Begin new episodes.
+
+        Args:
+            worlds: Which worlds, shape (world,).
+            generators: Of each world, for its kick and its goal.
+        """
+        if not worlds.any():
+            return
+        dim = self.model.dim
+        kicks, goals = np.zeros((self.count, 1, dim)), np.zeros((self.count, dim))
+        for world in np.flatnonzero(worlds).tolist():
+            kicks[world] = self.conf.kick * generators[world].standard_normal(dim)
+            goals[world] = generators[world].uniform(-1.0, 1.0, dim)
+        mask = self._mask(worlds)
+        velocity = self._tensor(kicks).expand_as(self.origin.v)
+        self.origin = self.origin._replace(v=select(mask, velocity, self.origin.v))
+        if self.goal is not None:
+            self.goal = select(mask, self._centre + self._spread * self._tensor(goals), self.goal)
+        self.steps = np.where(worlds, 0, self.steps)
+        self._fresh = self._fresh | worlds
+        self._cost = torch.where(mask, 0.0, self._cost)
+        self._value = torch.where(mask, self._final(self.origin), self._value)
+        self.activation = select(mask, torch.zeros_like(self.activation), self.activation)
+
+    def observe(self) -> Tensor:
+        """Features and, if it is drawn at random, the goal in [-1, 1] along each axis of its box; shape (world, size)."""
+        features = self.observer(self.model, self.shown)
+        if self.goal is None:
+            return features
+        inverse = torch.where(self._spread > 0, 1 / self._spread, 0.0)
+        return torch.cat([features, (self.goal - self._centre) * inverse], dim=-1)
+
+    @property
+    def shown(self) -> State:
+        """Particles of every world as they are now."""
+        mask, first, now = self._mask(self._fresh), self.origin, self.state
+        if not self._fresh.any():
+            return State(now.x, now.v, now.C, now.F)
+        x, v, C, F = (select(mask, one, two) for one, two in zip(first[:4], now[:4], strict=True))
+        return State(x, v, C, F)
+
+    def step(self, activation: Tensor, moving: np.ndarray | None = None) -> Outcome:
+        """One control step.
+
+        Args:
+            activation: Activation [-], shape (world, muscle). Differentiable.
+            moving: Worlds that take part, shape (world,); the others stay as they are, with a reward of 0.
+        """
+        shape = self.count, self.model.muscle_count
+        if tuple(activation.shape) != shape:
+            raise ValueError(
+                f"the action must have shape {shape}, one number per muscle, got {tuple(activation.shape)}."
+            )
+        moving = np.ones(self.count, dtype=bool) if moving is None else moving
+        failures = self._simulate(activation, moving) if moving.any() else {}
+        failed = np.array([world in failures for world in range(self.count)])
+        self.activation = select(self._mask(moving), activation.detach(), self.activation)
+        self.steps = self.steps + moving
+        reward = self._reward(activation, moving, failed)
+        truncated = moving & ~failed & (self.steps >= self.task.control_steps)
+        return Outcome(self.observe(), reward, failed, truncated, failures)
+
+    def _simulate(self, activation: Tensor, moving: np.ndarray) -> dict[int, UnstableError]:
+        """Advance the worlds that move. Episodes that begin and episodes that go on take a launch each: only the state of the latter
+        has surface points and nodes."""
+        found = {}
+        for group, start in ((moving & ~self._fresh, self.state), (moving & self._fresh, self.origin)):
+            if not group.any():
+                continue
+            mask, failures = self._mask(group), Failures("freeze")
+            driven = select(mask, activation, torch.zeros_like(activation))
+            end = softmpm.simulate(
+                self.model, start, driven[None], self.params, substeps=self.task.substeps, failures=failures
+            )
+            others = bool((~group & ~self._fresh).any())
+            self.state = select(mask, end, self.state) if others else end
+            for error in failures.errors:
+                if group[error.world]:
+                    found.setdefault(error.world, error)
+        self._fresh = self._fresh & ~moving
+        return found
+
+    def _reward(self, activation: Tensor, moving: np.ndarray, failed: np.ndarray) -> Tensor:
+        objective, count, shown = self.task.objective, self.task.control_steps, self.shown
+        value, mask = self._final(shown), self._mask(moving)
+        cost = objective.running(shown.x, activation) / count
+        reward = -value / count if self.reward == "closeness" else self._value - value
+        if failed.any():
+            left = self._tensor(failed * (count - self.steps))
+            cost = cost + left * objective.running(shown.x, torch.zeros_like(activation)) / count
+            if self.reward == "closeness":
+                reward = reward - left * value / count
+        self._cost = self._cost + torch.where(mask, cost, 0.0).detach()
+        self._value = torch.where(mask, value, self._value)
+        return torch.where(mask, reward - cost, 0.0)
+
+    def _final(self, state: State) -> Tensor:
+        return self.task.objective.final(self.origin, state, self.goal)
+
+    def _mask(self, worlds: np.ndarray) -> Tensor:
+        return torch.as_tensor(worlds, device=self.model.device)
+
+    def detach(self) -> None:
+        """Cut the gradient: later steps do not differentiate through earlier ones."""
+        self.state, self._value = self.state.detach(), self._value.detach()
+
+
+def centroids(task: Task, model: Model) -> Observer:
+    """Position and velocity of each region of the task."""
+    return Centroids(model, list(task.regions.values()), task.body_length)
+
+
+def select(mask: Tensor, chosen: Tree, other: Tree) -> Tree:
+    """Rows of ``chosen`` in the worlds of ``mask`` and of ``other`` elsewhere, of tensors or of named tuples of them."""
+    if isinstance(chosen, Tensor):
+        return torch.where(mask.view(-1, *(1,) * (chosen.ndim - 1)), chosen, other)  # type: ignore[return-value]
+    if chosen is None:
+        return chosen
+    pairs = zip(chosen, other, strict=True)  # type: ignore[call-overload]
+    return type(chosen)(*(select(mask, one, two) for one, two in pairs))  # type: ignore[return-value]
