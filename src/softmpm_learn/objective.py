@@ -14,11 +14,13 @@ class Spin(Term):
         return path.C[self.window(path)].diagonal(dim1=-2, dim2=-1).sum(-1).square().mean(dim=(0, 2))
 """
 
+import dataclasses
 import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -78,6 +80,9 @@ class Placed:
 class Term(Placed, ABC):
     """A term of an objective: its weight times its value. Smaller is better."""
 
+    adds_up: ClassVar[Literal["states", "steps", "way"]] = "states"
+    """The value is a mean over the states or the control steps of the window, or a sum over the control steps that lie in it. Where
+    rewards are given step by step, a constraint counts state by state."""
     weight: float = 1.0
     begin: float = 0.0
     """The window begins here [s]; the state of that time counts."""
@@ -109,9 +114,10 @@ class Term(Placed, ABC):
         return slice(inside[0], inside[-1] + 1)
 
     def steps(self, path: Path) -> slice:
-        """The control steps that end in the window, but for one that begins before it."""
+        """The control steps between these states, or the one that ends in a single state."""
         states = self.window(path)
-        return slice(states.start, max(states.stop - 1, states.start + 1))
+        stop = max(states.stop - 1, 1)
+        return slice(min(states.start, stop - 1), stop)
 
     def rate(self, path: Path) -> float:
         """Value that windows of different lengths can be compared by, in the mean of the worlds."""
@@ -134,6 +140,7 @@ class Term(Placed, ABC):
 class Progress(Term):
     """Go far: minus the distance [m] that the mean position travels along an axis within the window."""
 
+    adds_up: ClassVar[Literal["states", "steps", "way"]] = "way"
     axis: int = 0
     particles: np.ndarray | None = None
     """Indices of the particles that count, None for all."""
@@ -195,6 +202,8 @@ class Still(Term):
 class Effort(Term):
     """Mean squared activation [-] (Spielberg et al. 2021 use weights of about 1e-6)."""
 
+    adds_up: ClassVar[Literal["states", "steps", "way"]] = "steps"
+
     def value(self, path: Path) -> Tensor:
         return path.activation[self.steps(path)].square().mean(dim=(0, -1))
 
@@ -253,11 +262,12 @@ class AtMost(Term):
     """The constraint that another term's value is at most ``most``, as a penalty: the square of what is beyond it."""
 
     term: Term
-    """Its own window counts, its weight does not."""
+    """Its weight and its window do not count."""
     most: float
 
     def value(self, path: Path) -> Tensor:
-        return (self.term.value(path) - self.most).clamp(min=0.0).square()
+        term = dataclasses.replace(self.term, begin=self.begin, end=self.end)
+        return (term.value(path) - self.most).clamp(min=0.0).square()
 
     @property
     def name(self) -> str:

@@ -1,5 +1,6 @@
 """Tasks as gymnasium environments: the interface, the agreement of worlds with single environments, rewards and gradients."""
 
+import dataclasses
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from gymnasium.vector import SyncVectorEnv
 import softmpm_learn.gym
 from softmpm_learn.episode import run_episode
 from softmpm_learn.gym import EnvConf, SoftRobotEnv, SoftRobotVectorEnv, make, make_vec
+from softmpm_learn.objective import Path as Motion
 from softmpm_learn.observe import Centroids
 from softmpm_learn.tasks import TASKS
 
@@ -100,29 +102,33 @@ def test_episodes_may_begin_at_different_times(formulation):
             assert reward[k] == pytest.approx(want[1], rel=1e-6)
 
 
+@pytest.mark.parametrize("reward", ["objective", "dense"])
 @pytest.mark.parametrize("name", ["arm", "biped"])
-def test_the_rewards_add_up_to_the_objective(name):
-    """Of a walker their sum is minus the loss of the same episode of the learner; of the arm it is minus the mean over all control
-    steps of the squared distance, with the effort. Both end with the learner's loss in the info."""
-    env = make(name, **SHORT)
+def test_the_rewards_add_up_to_the_objective(name, reward):
+    """Their sum is minus what the steps of an episode add to the objective, with or without its windows; the info has the learner's
+    loss."""
+    late = {"hold": 0.025} if name == "arm" else {}
+    env = make(name, reward=reward, **SHORT, **late)
     worlds = env.worlds
     rows = np.random.default_rng(1).uniform(-1.0, 1.0, (4, worlds.model.muscle_count)).astype(np.float32)
     env.reset(seed=0)
     results = [env.step(row) for row in rows]
-    frames = []
+    frames, terms = [], worlds.task.objective.terms
     with torch.no_grad():
         policy = Replayed(torch.as_tensor(rows)[:, None])
         episode = run_episode(
             worlds.task, worlds.model, worlds.observer, policy, worlds.params, on_frame=frames.append
         )
-    total = sum(result[1] for result in results)
-    if name == "arm":
-        tip = worlds.task.objective.particles
-        away = [frame.state.x[0, tip].mean(0).numpy() - worlds.task.goal for frame in frames[1:]]
-        want = np.square(away).sum(axis=1).mean() + 1e-3 * np.square(rows).mean()
-        assert total == pytest.approx(-want, rel=1e-5)
-    else:
-        assert total == pytest.approx(-float(episode.loss), abs=1e-7)
+    states, activation = [frame.state for frame in frames], torch.as_tensor(rows)[:, None]
+    path = Motion([frame.time for frame in frames], states, activation)
+    if reward == "dense":
+        terms = [dataclasses.replace(term, begin=0.0) for term in terms]
+    want = sum(term.weight * float(term.value(path)) for term in terms)
+    for term in terms:  # the first state belongs to no step
+        if term.adds_up == "states" and term.begin == 0.0:
+            alone = dataclasses.replace(term, end=0.0)
+            want -= term.weight * float(alone.value(path)) / len(states)
+    assert sum(result[1] for result in results) == pytest.approx(-want, rel=1e-5, abs=1e-7)
     assert [result[3] for result in results] == [False, False, False, True]
     assert results[-1][4]["loss"] == pytest.approx(float(episode.loss), rel=1e-4, abs=1e-7)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
@@ -155,7 +161,7 @@ def total_return(env, rows: torch.Tensor) -> torch.Tensor:
     return total
 
 
-@pytest.mark.parametrize("kind", ["progress", "closeness"])
+@pytest.mark.parametrize("kind", ["dense", "objective"])
 @pytest.mark.parametrize("worlds", [None, 2])
 def test_the_gradient_of_a_step(task, kind, worlds):
     """In float64, step_torch agrees with central differences of rewards and observations through an episode, and with step."""
@@ -179,7 +185,7 @@ def test_the_gradient_of_a_step(task, kind, worlds):
 
 def test_windows_and_episodes_cut_the_gradient(task):
     """After detach no gradient reaches earlier actions; neither does it from the next episode of the same world."""
-    env = SoftRobotVectorEnv(task, 2, EnvConf(device="cpu", reward="progress"))
+    env = SoftRobotVectorEnv(task, 2, EnvConf(device="cpu"))
     env.reset(seed=0)
     rows = (0.5 * torch.ones(task.control_steps + 2, 2, 2)).requires_grad_()
     env.step_torch(rows[0])
@@ -219,7 +225,7 @@ def test_any_observer_takes_the_place_of_the_centroids():
     ("settings", "message"),
     [
         ({"sceonds": 1.0}, "there is no setting sceonds; known are render_mode, observer, reward"),
-        ({"reward": "sparse"}, "reward must be one of progress, closeness or None"),
+        ({"reward": "sparse"}, "reward must be one of dense, objective"),
         ({"kick": -1.0}, "kick and goal_spread must be ≥ 0"),
         ({"dtype": "float16"}, "dtype must be 'float32' or 'float64'"),
         ({"render_mode": "human"}, "render_mode must be one of rgb_array or None"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from softmpm_learn.gym import EnvConf, SoftRobotEnv, make_vec
-from softmpm_learn.objective import Effort, Height, Progress
+from softmpm_learn.objective import Effort, Low, Objective, Progress
 
 FAILING = dict(seconds=0.1, device="cpu", strength=1e5, safety=1.0)
 """An arm whose muscles are too strong for its time step as soon as they pull."""
@@ -21,10 +21,12 @@ def test_a_world_that_fails_ends_alone():
     rows[:, 1:] = 0.003 * np.random.default_rng(0).uniform(-1.0, 1.0, (8, 2, 6))
     for one in (env, calm):
         one.reset(seed=2)
+    first, total = float(env.worlds.loss[0]), 0.0
     for step, row in enumerate(rows):
         wild = row.copy()
         wild[0] = 1.0 if step == 1 else 0.0
         got, want = env.step(wild), calm.step(row)
+        total += got[1][0]
         np.testing.assert_array_equal(got[0][1:], want[0][1:])
         np.testing.assert_array_equal(got[1][1:], want[1][1:])
         assert got[2].tolist() == [step == 1, False, False]
@@ -32,9 +34,7 @@ def test_a_world_that_fails_ends_alone():
             info, value = got[4], float(env.worlds.loss[0])
             assert info["failure"][0] == "step" and "stable step" in info["message"][0]
             assert info["failure"][1] is None and info["_failure"].tolist() == [True, False, False]
-            effort = 1e-3 / 8  # of the one step with full activation
-            left = got[1][0] * 8 / 7 + effort * 8 / 7  # seven of the eight steps, the failed one included
-            assert value == pytest.approx(-left + effort, rel=1e-3)
+            assert value == pytest.approx(first - total, rel=1e-3)
         if step == 2:
             assert got[1][0] == 0.0
             fresh = env.worlds.shown.x[0] - env.worlds.model.positions
@@ -45,11 +45,13 @@ def test_a_failed_world_is_charged_until_the_horizon(task, make_block):
     """The running cost of its last state without activation counts for all steps that are left."""
     muscles = [dataclasses.replace(muscle, strength=290.0) for muscle in task.scene.muscles]
     high = dataclasses.replace(
-        task, scene=make_block(muscles=muscles), objective=Progress(terms=(Height(1.0, 10.0), Effort(1e-2)))
+        task,
+        scene=make_block(muscles=muscles),
+        objective=Objective(Progress(), Low(lowest=10.0), Effort(weight=1e-2)),
     )
-    env = SoftRobotEnv(high, EnvConf(device="cpu", reward="progress"))
+    env = SoftRobotEnv(high, EnvConf(device="cpu"))
     env.reset(seed=0)
-    costs, total = [], 0.0
+    total, costs = 0.0, [float((10.0 - env.worlds.shown.x[0, :, 1].mean()).square())]
     for pull in (0.0, 1.0):
         _, reward, terminated, _, info = env.step(np.full(2, pull))
         costs.append(float((10.0 - env.worlds.shown.x[0, :, 1].mean()).square()))
@@ -57,8 +59,9 @@ def test_a_failed_world_is_charged_until_the_horizon(task, make_block):
     assert terminated and "failure" in info
     moved = float((env.worlds.shown.x - env.worlds.model.positions)[..., 0].mean())
     steps = task.control_steps
-    want = moved - (costs[0] + (steps - 1) * costs[1] + 1e-2) / steps
-    assert total == pytest.approx(want, rel=1e-6) and info["loss"] == pytest.approx(-want, rel=1e-6)
+    want = moved - (costs[1] + (steps - 1) * costs[2]) / (steps + 1) - 1e-2 / steps
+    assert total == pytest.approx(want, rel=1e-6)
+    assert info["loss"] == pytest.approx(costs[0] / (steps + 1) - want, rel=1e-6)
 
 
 def test_a_failed_world_has_no_gradient():

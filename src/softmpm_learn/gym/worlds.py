@@ -1,12 +1,7 @@
 """Episodes of a task in the worlds of one model, each with a clock of its own: reset, step, observation and reward.
 
-Reward of control step t of N, from the loss f of the state after it and the running cost c (:mod:`softmpm_learn.objective`):
-
-    progress    f(sₜ) − f(sₜ₊₁) − cₜ / N      its sum over an episode is f(s₀) − f(s_N) − mean c
-    closeness   −(f(sₜ₊₁) + cₜ) / N           its sum over an episode is −(mean f + mean c)
-
-A world that fails ends its episode and is charged as if it stood still in its last state until the horizon, so that neither sum
-rewards failing.
+The reward of a control step is minus what it adds to the loss (rewards.py). A world that fails ends its episode and is charged as if it stood still in its last state until the horizon, so that failing
+is not rewarded.
 """
 
 import math
@@ -20,11 +15,11 @@ from torch import Tensor
 
 import softmpm
 from softmpm import Failures, Model, State, UnstableError
+from softmpm_learn.gym.rewards import REWARDS, Costs
 from softmpm_learn.observe import Centroids, Observer
 from softmpm_learn.tasks import Task
 
 Tree = TypeVar("Tree")
-REWARDS = ("progress", "closeness")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +28,8 @@ class EnvConf:
 
     observer: Callable[[Task, Model], Observer] | None = None
     """Builds the observer; None takes the centroids of the task's regions."""
-    reward: Literal["progress", "closeness"] | None = None
-    """Kind of reward; None is closeness for a task with a goal, otherwise progress."""
+    reward: Literal["dense", "objective"] = "dense"
+    """Kind of reward, see rewards.py."""
     kick: float = 0.0
     """Standard deviation of each component of the robot's velocity when an episode begins [m/s]; 0 starts at rest."""
     goal_spread: Sequence[float] = ()
@@ -45,8 +40,8 @@ class EnvConf:
     """Precision of the simulation, of the observations and of the actions."""
 
     def __post_init__(self):
-        if self.reward not in (None, *REWARDS):
-            raise ValueError(f"reward must be one of {', '.join(REWARDS)} or None, got {self.reward!r}.")
+        if self.reward not in REWARDS:
+            raise ValueError(f"reward must be one of {', '.join(REWARDS)}, got {self.reward!r}.")
         if self.dtype not in ("float32", "float64"):
             raise ValueError(f"dtype must be 'float32' or 'float64', got {self.dtype!r}.")
         if not all(math.isfinite(value) and value >= 0 for value in (self.kick, *self.goal_spread)):
@@ -98,7 +93,7 @@ class Worlds:
         )
         self.params = self.model.params()
         self.observer = (conf.observer or centroids)(task, self.model)
-        self.reward = conf.reward or ("progress" if task.goal is None else "closeness")
+        self._costs, self._losses = Costs(task, conf.reward == "dense"), Costs(task, dense=False)
         self._spread = self._tensor(self._checked_spread())
         self._centre = self._tensor([] if task.goal is None else task.goal)
         self.goal = self._centre.expand(count, -1).clone() if conf.goal_spread else None
@@ -108,8 +103,7 @@ class Worlds:
         self.steps = np.zeros(count, dtype=int)
         self.activation = self._tensor(np.zeros((count, self.model.muscle_count)))
         self._fresh = np.ones(count, dtype=bool)
-        self._cost = self._tensor(np.zeros(count))
-        self._value = self._final(self.origin)
+        self.loss = self._losses.first(self.origin, self.activation, self.goal)
 
     def _checked_spread(self) -> list[float]:
         spread = list(self.conf.goal_spread)
@@ -122,10 +116,6 @@ class Worlds:
 
     def _tensor(self, values: Any) -> Tensor:
         return torch.as_tensor(np.asarray(values), device=self.model.device).to(self.model.dtype)
-
-    @property
-    def loss(self) -> Tensor:
-        return self._value.detach() + self._cost
 
     def begin(self, worlds: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes.
@@ -148,9 +138,8 @@ class Worlds:
             self.goal = select(mask, self._centre + self._spread * self._tensor(goals), self.goal)
         self.steps = np.where(worlds, 0, self.steps)
         self._fresh = self._fresh | worlds
-        self._cost = torch.where(mask, 0.0, self._cost)
-        self._value = torch.where(mask, self._final(self.origin), self._value)
         self.activation = select(mask, torch.zeros_like(self.activation), self.activation)
+        self.loss = torch.where(mask, self._losses.first(self.origin, self.activation, self.goal), self.loss)
 
     def observe(self) -> Tensor:
         """Features and, if it is drawn at random, the goal in [-1, 1] along each axis of its box; shape (world, size)."""
@@ -182,11 +171,12 @@ class Worlds:
                 f"the action must have shape {shape}, one number per muscle, got {tuple(activation.shape)}."
             )
         moving = np.ones(self.count, dtype=bool) if moving is None else moving
+        before = self.shown
         failures = self._simulate(activation, moving) if moving.any() else {}
         failed = np.array([world in failures for world in range(self.count)])
         self.activation = select(self._mask(moving), activation.detach(), self.activation)
         self.steps = self.steps + moving
-        reward = self._reward(activation, moving, failed)
+        reward = self._reward(before, activation, moving, failed)
         truncated = moving & ~failed & (self.steps >= self.task.control_steps)
         return Outcome(self.observe(), reward, failed, truncated, failures)
 
@@ -210,29 +200,24 @@ class Worlds:
         self._fresh = self._fresh & ~moving
         return found
 
-    def _reward(self, activation: Tensor, moving: np.ndarray, failed: np.ndarray) -> Tensor:
-        objective, count, shown = self.task.objective, self.task.control_steps, self.shown
-        value, mask = self._final(shown), self._mask(moving)
-        cost = objective.running(shown.x, activation) / count
-        reward = -value / count if self.reward == "closeness" else self._value - value
-        if failed.any():
-            left = self._tensor(failed * (count - self.steps))
-            cost = cost + left * objective.running(shown.x, torch.zeros_like(activation)) / count
-            if self.reward == "closeness":
-                reward = reward - left * value / count
-        self._cost = self._cost + torch.where(mask, cost, 0.0).detach()
-        self._value = torch.where(mask, value, self._value)
-        return torch.where(mask, reward - cost, 0.0)
-
-    def _final(self, state: State) -> Tensor:
-        return self.task.objective.final(self.origin, state, self.goal)
+    def _reward(self, before: State, activation: Tensor, moving: np.ndarray, failed: np.ndarray) -> Tensor:
+        """Reward of the step that has just been made, which also adds to the loss."""
+        mask, after, steps, found = self._mask(moving), self.shown, self.steps - moving, []
+        for costs in (self._costs, self._losses):
+            cost = costs.cost(before, after, activation, steps, self.goal)
+            if failed.any():
+                still = costs.standing(after, activation, self.steps, self.goal)
+                cost = cost + torch.where(self._mask(failed), still, 0.0)
+            found.append(torch.where(mask, cost, 0.0))
+        self.loss = self.loss + found[1].detach()
+        return -found[0]
 
     def _mask(self, worlds: np.ndarray) -> Tensor:
         return torch.as_tensor(worlds, device=self.model.device)
 
     def detach(self) -> None:
         """Cut the gradient: later steps do not differentiate through earlier ones."""
-        self.state, self._value = self.state.detach(), self._value.detach()
+        self.state = self.state.detach()
 
 
 def centroids(task: Task, model: Model) -> Observer:
