@@ -18,6 +18,7 @@ IMPORTED_AS = {
     "rerun-sdk": "rerun",
     "hydra-core": "hydra",
     "pillow": "PIL",
+    "imageio-ffmpeg": "imageio_ffmpeg",
     "charset-normalizer": "trimesh",
 }
 

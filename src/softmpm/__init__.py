@@ -15,6 +15,8 @@ from softmpm.errors import UnstableError
 from softmpm.forces import clamp_forces, contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
+from softmpm.pictures.figure import show
+from softmpm.pictures.film import to_video
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
@@ -78,10 +80,12 @@ __all__ = [
     "polygons",
     "presets",
     "rasterize",
+    "show",
     "simulate",
     "stable_dt",
     "step",
     "to_rerun",
+    "to_video",
     "torch_state",
     "warp_solid",
     "warp_state",
