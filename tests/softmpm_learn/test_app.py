@@ -17,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.__main__ import help_text
 from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
 from softmpm_learn.saved import load, save
