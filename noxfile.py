@@ -16,6 +16,13 @@ def check(session: nox.Session) -> None:
 
 
 @nox.session
+def docs(session: nox.Session) -> None:
+    """The site of the documentation, in ``site/``; a warning is an error."""
+    session.install("-e", ".[docs]")
+    session.run("python", "-m", "sphinx", "-W", "--keep-going", "-q", "docs", "site")
+
+
+@nox.session
 def gpu(session: nox.Session) -> None:
     """The tests that need a GPU."""
     session.install("-e", ".[dev]")

@@ -1,11 +1,17 @@
-"""The examples of the README run as printed."""
+"""The examples of the README and of the pages run as printed."""
 
 import re
 from pathlib import Path
 
+import pytest
 import torch
+import warp
+from PIL import Image, ImageSequence
+
+import softmpm
 
 README = Path(__file__).parents[1] / "README.md"
+START = README.parent / "docs" / "start.md"
 FORMULATIONS = README.parent / "docs" / "formulations.md"
 QUANTITIES = README.parent / "docs" / "quantities.md"
 
@@ -30,11 +36,44 @@ def test_the_code_on_contact_forces_runs():
     assert abs(names["friction"].grad.item() / 588 - 1) < 0.15
 
 
-def test_every_file_that_the_readme_names_is_there():
-    """Links and pictures lead somewhere."""
-    for target in re.findall(r"\]\(([^)#]+)\)", README.read_text()):
+def test_the_code_of_the_first_page_runs(tmp_path, monkeypatch, capsys):
+    """In one program, block after block: the tip learns, and a picture, a film, a recording and a Rerun file are written."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("warp.config.log_level", warp.config.log_level)
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", START.read_text(), re.DOTALL):
+        exec(code, names)
+    losses = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines() if line[:1].isdigit()]
+    assert len(losses) == 5 and losses[-1] < 0.1 * losses[0]
+    wanted = {"scene.png", "end.png", "finger.gif", "finger.h5", "finger.rrd"}
+    assert {path.name for path in tmp_path.iterdir()} == wanted
+    with Image.open("finger.gif") as film:  # 0.1 s at a tenth of the speed, with equal pictures merged
+        assert film.n_frames == len(names["states"]) == 11
+        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(film)) == 26 * 40
+
+
+PAGES = [
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    *(f"docs/{p.name}" for p in (README.parent / "docs").glob("*.md")),
+]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_file_that_a_page_names_is_there(page):
+    """Links and pictures lead somewhere, also on a host that shows the files as they are."""
+    text = re.sub(r"```.*?```|`[^`]*`", "", (README.parent / page).read_text(), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
         if not target.startswith("http"):
-            assert (README.parent / target).exists(), target
+            assert (README.parent / page).parent.joinpath(target).exists(), target
+
+
+def test_the_reference_has_every_public_name():
+    """``docs/api.rst`` lists what ``softmpm`` exports, each once."""
+    listed = re.findall(r"auto\w+:: ([\w.]+)", (README.parent / "docs" / "api.rst").read_text())
+    names = [name.rpartition(".")[2] for name in listed if name != "Episode"]
+    assert sorted(names) == sorted(softmpm.__all__)
 
 
 def test_the_code_on_quantities_runs():

@@ -1,6 +1,7 @@
 """The installed package has types, a version, and no dependency that nothing imports."""
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 import softmpm
 
@@ -18,6 +20,7 @@ IMPORTED_AS = {
     "rerun-sdk": "rerun",
     "hydra-core": "hydra",
     "pillow": "PIL",
+    "imageio-ffmpeg": "imageio_ffmpeg",
     "charset-normalizer": "trimesh",
     "stable-baselines3": "stable_baselines3",
 }
@@ -45,10 +48,28 @@ def test_the_version_is_that_of_the_wheel(wheel):
     assert re.fullmatch(r"\d+\.\d+\.\d+", softmpm.__version__)
 
 
+def test_the_learner_is_a_command(wheel):
+    """The installed command is the entry of ``python -m softmpm_learn``."""
+    (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
+    assert "softmpm-learn = softmpm_learn.__main__:main" in wheel.read(name).decode()
+    assert callable(importlib.import_module("softmpm_learn.__main__").main)
+
+
+def test_the_citation_has_the_version():
+    """And the authors of the metadata."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert citation["version"] == softmpm.__version__
+    assert [one["name"] for one in citation["authors"]] == [one["name"] for one in project["authors"]]
+    assert citation["license"] == project["license"]
+
+
 def test_everything_that_is_installed_is_imported():
     """By a module of src: a dependency or extra that nothing uses promises what is not there."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = {name: asked for name, asked in project["optional-dependencies"].items() if name != "dev"}
+    extras = {
+        name: asked for name, asked in project["optional-dependencies"].items() if name not in ("dev", "docs")
+    }
     imported = set()
     for path in (ROOT / "src").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -15,6 +15,8 @@ from softmpm.errors import UnstableError
 from softmpm.forces import clamp_forces, contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
+from softmpm.pictures.figure import show
+from softmpm.pictures.film import to_video
 from softmpm.quantities import (
     body_mean,
     center_of_mass,
@@ -104,10 +106,12 @@ __all__ = [
     "presets",
     "rasterize",
     "save_scene",
+    "show",
     "simulate",
     "stable_dt",
     "step",
     "to_rerun",
+    "to_video",
     "torch_state",
     "trajectory",
     "von_mises_strain",

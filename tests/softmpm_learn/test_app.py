@@ -17,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.__main__ import help_text
 from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
 from softmpm_learn.saved import load, save
@@ -148,6 +149,20 @@ def test_help_is_worth_reading(monkeypatch, capsys):
     for word in ("python -m softmpm_learn task=arm", "resume=", "-m train.seed=0,1,2", *LEFT):
         assert word in text
     assert "_schema" not in text and max(map(len, text.splitlines())) <= 110
+    assert text.strip() == help_text().strip()
+
+
+def test_help_does_not_wait_for_pytorch():
+    """The text comes without the imports that take seconds."""
+    code = (
+        "import runpy, sys\n"
+        "sys.argv = ['softmpm_learn', '--help']\n"
+        "runpy.run_module('softmpm_learn', run_name='__main__')\n"
+        "sys.exit(bool({'torch', 'warp', 'softmpm', 'hydra'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("softmpm_learn: a soft robot learns to move")
 
 
 # How it refuses

@@ -71,12 +71,12 @@ def wall_outlines(normals: np.ndarray, offsets: np.ndarray, upper: np.ndarray) -
         outline = offset * normal + 10 * (np.linalg.norm(upper) + abs(offset)) * corners
         others = [other for j, other in enumerate(zip(normals, offsets, strict=True)) if j != k]
         for limit_normal, limit in [*free, *others]:
-            outline = _clip(outline, limit_normal, limit - 1e-6 * upper.max())
+            outline = clip(outline, limit_normal, limit - 1e-6 * upper.max())
         outlines.append(outline)
     return outlines
 
 
-def _clip(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
+def clip(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
     """Part of a convex polygon, or of a line of two points, with n·x ≥ offset (Sutherland and Hodgman 1974)."""
     side = corners @ normal - offset
     kept = []

@@ -1,4 +1,4 @@
-"""Rewards of control steps: what each adds to the terms of the task's objective (:mod:`softmpm_learn.objective`), with the sign changed.
+"""Rewards of control steps: minus what each adds to the terms of the task's objective (:mod:`softmpm_learn.objective`).
 
 dense       windows of time are left out: distances count, and places are compared, from the first step to the last
 objective   as the learner counts it: the sum over an episode is minus the loss, but for what the first state adds

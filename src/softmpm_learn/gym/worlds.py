@@ -1,7 +1,7 @@
 """Episodes of a task in the worlds of one model, each with a clock of its own: reset, step, observation and reward.
 
-The reward of a control step is minus what it adds to the loss (rewards.py). A world that fails ends its episode and is charged as if it stood still in its last state until the horizon, so that failing
-is not rewarded.
+The reward of a control step is minus what it adds to the loss (rewards.py). A world that fails ends its episode and is charged as if it
+stood still in its last state until the horizon, so that failing is not rewarded.
 """
 
 import math
@@ -155,6 +155,8 @@ class Worlds:
         mask, first, now = self._mask(self._fresh), self.origin, self.state
         if not self._fresh.any():
             return State(now.x, now.v, now.C, now.F)
+        if self._fresh.all():  # without the graph of the episodes before
+            return State(first.x, first.v, first.C, first.F)
         x, v, C, F = (select(mask, one, two) for one, two in zip(first[:4], now[:4], strict=True))
         return State(x, v, C, F)
 

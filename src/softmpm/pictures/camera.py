@@ -1,0 +1,80 @@
+"""Perspective view of a 3D scene: places in the picture, sizes, order and shading. NumPy only."""
+
+import itertools
+
+import numpy as np
+
+from softmpm.pictures.surroundings import Surroundings
+from softmpm.recording import style
+
+AMBIENT = 0.6
+"""Brightness of a surface that is turned away from the light."""
+
+
+class Camera:
+    """Pinhole camera a little above a box, from which lengths in the picture are those at the centre of the box [m].
+
+    Attributes:
+        position: Of the pinhole [m], shape (3,).
+    """
+
+    def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray):
+        self.position, target = style.eye(low, high, up)
+        forward = target - self.position
+        self._distance = float(np.linalg.norm(forward))
+        forward = forward / self._distance
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        self._axes = np.stack([right, np.cross(right, forward), forward])
+        light = self._axes.T @ np.array([-0.45, 0.75, -0.8])  # from the upper left, behind the camera
+        self._light = light / np.linalg.norm(light)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Place of points (point, 3) in the picture (point, 2), and magnification (point,): larger is nearer."""
+        across, above, depth = self._axes @ (points - self.position).T
+        scale = self._distance / np.maximum(depth, 0.05 * self._distance)
+        return np.stack([across * scale, above * scale], -1), scale
+
+    def shading(self, place: Surroundings, positions: np.ndarray) -> np.ndarray:
+        """Brightness of each particle (particle,): Lambert's law, with the normal from the centre of its neighbours to it."""
+        outward = positions - positions[place.neighbours].mean(1)
+        length = np.linalg.norm(outward, axis=-1)
+        cosine = outward @ self._light / np.maximum(length, 1e-12)
+        return AMBIENT + (1.0 - AMBIENT) * np.clip(cosine, 0.0, 1.0)
+
+    def frame(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the picture that contains a box."""
+        corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+        places, _ = self.project(corners)
+        return places.min(0), places.max(0)
+
+
+def tiles(outline: np.ndarray, gap: float) -> np.ndarray:
+    """Lines across a convex polygon in space, along and across its longest edge, at multiples of ``gap`` [m]; shape (line, 2, 3)."""
+    edges = np.roll(outline, -1, axis=0) - outline
+    along = edges[np.linalg.norm(edges, axis=1).argmax()]
+    along = along / np.linalg.norm(along)
+    normal = np.cross(edges[0], edges[1])
+    lines = []
+    for axis in (along, np.cross(normal / np.linalg.norm(normal), along)):
+        axis = axis * np.sign(axis[np.abs(axis).argmax()])
+        heights = outline @ axis
+        for level in np.arange(np.ceil(heights.min() / gap), np.floor(heights.max() / gap) + 1) * gap:
+            cut = _crossings(outline, heights - level)
+            if len(cut) == 2:
+                lines.append(cut)
+    return np.array(lines).reshape(-1, 2, 3)
+
+
+def _crossings(outline: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Places where a polygon's edges change side."""
+    after, far = np.roll(side, -1), np.roll(outline, -1, axis=0)
+    change = (side >= 0) != (after >= 0)
+    share = side[change] / (side[change] - after[change])
+    return outline[change] + share[:, None] * (far[change] - outline[change])
+
+
+def round_length(extent: float) -> float:
+    """The largest of 1, 2, 5 · 10ⁿ that is at most a fifth of an extent."""
+    unit = 10.0 ** np.floor(np.log10(extent / 5))
+    return float(unit * max(step for step in (1, 2, 5) if step * unit <= extent / 5 * (1 + 1e-9)))

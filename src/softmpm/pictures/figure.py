@@ -1,0 +1,216 @@
+"""show: a picture of a scene or of a state as a matplotlib figure, without pyplot, so that nothing global changes."""
+
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from softmpm.checks import check_state
+from softmpm.model import Model
+from softmpm.pictures.camera import Camera
+from softmpm.pictures.colouring import QUANTITIES, Colouring, coloured, values_of
+from softmpm.pictures.instant import Instant, array, at_rest, of_state
+from softmpm.pictures.panel import Panel
+from softmpm.pictures.surroundings import Surroundings, of_scene
+from softmpm.scene.scene import Scene
+from softmpm.state import State
+
+WIDTH, TALLEST = 7.0, 6.0
+"""Most width of a figure, and most height of its panels together [inch]."""
+NARROWEST, LOWEST = 3.6, 1.6
+"""Least width of a figure, and least height of its panels together [inch]."""
+LABELS = (1.55, 0.45)
+"""Room for the labels of the axes and the colours [inch], across and above each other."""
+
+
+def show(
+    model: Model | Scene,
+    state: State | None = None,
+    *,
+    colour: str | Tensor | np.ndarray | None = None,
+    activation: Tensor | None = None,
+    world: int | Sequence[int] = 0,
+    limits: tuple[float, float] | None = None,
+    label: str = "",
+    axes: Any = None,
+) -> Any:
+    """Draw a scene or a state: particles, walls, and where there are any surface points and the tractions of the walls.
+
+    ::
+
+        softmpm.show(scene)  # the design, before anything is built
+        softmpm.show(model, state, colour="strain").savefig("strain.png")
+        softmpm.show(model, state, world=range(4))  # four worlds side by side
+
+    The figure shows itself in a notebook. Walls are drawn as the scene describes them. Driven particles have dark edges.
+
+    Args:
+        model: What ``state`` belongs to; a scene is drawn at rest.
+        state: State of all worlds; None is the scene at rest. The tractions are those of :func:`softmpm.contact_forces`.
+        colour: "speed", "strain" (size of the Green strain), "activation", "muscle", "body", or an array of one number per particle,
+            shape (particle,) or (world, particle). None takes the activation if it is given, else the speed, and of a scene at rest the
+            muscles, or the bodies if there are none.
+        activation: Activation [-], shape (muscle,) or (world, muscle).
+        world: The world to draw, or several, side by side.
+        limits: Ends of the colour scale; None takes those of the values.
+        label: Of the colour bar, for an array of one's own.
+        axes: matplotlib axes to draw into, or one for each world, in place of a figure of its own.
+
+    Returns:
+        The ``matplotlib.figure.Figure``.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        TypeError, ValueError: An argument has another type or shape; the message names the remedy.
+    """
+    if not isinstance(model, Model | Scene):
+        raise TypeError(f"show needs a model or a scene, got {type(model).__name__}.")
+    scene = model if isinstance(model, Scene) else model.scene
+    place = of_scene(scene)
+    worlds = (world,) if isinstance(world, int) else tuple(world)
+    instants = _instants(model, state, activation, worlds)
+    if colour is None:
+        at_work = "activation" if activation is not None else "speed"
+        colour = at_work if state is not None else ("muscle" if scene.muscles else "body")
+    if isinstance(colour, str):
+        if colour not in QUANTITIES:
+            raise ValueError(f"colour must be one of {', '.join(QUANTITIES)}, or an array, got {colour!r}.")
+        values = [values_of(colour, place, instant) for instant in instants]
+    else:
+        values = _own(colour, worlds, len(place.rest))
+    colouring = coloured(colour if isinstance(colour, str) else None, label, place, values, limits)
+    titles = [f"world {k}" if len(worlds) > 1 else "" for k in worlds]
+    low, high = place.window(np.concatenate([instant.positions for instant in instants]))
+    figure, panels = panels_of(place, low, high, len(worlds), colouring, longest(instants), axes)
+    for panel, instant, one, title in zip(panels, instants, values, titles, strict=True):
+        panel.draw(instant, colouring.rgb(one), title)
+    if axes is None:
+        figure.draw_without_rendering()  # the ticks decide the layout, which decides the ticks: once is not enough
+    return figure
+
+
+def _instants(
+    model: Model | Scene, state: State | None, activation: Tensor | None, worlds: tuple[int, ...]
+) -> list[Instant]:
+    """What is drawn of each world."""
+    if state is None:
+        scene = model if isinstance(model, Scene) else model.scene
+        return [at_rest(scene)] * len(worlds)
+    if isinstance(model, Scene):
+        raise TypeError("a state is drawn with its model, got a scene; give softmpm.build(scene).")
+    check_state(model, state)
+    if not worlds or not all(0 <= k < model.worlds for k in worlds):
+        raise ValueError(
+            f"world must be between 0 and {model.worlds - 1}, or several of these, got {worlds}."
+        )
+    shapes = ((model.muscle_count,), (model.worlds, model.muscle_count))
+    if activation is not None and tuple(activation.shape) not in shapes:
+        raise ValueError(
+            f"activation must have shape {shapes[0]} or {shapes[1]}, got {tuple(activation.shape)}; a picture is one instant, so of "
+            "many control steps it takes one."
+        )
+    return [of_state(model, state, activation, k) for k in worlds]
+
+
+def _own(colour: Tensor | np.ndarray, worlds: tuple[int, ...], count: int) -> list[np.ndarray]:
+    """A number for each particle of each world, of the user's own."""
+    values = array(colour) if isinstance(colour, Tensor) else np.asarray(colour, dtype=float)
+    if values.shape == (count,):
+        return [values] * len(worlds)
+    if values.ndim != 2 or values.shape[1] != count or len(values) <= max(worlds):
+        raise ValueError(f"colour must have shape ({count},) or (world, {count}), got {values.shape}.")
+    return [values[k] for k in worlds]
+
+
+def longest(instants: Sequence[Instant]) -> float:
+    """Traction at the top of its scale [Pa]; 0 without any."""
+    sizes = (np.linalg.norm(one.traction.sum(0), axis=-1) for one in instants if one.traction is not None)
+    return max((float(size.max(initial=0.0)) for size in sizes), default=0.0)
+
+
+def panels_of(
+    place: Surroundings,
+    low: np.ndarray,
+    high: np.ndarray,
+    count: int,
+    colouring: Colouring,
+    traction: float,
+    axes: Any = None,
+) -> tuple[Any, list[Panel]]:
+    """A figure, or that of given axes, with a panel for each world and the key of the colours."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("a picture needs the package matplotlib: pip install matplotlib") from error
+
+    class Picture(Figure):
+        """Figure that shows itself in a notebook."""
+
+        def _repr_png_(self) -> bytes:
+            png = io.BytesIO()
+            self.savefig(png, format="png", dpi=110)
+            return png.getvalue()
+
+    if axes is None:
+        corners = (low, high) if place.dim == 2 else Camera(low, high, place.up).frame(low, high)
+        width, height = corners[1] - corners[0]
+        rows, columns = _grid(count, float(height / width))
+        figure = Picture(
+            figsize=_size(float(rows * height), float(columns * width), rows, columns),
+            layout="constrained",
+            facecolor="white",
+        )
+        axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        for spare in axes[count:]:
+            spare.set_axis_off()
+        axes = axes[:count]
+    else:
+        axes = np.ravel(np.asarray(axes, dtype=object))
+        if len(axes) != count:
+            raise ValueError(f"axes must be one for each world, {count}, got {len(axes)}.")
+        figure = axes[0].get_figure()
+    panels = [Panel(one, place, low, high, traction) for one in axes]
+    for one in axes if place.dim == 2 and count > 1 else ():
+        one.label_outer()
+    _key(figure, list(axes), colouring)
+    return figure, panels
+
+
+def _grid(count: int, ratio: float) -> tuple[int, int]:
+    """Rows and columns of panels with this ratio of height to width, so that the figure is at most as high as it is wide."""
+    columns = next(n for n in range(1, count + 1) if math.ceil(count / n) * ratio / n <= 1.0 or n == count)
+    return math.ceil(count / columns), columns
+
+
+def _size(height: float, width: float, rows: int, columns: int) -> tuple[float, float]:
+    """Size of a figure [inch] whose panels, of these sizes together in any unit, leave no empty space."""
+    across, above = LABELS[0] + 0.1 * columns, LABELS[1] + 0.25 * rows
+    scale = min((WIDTH - across) / width, TALLEST / height)
+    return max(scale * width + across, NARROWEST), max(scale * height, LOWEST) + above
+
+
+def _key(figure: Any, axes: list[Any], colouring: Colouring) -> None:
+    """The colour bar, or the names of the categories."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+    from matplotlib.patches import Patch
+
+    if colouring.names:
+        names = colouring.names[: len(colouring.ramp)]
+        patches = [
+            Patch(facecolor=colour / 255, label=name)
+            for colour, name in zip(colouring.ramp, names, strict=False)
+        ]
+        axes[-1].legend(
+            handles=patches, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8
+        )
+        return
+    ramp = LinearSegmentedColormap.from_list(colouring.label or "values", colouring.ramp / 255)
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(*colouring.limits), ramp), ax=axes, shrink=0.85, pad=0.02, aspect=25
+    )
+    bar.set_label(colouring.label, fontsize=9)
+    bar.ax.tick_params(labelsize=8)

@@ -1,0 +1,208 @@
+"""to_video: a recording, or the states of a simulation, as a GIF or an MP4."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from softmpm.checks import check_state
+from softmpm.model import Model, check_model
+from softmpm.pictures.colouring import QUANTITIES, coloured, values_of
+from softmpm.pictures.figure import longest, panels_of
+from softmpm.pictures.instant import Instant, of_state, recorded
+from softmpm.pictures.surroundings import Surroundings, of_recording, of_scene
+from softmpm.recording.reader import Recording
+from softmpm.state import State
+
+DPI = 100
+"""Pixels per inch: a film is 700 pixels wide."""
+
+
+def to_video(
+    source: Recording | str | Path | Sequence[State],
+    path: str | Path,
+    *,
+    model: Model | None = None,
+    activation: Tensor | None = None,
+    period: float | None = None,
+    iteration: int | None = None,
+    world: int = 0,
+    colour: str | None = None,
+    limits: tuple[float, float] | None = None,
+    fps: int = 25,
+    rate: float = 1.0,
+) -> Path:
+    """Make a film of a recorded simulation or of states.
+
+    ::
+
+        softmpm.to_video("run.h5", "run.gif")
+        softmpm.to_video(states, "jump.mp4", model=model, period=20 * scene.dt, rate=0.2)
+
+    Args:
+        source: A recording, or states one after the other.
+        path: File to write, ``.gif`` (Pillow) or ``.mp4`` (``pip install softmpm[video]``). An older one is replaced.
+        model: What the states belong to.
+        activation: Activation [-] of each state, shape (state, world, muscle).
+        period: Simulated time between two states [s]; None shows each state in one picture.
+        iteration: Recorded simulation to show; None is the last.
+        world: The world of the states to show.
+        colour, limits: As for :func:`softmpm.show`, with one scale for the whole film. None for ``colour`` is the activation if there
+            is any, else the speed.
+        fps: Pictures per second.
+        rate: Simulated time per time of the film; 0.1 is slow motion.
+
+    Returns:
+        The path of the film.
+
+    Raises:
+        ImportError: A package is not installed; the message names it.
+        TypeError, ValueError: An argument has another type or value, or there is nothing to show.
+        FileNotFoundError, OSError: The recording cannot be read; see :class:`softmpm.Recording`.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in WRITERS:
+        raise ValueError(f"a film is a .gif or .mp4, got {path.name!r}.")
+    for name, value in (("fps", fps), ("rate", rate), ("period", 1.0 if period is None else period)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be > 0, got {value}.")
+    if colour is not None and colour not in QUANTITIES:
+        raise ValueError(f"colour must be one of {', '.join(QUANTITIES)}, got {colour!r}.")
+    if isinstance(source, str | Path):
+        with Recording(source) as recording:
+            place, instants = _of_recording(recording, iteration, fps, rate)
+    elif isinstance(source, Recording):
+        place, instants = _of_recording(source, iteration, fps, rate)
+    else:
+        place, instants = _of_states(source, model, activation, world, period, fps, rate)
+    draft = path.with_name(f"{path.stem}.new{path.suffix}")
+    try:
+        WRITERS[path.suffix.lower()](draft, _pictures(place, instants, colour, limits), fps)
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+    return path
+
+
+def _of_recording(
+    recording: Recording, iteration: int | None, fps: float, rate: float
+) -> tuple[Surroundings, list[Instant]]:
+    if not recording.episodes:
+        raise ValueError(f"{recording.path} has no simulation to show.")
+    iteration = recording.episodes[-1] if iteration is None else iteration
+    rows = recording.rows(iteration)
+    if len(rows) == 0:
+        raise ValueError(f"{recording.path} has no frames of iteration {iteration} to show.")
+    time = recording.read("time", rows)[1]
+    chosen = resampled(time, fps, rate)
+    found = dict(zip(np.unique(chosen), recorded(recording, iteration, rows[np.unique(chosen)]), strict=True))
+    return of_recording(recording), [found[k] for k in chosen]
+
+
+def _of_states(
+    states: Sequence[State],
+    model: Model | None,
+    activation: Tensor | None,
+    world: int,
+    period: float | None,
+    fps: float,
+    rate: float,
+) -> tuple[Surroundings, list[Instant]]:
+    check_model(model, "a film of states")
+    assert model is not None
+    states = list(states)
+    if not states or not all(isinstance(state, State) for state in states):
+        raise TypeError("a film needs a recording or a sequence of at least one softmpm.State.")
+    for state in states:
+        check_state(model, state)
+    if not 0 <= world < model.worlds:
+        raise ValueError(f"world must be between 0 and {model.worlds - 1}, got {world}.")
+    shape = (len(states), model.worlds, model.muscle_count)
+    if activation is not None and tuple(activation.shape) != shape:
+        raise ValueError(
+            f"activation must have shape {shape}, one row for each state, got {tuple(activation.shape)}."
+        )
+    step = rate / fps if period is None else period
+    found = {}
+    chosen = resampled(step * np.arange(len(states)), fps, rate)
+    for k in np.unique(chosen):
+        one = of_state(model, states[k], None if activation is None else activation[k], world)
+        found[k] = replace(one, time=None if period is None else k * step)
+    return of_scene(model.scene), [found[k] for k in chosen]
+
+
+def resampled(time: np.ndarray, fps: float, rate: float) -> np.ndarray:
+    """Frame to show in each picture of a film: the nearest in time."""
+    count = int(np.floor((time[-1] - time[0]) * fps / rate + 1e-6)) + 1
+    at = time[0] + np.arange(count) * rate / fps
+    return np.abs(time[None] - at[:, None]).argmin(1)
+
+
+def _pictures(
+    place: Surroundings, instants: list[Instant], colour: str | None, limits: tuple[float, float] | None
+) -> Iterator[np.ndarray]:
+    """Pictures of the film, shape (height, width, 3), uint8."""
+    if colour is None:
+        has = all(instant.activation is not None for instant in instants) and len(place.muscle)
+        colour = "activation" if has else "speed"
+    values = [values_of(colour, place, instant) for instant in instants]
+    colouring = coloured(colour, "", place, values, limits)
+    low, high = place.window(np.concatenate([instant.positions for instant in instants]))
+    figure, (panel,) = panels_of(place, low, high, 1, colouring, longest(instants))
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    for instant, one in zip(instants, values, strict=True):
+        panel.draw(instant, colouring.rgb(one), "" if instant.time is None else f"{instant.time:.2f} s")
+        if figure.get_layout_engine() is not None:  # the first picture decides the layout, see show
+            figure.draw_without_rendering()
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+        yield pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]  # MP4 needs even sizes
+
+
+def _write_gif(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError("a GIF needs the package Pillow: pip install pillow") from error
+    most = Image.Quantize.MAXCOVERAGE  # the median cut would lose the colours of small things, such as arrows
+    frames = [
+        Image.fromarray(np.ascontiguousarray(picture)).quantize(256, most, dither=Image.Dither.NONE)
+        for picture in pictures
+    ]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0)
+
+
+def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(
+            "an MP4 needs the package imageio-ffmpeg: pip install softmpm[video]. A .gif needs no further package."
+        ) from error
+    writer = None
+    try:
+        for picture in pictures:
+            if writer is None:
+                size = (picture.shape[1], picture.shape[0])
+                writer = imageio_ffmpeg.write_frames(
+                    str(path), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error"
+                )
+                writer.send(None)
+            writer.send(np.ascontiguousarray(picture))
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+WRITERS: dict[str, Callable[[Path, Iterable[np.ndarray], int], None]] = {
+    ".gif": _write_gif,
+    ".mp4": _write_mp4,
+}

@@ -1,0 +1,188 @@
+"""One world drawn into matplotlib axes, from the front in 2D and in perspective in 3D. matplotlib is imported where it is used."""
+
+from typing import Any
+
+import numpy as np
+
+from softmpm.pictures.camera import Camera, round_length, tiles
+from softmpm.pictures.instant import Instant
+from softmpm.pictures.surroundings import Surroundings
+from softmpm.recording import style
+
+POINT = (44, 44, 52)
+"""Colour of surface points and of the edges of driven particles."""
+POINT_RADIUS = 0.07
+"""Of a surface point [cells]."""
+
+
+class Panel:
+    """The picture of one world; :meth:`draw` replaces what moves.
+
+    Args:
+        axes: matplotlib axes.
+        place: Everything that does not move.
+        low, high: Box to frame [m], shape (dim,).
+        traction: Traction of the longest arrow [Pa]; 0 for no arrows.
+    """
+
+    def __init__(self, axes: Any, place: Surroundings, low: np.ndarray, high: np.ndarray, traction: float):
+        self._axes, self._place, self._traction = axes, place, traction
+        self._moving: list[Any] = []
+        self._camera = Camera(low, high, place.up) if place.dim == 3 else None
+        corners = (low, high) if self._camera is None else self._camera.frame(low, high)
+        self._draw_walls(low, high)
+        axes.set(xlim=(corners[0][0], corners[1][0]), ylim=(corners[0][1], corners[1][1]), aspect="equal")
+        axes.set_facecolor("white")
+        if self._camera is None:
+            axes.set(xlabel="x [m]", ylabel="y [m]")
+            axes.tick_params(labelsize=8)
+            axes.locator_params(nbins=7)
+        else:
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+            self._draw_axes(low, high)
+
+    def draw(self, instant: Instant, rgb: np.ndarray, title: str = "") -> None:
+        """Show an instant.
+
+        Args:
+            rgb: Colour of each particle, shape (particle, 3), 0 to 255.
+        """
+        for artist in self._moving:
+            artist.remove()
+        self._moving = []
+        finite = np.isfinite(instant.positions).all(-1)
+        x, radii, rgb = instant.positions[finite], self._place.radii[finite], rgb[finite] / 255
+        edge = self._place.driven[finite]
+        if self._camera is not None:
+            shade = self._camera.shading(self._place, instant.positions)[finite]
+            x, scale = self._camera.project(x)
+            order = np.argsort(scale)  # from back to front
+            x, radii, rgb, edge = x[order], (radii * scale)[order], (rgb * shade[:, None])[order], edge[order]
+        self._dots(x, radii, rgb, edge, zorder=2)
+        if instant.places is not None:
+            self._draw_points(instant.places, instant.traction)
+        if title:
+            self._axes.set_title(title, fontsize=9, loc="left")
+
+    def _dots(self, x: np.ndarray, radii: np.ndarray, rgb: np.ndarray, edge: np.ndarray, zorder: int) -> None:
+        from matplotlib.collections import EllipseCollection
+
+        lines = np.where(edge[:, None], np.array(POINT) / 255, rgb) if edge.any() else "none"
+        dots = EllipseCollection(
+            2 * radii,
+            2 * radii,
+            np.zeros(len(x)),
+            units="xy",
+            offsets=x,
+            offset_transform=self._axes.transData,
+            facecolors=rgb,
+            edgecolors=lines,
+            linewidths=np.where(edge, 0.7, 0.0),
+            zorder=zorder,
+        )
+        self._moving.append(self._axes.add_collection(dots, autolim=False))
+
+    def _draw_points(self, places: np.ndarray, traction: np.ndarray | None) -> None:
+        """Surface points in 2D, and arrows of the tractions there."""
+        radius = POINT_RADIUS * self._place.spacing
+        if self._camera is None:
+            colours = np.tile(np.array(POINT) / 255, (len(places), 1))
+            self._dots(places, np.full(len(places), radius), colours, np.zeros(len(places), bool), zorder=3)
+        if traction is None or self._traction == 0.0:
+            return
+        feet, arrows = style.traction_arrows(places, traction, self._place.spacing, self._traction)
+        tips, zorder = feet + arrows, 4.0
+        if (
+            self._camera is not None
+        ):  # from outside to the surface, and behind the particles, which would be hidden
+            feet, tips, zorder = self._camera.project(feet - arrows)[0], self._camera.project(feet)[0], 1.5
+        if len(feet):
+            look: dict = dict(angles="xy", scale_units="xy", scale=1.0, units="xy", zorder=zorder)
+            colour = tuple(np.array(style.TRACTION) / 255)
+            width = 0.2 * self._place.spacing
+            self._moving.append(
+                self._axes.quiver(*feet.T, *(tips - feet).T, color=[colour], width=width, **look)
+            )
+
+    def _draw_walls(self, low: np.ndarray, high: np.ndarray) -> None:
+        place = self._place
+        outlines = style.wall_outlines(place.normals, place.offsets, place.upper)
+        for k, outline in enumerate(outlines):
+            colour = tuple(np.array(style.WALL[place.contacts[k]]) / 255)
+            if len(outline) < place.dim:
+                continue
+            if self._camera is None:
+                self._draw_line_wall(k, outline, colour, low, high)
+            else:
+                for axis, sign in ((axis, sign) for axis in range(3) for sign in (1.0, -1.0)):
+                    limit = low[axis] if sign > 0 else -high[axis]
+                    outline = style.clip(outline, sign * np.eye(3)[axis], limit)
+                if len(outline) >= 3:
+                    self._draw_plane_wall(k, outline, colour, float((high - low).max()))
+
+    def _draw_line_wall(
+        self, k: int, outline: np.ndarray, colour: tuple, low: np.ndarray, high: np.ndarray
+    ) -> None:
+        """A wall of a 2D scene: its solid side, surface and hatching."""
+        from matplotlib.collections import LineCollection
+        from matplotlib.patches import Polygon
+
+        normal, offset = self._place.normals[k], self._place.offsets[k]
+        room = high - low
+        box = np.array(
+            [
+                low - room,
+                (high[0] + room[0], low[1] - room[1]),
+                high + room,
+                (low[0] - room[0], high[1] + room[1]),
+            ]
+        )
+        solid = style.clip(box, -normal, -offset)
+        if len(solid) >= 3:
+            self._axes.add_patch(
+                Polygon(
+                    solid, facecolor=tuple(1.0 - 0.11 * (1.0 - np.array(colour))), edgecolor="none", zorder=0
+                )
+            )
+        strokes = style.hatch(outline, normal, float(room.max()) / 50)
+        self._axes.add_collection(
+            LineCollection(list(strokes), colors=[(*colour, 0.7)], linewidths=0.8, zorder=1), autolim=False
+        )
+        self._axes.plot(*outline.T, color=colour, linewidth=1.6, zorder=1, solid_capstyle="butt")
+
+    def _draw_plane_wall(self, k: int, outline: np.ndarray, colour: tuple, extent: float) -> None:
+        """A wall of a 3D scene, tiled; where it stands between the camera and the bodies, only its edge."""
+        from matplotlib.collections import LineCollection
+        from matplotlib.patches import Polygon
+
+        assert self._camera is not None
+        behind = float(self._camera.position @ self._place.normals[k]) > self._place.offsets[k]
+        corners, _ = self._camera.project(outline)
+        face = (*colour, 0.22) if behind else "none"
+        edge = Polygon(corners, facecolor=face, edgecolor=colour, linewidth=1.0, zorder=0 if behind else 3)
+        self._axes.add_patch(edge)
+        if behind:
+            ends = self._camera.project(tiles(outline, round_length(extent)).reshape(-1, 3))[0]
+            lines = LineCollection(
+                list(ends.reshape(-1, 2, 2)), colors=[(*colour, 0.6)], linewidths=0.6, zorder=1
+            )
+            self._axes.add_collection(lines, autolim=False)
+
+    def _draw_axes(self, low: np.ndarray, high: np.ndarray) -> None:
+        """Arrows along x, y and z in the lower left corner, and the length of tiles and arrows."""
+        assert self._camera is not None
+        length = round_length(float((high - low).max()))
+        middle = (low + high) / 2
+        ends, _ = self._camera.project(middle + np.concatenate([np.zeros((1, 3)), length * np.eye(3)]))
+        corner, _ = self._camera.frame(low, high)
+        ends = ends + (corner - ends.min(0)) + 0.25 * length  # with room for a name
+        for end, name in zip(ends[1:], "xyz", strict=True):
+            self._axes.annotate(
+                "", end, ends[0], arrowprops=dict(arrowstyle="->", color="0.25", linewidth=1.0)
+            )
+            away = end + 0.12 * (end - ends[0])
+            self._axes.annotate(
+                name, away, fontsize=8, color="0.25", ha="center", va="center", annotation_clip=False
+            )
+        self._axes.set_xlabel(f"arrows and tiles: {length:g} m", fontsize=8, loc="left")

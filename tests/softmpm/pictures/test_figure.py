@@ -1,0 +1,240 @@
+"""Pictures of scenes and states: places, scale, colours and walls, measured in pixels; and what is refused."""
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+
+import softmpm
+from softmpm.pictures.colouring import CATEGORIES
+from softmpm.recording import style
+
+RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
+FLOOR, SIDE = 0.1, 0.15
+
+
+def scene_of(dim: int = 2, **changes) -> softmpm.Scene:
+    """A box 0.05 m above a floor and beside a wall, and a ball 0.4 m to the right of it."""
+    middle, depth = ((), ()) if dim == 2 else ((0.5,), (0.1,))
+    low = (0.3, 0.15, *(m - d for m, d in zip(middle, depth, strict=True)))
+    high = (0.5, 0.45, *(m + d for m, d in zip(middle, depth, strict=True)))
+    box = softmpm.box(low, high, 1 / 40)
+    ball = softmpm.ball((0.8, 0.3, *middle), 0.1, 1 / 40)
+    axes = np.eye(dim)
+    settings = dict(
+        grid=softmpm.Grid(shape=(25, 21, 21)[:dim], spacing=1 / 20),
+        bodies=[softmpm.Body(box, RUBBER), softmpm.Body(ball, RUBBER)],
+        walls=[
+            softmpm.Wall(normal=tuple(axes[1]), offset=FLOOR),
+            softmpm.Wall(normal=tuple(axes[0]), offset=SIDE, contact="stick"),
+        ],
+        muscles=[softmpm.Muscle(particles=np.arange(len(box)), direction=tuple(axes[1]), strength=1e3)],
+        gravity=tuple(-9.8 * axes[1]),
+        dt=2e-4,
+    )
+    return softmpm.Scene(**(settings | changes))
+
+
+@pytest.fixture(scope="module")
+def model() -> softmpm.Model:
+    return softmpm.build(scene_of(), device="cpu", worlds=2)
+
+
+def pixels(figure: Figure, dpi: int = 100) -> np.ndarray:
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=dpi)
+    image = np.asarray(Image.open(png).convert("RGB")).astype(int)
+    right = max(axes.get_position().x1 for axes in figure.axes if axes.get_aspect() == 1.0)
+    return image[:, : int(right * image.shape[1])]  # without the key of the colours
+
+
+def where(image: np.ndarray, colour: np.ndarray, within: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels of a colour."""
+    return (np.abs(image - np.asarray(colour, dtype=int)).max(-1) <= within).nonzero()
+
+
+def test_bodies_and_walls_are_where_they_are_in_metres():
+    """In pixels, the box, the distance to the ball and the gaps to both walls have the scale of the box's width, along both axes."""
+    image = pixels(softmpm.show(scene_of(), colour="body"), dpi=200)
+    rows, columns = where(image, CATEGORIES[0])
+    out = 0.2 / 40  # [m] by which a dot is wider than its cell, on each side
+    scale = (columns.max() - columns.min()) / (0.2 + 2 * out)  # pixels per metre
+    slack = 0.004 * scale
+    assert 300 < scale < 3000
+    assert rows.max() - rows.min() == pytest.approx((0.3 + 2 * out) * scale, abs=slack)
+    ball = where(image, CATEGORIES[1])
+    assert ball[1].mean() - columns.mean() == pytest.approx(0.4 * scale, abs=slack)
+    assert ball[0].mean() == pytest.approx(rows.mean(), abs=slack)
+    floor, _ = where(image, style.WALL[b"separate"], within=1)
+    assert np.median(floor) - rows.max() == pytest.approx((0.05 - out) * scale, abs=slack)
+    _, side = where(image, style.WALL[b"stick"], within=1)
+    assert columns.min() - np.median(side) == pytest.approx((0.15 - out) * scale, abs=slack)
+
+
+def test_hatching_is_below_the_floor():
+    """Pixels between white and the wall's colour are on the solid side."""
+    image = pixels(
+        softmpm.show(scene_of(walls=[softmpm.Wall(normal=(0.0, 1.0), offset=FLOOR)]), colour="body")
+    )
+    floor = int(np.median(where(image, style.WALL[b"separate"], within=1)[0]))
+    part = image[:, image.shape[1] // 4 : image.shape[1] // 2]
+    below, above = part[floor + 4 : floor + 20], part[floor - 8 : floor - 3]
+    assert (above == 255).all() and (below < 255).all() and np.ptp(below[..., 0]) > 30
+
+
+def test_colours_follow_the_speed(model):
+    """The body that moves is dark, the one at rest is light; the scale ends at its speed or at given limits."""
+    state = model.rest()
+    moving = np.flatnonzero(model.body.numpy() == 1)
+    state.v[0, moving, 0] = 3.0
+    figure = softmpm.show(model, state)
+    image = pixels(figure)
+    dark, light = where(image, (12, 22, 64)), where(image, (206, 212, 220))
+    assert len(dark[0]) > 500 and len(light[0]) > 500 and dark[1].min() > np.quantile(light[1], 0.99)
+    (bar,) = (axes for axes in figure.axes if axes.get_ylabel() == "speed [m/s]")
+    assert bar.get_ylim() == pytest.approx((0.0, 3.0))
+    half = pixels(softmpm.show(model, state, limits=(0.0, 6.0)))
+    assert len(where(half, (12, 22, 64))[0]) == 0 and len(where(half, (48, 124, 188))[0]) > 500
+
+
+def test_strain_is_that_of_the_deformation_gradient(model):
+    """A stretch of 1.2 along one axis has the Green strain (1.44 − 1)/2 at the upper end of the scale; a rotation has none."""
+    state = model.rest()
+    state.F[0, 0] = torch.tensor([[1.2, 0.0], [0.0, 1.0]])
+    state.F[0, 1] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    figure = softmpm.show(model, state, colour="strain")
+    (bar,) = (axes for axes in figure.axes if "strain" in axes.get_ylabel())
+    assert bar.get_ylim() == pytest.approx((0.0, 0.22), rel=1e-5)
+
+
+def test_activation_is_red_where_a_muscle_pulls(model):
+    """The muscle of each world has the colour of its activation, and the ball, which has none, stays grey."""
+    activation = torch.tensor([[1.0], [-1.0]])
+    figure = softmpm.show(model, model.rest(), activation=activation, world=(0, 1))
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["world 0", "world 1"]
+    image = pixels(figure)
+    red, blue = where(image, style.CONTRACT), where(image, style.EXTEND)
+    assert len(red[0]) > 300 and len(blue[0]) > 300
+    assert red[1].max() < blue[1].min() or red[0].max() < blue[0].min()
+    assert len(where(image, style.BODY[0])[0]) > 300
+
+
+def test_own_values_have_a_labelled_scale(model):
+    """An array with a row for each world shows the row of the world."""
+    values = torch.arange(2.0)[:, None] + torch.linspace(0.0, 0.5, model.particle_count)
+    figure = softmpm.show(model, model.rest(), colour=values, world=1, label="mass [kg]")
+    (bar,) = (axes for axes in figure.axes if axes.get_ylabel() == "mass [kg]")
+    assert bar.get_ylim() == pytest.approx((1.0, 1.5))
+
+
+def test_tractions_are_green_arrows(model):
+    """A force on one surface point draws an arrow there, upward; without forces there is no green."""
+    state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1)
+    assert state.surface is not None
+    green = pixels(softmpm.show(model, state))
+    assert len(where(green, style.TRACTION)[0]) == 0
+    points = model.surface.shown(state)[0]
+    point = int(points[:, 0].argmin())
+    force = torch.zeros_like(state.surface.force)
+    force[0, 0, point] = torch.tensor([0.0, 5.0])
+    pushed = state._replace(surface=state.surface._replace(force=force))
+    rows, columns = where(pixels(softmpm.show(model, pushed)), style.TRACTION)
+    assert len(rows) > 30 and np.ptp(rows) > 2 * np.ptp(columns)
+
+
+def test_driven_particles_have_dark_edges():
+    """They are told from the others, in a scene at rest."""
+    scene = scene_of(walls=[], muscles=[])
+    plain = pixels(softmpm.show(scene, colour="body"), dpi=200)
+    driven = pixels(softmpm.show(scene_of(walls=[], muscles=[], driven=range(24)), colour="body"), dpi=200)
+    left = slice(None, plain.shape[1] // 2)
+    dark = [(image[:, left].sum(-1) < 200).sum() for image in (plain, driven)]
+    assert dark[1] > dark[0] + 300
+
+
+def test_a_solid_scene_is_drawn_in_perspective():
+    """Both bodies are seen, shaded from above: the upper half of the ball is brighter than the lower."""
+    figure = softmpm.show(scene_of(3), colour="body")
+    image = pixels(figure)
+    orange = (image[..., 0] > image[..., 2] + 60).nonzero()
+    rows, columns = orange
+    assert len(rows) > 1000
+    bright = image[rows, columns].sum(-1)
+    upper = rows < np.median(rows)
+    assert bright[upper].mean() > 1.1 * bright[~upper].mean()
+    assert "0.1 m" in figure.axes[0].get_xlabel()
+
+
+def test_particles_that_are_not_finite_are_left_out(model):
+    """The picture of a failed world has the others, in their place."""
+    state = model.rest()
+    state.x[0, :5] = torch.nan
+    assert (pixels(softmpm.show(model, state, colour="body")) != 255).any()
+
+
+def test_given_axes_are_drawn_into(model):
+    """A figure of the user's own, with other panels, stays as it is."""
+    figure = Figure(figsize=(8, 4))
+    left, right = figure.subplots(1, 2)
+    left.plot([0, 1], [0, 1])
+    assert softmpm.show(model, model.rest(), axes=right) is figure
+    assert right.get_aspect() == 1.0 and len(left.lines) == 1
+
+
+def test_a_figure_shows_itself_in_a_notebook(model):
+    """By the method that Jupyter calls, as a PNG."""
+    png = softmpm.show(model, model.rest())._repr_png_()
+    assert Image.open(io.BytesIO(png)).format == "PNG"
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(colour="pressure"), "colour must be one of speed, strain"),
+        (dict(colour=np.zeros(3)), "colour must have shape"),
+        (dict(colour="activation"), "needs the activation of each muscle"),
+        (dict(activation=torch.zeros(5, 2, 1)), "of many control steps it takes one"),
+        (dict(world=2), "world must be between 0 and 1"),
+        (dict(world=()), "world must be between 0 and 1"),
+        (dict(limits=(1.0, 0.0)), "ascending order"),
+        (dict(axes=[]), "axes must be one for each world"),
+    ],
+)
+def test_wrong_arguments_are_refused(model, changes, message):
+    """By a sentence that names what is wanted."""
+    with pytest.raises(ValueError, match=message):
+        softmpm.show(model, model.rest(), **changes)
+
+
+def test_wrong_kinds_are_refused(model):
+    """A state needs its model, and a model is no path."""
+    with pytest.raises(TypeError, match="with its model"):
+        softmpm.show(model.scene, model.rest())
+    with pytest.raises(TypeError, match="needs a model or a scene"):
+        softmpm.show("run.h5")  # pyright: ignore[reportArgumentType]
+
+
+def test_without_matplotlib_the_remedy_is_named(model, monkeypatch):
+    """The simulator works without it."""
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match="pip install matplotlib"):
+        softmpm.show(model, model.rest())
+
+
+def test_pictures_leave_pyplot_alone():
+    """No figure stays behind in the memory of pyplot, which is not even imported."""
+    code = (
+        "import sys, softmpm\n"
+        "body = softmpm.Body(softmpm.box((0.2, 0.2), (0.4, 0.4), 0.05), softmpm.NeoHookean(density=1.0, young=1.0))\n"
+        "scene = softmpm.Scene(grid=softmpm.Grid(shape=(9, 9), spacing=0.1), bodies=[body], dt=1e-3)\n"
+        "softmpm.show(scene)._repr_png_()\n"
+        "sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
+    subprocess.run(
+        [sys.executable, "-c", code], check=True, env={"PYTHONPATH": ":".join(sys.path)}, timeout=120
+    )

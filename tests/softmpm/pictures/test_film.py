@@ -1,0 +1,174 @@
+"""Films: the files open, have the right pictures at the right times, and errors name the remedy."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import softmpm
+from softmpm.pictures.film import resampled
+
+
+@pytest.fixture(scope="module")
+def model() -> softmpm.Model:
+    """A block that can be moved by hand."""
+    block = softmpm.box((0.3, 0.2), (0.5, 0.4), 1 / 20)
+    muscle = softmpm.Muscle(particles=np.arange(len(block)), direction=(0.0, 1.0), strength=1.0)
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(21, 11), spacing=0.1),
+        bodies=[softmpm.Body(block, softmpm.NeoHookean(density=1.0, young=10.0))],
+        muscles=[muscle],
+        walls=[softmpm.Wall(normal=(0.0, 1.0), offset=0.15)],
+        dt=1e-3,
+    )
+    return softmpm.build(scene, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def states(model) -> list[softmpm.State]:
+    """Ten states, each 0.1 m further to the right and faster."""
+    found = []
+    for k in range(10):
+        state = model.rest()
+        state.x[..., 0] += 0.1 * k
+        state.v[..., 0] = 0.1 * k
+        found.append(state)
+    return found
+
+
+@pytest.fixture(scope="module")
+def recording(model, states, tmp_path_factory):
+    """The same states, 0.1 s apart, as iteration 3; iteration 5 has only two of them."""
+    path = tmp_path_factory.mktemp("recording") / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        for iteration, count in ((3, 10), (5, 2)):
+            with recorder.episode(iteration) as episode:
+                for k, state in enumerate(states[:count]):
+                    episode.frame(0.1 * k, state, torch.tensor([k / 10]))
+    return path
+
+
+def pictures(path) -> np.ndarray:
+    """All pictures of a GIF."""
+    with Image.open(path) as film:
+        found = []
+        for k in range(film.n_frames):
+            film.seek(k)
+            found.append(np.asarray(film.convert("RGB")).astype(int))
+        return np.stack(found)
+
+
+def middle(picture: np.ndarray) -> float:
+    """Mean column of the body, which is neither white nor grey, left of the scale."""
+    colour = np.ptp(picture, axis=-1) > 40
+    colour[:, int(0.8 * picture.shape[1]) :] = False
+    return float(colour.nonzero()[1].mean())
+
+
+def test_a_gif_has_a_picture_for_each_state(model, states, tmp_path):
+    """Without a period; the body moves evenly to the right, in a frame that stays."""
+    film = softmpm.to_video(states, tmp_path / "run.gif", model=model, fps=20, colour="body")
+    with Image.open(film) as file:
+        assert file.format == "GIF" and file.n_frames == 10 and file.info["duration"] == 50
+    found = pictures(film)
+    assert found.shape[2] >= 600
+    steps = np.diff([middle(picture) for picture in found])
+    assert steps.min() > 10 and np.ptp(steps) < 3
+
+
+def test_a_film_plays_at_its_rate(model, states, tmp_path):
+    """States 0.1 s apart last 0.9 s; at half the rate twice as long, with each state in two pictures."""
+    times = resampled(0.1 * np.arange(10), fps=10, rate=1.0)
+    assert times.tolist() == list(range(10))
+    slow = resampled(0.1 * np.arange(10), fps=10, rate=0.5)
+    assert len(slow) == 19 and np.bincount(slow, minlength=10).max() <= 3 and set(slow) == set(range(10))
+    assert resampled(0.1 * np.arange(10), fps=5, rate=1.0).tolist() == [0, 2, 4, 6, 8]
+    film = softmpm.to_video(states, tmp_path / "a.gif", model=model, fps=5, period=0.1)
+    assert len(pictures(film)) == 5
+
+
+def test_a_recording_becomes_a_film(recording, tmp_path):
+    """The last simulation, or the one that is named; muscles grow red with their activation."""
+    whole = pictures(softmpm.to_video(recording, tmp_path / "a.gif", iteration=3, fps=10))
+    assert len(whole) == 10
+    red = [(picture[..., 0] > picture[..., 2] + 60)[:, :500].sum() for picture in whole]
+    assert red[0] < 50 < 1000 < red[-1]
+    with softmpm.Recording(recording) as opened:
+        assert len(pictures(softmpm.to_video(opened, tmp_path / "b.gif", fps=10))) == 2
+
+
+def test_an_mp4_opens(model, states, tmp_path):
+    """With as many pictures and the size and rate that were asked for."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    film = softmpm.to_video(states, str(tmp_path / "run.mp4"), model=model, fps=10)
+    frames, seconds = ffmpeg.count_frames_and_secs(str(film))
+    assert frames == 10 and seconds == pytest.approx(1.0, abs=0.06)
+    reader = ffmpeg.read_frames(str(film))
+    width, height = next(reader)["size"]
+    first = np.frombuffer(next(reader), np.uint8).reshape(height, width, 3)
+    reader.close()
+    assert width >= 600 and first.std() > 10
+
+
+def test_the_scale_is_that_of_the_whole_film(model, states, tmp_path):
+    """The slow body of the second picture is lighter than the fast one of the last."""
+    found = pictures(softmpm.to_video(states, tmp_path / "a.gif", model=model, limits=(0.0, 0.9)))
+    dark = [((picture.sum(-1) < 300) & (np.ptp(picture, axis=-1) > 30))[:, :550].sum() for picture in found]
+    assert dark[1] < 0.1 * dark[-1]
+
+
+def test_an_older_film_is_replaced_and_no_draft_is_left(model, states, tmp_path):
+    """Also when the film fails half way: then the older one stays."""
+    path = tmp_path / "run.gif"
+    softmpm.to_video(states[:2], path, model=model)
+    before = path.read_bytes()
+    softmpm.to_video(states[:3], path, model=model)
+    assert path.read_bytes() != before and list(tmp_path.iterdir()) == [path]
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="limits"):
+        softmpm.to_video(states, path, model=model, limits=(1.0, 1.0))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(path="run.avi"), "a .gif or .mp4"),
+        (dict(fps=0), "fps must be > 0"),
+        (dict(rate=-1.0), "rate must be > 0"),
+        (dict(period=0.0), "period must be > 0"),
+        (dict(world=1), "world must be between 0 and 0"),
+        (dict(colour="heat"), "colour must be one of"),
+        (dict(activation=torch.zeros(3, 1, 1)), "one row for each state"),
+    ],
+)
+def test_wrong_arguments_are_refused(model, states, tmp_path, changes, message):
+    """By a sentence, before anything is drawn."""
+    changes = dict(path="run.gif", model=model) | changes
+    with pytest.raises(ValueError, match=message):
+        softmpm.to_video(states, tmp_path / changes.pop("path"), **changes)
+
+
+def test_wrong_sources_are_refused(model, states, recording, tmp_path):
+    """States without a model, no states, a recording that is not there or lacks the simulation."""
+    with pytest.raises(TypeError, match="needs a model"):
+        softmpm.to_video(states, tmp_path / "a.gif")
+    with pytest.raises(TypeError, match="at least one"):
+        softmpm.to_video([], tmp_path / "a.gif", model=model)
+    with pytest.raises(FileNotFoundError):
+        softmpm.to_video(tmp_path / "none.h5", tmp_path / "a.gif")
+    with pytest.raises(KeyError, match="iteration 4"):
+        softmpm.to_video(recording, tmp_path / "a.gif", iteration=4)
+
+
+@pytest.mark.parametrize(
+    "name, package, remedy", [("a.mp4", "imageio_ffmpeg", "softmpm\\[video\\]"), ("a.gif", "PIL", "pillow")]
+)
+def test_without_a_package_the_remedy_is_named(model, states, tmp_path, monkeypatch, name, package, remedy):
+    """And no file is left."""
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=remedy):
+        softmpm.to_video(states, tmp_path / name, model=model)
+    assert list(tmp_path.iterdir()) == []
