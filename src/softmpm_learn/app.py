@@ -1,14 +1,13 @@
 """The bridge from Hydra to plain objects: command line and ``conf/`` in, a run in its folder out."""
 
-import contextlib
 import dataclasses
 import logging
-import logging.handlers
+import math
 import os
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -17,6 +16,7 @@ import torch
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
@@ -25,15 +25,19 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from softmpm_learn import files
+from softmpm_learn import files, sweep
 from softmpm_learn.checkpoint import LockedError
 from softmpm_learn.config import RunConf, conf_dir, to_run, unknown_key
 from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
 from softmpm_learn.experiment import run_experiment
+from softmpm_learn.log_file import log_file
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.saved import load
 from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import TASKS
+from softmpm_learn.train import Result
+
+logger = logging.getLogger("softmpm_learn")
 
 CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "train.examine", "device")
 """Settings that may differ when a run is resumed: its length, the recorded episodes and the device."""
@@ -60,8 +64,12 @@ def main(signals: Signals | None = None) -> None:
                 signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
             register(group.broadcast(time.time()))
+            failed: dict[int, Path] = {}
             run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
-            run(lambda config: job(config, group, signals))()
+            run(lambda config: job(config, group, signals, failed))()
+            if failed:
+                numbers, table = ", ".join(map(str, failed)), next(iter(failed.values()))
+                _end(1, f"these jobs of {table} failed: {numbers}; the same command tries them again.")
     except Exception as error:
         if full:
             raise
@@ -79,10 +87,25 @@ def register(began: float | None = None) -> None:
     for name, (conf, _) in TASKS.items():
         store.store(group="_schema/task", name=name, node=conf)
     OmegaConf.register_new_resolver("run_dir", _run_dir, replace=True)
+    OmegaConf.register_new_resolver("sweep_name", _sweep_name(), replace=True)
     began = time.time() if began is None else began
     OmegaConf.register_new_resolver(
         "began", lambda pattern: time.strftime(pattern, time.localtime(began)), replace=True
     )
+
+
+def _sweep_name() -> Callable[[DictConfig], str]:
+    """Gives the name of a sweep's folder; jobs, whose command line is only their own part, get that of the whole sweep."""
+    names: list[str] = []
+
+    def name(_root_: DictConfig) -> str:
+        if not names:
+            asked = _root_.hydra.overrides
+            sweeper = [text for text in asked.hydra if text.startswith(("hydra/sweeper", "hydra.sweeper"))]
+            names.append(sweep.folder_name([*asked.task, *sweeper]))
+        return names[0]
+
+    return name
 
 
 def _run_dir(resume: str | None, fresh: str) -> str:
@@ -94,29 +117,112 @@ def _run_dir(resume: str | None, fresh: str) -> str:
     return resume
 
 
-def job(config: DictConfig, group: Group, signals: Signals) -> None:
-    """One run. An error ends it with a sentence on stderr and the traceback in its folder, both from where it happened."""
-    out = Path(group.broadcast(HydraConfig.get().runtime.output_dir))
+class JobError(Exception):
+    """A run that failed: the sentence for people, empty where another process has it."""
+
+
+class RefusedError(JobError):
+    """A run that is another's: its folder is left as it is."""
+
+
+def job(config: DictConfig, group: Group, signals: Signals, failed: dict[int, Path]) -> float:
+    """One run, or a job of a sweep; gives the objective, its lowest loss. An error ends a run with a sentence on stderr, and is the
+    outcome of a job, whose number is added to ``failed``.
+    """
+    hydra_config = HydraConfig.get()
+    out = Path(group.broadcast(hydra_config.runtime.output_dir))
+    if hydra_config.mode == RunMode.MULTIRUN:
+        return _swept(config, out, group, signals, failed)
+    try:
+        conf = _configured(config, out, group)
+        return _experiment(conf, out, group, signals).best_loss
+    except JobError as failure:
+        _end(1, str(failure))
+
+
+def _swept(config: DictConfig, out: Path, group: Group, signals: Signals, failed: dict[int, Path]) -> float:
+    """A job of a sweep: skipped if it has finished, gone on with if it has begun. Only its own failure lets the next one run."""
+    hydra_config, loss = HydraConfig.get(), math.inf
+    number, table = int(hydra_config.job.num), Path(hydra_config.sweep.dir) / sweep.TABLE
+    about = {"job": number, "settings": " ".join(hydra_config.overrides.task), "folder": str(out)}
+    try:
+        conf = _configured(config, out, group)
+        before = group.broadcast(group.once(sweep.outcome, out))
+        if before and before.status == "finished" and before.iterations >= conf.train.iterations:
+            group.once(sweep.tabulate, table.parent)  # a kill may have come between outcome and table
+            logger.info("Job %d had finished with the loss %.5g: %s", number, before.loss, out)
+            return before.loss
+        result = _experiment(conf, out, group, signals)
+        if not result.finished:
+            logger.info("The same command goes on with the sweep.")
+            raise SystemExit(0)
+        loss, done = result.best_loss, result.run.iteration
+        found = sweep.Outcome(
+            status="finished", loss=loss, iteration=result.best_iteration, iterations=done, **about
+        )
+    except JobError as failure:
+        if isinstance(failure, RefusedError):
+            _end(1, str(failure))
+        if str(failure):
+            print(f"softmpm_learn: job {number}: {failure}", file=sys.stderr)
+        failed[number] = table
+        found = sweep.Outcome(status="failed", error=str(failure), **about)
+    except (ValueError, OSError) as error:
+        _give_up(error)
+    if group.first:
+        sweep.record(out, found)
+        sweep.tabulate(table.parent)
+    if failed and group.size > 1:
+        raise SystemExit(1)  # the processes may no longer be in step; the same command goes on
+    return loss
+
+
+def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
+    """Settings of a run, of the one to resume or of one to begin."""
     try:
         with group.fail_together():
-            conf = to_run(config)
+            conf, hydra_config = to_run(config), HydraConfig.get()
+            sweeps, begun = hydra_config.mode == RunMode.MULTIRUN, (out / "config.yaml").exists()
             if conf.resume is not None:
-                conf = resumed(conf, [text.lstrip("+~") for text in HydraConfig.get().overrides.task])
-            elif (out / "config.yaml").exists():
-                raise ValueError(
+                if sweeps:
+                    raise ValueError("resume=FOLDER is for one run; the same command goes on with a sweep.")
+                return resumed(conf, [text.lstrip("+~") for text in hydra_config.overrides.task])
+            if begun and not sweeps:
+                raise RefusedError(
                     f"{out} holds a run already; go on with resume={out}, or choose another folder."
                 )
+            if begun and _fixed(load(out)) != _fixed(conf):
+                raise RefusedError(
+                    f"{out} holds a run with other settings; choose another folder for the sweep with hydra.sweep.dir=FOLDER."
+                )
+            return conf
+    except JobError:
+        raise
     except OtherProcessError:
-        raise SystemExit(1) from None  # the other process says it
+        raise JobError from None  # the other process says it
     except Exception as error:
-        _give_up(error)
+        raise JobError(sentence(error)) from error
+
+
+def _experiment(conf: RunConf, out: Path, group: Group, signals: Signals) -> Result:
+    """The run; an error leaves its traceback in the folder, from where it happened."""
     with log_file() as begin_log:
         try:
-            run_experiment(conf, out, group, signals, lambda: begin_log(out / "softmpm_learn.log"))
+            return run_experiment(conf, out, group, signals, lambda: begin_log(out / "softmpm_learn.log"))
         except Exception as error:
             if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
-                raise SystemExit(1) from None
-            _give_up(error, _left(error, out, group))
+                raise JobError from None
+            kind = RefusedError if isinstance(error, LockedError) else JobError
+            raise kind(f"{sentence(error)}{_left(error, out, group)}") from error
+
+
+def _fixed(conf: RunConf) -> dict:
+    """Settings that a run keeps when it is resumed."""
+    flat = dataclasses.asdict(conf)
+    for key in (*CHANGEABLE, "resume"):
+        group, _, name = key.partition(".")
+        del (flat[group] if name else flat)[name or group]
+    return flat
 
 
 def _left(error: Exception, out: Path, group: Group) -> str:
@@ -129,37 +235,6 @@ def _left(error: Exception, out: Path, group: Group) -> str:
     except OSError as other:
         return "" if isinstance(error, EXPECTED) else f" The traceback could not be saved: {other}"
     return "" if isinstance(error, EXPECTED) else f" The traceback is in {place}."
-
-
-class _LogFile(logging.FileHandler):
-    """A log file that cannot be written ends the run, as any other file does."""
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        with files.named("write", Path(self.baseFilename)):
-            raise
-
-
-@contextlib.contextmanager
-def log_file() -> Iterator[Callable[[Path], None]]:
-    """Gives a function that begins the log file; what was logged before it is called, while the folder may be another's, follows."""
-    root = logging.getLogger()
-    early = logging.handlers.MemoryHandler(10**6, flushLevel=logging.CRITICAL + 1, flushOnClose=False)
-    root.addHandler(early)
-
-    def begin(path: Path) -> None:
-        before = files.read(path) if path.exists() else b""
-        files.replace(path, before)  # a file of its own, whatever else had its name
-        early.setTarget(_LogFile(path, encoding="utf-8"))
-        early.flush()
-        early.flushLevel = logging.NOTSET
-
-    try:
-        yield begin
-    finally:
-        root.removeHandler(early)
-        if early.target is not None:
-            early.target.close()
-        early.close()
 
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:

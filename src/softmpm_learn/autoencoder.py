@@ -170,7 +170,8 @@ def train_autoencoder(
 
     Args:
         sample: Gives a minibatch of velocities [m/s], shape (batch, dim, *nodes).
-        validation: Velocity images of other iterations, or None; without them there is no early stopping.
+        validation: Velocity images of other iterations, or None: early stopping then allows ``conf.patience`` epochs, because more
+            would fit the few pictures of the beginning alone.
         generator: Source of the variational noise.
     """
     kl = conf.kl if conf.variational else None
@@ -183,7 +184,8 @@ def train_autoencoder(
 
     best = level = validation_loss()
     kept = _copied(autoencoder, optimizer)
-    while epochs < conf.epochs and waited < conf.patience:
+    most = min(conf.epochs, conf.patience) if conf.early_stopping and validation is None else conf.epochs
+    while epochs < most and waited < conf.patience:
         losses = []
         for _ in range(conf.batches):
             loss = autoencoder.loss(sample(), kl, generator)

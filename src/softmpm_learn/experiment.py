@@ -57,7 +57,7 @@ def run_experiment(
     group: Group | None = None,
     signals: Signals | None = None,
     begin: Callable[[], None] = lambda: None,
-) -> None:
+) -> Result:
     """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next.
 
     Of several processes, the first draws, converts and speaks.
@@ -99,6 +99,7 @@ def run_experiment(
         draw(result, task, out)
         logger.info("%s", farewell(result, task, out))
         signals.advice = f"The run had ended; everything is in {out}."
+    return result
 
 
 def finer(conf: TaskConf) -> Task | None:

@@ -1,8 +1,9 @@
 """Replay: grid velocity of many past simulations, bounded in memory, kept on disk, split by iteration.
 
-Blocks of iterations are held out for validation, with all their worlds, and the iterations beside a block are used for neither: the
-motions of one iteration, and of two in a row, are too alike to test on. Each simulation is one HDF5 file that is written once and
-never changed, so a checkpoint need only name its simulations, each with the SHA-256 of its file.
+Iterations are held out for validation with all their worlds, and those beside them are used for neither: the motions of one iteration,
+and of two in a row, are too alike to test on. Old motions are no test of what is learned from new ones, so one is held out in each
+cycle. Each simulation is one HDF5 file that is written once and never changed, so a checkpoint need only name its simulations, each
+with the SHA-256 of its file.
 """
 
 import hashlib
@@ -19,23 +20,24 @@ from torch import Tensor
 from softmpm_learn import files
 
 SPLITS = ("training", "validation")
-CYCLE = 15
-"""Iterations after which the split repeats. Our choice: a buffer of 50 simulations has three blocks of either kind."""
-FIRST = 3
-"""Iteration of a cycle with which the held-out block begins: there are pictures to learn from before and, of the newest, after it."""
+HELD_OUT = 2
+"""Place in a cycle of the iteration held out. The one before the next cycle is for training: with a learning phase at the end of each
+cycle the autoencoder learns from the newest motion, and validation is two iterations old."""
+
+
+def cycle(validation: float) -> int:
+    """Iterations after which the split repeats: one held out, its neighbours for neither, and at least one for training."""
+    return max(4, round(1 / validation))
 
 
 def split_of(iteration: int, validation: float) -> str | None:
-    """Split that the simulations of an iteration belong to, for good; None beside a held-out block.
+    """Split that the simulations of an iteration belong to, for good; None beside one that is held out.
 
     Args:
-        validation: Share of the iterations held out, rounded to at least one in a cycle.
+        validation: Share of the iterations held out, at most a quarter.
     """
-    block = range(FIRST, FIRST + max(1, round(validation * CYCLE)))
-    if iteration % CYCLE in block:
-        return "validation"
-    beside = (iteration - 1) % CYCLE in block or (iteration + 1) % CYCLE in block
-    return None if beside else "training"
+    away = abs(iteration % cycle(validation) - HELD_OUT)
+    return ("validation", None)[away] if away < 2 else "training"
 
 
 class ReplayError(ValueError):
@@ -76,7 +78,7 @@ class Replay:
     def per_iteration(self) -> int:
         """Most simulations of an iteration, so that the buffer spans a cycle of the split and has both kinds."""
         room = 1e6 * self.megabytes / (4 * math.prod(self.shape))
-        return max(1, int(min(self.simulations, room)) // CYCLE)
+        return max(1, int(min(self.simulations, room)) // cycle(self.validation))
 
     @property
     def ids(self) -> list[int]:

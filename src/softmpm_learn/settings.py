@@ -187,7 +187,7 @@ class LearningConf:
     every: int = 5
     """Optimisation steps between two learning phases."""
     epochs: int = 100
-    """Most epochs in a learning phase. Early stopping ends most phases before; the first takes about fifty."""
+    """Most epochs in a learning phase. Early stopping ends most phases before; where nothing is held out yet it allows ``patience``."""
     batches: int = 8
     """Minibatches in an epoch."""
     batch: int = 32
@@ -206,11 +206,11 @@ class LearningConf:
     """Share by which the validation loss must fall to count as better. Our choice: in a run of the biped every phase then stopped by
     itself, at a loss at most 11 % above the lowest of 60 epochs; with 0 most phases ran on for ever smaller gains."""
     validation: float = 0.2
-    """Share of the iterations that are held out for validation, in blocks; their neighbours are used for neither."""
+    """Share of the iterations that are held out for validation, at most a quarter; their neighbours are used for neither."""
     replay: bool = True
     """Refinement 2: learn from many past simulations; False learns from those since the last learning phase."""
     simulations: int = 50
-    """Most simulations in the replay buffer; the oldest go first. Of many worlds it takes a fifteenth of this in each iteration."""
+    """Most simulations in the replay buffer; the oldest go first. Of many worlds it takes a share of this in each iteration."""
     megabytes: float = 256.0
     """Most memory of the replay buffer [MB]; the oldest simulations go first."""
     frame_every: int = 2
@@ -226,8 +226,8 @@ class LearningConf:
         _share("learning", self, "target_rate")
         if not 0.0 <= self.improvement < 1.0:
             raise ValueError(f"learning.improvement must lie in [0, 1), got {self.improvement}.")
-        if not 0.0 < self.validation <= 0.5:
-            raise ValueError(f"learning.validation must lie in (0, 0.5], got {self.validation}.")
+        if not 0.0 < self.validation <= 0.25:
+            raise ValueError(f"learning.validation must lie in (0, 0.25], got {self.validation}.")
         if not (math.isfinite(self.kl) and self.kl >= 0):
             raise ValueError(f"learning.kl must be ≥ 0, got {self.kl}.")
 

@@ -57,6 +57,6 @@ def settings() -> Settings:
     return Settings(
         observer=ObserverConf(latent_size=3, channels=[4, 4]),
         policy=PolicyConf(name="linear"),
-        learning=LearningConf(every=2, epochs=3, batches=2, batch=4, validation=0.5, frame_every=2),
+        learning=LearningConf(every=2, epochs=3, batches=2, batch=4, validation=0.25, frame_every=2),
         train=TrainConf(iterations=5, record_every=0, examine=False),
     )

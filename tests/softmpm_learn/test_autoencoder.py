@@ -144,6 +144,14 @@ def test_the_optimiser_goes_back_with_the_weights():
     assert best * conf.batches == (steps.pop() if steps else 0) and learned.epochs < conf.epochs
 
 
+@pytest.mark.parametrize("early_stopping, epochs", [(True, 4), (False, 30)])
+def test_without_validation_a_phase_is_short(early_stopping, epochs):
+    """Nothing could tell when to stop, so early stopping allows the patience."""
+    conf = LearningConf(epochs=30, batches=1, patience=4, early_stopping=early_stopping)
+    _, learned = trained(make(), lambda: waves(8), conf)
+    assert learned.epochs == epochs and learned.validation != learned.validation
+
+
 @pytest.mark.parametrize("validated", [True, False])
 @pytest.mark.parametrize("where", ["loss", "gradient"])
 def test_a_gradient_that_is_not_finite_is_undone(validated, where, caplog):

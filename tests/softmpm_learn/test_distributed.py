@@ -23,8 +23,9 @@ from softmpm_learn.settings import Settings
 from softmpm_learn.tasks import make_task
 
 HERE = Path(__file__).parent
-SAME = 1e-5
-"""Sums over the worlds have another order: a rounding of 1e-7, a few iterations on."""
+SAME, SMALL = 1e-5, 1e-8
+"""Relative and absolute: sums over the worlds have another order. A rounding of 1e-7, a few iterations on; and a loss is a difference
+of positions of order one, whose rounding is 6e-8 [m]."""
 ARM = [
     *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025"),
     *("train.worlds=4", "train.goal_spread=[0.05,0.05]", "train.record_every=2"),
@@ -133,15 +134,14 @@ def figures(folder: Path) -> list[dict[str, float]]:
 def assert_same(folder: Path, other: Path) -> None:
     """Every metric is equal, and so are the weights, the policy's encoder and the random stream of the goals in the checkpoint."""
     for row, want in zip(figures(folder), figures(other), strict=True):
-        assert row == pytest.approx(want, rel=SAME, nan_ok=True)
+        assert row == pytest.approx(want, rel=SAME, abs=SMALL, nan_ok=True)
     now, want = checkpoint.load(folder), checkpoint.load(other)
     for part in ("policy", "design"):
         torch.testing.assert_close(now[part], want[part], rtol=SAME, atol=SAME)
     for part in ("autoencoder", "target"):
         torch.testing.assert_close(now["learner"][part], want["learner"][part], rtol=SAME, atol=SAME)
     assert torch.equal(now["goals"], want["goals"]) and now["iteration"] == want["iteration"] == 3
-    held = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # three worlds of each iteration
-    assert list(now["learner"]["replay"]) == list(want["learner"]["replay"]) == held
+    assert list(now["learner"]["replay"]) == list(want["learner"]["replay"]) == list(range(12))
 
 
 def assert_in_step(out: Path, name: str) -> None:
@@ -239,7 +239,7 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
     task, one = make_task(conf.task), tmp_path / "one"
     train.train(task, make_model(task, conf, Group()), conf.settings, one)
     for row, want in zip(figures(out), figures(one), strict=True):
-        assert row == pytest.approx(want, rel=SAME, nan_ok=True)
+        assert row == pytest.approx(want, rel=SAME, abs=SMALL, nan_ok=True)
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="native threads are listed by Linux only")

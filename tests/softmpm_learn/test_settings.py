@@ -26,7 +26,7 @@ from softmpm_learn import settings
         ("OptimizerConf", {"fallback_rate": 0.0}, "fallback_rate"),
         ("LearningConf", {"every": 0}, "every"),
         ("LearningConf", {"improvement": 1.0}, "improvement"),
-        ("LearningConf", {"validation": 0.6}, "validation"),
+        ("LearningConf", {"validation": 0.3}, "validation"),
         ("LearningConf", {"target_rate": 0.0}, "target_rate"),
         ("TrainConf", {"iterations": 0}, "iterations"),
         ("TrainConf", {"evaluate_every": 0}, "evaluate_every"),

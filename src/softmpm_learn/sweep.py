@@ -1,0 +1,85 @@
+"""Jobs of a sweep: the outcome of each in its own folder, and one table of all. The same command finds them again and goes on."""
+
+import csv
+import dataclasses
+import hashlib
+import io
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from softmpm_learn import files
+
+OUTCOME, TABLE = "outcome.json", "sweep.csv"
+LONGEST = 80
+"""Characters of a folder's name, without its digest."""
+_MOST = 2**16  # bytes of an outcome
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Outcome of a job; the fields are the columns of the table."""
+
+    job: int
+    """Number in the sweep."""
+    status: str
+    """finished or failed."""
+    loss: float = math.inf
+    """Objective of the sweep: the lowest loss of the run, at fixed goals where goals are drawn at random; infinite if it failed."""
+    iteration: int = -1
+    """Iteration of the lowest loss."""
+    iterations: int = 0
+    """Iterations done."""
+    settings: str
+    """Settings of the job, as on the command line."""
+    folder: str
+    error: str = ""
+    """Reason why it failed."""
+
+
+def folder_name(overrides: Sequence[str]) -> str:
+    """Name of the folder of a sweep, from its command line: the same for the same words."""
+    text = ",".join(overrides)
+    name = re.sub(r"[^\w.=,+-]", "_", text, flags=re.ASCII)[:LONGEST]
+    if name == text and name.strip("."):
+        return name
+    return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def outcome(folder: Path) -> Outcome | None:
+    """Outcome in the folder of a job, None if there is none yet.
+
+    Raises:
+        ValueError: It cannot be read; names the file.
+    """
+    path = folder / OUTCOME
+    if not path.exists():
+        return None
+    try:
+        found = Outcome(**json.loads(files.read(path, _MOST)))
+        if found.status not in ("finished", "failed") or not isinstance(found.loss, float):
+            raise ValueError("its values are others")
+        return found
+    except (ValueError, TypeError) as error:
+        raise ValueError(
+            f"{path} is no outcome of a job: {error}; remove it to run the job again."
+        ) from error
+
+
+def record(folder: Path, found: Outcome) -> None:
+    """Write the outcome of a job into its folder."""
+    files.replace(folder / OUTCOME, json.dumps(dataclasses.asdict(found), indent=1).encode())
+
+
+def tabulate(sweep: Path) -> None:
+    """Write the table of all jobs of the sweep that have an outcome."""
+    known = [outcome(path.parent) for path in sweep.rglob(OUTCOME)]
+    rows = sorted((one for one in known if one), key=lambda one: one.job)
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, [field.name for field in dataclasses.fields(Outcome)], lineterminator="\n")
+    table.writeheader()
+    table.writerows(dataclasses.asdict(row) for row in rows)
+    files.replace(sweep / TABLE, text.getvalue().encode())
