@@ -88,3 +88,12 @@ def test_the_code_on_quantities_runs():
     frames = names["way"].frames
     assert frames.shape == (10, 1, 2)
     assert abs(frames[-1] - softmpm.center_of_mass(model, end, names["params"])).max() < 1e-6
+
+
+def test_the_code_on_objectives_runs():
+    """Three terms by name, the constraint among them."""
+    text = (README.parent / "docs" / "learning.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    assert names["objective"].names == ["progress", "effort", "spread_beyond"]

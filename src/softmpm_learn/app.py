@@ -157,9 +157,8 @@ def _swept(config: DictConfig, out: Path, group: Group, signals: Signals, failed
             logger.info("The same command goes on with the sweep.")
             raise SystemExit(0)
         loss, done = result.best_loss, result.run.iteration
-        found = sweep.Outcome(
-            status="finished", loss=loss, iteration=result.best_iteration, iterations=done, **about
-        )
+        about |= {"iteration": result.best_iteration, "iterations": done} | result.examination
+        found = sweep.Outcome(status="finished", loss=loss, **about)
     except JobError as failure:
         if isinstance(failure, RefusedError):
             _end(1, str(failure))

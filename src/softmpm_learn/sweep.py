@@ -33,6 +33,12 @@ class Outcome:
     """Iteration of the lowest loss."""
     iterations: int = 0
     """Iterations done."""
+    later: float = math.nan
+    """This and the next four: see examination.py; nan where a job has no answer."""
+    kicked: float = math.nan
+    friction: float = math.nan
+    finer: float = math.nan
+    tilt: float = math.nan
     settings: str
     """Settings of the job, as on the command line."""
     folder: str
