@@ -24,7 +24,7 @@ import softmpm
 from softmpm import Model, State
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.episode import Frame, run_episode
-from softmpm_learn.objective import Path, Tilt
+from softmpm_learn.objective import Path, Term, Tilt
 from softmpm_learn.observe import Observer
 from softmpm_learn.run import Run
 from softmpm_learn.tasks.task import Task
@@ -69,8 +69,8 @@ def examine(run: Run, finer: Task | None = None) -> dict[str, float]:
         return dict.fromkeys(NAMES, math.nan)
     found = {}
 
-    def against(path: Path | None) -> float:
-        return math.nan if path is None else term.verdict(term.rate(own), term.rate(path))
+    def against(path: Path | None, like: Term = term) -> float:
+        return math.nan if path is None else term.verdict(term.rate(own), like.rate(path))
 
     long = _asked(
         lambda: motion(run, dataclasses.replace(task, control_steps=LONGER * task.control_steps)), "later"
@@ -83,7 +83,8 @@ def examine(run: Run, finer: Task | None = None) -> dict[str, float]:
     found["friction"] = term.worst([against(path) for path in rough])
     found["finer"] = math.nan
     if finer is not None:
-        found["finer"] = against(_asked(lambda: replayed(run, finer, own.activation), "finer"))
+        path = _asked(lambda: replayed(run, finer, own.activation), "finer")
+        found["finer"] = against(path, finer.objective.terms[0])
     tilts = [one for one in task.objective.terms if isinstance(one, Tilt)]
     found["tilt"] = tilts[0].degrees(long) if tilts and long is not None else math.nan
     return found
