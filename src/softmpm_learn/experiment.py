@@ -260,11 +260,9 @@ def farewell(result: Result, task: Task, out: Path) -> str:
 
 
 def examined(examination: dict[str, float]) -> str:
-    """What was found at the end of a run, in words; see examination.py."""
-    return ", ".join(
-        f"{name} failed" if math.isnan(value) else f"{name} {value:.3g}"
-        for name, value in examination.items()
-    )
+    """What was found at the end of a run; see examination.py."""
+    answers = {name: "none" if math.isnan(value) else f"{value:.3g}" for name, value in examination.items()}
+    return ", ".join(f"{name} {answer}" for name, answer in answers.items())
 
 
 def outcome(task: Task, out: Path) -> str:

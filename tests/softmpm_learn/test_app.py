@@ -294,9 +294,9 @@ def test_the_objective_is_part_of_a_run(monkeypatch, capsys, tmp_path, finished)
     """A weight of the loss that was edited in config.yaml is refused: the numbers after it would be others."""
     shutil.copytree(finished[0], tmp_path / "run")
     path = tmp_path / "run" / "config.yaml"
-    path.write_text(path.read_text().replace("effort: 0.001", "effort: 0.5"))
+    path.write_text(path.read_text().replace("effort: 1.0e-05", "effort: 0.5"))
     said = refusal(monkeypatch, capsys, f"resume={tmp_path}/run")
-    assert "task.objective.terms[2].weight: 0.001 then, 0.5 now" in said
+    assert "task.objective.terms[2].weight: 1e-05 then, 0.5 now" in said
 
 
 def test_the_log_follows_the_run(monkeypatch, tmp_path, finished):

@@ -30,6 +30,8 @@ class ArmConf(TaskConf):
     """Downward acceleration [m/s²]; 0: the arm lies on a table."""
     damping: float = 6.0
     """Rate at which velocity decays [1/s]: an arm that swings for long is hard to stop at its goal."""
+    effort: float = 1e-5
+    """Weight of the mean squared activation in the loss [m²]; decides between motions that are equally good."""
     strength: float = 4e3
     """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
