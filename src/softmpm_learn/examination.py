@@ -21,11 +21,10 @@ import torch
 from torch import Tensor
 
 import softmpm
-from softmpm import Model, State
+from softmpm import Model
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.episode import Frame, run_episode
 from softmpm_learn.objective import Path, Term, Tilt
-from softmpm_learn.observe import Observer
 from softmpm_learn.run import Run
 from softmpm_learn.tasks.task import Task
 
@@ -38,20 +37,6 @@ NAMES = ["later", "kicked", "friction", "finer", "tilt"]
 """Columns of metrics.csv."""
 
 logger = logging.getLogger("softmpm_learn")
-
-
-class Onlooker(Observer):
-    """The observer of a run, which looks at the robot as if it were on the grid of the run."""
-
-    def __init__(self, run: Run):
-        super().__init__()
-        self.run, self.size = run, run.observer.size
-
-    def observe(self, model: Model, state: State) -> Tensor:
-        return self.run.observer.observe(self.run.model, state)
-
-    def encode(self, observation: Tensor) -> Tensor:
-        return self.run.observer.encode(observation)
 
 
 @torch.no_grad()
@@ -111,7 +96,7 @@ def motion(run: Run, task: Task, kick: float = 0.0) -> Path:
     frames: list[Frame] = []
     policy, goal = run.policy, run.middle_goals()
     settings = dict(inputs=inputs, goal=goal, start=start, on_frame=frames.append)
-    run_episode(task, model, Onlooker(run), policy, params, **settings)
+    run_episode(task, model, run.observer, policy, params, **settings)
     activation = torch.stack([frame.activation for frame in frames if frame.activation is not None])
     return Path([frame.time for frame in frames], [frame.state for frame in frames], activation, goal)
 
