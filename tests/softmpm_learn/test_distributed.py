@@ -28,7 +28,7 @@ SAME, SMALL = 1e-5, 1e-8
 of positions of order one, whose rounding is 6e-8 [m]."""
 ARM = [
     *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025"),
-    *("train.worlds=4", "train.goal_spread=[0.05,0.05]", "train.record_every=2"),
+    *("train.worlds=4", "train.goal_spread=[0.05,0.05]", "train.record_every=2", "train.examine=false"),
 ]
 """Three iterations; goals of their own give each world a gradient of its own."""
 
