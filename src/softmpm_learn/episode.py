@@ -1,5 +1,6 @@
 """Closed-loop simulation: observe → act → simulate in each control step, differentiable end to end."""
 
+import math
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 import softmpm
 from softmpm import Inputs, Model, Params, State
+from softmpm_learn.fading import Fading
 from softmpm_learn.objective import Path
 from softmpm_learn.observe import Observer
 
@@ -74,6 +76,7 @@ def run_episode(
     inputs: Inputs | None = None,
     goal: Tensor | None = None,
     start: State | None = None,
+    fade: float = math.inf,
     keep_every: int = 0,
     on_frame: Callable[[Frame], None] | None = None,
 ) -> Episode:
@@ -83,6 +86,7 @@ def run_episode(
         params, inputs: Material of the robot and what else is not the scene's, see :class:`softmpm_learn.design.Design`.
         goal: Goal of each world [m], shape (world, dim), where it is not the task's own.
         start: Initial state, None for rest.
+        fade: Time constant with which gradients fade on their way through the states [s], see :mod:`softmpm_learn.fading`.
         keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
 
@@ -91,7 +95,7 @@ def run_episode(
     """
     state = model.rest() if start is None else start
     period, times = task.control_period, _times(task, model)
-    made, states, observations = Decisions(), [state], []
+    made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
     for step in range(task.control_steps):
         observation = observer.observe(model, state)
         if keep_every and step % keep_every == 0:
@@ -112,7 +116,8 @@ def run_episode(
             raise
         made.features.append(features)
         made.activations.append(activation)
-        states.append(state)
+        state, seen = fading(state)
+        states.append(seen)
     if on_frame:
         with torch.no_grad():
             on_frame(Frame(task.control_steps * period, state, observer(model, state), None))
@@ -139,7 +144,7 @@ class ClosedLoop:
     Args:
         design: Gives the material and the inputs, see :class:`softmpm_learn.design.Design`.
         free: Parameters of the design.
-        keep_every: As in :func:`run_episode`.
+        keep_every, fade: As in :func:`run_episode`.
     """
 
     def __init__(
@@ -151,7 +156,9 @@ class ClosedLoop:
         design: Callable[[], tuple[Params, Inputs]],
         free: list[nn.Parameter],
         keep_every: int = 0,
+        fade: float = math.inf,
     ):
+        self.fade = fade
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
         self.design, self.free, self.keep_every = design, free, keep_every
         self._goal: Tensor | None = None
@@ -186,6 +193,7 @@ class ClosedLoop:
             inputs=inputs,
             goal=self._goal,
             keep_every=self.keep_every,
+            fade=self.fade,
             on_frame=on_frame,
         )
         activations = episode.decisions.activations

@@ -76,7 +76,8 @@ class Run:
         self.safe: list[Tensor] = []
         every = settings.learning.frame_every if self.learner else 0
         parts = (task, model, self.observer, self.policy, self.design, list(self.design.parameters()))
-        self.loop = ClosedLoop(*parts, keep_every=every)
+        fade = settings.optimizer.fade
+        self.loop = ClosedLoop(*parts, keep_every=every, fade=math.inf if fade is None else fade)
 
     def _make_observer(self, out: Path) -> Observer:
         conf, model, task = self.settings.observer, self.model, self.task

@@ -154,6 +154,9 @@ class OptimizerConf:
     """Learning rate of the design, in the unbounded space before the sigmoid."""
     max_norm: float | None = 1.0
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
+    fade: float | None = 0.25
+    """Time constant with which gradients fade on their way back through the simulation [s]: what a muscle did long before a step has an
+    effect that changes of a useful size do not have (fading.py). null: never."""
     retries: int = 4
     """Maximum number of times that a failed step is halved towards the last successful simulation; 0 ends the run at once."""
     fallback_share: float = 0.5
@@ -169,8 +172,9 @@ class OptimizerConf:
     def __post_init__(self):
         _one_of("optimizer.name", self.name, OPTIMIZERS)
         _positive("optimizer", self, "policy_rate", "design_rate")
-        if self.max_norm is not None:
-            _positive("optimizer", self, "max_norm")
+        for name in ("max_norm", "fade"):
+            if getattr(self, name) is not None:
+                _positive("optimizer", self, name)
         for name in ("retries", "fallback_from"):
             if getattr(self, name) < 0:
                 raise ValueError(f"optimizer.{name} must be ≥ 0, got {getattr(self, name)}.")
