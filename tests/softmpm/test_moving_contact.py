@@ -392,6 +392,6 @@ def test_what_cannot_be_is_refused(settled):
     ordered = build(slab(), dtype=torch.float32, deterministic=True, scheme="auto")
     assert "plain: deterministic contact at surface points" in ordered.describe()
     args = (None, model.params())
-    at_nodes = softmpm.build(slab(), device="cpu", dtype=torch.float64)
+    at_nodes = softmpm.build(slab(), device="cpu", dtype=torch.float64, contact="nodes")
     with pytest.raises(ValueError, match="state.surface must be None"):
         softmpm.simulate(at_nodes, state, *args, substeps=1)
