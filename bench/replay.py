@@ -28,12 +28,27 @@ from softmpm_learn.design import declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.experiment import make_model
+from softmpm_learn.observe import Observer
 from softmpm_learn.run import Run
 from softmpm_learn.saved import load
 from softmpm_learn.tasks import Resolution, Task, make_task
 
 LONGER = 3
 """Length of the continued walk over that of an episode."""
+
+
+class Onlooker(Observer):
+    """An observer of a run that sees the robot on the track of the run, wherever it is."""
+
+    def __init__(self, run: Run):
+        super().__init__()
+        self.run, self.size = run, run.observer.size
+
+    def observe(self, model, state):
+        return self.run.observer.observe(self.run.model, state)
+
+    def encode(self, observation):
+        return self.run.observer.encode(observation)
 
 
 def learned(folder: Path, device: torch.device, out: Path) -> tuple[RunConf, Run]:
@@ -50,7 +65,7 @@ def learned(folder: Path, device: torch.device, out: Path) -> tuple[RunConf, Run
 def played(run: Run, task: Task, model: softmpm.Model) -> tuple[torch.Tensor, list[float]]:
     """Activations of the policy, (step, world, muscle), and displacement at the beginning of each step and at the end [m]."""
     frames, (params, inputs) = [], run.design()
-    run_episode(task, model, run.observer, run.policy, params, inputs=inputs, on_frame=frames.append)
+    run_episode(task, model, Onlooker(run), run.policy, params, inputs=inputs, on_frame=frames.append)
     way = [travelled(model, params, frame.state) for frame in frames]
     return torch.stack([frame.activation for frame in frames[:-1]]), way
 
