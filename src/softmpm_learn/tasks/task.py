@@ -145,8 +145,8 @@ class WalkerConf(TaskConf):
     formulation: 4e-3."""
     strength: float = 6e3
     """Stress of a muscle at full activation [Pa]."""
-    effort: float = 1e-2
-    """Weight of the mean squared activation in the loss [m]."""
+    effort: float = 5e-2
+    """Weight of the mean squared activation in the loss [m]; with less, gaits stretch the robot until it breaks."""
     upright: float = 1.0
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
     friction: float = 0.8
