@@ -79,7 +79,7 @@ class PolicyConf:
     """Number of periods: period, period/2, period/3, …"""
     knots: int = 16
     """knots: values of each muscle along the episode, joined by straight lines."""
-    gain: float = 0.3
+    gain: float = 1.0
     """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 1 close to saturation."""
 
     def __post_init__(self):
