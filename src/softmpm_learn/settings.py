@@ -80,7 +80,7 @@ class PolicyConf:
     knots: int = 16
     """knots: values of each muscle along the episode, joined by straight lines."""
     gain: float = 1.0
-    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 1 close to saturation."""
+    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 1 moves vigorously at random."""
 
     def __post_init__(self):
         _one_of("policy.name", self.name, POLICIES)
