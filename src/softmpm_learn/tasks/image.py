@@ -1,0 +1,143 @@
+"""A flat robot from a picture, in which each colour is a material or a muscle."""
+
+import math
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from softmpm_learn.tasks.drawing import Part, drawn
+from softmpm_learn.tasks.own import OwnConf
+from softmpm_learn.tasks.task import Task
+
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "WEBP")
+MOST_PIXELS = 2**22
+PAPER = np.array([255, 255, 255])
+BLEND = 1.5
+"""Pixels of an unknown colour this near to a known one [pixels] are the blurred edge of a part."""
+
+
+@dataclass(kw_only=True)
+class Colour:
+    """Meaning of a colour in the picture."""
+
+    colour: str
+    """#rrggbb."""
+    muscle: bool = False
+    """True for a muscle: all pixels of the colour contract together."""
+    angle: float | None = None
+    """Direction of the fibres of a muscle, counter-clockwise from forward [°]; null for along the longer axis of the part."""
+    stiffness: float = 1.0
+    """Young's modulus in units of task.young."""
+
+    def __post_init__(self):
+        if not (len(self.colour) == 7 and self.colour[0] == "#"):
+            raise ValueError(f"a colour of task.legend must be #rrggbb, got {self.colour!r}.")
+        try:
+            bytes.fromhex(self.colour[1:])
+        except ValueError as error:
+            raise ValueError(f"a colour of task.legend must be #rrggbb, got {self.colour!r}.") from error
+        if not (math.isfinite(self.stiffness) and self.stiffness > 0):
+            raise ValueError(f"stiffness in task.legend must be > 0, got {self.stiffness}.")
+        if self.angle is not None and not math.isfinite(self.angle):
+            raise ValueError(f"angle in task.legend must be finite, got {self.angle}.")
+
+    @property
+    def rgb(self) -> np.ndarray:
+        """Red, green and blue, 0 to 255."""
+        return np.array(list(bytes.fromhex(self.colour[1:])))
+
+
+def _legend() -> dict[str, Colour]:
+    muscles = dict(red="#ff0000", green="#00c000", blue="#0000ff", yellow="#ffff00")
+    muscles |= dict(cyan="#00ffff", magenta="#ff00ff", orange="#ff8000", purple="#8000ff")
+    return {
+        "passive": Colour(colour="#808080"),
+        "stiff": Colour(colour="#202020", stiffness=10.0),
+        **{name: Colour(colour=code, muscle=True) for name, code in muscles.items()},
+    }
+
+
+@dataclass(kw_only=True)
+class ImageConf(OwnConf):
+    """A walker drawn in a picture; white and transparent pixels are outside."""
+
+    name: str = "image"
+    legend: dict[str, Colour] = field(default_factory=_legend)
+    """Meaning of the colours by name."""
+    tolerance: float = 64.0
+    """Largest distance of a pixel from a colour of the legend, of red, green and blue from 0 to 255 each."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.need_not_negative("tolerance")
+
+
+def image(conf: ImageConf) -> Task:
+    """Build the walker that a picture shows.
+
+    Raises:
+        ValueError: The picture cannot be read, has an unknown colour, shows nothing, or a robot that does not fit.
+    """
+    pixels = _read(conf.path("a picture of the robot"))
+    label = _labels(conf, pixels)
+    parts = []
+    for k, (name, colour) in enumerate(conf.legend.items()):
+        angle = None if colour.angle is None else math.radians(colour.angle)
+        direction = None if angle is None else (math.cos(angle), math.sin(angle))
+        parts.append(Part(name, label == k, colour.muscle, direction, colour.stiffness))
+    return drawn(conf, parts)
+
+
+def _labels(conf: ImageConf, pixels: np.ndarray) -> np.ndarray:
+    """Number in the legend of each pixel, or the legend's length for paper."""
+    from scipy.ndimage import distance_transform_edt
+
+    known = np.array([*(colour.rgb for colour in conf.legend.values()), PAPER], dtype=float)
+    packed = pixels.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    codes, index = np.unique(packed, return_inverse=True)
+    colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(float)
+    away = np.stack([np.linalg.norm(colours - one, axis=1) for one in known], axis=1)
+    nearest = np.where(away.min(axis=1) <= conf.tolerance, away.argmin(axis=1), -1)
+    label = nearest[index.reshape(packed.shape)]
+    if (label < 0).any():
+        distance, place = map(np.asarray, distance_transform_edt(label < 0, return_indices=True) or ())
+        unknown = packed[distance > BLEND] if (label >= 0).any() else packed.ravel()
+        if len(unknown):
+            found, count = np.unique(unknown, return_counts=True)
+            code = f"#{found[count.argmax()]:06x}"
+            listed = ", ".join(f"{name} {colour.colour}" for name, colour in conf.legend.items())
+            raise ValueError(
+                f"{conf.file} has {count.max()} pixels of the colour {code}, which the legend lacks; it has {listed}. Repaint them, or "
+                f"add it: '+task.legend.NAME={{colour:\"{code}\",muscle:true}}'."
+            )
+        label = label[tuple(place)]
+    return label
+
+
+def _read(path: Path) -> np.ndarray:
+    """Colours on white paper, shape (row, column, 3)."""
+    import PIL.Image
+
+    damaged = (
+        ArithmeticError,
+        EOFError,
+        LookupError,
+        OSError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+        struct.error,
+    )
+    try:
+        with PIL.Image.open(path, formats=FORMATS) as picture:
+            if picture.width * picture.height <= MOST_PIXELS:
+                paper = PIL.Image.new("RGBA", picture.size, "white")
+                return np.asarray(PIL.Image.alpha_composite(paper, picture.convert("RGBA")).convert("RGB"))
+            size = f"{picture.width} x {picture.height}"
+    except (*damaged, PIL.Image.DecompressionBombError) as error:
+        raise ValueError(f"{path} cannot be read as a picture ({', '.join(FORMATS)}): {error}") from error
+    raise ValueError(
+        f"{path} must have at most {MOST_PIXELS} pixels, got {size}; a few for each particle are enough."
+    )
