@@ -265,7 +265,12 @@ def sentence(error: BaseException) -> str:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
+        file = (
+            ""
+            if plugins.loaded
+            else f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
+        )
+        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
     text = in_full(error).strip() or "no details"
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror

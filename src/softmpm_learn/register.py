@@ -67,10 +67,11 @@ class Table(Mapping[str, Entry]):
         """Names that users registered; imports nothing."""
         return [name for name, entry in self._entries.items() if not entry.is_own]
 
-    def need(self, name: object) -> None:
-        """Raise ValueError unless the name is registered."""
+    def need(self, name: str, options: Mapping[str, Any]) -> None:
+        """Raise ValueError unless the name is registered and has these options, of the right types."""
         if name not in self._all():
             raise ValueError(f"{self.what}.name must be one of {', '.join(self)}; got {name!r}.")
+        self._checked(name, self[name], dict(options))
 
     def add(self, name: str, entry: Entry) -> None:
         """Register; the same function of the same module may come again, as in a notebook.
@@ -97,7 +98,6 @@ class Table(Mapping[str, Entry]):
         Raises:
             ValueError: An option is unknown or has another type.
         """
-        self.need(name)
         entry = self[name]
         return entry.build(*arguments, **self._checked(name, entry, dict(options)))
 

@@ -54,7 +54,7 @@ class ObserverConf:
     """Options of an observer of one's own."""
 
     def __post_init__(self):
-        OBSERVERS.need(self.name)
+        OBSERVERS.need(self.name, self.options)
         _positive("observer", self, "clusters", "latent_size")
         if not self.channels or min(self.channels) < 1:
             raise ValueError(
@@ -86,7 +86,7 @@ class PolicyConf:
     """Options of a policy of one's own."""
 
     def __post_init__(self):
-        POLICIES.need(self.name)
+        POLICIES.need(self.name, self.options)
         _positive("policy", self, "period", "harmonics")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
@@ -172,7 +172,7 @@ class OptimizerConf:
     """Further arguments of the optimiser, such as betas of adam."""
 
     def __post_init__(self):
-        OPTIMIZERS.need(self.name)
+        OPTIMIZERS.need(self.name, self.options)
         _positive("optimizer", self, "policy_rate", "design_rate")
         if self.max_norm is not None:
             _positive("optimizer", self, "max_norm")

@@ -2,8 +2,9 @@
 
 import math
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,7 @@ class Colour:
         return np.array(list(bytes.fromhex(self.colour[1:])))
 
 
-def _legend() -> dict[str, Colour]:
+def _legend() -> dict[str, Any]:
     muscles = dict(red="#ff0000", green="#00c000", blue="#0000ff", yellow="#ffff00")
     muscles |= dict(cyan="#00ffff", magenta="#ff00ff", orange="#ff8000", purple="#8000ff")
     return {
@@ -59,19 +60,30 @@ def _legend() -> dict[str, Colour]:
     }
 
 
+def _colour(name: str, entry: Any) -> Colour:
+    if isinstance(entry, Colour):
+        return entry
+    try:
+        return Colour(**entry)
+    except TypeError as error:
+        known = ", ".join(one.name for one in fields(Colour))
+        raise ValueError(f"task.legend.{name} must have the fields {known}: {error}.") from error
+
+
 @dataclass(kw_only=True)
 class ImageConf(OwnConf):
     """A walker drawn in a picture; white and transparent pixels are outside."""
 
     name: str = "image"
-    legend: dict[str, Colour] = field(default_factory=_legend)
-    """Meaning of the colours by name."""
+    legend: dict[str, Any] = field(default_factory=_legend)
+    """Meaning of the colours by name, a :class:`Colour` each or a dict of its fields."""
     tolerance: float = 64.0
     """Largest distance of a pixel from a colour of the legend, of red, green and blue from 0 to 255 each."""
 
     def __post_init__(self):
         super().__post_init__()
         self.need_not_negative("tolerance")
+        self.legend = {name: _colour(name, entry) for name, entry in self.legend.items()}
 
 
 def image(conf: ImageConf) -> Task:

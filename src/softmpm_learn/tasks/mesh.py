@@ -32,10 +32,10 @@ class MeshConf(OwnConf):
     seconds: float = 1.0
     """Length of an episode [s]."""
     slabs: int = 4
-    """Number of vertical slabs of equal thickness along x, each a muscle, unless there are boxes."""
+    """Number of vertical slabs of equal thickness along x, each a muscle with fibres along x, unless there are boxes."""
     boxes: dict[str, list[float]] = field(default_factory=dict)
-    """Muscles by name: a box from x0, y0, z0 to x1, y1, z1 in shares of the bounding box, x forward and y up; of boxes that overlap,
-    the first has the particles."""
+    """Muscles by name, with fibres along their longer axes: boxes from x0, y0, z0 to x1, y1, z1 in shares of the bounding box, x
+    forward and y up. Of boxes that overlap, the first has the particles."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -81,7 +81,7 @@ def _muscles(conf: MeshConf, rest: np.ndarray) -> list[Muscular]:
         upper = np.where(np.array(box[3:]) >= 1.0, math.inf, box[3:])  # the far face belongs to the last
         chosen = np.flatnonzero(free & (share >= box[:3]).all(axis=1) & (share < upper).all(axis=1))
         free[chosen] = False
-        direction = longer_axis(rest[chosen]) if len(chosen) else (1.0, 0.0, 0.0)
+        direction = longer_axis(rest[chosen]) if conf.boxes and len(chosen) else (1.0, 0.0, 0.0)
         found.append(Muscular(name, chosen, direction))
     return found
 

@@ -85,8 +85,8 @@ def walker(
     """A walker on the track.
 
     Args:
-        shapes: Particles with the lower corner of the robot at the origin, and their Young's modulus in units of the setting's; all have
-            its viscosity, because a higher one takes a smaller step.
+        shapes: Particles with the lower corner of the robot at the origin, and their Young's modulus in units of the setting's; all
+            have its viscosity, because a higher one takes a smaller step.
         muscles: Its muscles, which are its regions too; they do not overlap.
 
     Raises:
@@ -107,12 +107,13 @@ def walker(
     if rest.shape[1] == 3:
         grid, walls, place = _widened(grid, walls, place, float(np.ptp(rest[:, 2])) + conf.spacing)
     material = neo_hookean(conf)
+    bodies = [
+        softmpm.Body(shape.moved(place), dataclasses.replace(material, young=factor * material.young))
+        for shape, factor in shapes
+    ]
     scene = softmpm.Scene(
         grid=grid,
-        bodies=[
-            softmpm.Body(shape.moved(place), dataclasses.replace(material, young=factor * material.young))
-            for shape, factor in shapes
-        ],
+        bodies=bodies,
         muscles=[
             softmpm.Muscle(particles=m.particles, direction=m.direction, strength=conf.strength)
             for m in muscles
