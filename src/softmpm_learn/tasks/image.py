@@ -15,8 +15,6 @@ from softmpm_learn.tasks.task import Task
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "WEBP")
 MOST_PIXELS = 2**22
 PAPER = np.array([255, 255, 255])
-BLEND = 1.5
-"""Pixels of an unknown colour this near to a known one [pixels] are the blurred edge of a part."""
 
 
 @dataclass(kw_only=True)
@@ -104,27 +102,33 @@ def image(conf: ImageConf) -> Task:
 
 def _labels(conf: ImageConf, pixels: np.ndarray) -> np.ndarray:
     """Number in the legend of each pixel, or the legend's length for paper."""
-    from scipy.ndimage import distance_transform_edt
-
     known = np.array([*(colour.rgb for colour in conf.legend.values()), PAPER], dtype=float)
     packed = pixels.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     codes, index = np.unique(packed, return_inverse=True)
     colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(float)
     away = np.stack([np.linalg.norm(colours - one, axis=1) for one in known], axis=1)
     nearest = np.where(away.min(axis=1) <= conf.tolerance, away.argmin(axis=1), -1)
-    label = nearest[index.reshape(packed.shape)]
+    label = _blended(nearest[index.reshape(packed.shape)], pixels, known)
     if (label < 0).any():
-        distance, place = map(np.asarray, distance_transform_edt(label < 0, return_indices=True) or ())
-        unknown = packed[distance > BLEND] if (label >= 0).any() else packed.ravel()
-        if len(unknown):
-            found, count = np.unique(unknown, return_counts=True)
-            code = f"#{found[count.argmax()]:06x}"
-            listed = ", ".join(f"{name} {colour.colour}" for name, colour in conf.legend.items())
-            raise ValueError(
-                f"{conf.file} has {count.max()} pixels of the colour {code}, which the legend lacks; it has {listed}. Repaint them, or "
-                f"add it: '+task.legend.NAME={{colour:\"{code}\",muscle:true}}'."
-            )
-        label = label[tuple(place)]
+        found, count = np.unique(packed[label < 0], return_counts=True)
+        code = f"#{found[count.argmax()]:06x}"
+        listed = ", ".join(f"{name} {colour.colour}" for name, colour in conf.legend.items())
+        raise ValueError(
+            f"{conf.file} has {count.max()} pixels of the colour {code}, which the legend lacks; it has {listed}. Repaint them, or add "
+            f"it: '+task.legend.NAME={{colour:\"{code}\",muscle:true}}'."
+        )
+    return label
+
+
+def _blended(label: np.ndarray, pixels: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Labels, in which an unknown pixel, -1, beside known ones has that of them whose colour is nearest: the blurred edge of a part."""
+    row, column = np.nonzero(label < 0)
+    around = np.pad(label, 1, constant_values=-1)
+    beside = np.stack([around[row + i, column + j] for i in range(3) for j in range(3)], axis=1)
+    away = np.linalg.norm(known[beside] - pixels[row, column, None], axis=2)
+    chosen = np.where(beside < 0, np.inf, away).argmin(axis=1)
+    label = label.copy()
+    label[row, column] = beside[np.arange(len(row)), chosen]  # -1 if all are
     return label
 
 
