@@ -147,13 +147,10 @@ def test_a_taken_name_is_refused():
         @register.policy("cpg")
         def cpg(conf, space): ...
 
-    with pytest.raises(
-        ValueError, match=r"policy 'cpg' is registered already, by .*cpg; choose another name"
-    ):
+    def other(conf, space): ...
 
-        @register.policy("cpg")
-        def other(conf, space): ...
-
+    with pytest.raises(ValueError, match=r"'cpg' is registered already, by .*cpg; choose another name"):
+        register.policy("cpg")(other)
     with pytest.raises(ValueError, match="policy 'mlp' is registered already"):
         register.policy("mlp")(other)
     with pytest.raises(ValueError, match="letters, digits and underscores, got 'my-policy'"):
