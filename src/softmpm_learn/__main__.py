@@ -3,20 +3,28 @@
 import sys
 from pathlib import Path
 
+from softmpm_learn import plugins, register
 from softmpm_learn.stop import Signals
 
 
 def main() -> None:
-    """Print the help at once, or import the program, which takes seconds, and run it."""
-    if {"--help", "-h"} & set(sys.argv[1:]):
-        print(help_text())
-        return
+    """Print the help at once, or import the program, which takes seconds, and run it with the files that the command line names."""
+    files, words = plugins.split(sys.argv[1:])
+    asked = bool({"--help", "-h"} & set(words))
     signals = Signals()
     signals.install()  # before the imports that take seconds
+    if asked and not files:
+        print(help_text())
+        return
 
-    from softmpm_learn.app import main as run
+    from softmpm_learn import app
 
-    run(signals)
+    sys.argv[1:] = words
+    if asked:
+        app.load(files)
+        print(help_text())
+    else:
+        app.main(signals, files)
 
 
 def help_text() -> str:
@@ -26,7 +34,8 @@ def help_text() -> str:
     here = Path(__file__).resolve().parent
     places = (here / "conf" / "config.yaml", here.parents[1] / "conf" / "config.yaml")
     path = next(place for place in places if place.is_file())
-    return OmegaConf.load(path).hydra.help.template
+    text, added = OmegaConf.load(path).hydra.help.template, register.added()
+    return f"{text}\nRegistered by files and packages:\n\n{added}\n" if added else text
 
 
 if __name__ == "__main__":

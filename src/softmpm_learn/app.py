@@ -7,17 +7,16 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import hydra
 import torch
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
@@ -25,16 +24,15 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from softmpm_learn import files, sweep
+from softmpm_learn import files, plugins, sweep
 from softmpm_learn.checkpoint import LockedError
-from softmpm_learn.config import RunConf, conf_dir, to_run, unknown_key
+from softmpm_learn.config import RunConf, conf_dir, register, to_run, unknown_key
 from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
 from softmpm_learn.experiment import run_experiment
 from softmpm_learn.log_file import log_file
 from softmpm_learn.optimisation import TrainingError
-from softmpm_learn.saved import load
+from softmpm_learn.saved import load as saved_configuration
 from softmpm_learn.stop import Signals
-from softmpm_learn.tasks import TASKS
 from softmpm_learn.train import Result
 
 logger = logging.getLogger("softmpm_learn")
@@ -53,8 +51,12 @@ EXPECTED = (
 """Errors whose message is meant for people; any other is a fault of the program."""
 
 
-def main(signals: Signals | None = None) -> None:
-    """Entry of ``python -m softmpm_learn``: exit code 0, or 1 after one sentence on what went wrong."""
+def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
+    """Entry of ``python -m softmpm_learn``: exit code 0, or 1 after one sentence on what went wrong.
+
+    Args:
+        own: Files of the user to import first.
+    """
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))  # the user asks for tracebacks
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints an error its own way, in several lines
     group, signals = Group(), signals or Signals()
@@ -63,6 +65,7 @@ def main(signals: Signals | None = None) -> None:
             if not group.first:
                 signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
+            _load(own)
             register(group.broadcast(time.time()))
             failed: dict[int, Path] = {}
             run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
@@ -80,41 +83,21 @@ def main(signals: Signals | None = None) -> None:
         _end(130, "" if signals.quiet else f"interrupted. {signals.advice}")
 
 
-def register(began: float | None = None) -> None:
-    """Give Hydra the schema, and when the program began; a group that starts with an underscore is not offered to users."""
-    store = ConfigStore.instance()
-    store.store(group="_schema", name="run", node=RunConf)
-    for name, (conf, _) in TASKS.items():
-        store.store(group="_schema/task", name=name, node=conf)
-    OmegaConf.register_new_resolver("run_dir", _run_dir, replace=True)
-    OmegaConf.register_new_resolver("sweep_name", _sweep_name(), replace=True)
-    began = time.time() if began is None else began
-    OmegaConf.register_new_resolver(
-        "began", lambda pattern: time.strftime(pattern, time.localtime(began)), replace=True
-    )
+def load(own: Sequence[str]) -> None:
+    """Import files of the user and installed packages, or end with one sentence on what went wrong."""
+    try:
+        _load(own)
+    except Exception as error:
+        if os.environ.get("HYDRA_FULL_ERROR"):
+            raise
+        _give_up(error)
 
 
-def _sweep_name() -> Callable[[DictConfig], str]:
-    """Gives the name of a sweep's folder; jobs, whose command line is only their own part, get that of the whole sweep."""
-    names: list[str] = []
-
-    def name(_root_: DictConfig) -> str:
-        if not names:
-            asked = _root_.hydra.overrides
-            sweeper = [text for text in asked.hydra if text.startswith(("hydra/sweeper", "hydra.sweeper"))]
-            names.append(sweep.folder_name([*asked.task, *sweeper]))
-        return names[0]
-
-    return name
-
-
-def _run_dir(resume: str | None, fresh: str) -> str:
-    """Folder of a run: a resumed one goes on where it is."""
-    if resume is None:
-        return fresh
-    if not (Path(resume) / "config.yaml").is_file():
-        raise ValueError(f"there is no run to resume in {resume}: it has no config.yaml.")
-    return resume
+def _load(own: Sequence[str]) -> None:
+    plugins.need_complete()
+    plugins.load_packages()
+    for path in own:
+        plugins.load(path)
 
 
 class JobError(Exception):
@@ -181,6 +164,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
     try:
         with group.fail_together():
             conf, hydra_config = to_run(config), HydraConfig.get()
+            conf.files = plugins.files()
             sweeps, begun = hydra_config.mode == RunMode.MULTIRUN, (out / "config.yaml").exists()
             if conf.resume is not None:
                 if sweeps:
@@ -190,7 +174,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
                 raise RefusedError(
                     f"{out} holds a run already; go on with resume={out}, or choose another folder."
                 )
-            if begun and _fixed(load(out)) != _fixed(conf):
+            if begun and _fixed(saved_configuration(out)) != _fixed(conf):
                 raise RefusedError(
                     f"{out} holds a run with other settings; choose another folder for the sweep with hydra.sweep.dir=FOLDER."
                 )
@@ -218,7 +202,7 @@ def _experiment(conf: RunConf, out: Path, group: Group, signals: Signals) -> Res
 def _fixed(conf: RunConf) -> dict:
     """Settings that a run keeps when it is resumed."""
     flat = dataclasses.asdict(conf)
-    for key in (*CHANGEABLE, "resume"):
+    for key in (*CHANGEABLE, "resume", "files"):
         group, _, name = key.partition(".")
         del (flat[group] if name else flat)[name or group]
     return flat
@@ -238,7 +222,8 @@ def _left(error: Exception, out: Path, group: Group) -> str:
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
     """The configuration of the run to go on with, with what the command line may change of it."""
-    saved = load(Path(str(conf.resume)))
+    saved = saved_configuration(Path(str(conf.resume)))
+    saved.files = conf.files
     for key in (text.partition("=")[0] for text in overrides):
         group, _, name = key.partition(".")
         if group == "device":
@@ -279,7 +264,12 @@ def sentence(error: BaseException) -> str:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}."
+        file = (
+            ""
+            if plugins.loaded
+            else f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
+        )
+        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
     text = in_full(error).strip() or "no details"
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror

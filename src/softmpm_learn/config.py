@@ -6,11 +6,15 @@ a file names is ever imported or called.
 
 import dataclasses
 import difflib
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from softmpm_learn import sweep
+from softmpm_learn.register import TABLES
 from softmpm_learn.settings import (
     DesignConf,
     LearningConf,
@@ -66,6 +70,8 @@ class RunConf:
     device: DeviceConf = field(default_factory=DeviceConf)
     resume: str | None = None
     """Folder of an earlier run to continue; its configuration is used again."""
+    files: list[str] = field(default_factory=list)
+    """Files that registered robots, observers and policies of one's own; filled in by the program, to name them if one is missing."""
 
     @property
     def settings(self) -> Settings:
@@ -83,6 +89,50 @@ def conf_dir() -> str:
     raise FileNotFoundError(
         f"config.yaml is missing in {' and in '.join(map(str, places))}; install softmpm again."
     )
+
+
+def register(began: float | None = None) -> None:
+    """Give Hydra the schema, choices without a file in ``conf/``, and when the program began; a group that starts with an underscore is
+    not offered to users."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    store.store(group="_schema", name="run", node=RunConf)
+    for name, (conf, _) in TASKS.items():
+        store.store(group="_schema/task", name=name, node=conf)
+    for table in TABLES:
+        for name in table.added:
+            own = {"name": name, "options": table.defaults(name)} if table is not TASKS else TASKS[name].kind
+            store.store(group=table.what, name=name, node=own)
+    OmegaConf.register_new_resolver("run_dir", _run_dir, replace=True)
+    OmegaConf.register_new_resolver("sweep_name", _sweep_name(), replace=True)
+    began = time.time() if began is None else began
+    OmegaConf.register_new_resolver(
+        "began", lambda pattern: time.strftime(pattern, time.localtime(began)), replace=True
+    )
+
+
+def _sweep_name() -> Callable[[DictConfig], str]:
+    """Gives the name of a sweep's folder; jobs, whose command line is only their own part, get that of the whole sweep."""
+    names: list[str] = []
+
+    def name(_root_: DictConfig) -> str:
+        if not names:
+            asked = _root_.hydra.overrides
+            sweeper = [text for text in asked.hydra if text.startswith(("hydra/sweeper", "hydra.sweeper"))]
+            names.append(sweep.folder_name([*asked.task, *sweeper]))
+        return names[0]
+
+    return name
+
+
+def _run_dir(resume: str | None, fresh: str) -> str:
+    """Folder of a run: a resumed one goes on where it is."""
+    if resume is None:
+        return fresh
+    if not (Path(resume) / "config.yaml").is_file():
+        raise ValueError(f"there is no run to resume in {resume}: it has no config.yaml.")
+    return resume
 
 
 def to_run(config: DictConfig) -> RunConf:

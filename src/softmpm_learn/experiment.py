@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import dataclasses
 import logging
 import math
 import os
@@ -16,6 +15,7 @@ import torch
 import warp as wp
 
 import softmpm
+from softmpm_learn import plugins
 from softmpm_learn.config import RunConf
 from softmpm_learn.design import DESIGNABLE, declared_inputs
 from softmpm_learn.distributed import Group
@@ -24,7 +24,7 @@ from softmpm_learn.progress import ProgressBar
 from softmpm_learn.run import Run
 from softmpm_learn.saved import save
 from softmpm_learn.stop import Signals
-from softmpm_learn.tasks import Resolution, Task, TaskConf, make_task
+from softmpm_learn.tasks import Task, TaskConf, make_task
 from softmpm_learn.train import Result, train
 
 PICTURES = 4
@@ -104,10 +104,8 @@ def run_experiment(
 
 def finer(conf: TaskConf) -> Task | None:
     """The same task on the next finer grid, None if there is none."""
-    known = list(Resolution)
-    if conf.resolution is known[-1]:
-        return None
-    return make_task(dataclasses.replace(conf, resolution=known[known.index(conf.resolution) + 1]))
+    refined = conf.refined()
+    return None if refined is None else make_task(refined)
 
 
 def need_determinism(needed: bool) -> None:
@@ -255,7 +253,7 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     else:
         lines.append(f"Everything is in {shown}; train.record_every=0, so nothing was recorded.")
     if not result.finished:
-        lines.append(f"To go on: python -m softmpm_learn resume={shown}")
+        lines.append(f"To go on: {plugins.command()} resume={shown}")
     return "\n".join(lines)
 
 

@@ -210,7 +210,8 @@ def _draw_robot(
         linewidths=0,
     )
     for wall in scene.walls:
-        _draw_wall(panel, wall, low, high)
+        if any(wall.normal[:2]):  # not beside the picture
+            _draw_wall(panel, wall, low, high)
     panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     panel.tick_params(labelsize=6)
 

@@ -7,6 +7,7 @@ observer also trains on the observations. Both are differentiable.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +16,13 @@ from torch.nn import functional
 
 import softmpm
 from softmpm import Model, State
+from softmpm_learn import register
+from softmpm_learn.autoencoder import Autoencoder
+from softmpm_learn.register import OBSERVERS
+from softmpm_learn.settings import ObserverConf
+
+if TYPE_CHECKING:
+    from softmpm_learn.tasks.task import Task
 
 THIN = 0.01
 """A node with this share of a full node's mass shows half its velocity. Otherwise what is seen would jump, and the gradient
@@ -154,3 +162,34 @@ class Latent(Observer):
 
     def encode(self, observation: Tensor) -> Tensor:
         return self.encoder(observation)
+
+
+@register.observer("latent")
+def latent(conf: ObserverConf, model: Model, task: "Task") -> Latent:
+    """Learned; its encoder is an autoencoder yet to be trained, whose own encoder the learner puts in its place."""
+    picture, channels = VelocityImage(model, conf.nodes, conf.follow), list(conf.channels)
+    autoencoder = Autoencoder(model.dim, picture.shape, conf.latent_size, channels, scale=task.body_length)
+    return Latent(picture, autoencoder, conf.latent_size)
+
+
+@register.observer("centroids")
+def centroids(conf: ObserverConf, model: Model, task: "Task") -> Centroids:
+    """Centroids of the task's regions."""
+    return Centroids(model, list(task.regions.values()), task.body_length)
+
+
+@register.observer("kmeans")
+def kmeans(conf: ObserverConf, model: Model, task: "Task") -> Centroids:
+    """Centroids of clusters at rest."""
+    found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
+    return Centroids(model, found, task.body_length)
+
+
+def make_observer(conf: ObserverConf, model: Model, task: "Task") -> Observer:
+    """The observer that the settings name."""
+    made = OBSERVERS.build(conf.name, conf.options, conf, model, task)
+    if not (isinstance(made, Observer) and isinstance(getattr(made, "size", None), int)):
+        raise ValueError(
+            f"observer {conf.name} must be a softmpm_learn.observe.Observer with its size, got {type(made).__name__}."
+        )
+    return made

@@ -4,10 +4,13 @@ The clock, sines and cosines of the time, is our choice: a pure feedback policy 
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from softmpm_learn import register
+from softmpm_learn.register import POLICIES
 from softmpm_learn.seeding import seeded
 from softmpm_learn.settings import PolicyConf
 
@@ -113,6 +116,55 @@ class Knots(nn.Module):
         return torch.tanh(share @ self.values).expand(*z.shape[:-1], -1)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Space:
+    """Inputs and outputs of a policy, ``forward(z, time, goal)``: activation (..., world, muscle), in (-1, 1), from features
+    (..., world, feature), a time [s] of shape () or (step, 1), and goals (world, dim) [m] or None."""
+
+    features: int
+    """Number of features of the observer."""
+    muscles: int
+    """Number of activations."""
+    seconds: float
+    """Length of an episode [s]."""
+    goal: Goal | None = None
+    """If goals are drawn at random, how a feedback policy sees them."""
+
+
+def clock(conf: PolicyConf) -> Clock:
+    """The clock that the settings describe."""
+    return Clock(conf.period, conf.harmonics)
+
+
+@register.policy("linear")
+def linear(conf: PolicyConf, space: Space) -> nn.Module:
+    """tanh(Wz + b)."""
+    return _feedback(conf, space, [])
+
+
+@register.policy("mlp")
+def mlp(conf: PolicyConf, space: Space) -> nn.Module:
+    """A network with hidden layers."""
+    return _feedback(conf, space, list(conf.hidden))
+
+
+@register.policy("sinusoids")
+def sinusoids(conf: PolicyConf, space: Space) -> nn.Module:
+    """Open loop: sinusoids."""
+    return Sinusoids(space.muscles, conf.gain, clock(conf))
+
+
+@register.policy("knots")
+def knots(conf: PolicyConf, space: Space) -> nn.Module:
+    """Open loop: straight lines between knots."""
+    return Knots(space.muscles, conf.gain, conf.knots, space.seconds)
+
+
+def _feedback(conf: PolicyConf, space: Space, hidden: list[int]) -> nn.Module:
+    seen = clock(conf) if conf.clock else None
+    return Feedback(space.features, space.muscles, hidden, conf.gain, seen, space.goal)
+
+
 def make_policy(
     conf: PolicyConf, size: int, muscles: int, seconds: float, seed: int, goal: Goal | None = None
 ) -> nn.Module:
@@ -125,11 +177,9 @@ def make_policy(
     """
     if muscles < 1:
         raise ValueError("a policy needs muscles to drive; the scene has none.")
-    clock = Clock(conf.period, conf.harmonics)
+    space = Space(features=size, muscles=muscles, seconds=seconds, goal=goal)
     with seeded(seed):
-        if conf.name == "sinusoids":
-            return Sinusoids(muscles, conf.gain, clock)
-        if conf.name == "knots":
-            return Knots(muscles, conf.gain, conf.knots, seconds)
-        hidden = list(conf.hidden) if conf.name == "mlp" else []
-        return Feedback(size, muscles, hidden, conf.gain, clock if conf.clock else None, goal)
+        policy = POLICIES.build(conf.name, conf.options, conf, space)
+    if not isinstance(policy, nn.Module):
+        raise ValueError(f"policy {conf.name} must be a torch.nn.Module, got {type(policy).__name__}.")
+    return policy

@@ -20,7 +20,8 @@ from softmpm_learn.episode import ClosedLoop
 from softmpm_learn.fallback import Fallback
 from softmpm_learn.identity import identity, identity_of_settings
 from softmpm_learn.learner import Learner
-from softmpm_learn.observe import Centroids, Latent, Observer, VelocityImage, clusters
+from softmpm_learn.observe import Latent, Observer, make_observer
+from softmpm_learn.optimizers import make_optimizer
 from softmpm_learn.policy import Goal, make_policy
 from softmpm_learn.replay import Replay
 from softmpm_learn.seeding import seeded, stream, stream_seed
@@ -72,7 +73,8 @@ class Run:
         )
         self.policy: nn.Module = policy.to(model.device, model.dtype)
         self.design = Design(settings.design, model, task.regions)
-        self.optimizer = self._make_optimizer()
+        rates = list(self.policy.parameters()), list(self.design.parameters())
+        self.optimizer = make_optimizer(settings.optimizer, *rates)
         self.safe: list[Tensor] = []
         every = settings.learning.frame_every if self.learner else 0
         parts = (task, model, self.observer, self.policy, self.design, list(self.design.parameters()))
@@ -80,29 +82,26 @@ class Run:
         self.loop = ClosedLoop(*parts, keep_every=every, fade=math.inf if fade is None else fade)
 
     def _make_observer(self, out: Path) -> Observer:
-        conf, model, task = self.settings.observer, self.model, self.task
-        if conf.name == "centroids":
-            return Centroids(model, list(task.regions.values()), task.body_length)
-        if conf.name == "kmeans":
-            found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
-            return Centroids(model, found, task.body_length)
-        picture = VelocityImage(model, conf.nodes, conf.follow)
-        seed = self.settings.train.seed
+        seed, task = self.settings.train.seed, self.task
         with seeded(stream_seed(seed, "autoencoder")):
-            size, channels = conf.latent_size, list(conf.channels)
-            autoencoder = Autoencoder(model.dim, picture.shape, size, channels, scale=task.body_length)
+            observer = make_observer(self.settings.observer, self.model, task)
+        if not isinstance(observer, Latent):
+            return observer.to(self.model.device, self.model.dtype)
         learning = self.settings.learning
         since_last = learning.every * self.settings.train.worlds
         replay = Replay(
             out / "replay",
-            (-(-task.control_steps // learning.frame_every), model.dim, *picture.shape),
+            (-(-task.control_steps // learning.frame_every), self.model.dim, *observer.picture.shape),
             simulations=learning.simulations if learning.replay else since_last,
             megabytes=learning.megabytes,
             validation=learning.validation,
             worlds=self.settings.train.worlds,
         )
-        self.learner = Learner(learning, autoencoder.to(model.device, model.dtype), replay, seed)
-        return Latent(picture, self.learner.encoder, size)
+        autoencoder = observer.encoder
+        assert isinstance(autoencoder, Autoencoder)
+        self.learner = Learner(learning, autoencoder.to(self.model.device, self.model.dtype), replay, seed)
+        observer.encoder = self.learner.encoder
+        return observer
 
     def _make_goal(self) -> Goal | None:
         spread = self.settings.train.goal_spread
@@ -117,13 +116,6 @@ class Run:
             torch.tensor(np.asarray(v), dtype=self.model.dtype) for v in (self.task.goal, spread)
         )
         return Goal(centre, width).to(self.model.device)
-
-    def _make_optimizer(self) -> torch.optim.Optimizer:
-        conf = self.settings.optimizer
-        groups = [{"params": list(self.policy.parameters()), "lr": conf.policy_rate}]
-        if list(self.design.parameters()):
-            groups.append({"params": list(self.design.parameters()), "lr": conf.design_rate})
-        return {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[conf.name](groups)
 
     @property
     def parameters(self) -> list[nn.Parameter]:

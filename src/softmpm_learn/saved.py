@@ -11,8 +11,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from softmpm_learn import files
+from softmpm_learn import files, plugins
 from softmpm_learn.config import RunConf, to_run
+from softmpm_learn.register import TABLES
 from softmpm_learn.tasks import TASKS
 
 NAME = "config.yaml"
@@ -41,10 +42,14 @@ def load(folder: Path) -> RunConf:
         _check_plain(text)
         saved: Any = OmegaConf.create(text)
         name = OmegaConf.select(saved, "task.name") if isinstance(saved, DictConfig) else None
+        if isinstance(saved, DictConfig):
+            _need_files(saved, folder)
         if name not in TASKS:
             raise ValueError(f"it names the task {name!r}; known are {', '.join(TASKS)}.")
-        task: Any = TASKS[name][0]
+        task: Any = TASKS[str(name)].kind
         return to_run(DictConfig(OmegaConf.merge(OmegaConf.structured(RunConf(task=task())), saved)))
+    except MissingFileError:
+        raise
     except (
         yaml.YAMLError,
         OmegaConfBaseException,
@@ -56,6 +61,26 @@ def load(folder: Path) -> RunConf:
         raise ValueError(
             f"{path} is not the configuration of a run: {_problem(error)} Put the right file there."
         ) from error
+
+
+class MissingFileError(ValueError):
+    """A run needs files that were not loaded."""
+
+
+def _need_files(saved: DictConfig, folder: Path) -> None:
+    """Raise MissingFileError for a name that is not registered, if files had registered names when the run began.
+
+    They are named and not imported: a configuration is data.
+    """
+    names = [path for path in saved.get("files") or [] if isinstance(path, str)]
+    missing = [path for path in names if path not in plugins.files()]
+    for table in TABLES if missing else ():
+        name = OmegaConf.select(saved, f"{table.what}.name")
+        if name not in table:
+            raise MissingFileError(
+                f"the {table.what} {name!r} of the run in {folder} was registered by a file: "
+                f"{plugins.command(names)} resume={folder}"
+            )
 
 
 def _check_plain(text: str) -> None:

@@ -6,12 +6,11 @@ elsewhere name their source. A wrong value fails where the settings are made, in
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 from softmpm import QUANTITIES
+from softmpm_learn.register import OBSERVERS, OPTIMIZERS, POLICIES
 
-OBSERVERS = ("latent", "centroids", "kmeans")
-POLICIES = ("linear", "mlp", "sinusoids", "knots")
-OPTIMIZERS = ("adam", "sgd")
 DESIGNS = ("particle", "region", "uniform")
 
 
@@ -51,9 +50,11 @@ class ObserverConf:
     many with follow=False."""
     follow: bool = True
     """latent: the velocity image is a window around the robot, the same on any track; False shows the whole grid unchanged."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Options of an observer of one's own."""
 
     def __post_init__(self):
-        _one_of("observer.name", self.name, OBSERVERS)
+        OBSERVERS.need(self.name, self.options)
         _positive("observer", self, "clusters", "latent_size")
         if not self.channels or min(self.channels) < 1:
             raise ValueError(
@@ -81,9 +82,11 @@ class PolicyConf:
     """knots: values of each muscle along the episode, joined by straight lines."""
     gain: float = 1.0
     """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 1 moves vigorously at random."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Options of a policy of one's own."""
 
     def __post_init__(self):
-        _one_of("policy.name", self.name, POLICIES)
+        POLICIES.need(self.name, self.options)
         _positive("policy", self, "period", "harmonics")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
@@ -168,9 +171,11 @@ class OptimizerConf:
     """First iterations, which do not count: progress is small by then, and the best of it is chance."""
     fallback_rate: float = 0.5
     """Factor of both learning rates at each fallback."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Further arguments of the optimiser, such as betas of adam."""
 
     def __post_init__(self):
-        _one_of("optimizer.name", self.name, OPTIMIZERS)
+        OPTIMIZERS.need(self.name, self.options)
         _positive("optimizer", self, "policy_rate", "design_rate")
         for name in ("max_norm", "fade"):
             if getattr(self, name) is not None:

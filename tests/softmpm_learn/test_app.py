@@ -171,7 +171,7 @@ def test_help_does_not_wait_for_pytorch():
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ("task=elefant", "there is no task called elefant; choose one of arm, biped, elephant."),
+        ("task=elefant", "there is no task called elefant; choose one of arm, biped, elephant, image, mesh, voxels."),
         ("task.sekonds=3", "there is no setting task.sekonds; did you mean task.seconds?"),
         ("tsk=arm", "there is no setting tsk; did you mean task?"),
         ("train.iterations=1.5", "train.iterations: Value '1.5' of type 'float' could not be converted"),
@@ -207,7 +207,10 @@ def test_a_key_that_is_not_in_the_schema_is_refused(key):
         (["device.dtype=float16"], "device.dtype must be one of float32, float64"),
         (["device.memory=-1"], "device.memory must be > 0 MB or null"),
         (["device.name=tpu"], "device.name must be one of auto, cpu, cuda"),
-        (["~task"], "choose a task: task=elephant, task=arm, task=biped."),
+        (
+            ["~task"],
+            "choose a task: task=elephant, task=arm, task=biped, task=image, task=mesh, task=voxels.",
+        ),
     ],
 )
 def test_a_wrong_value_says_what_must_hold(overrides, message):

@@ -34,10 +34,11 @@ def make(name: str, **settings: Any) -> SoftRobotEnv:
     """Environment of a task, without wrappers.
 
     Args:
-        name: elephant, arm or biped.
+        name: Of a registered task.
         settings: ``render_mode``, fields of :class:`EnvConf` and of the task's own settings, such as ``seconds=0.5``; ``resolution``
             may be a string.
     """
+    register()  # tasks that were added since
     return cast(
         SoftRobotEnv, gymnasium.make(identifier(name), disable_env_checker=True, **settings).unwrapped
     )
@@ -45,6 +46,7 @@ def make(name: str, **settings: Any) -> SoftRobotEnv:
 
 def make_vec(name: str, num_envs: int = 1, **settings: Any) -> SoftRobotVectorEnv:
     """Environment of ``num_envs`` worlds of a task; settings as of :func:`make`, and ``autoreset_mode``."""
+    register()
     return cast(SoftRobotVectorEnv, gymnasium.make_vec(identifier(name), num_envs=num_envs, **settings))
 
 
@@ -71,7 +73,7 @@ def parts(name: str, settings: dict[str, Any]) -> tuple[Task, EnvConf]:
     Raises:
         ValueError: A keyword is a setting of neither.
     """
-    kind, _ = TASKS[name]
+    kind: Any = TASKS[name].kind
     own = [field.name for field in dataclasses.fields(EnvConf)]
     theirs = [field.name for field in dataclasses.fields(kind) if field.name != "name"]
     unknown = [key for key in settings if key not in (*own, *theirs)]

@@ -1,25 +1,33 @@
-"""The robots: one file each, and the table of their names."""
+"""The robots: one file each. ``conf/task/`` has a file of the same name for each."""
 
-from collections.abc import Callable
-
+from softmpm_learn import register
+from softmpm_learn.register import TASKS
 from softmpm_learn.tasks.arm import ArmConf, arm
 from softmpm_learn.tasks.biped import BipedConf, biped
 from softmpm_learn.tasks.elephant import ElephantConf, elephant
-from softmpm_learn.tasks.task import Resolution, Task, TaskConf
+from softmpm_learn.tasks.image import ImageConf, image
+from softmpm_learn.tasks.mesh import MeshConf, mesh
+from softmpm_learn.tasks.task import Resolution, Task, TaskConf, WalkerConf
+from softmpm_learn.tasks.voxels import VoxelsConf, voxels
 
-TASKS: dict[str, tuple[type[TaskConf], Callable[..., Task]]] = {
-    "elephant": (ElephantConf, elephant),
-    "arm": (ArmConf, arm),
-    "biped": (BipedConf, biped),
-}
-"""Settings and builder of each task; ``conf/task/`` has a file of the same name."""
+register.task("elephant", ElephantConf)(elephant)
+register.task("arm", ArmConf)(arm)
+register.task("biped", BipedConf)(biped)
+register.task("image", ImageConf)(image)
+register.task("mesh", MeshConf)(mesh)
+register.task("voxels", VoxelsConf)(voxels)
 
 
 def make_task(conf: TaskConf) -> Task:
     """Build the task that some settings describe."""
-    for kind, build in TASKS.values():
+    for name, (kind, build) in TASKS.items():
         if type(conf) is kind:
-            return build(conf)
+            task = build(conf)
+            if not isinstance(task, Task):
+                raise ValueError(
+                    f"the builder of task {name} must return a softmpm_learn.tasks.Task, got {type(task).__name__}."
+                )
+            return task
     raise ValueError(f"no task has settings of type {type(conf).__name__}; known are {', '.join(TASKS)}.")
 
 
@@ -28,11 +36,18 @@ __all__ = [
     "ArmConf",
     "BipedConf",
     "ElephantConf",
+    "ImageConf",
+    "MeshConf",
     "Resolution",
     "Task",
     "TaskConf",
+    "VoxelsConf",
+    "WalkerConf",
     "arm",
     "biped",
     "elephant",
+    "image",
     "make_task",
+    "mesh",
+    "voxels",
 ]

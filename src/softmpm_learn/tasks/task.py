@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -104,6 +104,13 @@ class TaskConf:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
+
+    def refined(self) -> Self | None:
+        """Settings of the same task on the next finer grid, None if there is none."""
+        known = list(Resolution)
+        if self.resolution is known[-1]:
+            return None
+        return dataclasses.replace(self, resolution=known[known.index(self.resolution) + 1])
 
     @property
     def cells(self) -> int:

@@ -1,0 +1,185 @@
+"""Parts of the tasks that read a robot from a file: common settings, size, track and the walker made of the parts.
+
+Positions begin at the lower corner of the robot, x forward and y up; in 3D z is sideways.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+import softmpm
+from softmpm_learn.tasks.task import Task, WalkerConf, clock, neo_hookean, track, walking
+
+START = 0.2
+"""Rear end of the robot on the track [m]."""
+HEADROOM = 0.1
+"""Free height above the robot [m]."""
+RUNWAY = 1.0
+"""Least length of the track beyond the robot [m]."""
+SIDES = 0.1
+"""Free width on either side of a robot in 3D [m]."""
+ROUND = 1.1
+"""A part whose variance along its longest axis is below this multiple of the next has no longer axis; its fibres lie along x."""
+
+
+@dataclass(kw_only=True)
+class OwnConf(WalkerConf):
+    """Settings of a walker that is read from a file."""
+
+    file: str = ""
+    """File of the robot, relative to where the program runs."""
+    size: float = 0.3
+    """Longer side of the robot, its length or its height [m]."""
+    cells: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride, reportAssignmentType]
+    """Cells of the grid per metre, any number; null for those of task.resolution. Good value: four cells or more across the thinnest
+    limb."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.cells is None:
+            self.cells = self.resolution.value
+        for name in ("size", "cells"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"task.{name} must be > 0, got {value}.")
+        if self.cells < 20:
+            raise ValueError(f"task.cells must be at least 20 per metre, got {self.cells}.")
+
+    def refined(self) -> Self:
+        """The same robot on a grid with half as many cells more."""
+        return dataclasses.replace(self, cells=math.ceil(1.5 / self.spacing))
+
+    def path(self, what: str) -> Path:
+        """The file.
+
+        Raises:
+            ValueError: None is named, or it is not there.
+        """
+        if not self.file:
+            raise ValueError(f"task {self.name} reads {what}: task.file=FILE.")
+        path = Path(self.file)
+        if not path.is_file():
+            raise ValueError(f"task.file = {self.file}: there is no such file in {Path.cwd()}.")
+        return path
+
+
+@dataclass(frozen=True, eq=False)
+class Muscular:
+    """A part of the robot that is a muscle."""
+
+    name: str
+    particles: np.ndarray
+    """Indices into all particles."""
+    direction: tuple[float, ...]
+    """Unit fibre direction."""
+
+
+def walker(
+    conf: OwnConf, shapes: Sequence[tuple[softmpm.Particles, float]], muscles: Sequence[Muscular]
+) -> Task:
+    """A walker on the track.
+
+    Args:
+        shapes: Particles with the lower corner of the robot at the origin, and their Young's modulus in units of the setting's; all
+            have its viscosity, because a higher one takes a smaller step.
+        muscles: Its muscles, which are its regions too; they do not overlap.
+
+    Raises:
+        ValueError: There is no muscle, one has no particle, or the robot does not fit the track.
+    """
+    rest = np.concatenate([shape.positions for shape, _ in shapes])
+    grid, walls, height = track(conf)
+    _check_size(conf, rest, grid, height)
+    if not muscles:
+        raise ValueError(f"{conf.file} has no muscle, so nothing would move.")
+    for muscle in muscles:
+        if not len(muscle.particles):
+            raise ValueError(
+                f"the muscle {muscle.name} of {conf.file} is smaller than a particle, {conf.spacing / 2:.3g} m: "
+                "make it or task.size larger, or increase task.cells."
+            )
+    place: tuple[float, ...] = (START, height)
+    if rest.shape[1] == 3:
+        grid, walls, place = _widened(grid, walls, place, float(np.ptp(rest[:, 2])) + conf.spacing)
+    material = neo_hookean(conf)
+    bodies = [
+        softmpm.Body(shape.moved(place), dataclasses.replace(material, young=factor * material.young))
+        for shape, factor in shapes
+    ]
+    scene = softmpm.Scene(
+        grid=grid,
+        bodies=bodies,
+        muscles=[
+            softmpm.Muscle(particles=m.particles, direction=m.direction, strength=conf.strength)
+            for m in muscles
+        ],
+        walls=walls,
+        gravity=(0.0, -conf.gravity, 0.0)[: grid.dim],
+        damping=conf.damping,
+        dt=conf.control_period,
+    )
+    scene, control_steps, substeps = clock(conf, scene)
+    regions = {muscle.name: muscle.particles for muscle in muscles}
+    passive = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
+    if len(passive):
+        regions["body"] = passive
+    return Task(
+        name=conf.name,
+        scene=scene,
+        control_steps=control_steps,
+        substeps=substeps,
+        regions=regions,
+        objective=walking(conf, rest, np.flatnonzero(rest[:, 1] >= np.median(rest[:, 1]))),
+        body_length=float(np.ptp(rest[:, 0])),
+        build=conf.build,
+    )
+
+
+def longer_axis(points: np.ndarray, piece: np.ndarray | None = None) -> tuple[float, ...]:
+    """Unit vector along the longest axis of a part, from points (point, dim) spread evenly over it.
+
+    Args:
+        piece: Number of the piece that each point belongs to, if the part has several, such as two legs: the axis of their shapes
+            counts, not that of their places.
+    """
+    centred = points - points.mean(axis=0)
+    for number in np.unique(piece) if piece is not None else ():
+        centred[piece == number] -= centred[piece == number].mean(axis=0)
+    variance, axes = np.linalg.eigh(centred.T @ centred)
+    if variance[-1] < ROUND * variance[-2]:
+        return tuple(np.eye(points.shape[1])[0].tolist())
+    axis = axes[:, -1]
+    return tuple((axis * np.sign(axis[np.abs(axis).argmax()])).tolist())
+
+
+def _check_size(conf: OwnConf, rest: np.ndarray, grid: softmpm.Grid, height: float) -> None:
+    length, tall = np.ptp(rest[:, :2], axis=0) + conf.spacing / 2
+    most = conf.track - RUNWAY, (grid.shape[1] - 1) * grid.spacing - height - HEADROOM
+    if length > most[0] or tall > most[1]:
+        raise ValueError(
+            f"the robot of {conf.file} is {length:.3g} m long and {tall:.3g} m high; the track of {conf.track:g} m has room for "
+            f"{most[0]:.3g} m and {most[1]:.3g} m: make task.size = {conf.size:g} smaller."
+        )
+    if len(np.unique(np.round(rest[:, 0] / conf.spacing))) < 4 or tall < 2 * conf.spacing:
+        raise ValueError(
+            f"the robot of {conf.file} is {length:.3g} m long and {tall:.3g} m high, too small for cells of {conf.spacing:.3g} m: "
+            "make task.size larger or increase task.cells."
+        )
+
+
+def _widened(
+    grid: softmpm.Grid, walls: Sequence[softmpm.Wall], place: tuple[float, ...], width: float
+) -> tuple[softmpm.Grid, list[softmpm.Wall], tuple[float, ...]]:
+    """The track in 3D, with a wall on either side: its grid, its walls, and the place of the lower corner of a robot so wide."""
+    margin = 4 * grid.spacing
+    side = math.ceil((width / 2 + SIDES + margin) / grid.spacing) * grid.spacing  # from the middle
+    wide = softmpm.Grid(shape=(*grid.shape, round(2 * side / grid.spacing) + 1), spacing=grid.spacing)
+    found = [dataclasses.replace(wall, normal=(*wall.normal, 0.0)) for wall in walls]
+    found.append(softmpm.Wall(normal=(0.0, 0.0, 1.0), offset=margin))
+    found.append(softmpm.Wall(normal=(0.0, 0.0, -1.0), offset=margin - 2 * side))
+    return wide, found, (*place, side - width / 2)

@@ -1,0 +1,267 @@
+"""Robots from pictures, arrays of voxels and meshes: the right parts in the right places, one command to train, and errors by name."""
+
+import csv
+import json
+import logging
+import sys
+
+import numpy as np
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from PIL import Image, ImageDraw
+
+from softmpm_learn import app, plugins
+from softmpm_learn.experiment import finer
+from softmpm_learn.tasks import ImageConf, MeshConf, Resolution, VoxelsConf, make_task
+from softmpm_learn.tasks.own import longer_axis
+
+trimesh = pytest.importorskip("trimesh")
+WALKER = np.array([[3, 3, 3], [2, 1, 2], [4, 0, 4]])
+TINY = [
+    *("experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
+    *("learning.epochs=1", "learning.batches=1", "train.iterations=2"),
+]
+
+
+def table() -> Image.Image:
+    """A grey board of 200 x 60 pixels on two legs of 30 x 40, red and green, with a dark bar on top, all on a margin of 20."""
+    picture = Image.new("RGB", (240, 140), "white")
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((20, 20, 219, 79), fill="#808080")
+    draw.rectangle((100, 20, 139, 29), fill="#101010")
+    draw.rectangle((40, 80, 69, 119), fill="#f01010")
+    draw.rectangle((170, 80, 199, 119), fill="#00c000")
+    return picture
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    table().save("robot.png")
+    np.save("robot.npy", WALKER)
+    trimesh.creation.box((0.2, 0.08, 0.06)).export("robot.stl")  # x, y, z
+    return tmp_path
+
+
+def places(task) -> np.ndarray:
+    """Rest positions from the lower corner of the robot."""
+    found = np.concatenate([body.particles.positions for body in task.scene.bodies])
+    corner = np.min([body.particles.outline.points.min(axis=0) for body in task.scene.bodies], axis=0)
+    return found - corner
+
+
+def volumes(task) -> np.ndarray:
+    return np.concatenate([body.particles.volume for body in task.scene.bodies])
+
+
+@pytest.fixture
+def fresh_hydra(monkeypatch):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
+    GlobalHydra.instance().clear()
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.mark.usefixtures("fresh_hydra")
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("image", ("task.file=robot.png", "observer=centroids", "task.cells=50", "policy=linear")),
+        ("voxels", ("task.file=robot.npy", "task.cells=40", "design=region")),
+        ("mesh", ("task.file=robot.stl", "task.size=0.2", "task.track=1.5", "task.slabs=2")),
+    ],
+)
+def test_one_command_trains(folder, monkeypatch, name, words):
+    """Two iterations, with pictures, a recording and an examination on a finer grid."""
+    quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.run.dir=run")
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", f"task={name}", *words, *TINY, *quiet])
+    app.main()
+    with open("run/metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["loss"] != "" for row in rows] == [True, True, False]  # the last is the examination
+    assert rows[0]["loss"] != rows[1]["loss"] and np.isfinite([float(row["loss"]) for row in rows[:2]]).all()
+    for left in ("robot.png", "run.h5", "checkpoint.pt"):
+        assert (folder / "run" / left).exists()
+
+
+def test_a_picture_is_a_robot(folder):
+    """Areas, places, stiffness, fibres and regions are those of the drawing; the soles stand on the floor."""
+    task = make_task(ImageConf(file="robot.png", size=0.4, cells=100))
+    pixel = 0.4 / 200
+    soft, stiff = task.scene.bodies
+    assert stiff.material.young == 10 * soft.material.young
+    assert stiff.particles.volume.sum() == pytest.approx(40 * 10 * pixel**2, rel=0.02)
+    assert soft.particles.volume.sum() == pytest.approx((200 * 60 - 400 + 2 * 1200) * pixel**2, rel=0.01)
+    assert list(task.regions) == ["red", "green", "body"] and len(task.scene.muscles) == 2
+    x = places(task)
+    for name, middle in (("red", 35), ("green", 165)):
+        leg = x[task.regions[name]]
+        np.testing.assert_allclose(leg.mean(axis=0), (middle * pixel, 20 * pixel), atol=1.5 * pixel)
+        assert len(leg) == pytest.approx(1200 * pixel**2 / 0.005**2, rel=0.1)
+    assert all(muscle.direction == pytest.approx((0.0, 1.0), abs=1e-9) for muscle in task.scene.muscles)
+    assert len(np.concatenate(list(task.regions.values()))) == len(x)
+    lowest = min(body.particles.outline.points[:, 1].min() for body in task.scene.bodies)
+    assert lowest == pytest.approx(task.scene.walls[0].offset, abs=1e-9)
+
+
+def test_blurred_edges_belong_to_the_nearest_part(folder):
+    """A smaller copy with blended edges, transparent around, and a JPEG give the same areas to 6 %."""
+    want = make_task(ImageConf(file="robot.png"))
+    clear = table().convert("RGBA")
+    clear.putalpha(
+        Image.fromarray(np.where(np.asarray(table().convert("L")) == 255, 0, 255).astype(np.uint8))
+    )
+    clear.resize((150, 88), Image.Resampling.BILINEAR).save("clear.png")
+    table().save("robot.jpg", quality=80)
+    for file in ("clear.png", "robot.jpg"):
+        got = make_task(ImageConf(file=file))
+        for one, other in zip(got.scene.bodies, want.scene.bodies, strict=True):
+            assert one.particles.volume.sum() == pytest.approx(other.particles.volume.sum(), rel=0.06)
+        for name in ("red", "green"):
+            area = [volumes(task)[task.regions[name]].sum() for task in (got, want)]
+            assert area[0] == pytest.approx(area[1], rel=0.1)
+
+
+def test_the_legend_decides(folder):
+    """Angle and stiffness of a colour; the legend of conf/task/image.yaml is that of the settings."""
+    app.register()
+    from hydra import compose, initialize_config_dir
+
+    from softmpm_learn.config import conf_dir, to_run
+
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        words = ["task=image", "task.legend.red.angle=30", "task.legend.green.stiffness=2"]
+        words.append('+task.legend.brown={colour:"#8b4513",muscle:true}')
+        conf = to_run(compose("config", [*words, "task.file=robot.png"])).task
+        plain = to_run(compose("config", ["task=image"])).task
+    GlobalHydra.instance().clear()
+    assert plain == ImageConf() and conf.legend["brown"].muscle
+    task = make_task(conf)
+    assert task.scene.muscles[0].direction == pytest.approx((np.sqrt(3) / 2, 0.5))
+    assert [body.material.young / conf.young for body in task.scene.bodies] == [1.0, 2.0, 10.0]
+    assert len(places(task)[task.scene.muscles[1].particles]) == len(task.scene.bodies[1].particles)
+
+
+def test_voxels_are_those_of_evolution_gym(folder):
+    """Each voxel has its material, each actuator its own muscle and direction; lists are read as well."""
+    (folder / "robot.json").write_text(json.dumps(WALKER.tolist()))
+    for file in ("robot.npy", "robot.json"):
+        task = make_task(VoxelsConf(file=file))
+        soft, rigid = task.scene.bodies
+        assert rigid.material.young == 10 * soft.material.young
+        assert rigid.particles.volume.sum() == pytest.approx(
+            0.01
+        ) and soft.particles.volume.sum() == pytest.approx(0.07)
+        x, middles = places(task), {}
+        for name, muscle in zip(task.regions, task.scene.muscles, strict=False):
+            middles[name] = (x[muscle.particles].mean(axis=0) / 0.1).round(2).tolist(), muscle.direction
+        across, up = (1.0, 0.0), (0.0, 1.0)
+        assert middles == {
+            "voxel_0_0": ([0.5, 2.5], across),
+            "voxel_0_1": ([1.5, 2.5], across),
+            "voxel_0_2": ([2.5, 2.5], across),
+            "voxel_2_0": ([0.5, 0.5], up),
+            "voxel_2_2": ([2.5, 0.5], up),
+        }
+
+
+def test_a_mesh_stands_on_the_floor_in_3d(folder):
+    """Its z axis is up unless told otherwise; slabs and boxes are muscles; its volume is that of the mesh."""
+    task = make_task(MeshConf(file="robot.stl", size=0.4, slabs=4))
+    particles = task.scene.bodies[0].particles
+    assert particles.volume.sum() == pytest.approx(8 * 0.2 * 0.08 * 0.06, rel=1e-3)
+    assert np.ptp(particles.outline.points, axis=0) == pytest.approx((0.4, 0.12, 0.16), abs=0.03)
+    assert particles.outline.points[:, 1].min() == pytest.approx(task.scene.walls[0].offset, abs=1e-6)
+    x = places(task)
+    for k in range(4):
+        slab = x[task.regions[f"slab{k}"]]
+        assert len(slab) == len(x) / 4 and 0.1 * k < slab[:, 0].min() < slab[:, 0].max() < 0.1 * (k + 1)
+    boxes = {"left": [0, 0, 0.5, 1, 1, 1], "right": [0, 0, 0, 1, 0.4, 0.5]}
+    task = make_task(MeshConf(file="robot.stl", up="y", boxes=boxes))
+    x, muscle = places(task), task.scene.muscles[0]
+    assert np.ptp(x[:, 1]) > np.ptp(x[:, 2]) and x[muscle.particles, 2].min() > x[:, 2].mean() - 0.01
+    assert muscle.direction == pytest.approx((1, 0, 0), abs=1e-3) and list(task.regions) == [
+        "left",
+        "right",
+        "body",
+    ]
+
+
+def test_a_finer_grid_has_half_as_many_cells_more(folder):
+    """For the examination; without ``cells`` those of the resolution are taken."""
+    conf = ImageConf(file="robot.png", cells=50)
+    assert finer(conf).scene.grid.spacing == pytest.approx(1 / 75)
+    assert ImageConf(resolution=Resolution.standard).spacing == 1 / 128
+
+
+def test_the_longer_axis_is_that_of_the_pieces():
+    """Two upright legs side by side have upright fibres; what is round has none and takes x."""
+    x, y = np.meshgrid(np.arange(3.0), np.arange(9.0))
+    leg = np.stack([x.ravel(), y.ravel()], axis=1)
+    legs, piece = np.concatenate([leg, leg + (50, 0)]), np.repeat([1, 2], len(leg))
+    assert longer_axis(legs, piece) == pytest.approx((0, 1)) and longer_axis(legs) == pytest.approx((1, 0))
+    assert longer_axis(leg @ [[1, 0], [1, 1]]) == pytest.approx((0.72, 0.69), abs=0.05)
+    assert longer_axis(leg[leg[:, 1] < 3]) == (1.0, 0.0)
+
+
+def painted(**boxes: tuple) -> None:
+    picture = table()
+    for colour, box in boxes.items():
+        ImageDraw.Draw(picture).rectangle(box, fill=f"#{colour[1:]}")
+    picture.save("wrong.png")
+
+
+@pytest.mark.parametrize(
+    "make, conf, says",
+    [
+        (lambda: None, ImageConf(), "task image reads a picture of the robot: task.file=FILE"),
+        (lambda: None, ImageConf(file="none.png"), "task.file = none.png: there is no such file"),
+        (lambda: None, ImageConf(file="robot.npy"), "robot.npy cannot be read as a picture"),
+        (
+            lambda: painted(c8b4513=(30, 30, 49, 44)),
+            ImageConf(file="wrong.png"),
+            r"has 2[0-9]{2} pixels of the colour #8b4513, which the legend lacks.*'\+task.legend.NAME=\{colour:\"#8b4513\"",
+        ),
+        (lambda: Image.new("RGB", (30, 30), "white").save("wrong.png"), ImageConf(file="wrong.png"), "is empty"),
+        (lambda: painted(cffffff=(0, 78, 239, 84)), ImageConf(file="wrong.png"), "in 3 pieces.*fall apart"),
+        (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf(file="wrong.png"), "no muscle"),
+        (lambda: None, ImageConf(file="robot.png", size=2.0), "is 2 m long and 1 m high; the track of 4 m has room for"),
+        (lambda: None, ImageConf(file="robot.png", size=0.02), "too small for cells of 0.0125 m"),
+        (lambda: painted(c0000ff=(30, 30, 33, 33)), ImageConf(file="wrong.png", cells=20), "muscle blue .* is smaller than a particle"),
+        (lambda: np.save("wrong.npy", WALKER + 3), VoxelsConf(file="wrong.npy"), "7 voxels other than 0 empty.*the first is 6"),
+        (lambda: np.save("wrong.npy", np.zeros((2, 2))), VoxelsConf(file="wrong.npy"), "is empty"),
+        (lambda: np.save("wrong.npy", np.zeros(3)), VoxelsConf(file="wrong.npy"), "of shape .row, column"),
+        (lambda: None, VoxelsConf(file="robot.png"), "cannot be read as an array"),
+        (lambda: None, MeshConf(file="robot.png"), "cannot be read as a mesh"),
+        (lambda: trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export("open.stl"), MeshConf(file="open.stl"), "the mesh is not closed"),
+    ],
+)  # fmt: skip
+def test_what_is_no_robot_is_refused(folder, make, conf, says):
+    """Files that cannot be read, unknown colours and their count; what is empty, in pieces, without muscles, too large or small."""
+    make()
+    with pytest.raises(ValueError, match=says):
+        make_task(conf)
+
+
+@pytest.mark.parametrize(
+    "kind, change, says",
+    [
+        (ImageConf, {"size": 0.0}, "task.size must be > 0"),
+        (ImageConf, {"cells": 5}, "task.cells must be at least 20"),
+        (ImageConf, {"tolerance": -1.0}, "task.tolerance must be ≥ 0"),
+        (VoxelsConf, {"stiffness": 0.0}, "task.stiffness must be > 0"),
+        (MeshConf, {"up": "x"}, "task.up must be one of z, y"),
+        (MeshConf, {"slabs": 0}, "task.slabs must be at least 1"),
+        (MeshConf, {"boxes": {"a": [0, 0, 0, 1, 1, 0]}}, "task.boxes.a must be six numbers"),
+    ],
+)
+def test_a_wrong_setting_says_what_must_hold(kind, change, says):
+    """Settings are checked where they are made."""
+    with pytest.raises(ValueError, match=says):
+        kind(**change)
+
+
+def test_files_end_in_py():
+    """A setting whose value is such a file is no file to import."""
+    assert plugins.split(["a.py", "task.file=b.py", "x=1"]) == (["a.py"], ["task.file=b.py", "x=1"])
