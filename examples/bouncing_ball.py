@@ -14,6 +14,7 @@ import torch
 import softmpm
 
 period, frames = 0.005, 60  # time between two observations [s], and their number
+iterations = 5 if "--quick" in sys.argv else 9
 
 
 def heights(cell, young, viscosity):
@@ -37,8 +38,7 @@ def heights(cell, young, viscosity):
 
 data = heights(0.00625, *torch.tensor([3e4, 20.0]).split(1))
 logarithm = torch.tensor([1.2e4, 5.0]).log().requires_grad_()  # of positive numbers, known to a factor
-most = 6 if "--quick" in sys.argv else 9
-optimizer = torch.optim.LBFGS([logarithm], max_iter=most, line_search_fn="strong_wolfe")
+optimizer = torch.optim.LBFGS([logarithm], max_iter=iterations, line_search_fn="strong_wolfe")
 
 
 def evaluate():
@@ -50,14 +50,10 @@ def evaluate():
 
 
 optimizer.step(evaluate)
+(young, viscosity), found = logarithm.exp().tolist(), heights(0.0125, *logarithm.exp().detach().split(1))
 figure, axes = plt.subplots(layout="constrained")
-time, (young, viscosity) = 1000 * period * torch.arange(1, frames + 1), logarithm.exp().tolist()
-axes.plot(time, 1000 * data, "k.", label="data, E = 30.0 kPa, 20 Pa s")
-axes.plot(
-    time,
-    1000 * heights(0.0125, *logarithm.exp().detach().split(1)),
-    label=f"found, E = {young / 1000:.1f} kPa, {viscosity:.0f} Pa s",
-)
-axes.set(xlabel="time [ms]", ylabel="height of the centre [mm]")
+axes.plot(1000 * data, "k.", label="data, E = 30.0 kPa, 20 Pa s")
+axes.plot(1000 * found, label=f"found, E = {young / 1000:.1f} kPa, {viscosity:.0f} Pa s")
+axes.set(xlabel="frame, 5 ms apart", ylabel="height of the centre [mm]")
 axes.legend()
 figure.savefig("bouncing_ball.png", dpi=110)

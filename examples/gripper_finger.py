@@ -8,7 +8,7 @@ import torch
 
 import softmpm
 
-cell, iterations = (0.01, 8) if "--quick" in sys.argv else (0.0075, 15)  # [m]; 3 or 4 cells across the finger
+cell, iterations = (0.015, 6) if "--quick" in sys.argv else (0.0075, 15)  # [m]; 2 or 4 cells across it
 target = (0.125, 0.085, 0.045)  # [m]; the tip at rest is at (0.15, 0.06, 0.06)
 
 # The finger is 120 mm long and 30 mm thick, and begins in the plane of the wall that clamps it.

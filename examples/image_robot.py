@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 import softmpm
 
-iterations = 5 if "--quick" in sys.argv else 40
+iterations = 3 if "--quick" in sys.argv else 40
 cell, control_steps, period = 0.0125, 24, 0.025  # [m], -, [s]
 
 # Any drawing program will do. One pixel is 1 mm.
