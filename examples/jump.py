@@ -9,7 +9,7 @@ import torch
 
 import softmpm
 
-iterations = 6 if "--quick" in sys.argv else 40
+iterations = 12 if "--quick" in sys.argv else 40
 cell, gravity = 0.0125, 9.81
 
 # A table on two legs. The muscle of the legs pulls along them, and pushes where its activation is negative.
@@ -41,7 +41,7 @@ for name, rate in (("activation", 0.0), ("activation and E", 0.1)):
         params = base._replace(
             young=base.young * (2.0 ** torch.tanh(design))[region]
         )  # within a factor of two
-        activation = torch.cat([torch.tanh(control), torch.zeros_like(control[:8])])  # 0.1 s to take off
+        activation = torch.cat([torch.tanh(control), torch.zeros_like(control)])  # and 0.15 s to take off
         end = softmpm.simulate(model, model.rest(), activation, params, substeps=substeps)
         upward = softmpm.mean_velocity(model, end, params)[0, 1]  # in flight it rises by another v²/2g:
         apex = softmpm.center_of_mass(model, end, params)[0, 1] + upward * upward.abs() / (2 * gravity)

@@ -29,8 +29,7 @@ def throw(velocity: wp.array[wp.vec2], v: wp.array2d[wp.vec2]):
 @wp.kernel
 def loss_of(base: wp.array2d[wp.vec2i], fx: wp.array2d[wp.vec2], target: wp.vec2, loss: wp.array[float]):
     p = wp.tid()  # a position is stored as a node and the distance from it in cells
-    node = base[0, p]
-    away = wp.static(cell) * (wp.vec2(float(node[0]), float(node[1])) + fx[0, p]) - target
+    away = wp.static(cell) * (wp.vec2(float(base[0, p][0]), float(base[0, p][1])) + fx[0, p]) - target
     wp.atomic_add(loss, 0, wp.dot(away, away) / float(base.shape[1]))
 
 
@@ -56,4 +55,5 @@ for iteration in range(iterations):
     tape.zero()
 softmpm.show(model, softmpm.torch_state(model, states[-1]), axes=axes)
 axes.plot(*target, "rx", markersize=12)
+axes.set(xlim=(0.1, 0.9), ylim=(0.1, 0.55))
 figure.savefig("warp_tape.png", dpi=110)
