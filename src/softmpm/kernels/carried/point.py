@@ -1,10 +1,10 @@
 """Surface points on the moving grid: each has its place and its weights from a particle. Derivation: docs/math/contact.md.
 
-With the arm X_s − X_p at rest, a = F_p (X_s − X_p) / dx, and r_i the distance of node i from the particle, both in cells,
+With b = F_p (X_s − X_p) and the distance r_i of node i from the particle, both in cells,
 
-    x_s = x_p + dx a,  W_si = w_i (1 + 4 r_i·a)                                                      (K8)
+    x_s = x_p + dx b,  W_si = w_i (1 + 4 r_i·b)                                                      (K8)
 
-    x̄_p += x̄_s + Σ W̄_si [(1 + 4 r_i·a) ∇w_i − 4 w_i a / dx]
+    x̄_p += x̄_s + Σ W̄_si [(1 + 4 r_i·b) ∇w_i − 4 w_i b / dx]
     F̄_p += (x̄_s + Σ W̄_si 4 w_i r_i / dx) (X_s − X_p)ᵀ                                                (K8.adj)
 
 Places are in float64 in every precision: a point moves by 1e-5 of a cell in a substep.
@@ -65,7 +65,7 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
     class Point:
         base: ivec  # first node of the particle's stencil, counted from the first of the window
         fx: vec
-        arm: vec  # a
+        arm: vec  # b
         x: exact_vec
 
     @wp.func
