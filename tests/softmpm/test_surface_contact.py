@@ -117,7 +117,7 @@ def test_what_is_asked_for_must_be_possible():
             "needs a wall",
         ),
         (at_the_edge(made), dict(formulation="reference"), "surface points need the nodes around them"),
-        (made, dict(contact_width=0.01), "nodes meet the walls here"),
+        (made, dict(contact="nodes", contact_width=0.01), "nodes meet the walls here"),
         (made, dict(contact="points"), "contact must be"),
         (made, dict(contact_width=-1.0), "contact_width must be"),
     ):

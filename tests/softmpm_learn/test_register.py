@@ -43,6 +43,7 @@ def folder(tmp_path):
 
 def run(folder, *words, python=("-m", "softmpm_learn")):
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    environment.pop("HYDRA_FULL_ERROR", None)  # main() sets it, also in tests of this process
     command = [sys.executable, *python, *words]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
 
