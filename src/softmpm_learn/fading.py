@@ -1,11 +1,11 @@
 """Gradients that fade on their way back through the states of an episode.
 
-A walk amplifies small changes, so that the gradient of a distance with respect to what a muscle did a second before is exact and
-useless: it holds for changes that are too small to matter (docs/gait.md). With the time constant τ a gradient that passes a control
-step of T_c seconds is multiplied by γ = exp(−T_c/τ). What is taken off the gradient of the positions goes on as if the robot were
-only displaced:
+A walk amplifies small changes: the gradient of a distance with respect to what a muscle did seconds before is exact, but its norm
+grows a thousandfold, and steps along it lead away from gaits (docs/learning.md). With the time constant τ a gradient that passes a
+control step of T_c seconds is multiplied by γ = exp(−T_c/τ). What is taken off the gradient of the positions goes on as if the
+robot were only displaced:
 
-    s_k = γ s_k + (1 − γ) sg(s_k),   c_k = c_{k−1} + (1 − γ) (x_k − sg(x_k)),   x_k + c_k is what the objective sees
+    s_k = γ s_k + (1 − γ) sg(s_k),   c_k = c_{k−1} + (1 − γ) (x_k − sg(x_k)),   x_k + c_{k−1} is what the objective sees
 
 with sg for a value without its gradient: all values stay what they are, and c is zero. A distance counts every step, however long ago.
 """

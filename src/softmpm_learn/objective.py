@@ -9,9 +9,9 @@ objective = Objective(
 A term of one's own is a frozen dataclass, so that a resumed run can tell whether it is the same, with a method ``value``:
 
 @dataclass(frozen=True, kw_only=True)
-class Spin(Term):
+class Spread(Term):
     def value(self, path: Path) -> Tensor:
-        return path.C[self.window(path)].diagonal(dim1=-2, dim2=-1).sum(-1).square().mean(dim=(0, 2))
+        return path.x[self.window(path)][..., 0].var(dim=-1).mean(dim=0)
 """
 
 import dataclasses
@@ -53,11 +53,6 @@ class Path:
     def v(self) -> Tensor:
         """Velocities [m/s], shape (state, world, particle, dim)."""
         return torch.stack([state.v for state in self.states])
-
-    @functools.cached_property
-    def C(self) -> Tensor:
-        """Affine velocities [1/s], shape (state, world, particle, dim, dim)."""
-        return torch.stack([state.C for state in self.states])
 
 
 class Placed:

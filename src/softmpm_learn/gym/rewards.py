@@ -76,9 +76,9 @@ class Costs:
 
     def standing(self, state: State, activation: Tensor, steps: np.ndarray, goal: Tensor | None) -> Tensor:
         """What the steps from ``steps`` on add if a world stands still until the horizon, shape (world,)."""
-        nothing, total = torch.zeros_like(activation), activation.new_zeros(activation.shape[0])
+        nothing = torch.zeros_like(activation)
         path = Path([0.0, self.period], [state, state], nothing[None], goal)
         left = [
             (term, np.array([share[k : self.count].sum() for k in steps])) for term, _, share in self._terms
         ]
-        return total + self._sum(activation, left, path)
+        return self._sum(activation, left, path)
