@@ -112,7 +112,8 @@ def main():
 
         for formulation, threads in runs:
             torch.set_num_threads(threads)
-            values, cores = figures(scene(), formulation, worlds, substeps, args)
+            contact = "nodes" if formulation == "moving" else "auto"
+            values, cores = figures(scene(), formulation, worlds, substeps, args, contact)
             found.append(values)
             add(formulation, threads, values, cores)
             if device.type == "cuda":
