@@ -12,8 +12,8 @@ from torch import Tensor, nn
 import softmpm
 from softmpm import Inputs, Model, Params, State
 from softmpm_learn.fading import Fading
-from softmpm_learn.objective import Path
 from softmpm_learn.observe import Observer
+from softmpm_learn.term import Path
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task

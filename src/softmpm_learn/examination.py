@@ -24,9 +24,10 @@ import softmpm
 from softmpm import Model
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.episode import Frame, run_episode
-from softmpm_learn.objective import Path, Term, Tilt
+from softmpm_learn.objective import Tilt
 from softmpm_learn.run import Run
 from softmpm_learn.tasks.task import Task
+from softmpm_learn.term import Path, Term
 
 LONGER = 3
 """Length of the continued motion over that of an episode."""

@@ -17,7 +17,6 @@ class Spread(Term):
 import dataclasses
 import functools
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -26,109 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm import State
-
-
-class Path:
-    """Motion in an episode, as terms see it: states at the beginning and at the end of every control step.
-
-    Attributes:
-        times: Of the states [s].
-        states: The states. Differentiable.
-        activation: Activations during the control steps [-], shape (step, world, muscle). Differentiable.
-        goal: Goal of each world [m], shape (world, dim), or None if it is the task's own.
-    """
-
-    def __init__(
-        self, times: Sequence[float], states: Sequence[State], activation: Tensor, goal: Tensor | None = None
-    ):
-        self.times, self.states, self.activation, self.goal = list(times), list(states), activation, goal
-
-    @functools.cached_property
-    def x(self) -> Tensor:
-        """Positions [m], shape (state, world, particle, dim)."""
-        return torch.stack([state.x for state in self.states])
-
-    @functools.cached_property
-    def v(self) -> Tensor:
-        """Velocities [m/s], shape (state, world, particle, dim)."""
-        return torch.stack([state.v for state in self.states])
-
-
-class Placed:
-    """Arrays among the fields, moved to a device once: a captured graph cannot copy from the host."""
-
-    @functools.cached_property
-    def _placed(self) -> dict:
-        return {}
-
-    def on(self, name: str, like: Tensor) -> Tensor:
-        """The field ``name`` on the device of ``like``; real numbers in its precision."""
-        key = name, like.device, like.dtype
-        if key not in self._placed:
-            tensor = torch.as_tensor(getattr(self, name))
-            self._placed[key] = tensor.to(like.device, like.dtype if tensor.is_floating_point() else None)
-        return self._placed[key]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Term(Placed, ABC):
-    """A term of an objective: its weight times its value. Smaller is better."""
-
-    adds_up: ClassVar[Literal["states", "steps", "way"]] = "states"
-    """The value is a mean over the states or the control steps of the window, or a sum over the control steps that lie in it. Where
-    rewards are given step by step, a constraint counts state by state."""
-    weight: float = 1.0
-    begin: float = 0.0
-    """The window begins here [s]; the state of that time counts."""
-    end: float = math.inf
-    """The window ends here [s]; the state of that time counts."""
-
-    @abstractmethod
-    def value(self, path: Path) -> Tensor:
-        """Value of each world, shape (world,). Differentiable."""
-
-    @property
-    def name(self) -> str:
-        """Column of metrics.csv."""
-        return type(self).__name__.lower()
-
-    def window(self, path: Path) -> slice:
-        """The states of the window.
-
-        Raises:
-            ValueError: There is none.
-        """
-        near = 1e-6 * path.times[-1]
-        inside = [k for k, time in enumerate(path.times) if self.begin - near <= time <= self.end + near]
-        if not inside:
-            raise ValueError(
-                f"the objective's term {self.name} has a window from {self.begin:g} to {self.end:g} s without a state; the episode "
-                f"ends at {path.times[-1]:g} s."
-            )
-        return slice(inside[0], inside[-1] + 1)
-
-    def steps(self, path: Path) -> slice:
-        """The control steps between these states, or the one that ends in a single state."""
-        states = self.window(path)
-        stop = max(states.stop - 1, 1)
-        return slice(min(states.start, stop - 1), stop)
-
-    def rate(self, path: Path) -> float:
-        """Value that windows of different lengths can be compared by, in the mean of the worlds."""
-        return self.value(path).mean().item()
-
-    def verdict(self, own: float, other: float) -> float:
-        """How another :meth:`rate` compares with that of the episode: their quotient, 1 if they agree."""
-        return other / own if own else math.nan
-
-    def worst(self, verdicts: Sequence[float]) -> float:
-        """The worst of several; nan if one is."""
-        return math.nan if any(math.isnan(one) for one in verdicts) else max(verdicts)
-
-    def outcome(self, x: np.ndarray, body_length: float) -> str:
-        """What became of it in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
-        return ""
+import softmpm
+from softmpm_learn.term import Path, Term
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,6 +148,18 @@ class Tilt(Term):
         """Change of the slope, shape (state, world)."""
         x = path.x[self.window(path)]
         return x[..., self.up] @ self.on("lever", x) - float(self.lever @ self.rest[:, self.up])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strain(Term):
+    """Do not overstretch: mean over particles and states of max(0, ε − most)², with ε of :func:`softmpm.von_mises_strain` [-]."""
+
+    most: float
+    """Equivalent strain that costs nothing; an incompressible body that is 1.5 times as long has 0.54 in plane strain."""
+
+    def value(self, path: Path) -> Tensor:
+        strains = [softmpm.von_mises_strain(state) for state in path.states[self.window(path)]]
+        return (torch.stack(strains) - self.most).clamp(min=0.0).square().mean(dim=(0, -1))
 
 
 @dataclass(frozen=True, kw_only=True)

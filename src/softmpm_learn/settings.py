@@ -80,8 +80,8 @@ class PolicyConf:
     """Number of periods: period, period/2, period/3, …"""
     knots: int = 16
     """knots: values of each muscle along the episode, joined by straight lines."""
-    gain: float = 1.0
-    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 1 moves vigorously at random."""
+    gain: float = 3.0
+    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 3 moves vigorously at random."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of a policy of one's own."""
 
@@ -157,7 +157,7 @@ class OptimizerConf:
     """Learning rate of the design, in the unbounded space before the sigmoid."""
     max_norm: float | None = 1.0
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
-    fade: float | None = 0.25
+    fade: float | None = 0.1
     """Time constant with which gradients fade on their way back through the simulation [s]: what a muscle did long before a step has an
     effect that changes of a useful size do not have (fading.py). null: never."""
     retries: int = 4

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from softmpm import State
-from softmpm_learn.objective import AtMost, Effort, Low, Objective, Path, Progress, Reach, Still, Term, Tilt
+from softmpm_learn.objective import AtMost, Effort, Low, Objective, Path, Progress, Reach, Still, Strain, Term, Tilt
 
 
 @pytest.fixture
@@ -49,6 +49,18 @@ def test_still_is_the_mean_squared_speed_of_the_mean(path):
     still = Still(particles=np.array([1, 4]), begin=1.5)
     want = path.v[3:, :, [1, 4]].mean(dim=2).square().sum(dim=-1).mean(dim=0)
     torch.testing.assert_close(still.value(path), want)
+
+
+def test_strain_is_what_is_beyond_the_limit():
+    """By hand: bodies 1, 1.5 and 2 times as long, as wide as at rest, ε = (λ² − 1)/3; a rotation on top changes nothing."""
+    turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
+    F = torch.stack([turn @ torch.diag(torch.tensor([long, 1.0])) for long in (1.0, 1.5, 2.0)])
+    state = State(torch.zeros(1, 3, 2), torch.zeros(1, 3, 2), torch.zeros(1, 3, 2, 2), F[None])
+    rest = state._replace(F=torch.eye(2).expand(1, 3, 2, 2))
+    path = Path([0.0, 0.5], [rest, state], torch.zeros(1, 1, 1))
+    beyond = [max(0.0, (long**2 - 1) / 3 - 0.3) ** 2 for long in (1.0, 1.5, 2.0)]
+    torch.testing.assert_close(Strain(most=0.3, begin=0.5).value(path), torch.tensor([sum(beyond) / 3]))
+    torch.testing.assert_close(Strain(most=0.3).value(path), torch.tensor([sum(beyond) / 6]))
 
 
 def test_effort_counts_the_control_steps_of_the_window(path):

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from softmpm import State
-from softmpm_learn.objective import Path, Term
 from softmpm_learn.tasks import Task
+from softmpm_learn.term import Path, Term
 
 REWARDS = ("dense", "objective")
 

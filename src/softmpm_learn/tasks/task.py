@@ -10,12 +10,16 @@ from typing import Any, Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.objective import Effort, Objective, Progress, Tilt
+from softmpm_learn.objective import Effort, Objective, Progress, Strain, Tilt
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
 WIDTH = 0.01
 """Distance over which surface contact sets in while a robot learns [cells]."""
+SOLES = 0.15
+"""Part of a walker's height, from below, that belongs to its soles."""
+STRAIN = 0.5
+"""Equivalent strain of a walker that costs nothing: it is half as long again as at rest."""
 
 
 class Resolution(Enum):
@@ -156,6 +160,8 @@ class WalkerConf(TaskConf):
     """Weight of the mean squared activation in the loss [m]; with less, gaits stretch the robot until it breaks."""
     upright: float = 1.0
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
+    strain: float = 10.0
+    """Weight of strains beyond a half in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
     seconds: float = 2.0
@@ -167,7 +173,7 @@ class WalkerConf(TaskConf):
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("friction", "upright")
+        self.need_not_negative("friction", "upright", "strain")
         if self.lead is not None and not 0 <= self.lead < self.seconds:
             raise ValueError(
                 f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
@@ -242,12 +248,21 @@ def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:
 
 
 def walking(conf: "WalkerConf", rest: np.ndarray, torso: np.ndarray) -> Objective:
-    """Go far, without effort, while the hind and the front quarter of the torso stay level."""
+    """Bring the soles far, without effort or overstretching, while the hind and the front quarter of the torso stay level.
+
+    The soles count because they have to step for it. The whole robot also gains by leaning forward, which a gradient that fades takes
+    for a step.
+    """
     low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
     front, back = torso[rest[torso, 0] > high], torso[rest[torso, 0] < low]
-    tilt = Tilt(weight=conf.upright, front=front, back=back, rest=rest)
     lead = conf.seconds / 4 if conf.lead is None else conf.lead
-    return Objective(Progress(begin=lead), Effort(weight=conf.effort), tilt)
+    height = rest[:, 1] - rest[:, 1].min()
+    return Objective(
+        Progress(begin=lead, particles=np.flatnonzero(height <= SOLES * height.max())),
+        Effort(weight=conf.effort),
+        Tilt(weight=conf.upright, front=front, back=back, rest=rest),
+        Strain(weight=conf.strain, most=STRAIN),
+    )
 
 
 def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
