@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 
 class Graph(Generic[Result]):
-    """A function that calls :func:`softmpm.simulate`, captured once as a CUDA graph and replayed without any launch from the host.
+    """A function, which may call :func:`softmpm.simulate`, captured once as a CUDA graph and replayed without any launch from the host.
 
     On the CPU the function is called each time. After a replay that reports a failure the function is called again, which raises
     the error; if a particle only left the allocated part of the grid, that part is enlarged first. The call after one that
@@ -37,6 +37,7 @@ class Graph(Generic[Result]):
         self._graph: torch.cuda.CUDAGraph | None = None
         self._resources: GraphResources | None = None
         self._warm = False
+        self._failed: torch.Tensor | None = None
 
     def __call__(self) -> Result:
         """The result of the function; once captured, in the same tensors each time.
@@ -56,7 +57,7 @@ class Graph(Generic[Result]):
             self._graph = self._capture(self._stream)
             self._warm = True
         self._graph.replay()
-        if self._failed.item():
+        if self._failed is not None and self._failed.item():
             assert self._resources is not None
             self._resources.widen()
             self._graph = self._resources = None
@@ -83,6 +84,7 @@ class Graph(Generic[Result]):
             torch.cuda.synchronize(self.device)
             with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
-                self._failed = (torch.cat([words for words, _ in resources.words]) != NEVER).any()
+                words = [words for words, _ in resources.words]
+                self._failed = (torch.cat(words) != NEVER).any() if words else None
         self._resources = resources
         return graph

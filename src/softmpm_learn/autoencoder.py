@@ -1,23 +1,16 @@
-"""Convolutional autoencoder of grid velocity, plain or variational, in 2D and 3D; training with early stopping.
+"""Convolutional autoencoder of grid velocity, plain or variational, in 2D and 3D.
 
     ℓ = mean (u − û)² + β · mean Σ ½ (m² + s² − 1 − log s²)        (L1)   u: picture / scale; m, s: mean and deviation of z
 
 Kingma & Welling 2014, "Auto-encoding variational Bayes". Layers and channels are our choice: the 2019 paper states none.
 """
 
-import copy
 import itertools
-import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-from softmpm_learn.settings import LearningConf
-
-logger = logging.getLogger("softmpm_learn")
 
 QUIET = 0.1
 """A latent that deviates less than this, in units of the prior, is not blown up to deviation 1: it says next to nothing."""
@@ -128,95 +121,22 @@ class Autoencoder(nn.Module):
         self.encoder.centre.copy_(mean.mean(dim=0))
         self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=QUIET))
 
-    def loss(self, pictures: Tensor, kl: float | None, generator: torch.Generator | None = None) -> Tensor:
-        """(L1); ``kl`` is β, or None for a plain autoencoder. Without a generator the latent is its mean."""
+    def loss(
+        self, pictures: Tensor, kl: float | None, *, noise: Tensor | None = None, share: Tensor | None = None
+    ) -> Tensor:
+        """(L1); ``kl`` is β, or None for a plain autoencoder.
+
+        Args:
+            noise: Standard normal numbers, shape (picture, latent_size); without them the latent is its mean.
+            share: Weight of each picture in the means, shape (picture,); None for equal ones.
+        """
         mean, log_variance = self.encoder.moments(pictures)
-        z = mean
-        if kl is not None and generator is not None:
-            noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype).to(mean.device)
-            z = mean + noise * (0.5 * log_variance).exp()
-        loss = functional.mse_loss(self.decoder(z), pictures / self.encoder.scale)
-        if kl is not None:
-            divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
-            loss = loss + kl * divergence.mean()
-        return loss
-
-
-@dataclass(frozen=True)
-class Learned:
-    """Result of a learning phase."""
-
-    epochs: int
-    """Epochs that were run."""
-    training: float
-    """Mean loss of the last epoch; nan if it was undone because of such a loss."""
-    validation: float
-    """Loss of the final weights on held-out iterations; nan if there are none yet."""
-
-
-def train_autoencoder(
-    autoencoder: Autoencoder,
-    optimizer: torch.optim.Optimizer,
-    sample: Callable[[], Tensor],
-    validation: Tensor | None,
-    conf: LearningConf,
-    generator: torch.Generator,
-) -> Learned:
-    """Train on minibatches from ``sample``.
-
-    Early stopping ends where the validation loss has not fallen by ``conf.improvement`` for ``conf.patience`` epochs, and restores the
-    weights of the lowest one, even the initial ones, with the optimiser as it was there. An epoch after which a weight or a moment is
-    not finite ends the phase too, and is undone.
-
-    Args:
-        sample: Gives a minibatch of velocities [m/s], shape (batch, dim, *nodes).
-        validation: Velocity images of other iterations, or None: early stopping then allows ``conf.patience`` epochs, because more
-            would fit the few pictures of the beginning alone.
-        generator: Source of the variational noise.
-    """
-    kl = conf.kl if conf.variational else None
-    stops = conf.early_stopping and validation is not None
-    training, waited, epochs = float("nan"), 0, 0
-
-    def validation_loss() -> float:
-        with torch.no_grad():
-            return float("nan") if validation is None else autoencoder.loss(validation, kl).item()
-
-    best = level = validation_loss()
-    kept = _copied(autoencoder, optimizer)
-    most = min(conf.epochs, conf.patience) if conf.early_stopping and validation is None else conf.epochs
-    while epochs < most and waited < conf.patience:
-        losses = []
-        for _ in range(conf.batches):
-            loss = autoencoder.loss(sample(), kl, generator)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            losses.append(loss.detach())
-        training, epochs = torch.stack(losses).mean().item(), epochs + 1
-        if not _is_finite(autoencoder, optimizer):
-            logger.warning("The autoencoder's weights are not finite after epoch %d; going back.", epochs)
-            break
-        now = validation_loss()
-        if not stops or now < best:
-            best, kept = now, _copied(autoencoder, optimizer)
-        if stops and now < (1 - conf.improvement) * level:
-            level, waited = now, 0
-        elif stops:
-            waited += 1
-    autoencoder.load_state_dict(kept["autoencoder"])
-    optimizer.load_state_dict(kept["optimizer"])
-    return Learned(epochs, training, best)
-
-
-def _copied(autoencoder: Autoencoder, optimizer: torch.optim.Optimizer) -> dict[str, dict]:
-    return copy.deepcopy({"autoencoder": autoencoder.state_dict(), "optimizer": optimizer.state_dict()})
-
-
-def _is_finite(autoencoder: Autoencoder, optimizer: torch.optim.Optimizer) -> bool:
-    moments = (value for state in optimizer.state.values() for value in state.values())
-    tensors = [
-        *autoencoder.parameters(),
-        *(value for value in moments if isinstance(value, Tensor) and value.dim()),
-    ]
-    return bool(torch.stack([tensor.isfinite().all() for tensor in tensors]).all())
+        z = mean if noise is None else mean + noise * (0.5 * log_variance).exp()
+        got, want = self.decoder(z), pictures / self.encoder.scale
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(dim=-1)
+        if share is None:
+            loss, divergence = functional.mse_loss(got, want), divergence.mean()
+        else:
+            loss = (share * (got - want).square().flatten(start_dim=1).mean(dim=1)).sum()
+            divergence = (share * divergence).sum()
+        return loss if kl is None else loss + kl * divergence

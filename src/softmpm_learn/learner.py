@@ -6,14 +6,13 @@ Its three refinements, early stopping, replay and target network, each have a sw
 import torch
 from torch import Tensor, nn
 
-from softmpm_learn.autoencoder import Autoencoder, train_autoencoder
+from softmpm_learn.autoencoder import Autoencoder
+from softmpm_learn.learning_phase import learn_together
+from softmpm_learn.lockstep import LockStep
 from softmpm_learn.replay import Replay
 from softmpm_learn.seeding import stream
 from softmpm_learn.settings import LearningConf
 from softmpm_learn.target import TargetNetwork
-
-MANY = 512
-"""Number of evenly chosen velocity images that suffices for validation and for means."""
 
 
 class Learner:
@@ -22,9 +21,12 @@ class Learner:
     def __init__(self, conf: LearningConf, autoencoder: Autoencoder, replay: Replay, seed: int = 0):
         self.conf, self.autoencoder, self.replay = conf, autoencoder, replay
         self.streams = {name: stream(seed, name) for name in ("minibatches", "noise")}
+        # It stores the moments between phases; within one they are in the lock step:
         self.optimizer = torch.optim.Adam(autoencoder.parameters(), lr=conf.rate)
         self.target = TargetNetwork(autoencoder.encoder) if conf.target_network else None
         self.phases = 0
+        self.lockstep: LockStep | None = None
+        """Where this learner and those after it are trained, with the CUDA graph that was captured for them."""
 
     @property
     def encoder(self) -> nn.Module:
@@ -43,34 +45,28 @@ class Learner:
         for world in range(observations.shape[1])[: self.replay.per_iteration]:
             self.replay.add(first + world, observations[:, world])
 
+    @property
+    def can_learn(self) -> bool:
+        """True if there are pictures to learn from."""
+        return len(self.replay.places("training")) > 0
+
+    def pictures(self, split: str) -> Tensor:
+        """Evenly chosen pictures of a split, which suffice for means, in the precision of the autoencoder."""
+        return self.replay.some(split).to(self.autoencoder.encoder.scale)
+
     def learn(self) -> dict[str, float]:
         """One learning phase; its figures for metrics.csv."""
-        training, validation = self.replay.split("training"), self.replay.split("validation")
-        if not training:
-            return {}
-        scale = self.autoencoder.encoder.scale  # tells device and precision
-        pictures = _some(torch.cat(training)).to(scale)
-        self.autoencoder.rescale(pictures)
-        learned = train_autoencoder(
-            self.autoencoder,
-            self.optimizer,
-            lambda: self.replay.sample(self.streams["minibatches"], self.conf.batch).to(scale),
-            _some(torch.cat(validation)).to(scale) if validation else None,
-            self.conf,
-            self.streams["noise"],
-        )
-        self.autoencoder.standardise(pictures)
+        return learn_together([self])[0]
+
+    def finish_phase(self) -> None:
+        """Bring what the policy sees up to date with the autoencoder."""
+        self.autoencoder.standardise(self.pictures("training"))
         if self.target is not None:
             rate = self.conf.target_rate if self.phases else 1.0  # what it copies at first is only noise
             self.target.follow(self.autoencoder.encoder, rate)
         self.phases += 1
         if not self.conf.replay:
             self.replay.clear()
-        return {
-            "epochs": learned.epochs,
-            "training_loss": learned.training,
-            "validation_loss": learned.validation,
-        }
 
     def state_dict(self) -> dict:
         return {
@@ -91,7 +87,3 @@ class Learner:
         self.phases = content["phases"]
         for name, generator in self.streams.items():
             generator.set_state(content["streams"][name])
-
-
-def _some(pictures: Tensor) -> Tensor:
-    return pictures[:: -(-len(pictures) // MANY)]

@@ -1,5 +1,7 @@
 """Replay: grid velocity of many past simulations, bounded in memory, kept on disk, split by iteration.
 
+All pictures lie in one tensor on the device of the simulation, a ring of slots with a simulation in each, so a minibatch is one gather.
+
 Iterations are held out for validation with all their worlds, and those beside them are used for neither: the motions of one iteration,
 and of two in a row, are too alike to test on. Old motions are no test of what is learned from new ones, so one is held out in each
 cycle. Each simulation is one HDF5 file that is written once and never changed, so a checkpoint need only name its simulations, each
@@ -10,6 +12,7 @@ import hashlib
 import io
 import math
 import re
+from functools import cached_property
 from pathlib import Path
 
 import h5py
@@ -20,6 +23,8 @@ from torch import Tensor
 from softmpm_learn import files
 
 SPLITS = ("training", "validation")
+MANY = 512
+"""Number of evenly chosen pictures that suffices for validation and for means."""
 HELD_OUT = 2
 """Place in a cycle of the iteration held out. The one before the next cycle is for training: with a learning phase at the end of each
 cycle the autoencoder learns from the newest motion, and validation is two iterations old."""
@@ -54,6 +59,7 @@ class Replay:
         megabytes: Most memory [MB]; at least the newest simulation stays.
         validation: Share of the iterations held out, see :func:`split_of`.
         worlds: Simulations of an iteration: number n is of iteration n // worlds.
+        device: Where the pictures are.
     """
 
     def __init__(
@@ -65,74 +71,97 @@ class Replay:
         megabytes: float = math.inf,
         validation: float = 0.2,
         worlds: int = 1,
+        device: torch.device | str = "cpu",
     ):
-        self.folder, self.shape = folder, shape
+        self.folder, self.shape, self.device = folder, shape, device
         self.simulations, self.megabytes = simulations, megabytes
         self.validation, self.worlds = validation, worlds
-        self._pictures: dict[int, Tensor] = {}
+        self._slots: dict[int, int] = {}
+        self._next = 0
         self._sha256: dict[int, str] = {}
         with files.named("make the folder", folder):
             folder.mkdir(parents=True, exist_ok=True)
 
     @property
+    def capacity(self) -> int:
+        """Most simulations, by number and by memory."""
+        room = self.megabytes / (4e-6 * math.prod(self.shape))
+        return max(1, int(min(self.simulations, room * (1 + 1e-12))))
+
+    @property
     def per_iteration(self) -> int:
         """Most simulations of an iteration, so that the buffer spans a cycle of the split and has both kinds."""
-        room = 1e6 * self.megabytes / (4 * math.prod(self.shape))
-        return max(1, int(min(self.simulations, room)) // cycle(self.validation))
+        return max(1, self.capacity // cycle(self.validation))
+
+    @cached_property
+    def memory(self) -> Tensor:
+        """Velocities [m/s], shape (slot, frame, dim, *nodes) in float32; the same tensor for good, made when it is first used."""
+        return torch.empty(self.capacity, *self.shape, device=self.device)
+
+    @property
+    def pictures(self) -> Tensor:
+        """The pictures of all slots one after another, shape (slot · frame, dim, *nodes), not copied."""
+        return self.memory.flatten(0, 1)
 
     @property
     def ids(self) -> list[int]:
         """Numbers of the simulations held, oldest first."""
-        return list(self._pictures)
+        return list(self._slots)
 
     def add(self, number: int, pictures: Tensor) -> None:
         """Keep the velocities [m/s] of one simulation under a number not used before."""
-        if self._pictures and number <= self.ids[-1]:
+        if self._slots and number <= self.ids[-1]:
             raise ValueError(f"simulations are numbered upwards: {number} cannot follow {self.ids[-1]}.")
         if tuple(pictures.shape) != self.shape:
             raise ValueError(f"the pictures must have shape {self.shape}, got {tuple(pictures.shape)}.")
-        pictures = pictures.detach().to("cpu", torch.float32).contiguous()
-        data = _packed(pictures.numpy())
+        pictures = pictures.detach().float()
+        data = _packed(pictures.cpu().contiguous().numpy())
         files.replace(self._path(number), data)
-        self._pictures[number], self._sha256[number] = pictures, hashlib.sha256(data).hexdigest()
-        while len(self.ids) > 1 and (len(self.ids) > self.simulations or self.nbytes > 1e6 * self.megabytes):
-            del self._pictures[self.ids[0]]
+        self._store(number, pictures, hashlib.sha256(data).hexdigest())
+
+    def _store(self, number: int, pictures: Tensor, sha256: str) -> None:
+        """Put a simulation into the next slot, which is that of the oldest once all are taken."""
+        if len(self._slots) == len(self.memory):
+            oldest = self.ids[0]
+            del self._slots[oldest], self._sha256[oldest]
+        self.memory[self._next].copy_(pictures)
+        self._slots[number], self._sha256[number] = self._next, sha256
+        self._next = (self._next + 1) % len(self.memory)
 
     @property
     def seal(self) -> dict[int, str]:
         """For the checkpoint: what :meth:`load` takes, the SHA-256 of each simulation's file by its number."""
-        return {number: self._sha256[number] for number in self.ids}
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the pictures [B]."""
-        return sum(p.nbytes for p in self._pictures.values())
+        return dict(self._sha256)
 
     def clear(self) -> None:
         """Forget every simulation; the files stay until :meth:`prune`."""
-        self._pictures.clear()
+        self._slots.clear()
+        self._sha256.clear()
 
-    def split(self, name: str) -> list[Tensor]:
-        """Pictures of each simulation of ``training`` or ``validation``, (frame, dim, *nodes) each."""
-        if name not in SPLITS:
-            raise ValueError(f"split must be training or validation, got {name!r}.")
-        return [
-            pictures
-            for number, pictures in self._pictures.items()
-            if split_of(number // self.worlds, self.validation) == name
+    def places(self, split: str) -> Tensor:
+        """Places in :attr:`pictures` of those of ``training`` or ``validation``, oldest simulation first; on the CPU."""
+        if split not in SPLITS:
+            raise ValueError(f"split must be training or validation, got {split!r}.")
+        slots = [
+            slot
+            for number, slot in self._slots.items()
+            if split_of(number // self.worlds, self.validation) == split
         ]
+        frames = self.shape[0]
+        return (frames * torch.tensor(slots, dtype=torch.long)[:, None] + torch.arange(frames)).flatten()
 
-    def sample(self, generator: torch.Generator, batch: int, split: str = "training") -> Tensor:
-        """``batch`` pictures drawn evenly, with repetition, shape (batch, dim, *nodes)."""
-        simulations = self.split(split)
-        if not simulations:
+    def some(self, split: str) -> Tensor:
+        """At most :data:`MANY` evenly chosen pictures of a split, oldest first, shape (picture, dim, *nodes)."""
+        places = self.places(split)
+        chosen = places[:: max(1, -(-len(places) // MANY))]
+        return self.pictures.index_select(0, chosen.to(self.device))
+
+    def draw(self, generator: torch.Generator, count: int, split: str = "training") -> Tensor:
+        """Places in :attr:`pictures` of ``count`` pictures drawn evenly, with repetition; on the CPU."""
+        places = self.places(split)
+        if not len(places):
             raise ValueError(f"there is no {split} simulation in the replay buffer yet.")
-        ends = torch.tensor([len(pictures) for pictures in simulations]).cumsum(0)
-        drawn = torch.randint(int(ends[-1]), (batch,), generator=generator)
-        which = torch.bucketize(drawn, ends, right=True)
-        return torch.stack(
-            [simulations[k][i - ends[k]] for k, i in zip(which.tolist(), drawn.tolist(), strict=True)]
-        )
+        return places[torch.randint(len(places), (count,), generator=generator)]
 
     def load(self, seal: dict[int, str]) -> None:
         """Hold exactly the simulations of an earlier :attr:`seal`, from the folder.
@@ -141,14 +170,15 @@ class Replay:
             ReplayError: A file is missing, is not the one that was sealed, or does not hold finite pictures of :attr:`shape`; or
                 they are more than the buffer may hold.
         """
-        size = 4e-6 * math.prod(self.shape)
-        if len(seal) > self.simulations or (len(seal) > 1 and len(seal) * size > self.megabytes):
+        if len(seal) > self.capacity:
+            size = 4e-6 * math.prod(self.shape)
             raise ReplayError(
                 f"the checkpoint names {len(seal)} simulations of {size:.3g} MB each; the replay buffer in {self.folder} may have "
                 f"{self.simulations}, and {self.megabytes:g} MB in all."
             )
-        self._pictures = {number: self._read(number, sha256) for number, sha256 in sorted(seal.items())}
-        self._sha256 = dict(seal)
+        self.clear()
+        for number, sha256 in sorted(seal.items()):
+            self._store(number, self._read(number, sha256), sha256)
 
     def _read(self, number: int, sha256: str) -> Tensor:
         path = self._path(number)

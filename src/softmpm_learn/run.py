@@ -96,6 +96,7 @@ class Run:
             megabytes=learning.megabytes,
             validation=learning.validation,
             worlds=self.settings.train.worlds,
+            device=self.model.device,
         )
         autoencoder = observer.encoder
         assert isinstance(autoencoder, Autoencoder)

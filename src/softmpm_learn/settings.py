@@ -221,7 +221,7 @@ class LearningConf:
     simulations: int = 50
     """Most simulations in the replay buffer; the oldest go first. Of many worlds it takes a share of this in each iteration."""
     megabytes: float = 256.0
-    """Most memory of the replay buffer [MB]; the oldest simulations go first."""
+    """Most memory of the replay buffer [MB], on the device of the simulation; the oldest simulations go first."""
     frame_every: int = 2
     """Control steps between two recorded pictures."""
     target_network: bool = True

@@ -86,3 +86,13 @@ def test_a_recording_inside_another_is_refused():
     with pytest.raises(RuntimeError, match="being captured already: call the inner graph's function"):
         outer()
     assert_relative(inner(), want, 2e-5)
+
+
+@pytest.mark.gpu
+def test_a_function_without_a_simulation_is_captured_too():
+    """What its inputs hold at a replay is what it computes with, and nothing can have failed."""
+    x = torch.ones(3, device="cuda")
+    graph = softmpm.Graph(lambda: x * 2, x.device)
+    for value in (1.0, 5.0, 7.0):
+        x.fill_(value)
+        assert graph().tolist() == [2 * value] * 3

@@ -45,7 +45,7 @@ def test_the_policy_uses_the_target(tmp_path):
 def test_features_are_standardised(tmp_path):
     """After a phase the features of the training pictures have about mean 0 and deviation 1."""
     subject, _ = taught(tmp_path, simulations=8)
-    z = subject.encoder(torch.cat(subject.replay.split("training")))
+    z = subject.encoder(subject.pictures("training"))
     assert z.mean(dim=0).abs().max() < 0.7 and (z.std(dim=0) - 1).abs().max() < 0.5
 
 
@@ -70,7 +70,7 @@ def test_of_many_worlds_only_the_first_are_written(tmp_path):
     for iteration in range(2):
         subject.add_observations(10 * iteration, pictures)
     assert subject.replay.ids == [0, 1, 2, 10, 11, 12] and len(list(tmp_path.iterdir())) == 6
-    torch.testing.assert_close(torch.cat(subject.replay.split("training")[:1]), pictures[:, 0])
+    torch.testing.assert_close(subject.pictures("training")[:5], pictures[:, 0])
 
 
 def test_goes_on_from_its_state(tmp_path):

@@ -26,6 +26,15 @@ def filled(folder, count: int, **settings) -> Replay:
     return replay
 
 
+def split(replay: Replay, name: str) -> list[torch.Tensor]:
+    """Pictures of each simulation of a split."""
+    return list(replay.pictures[replay.places(name)].split(replay.shape[0]))
+
+
+def sample(replay: Replay, seed: int, count: int, *name: str) -> torch.Tensor:
+    return replay.pictures[replay.draw(torch.Generator().manual_seed(seed), count, *name)]
+
+
 def number_of(simulation: torch.Tensor) -> int:
     return int(simulation.flatten()[0]) // 100
 
@@ -33,16 +42,16 @@ def number_of(simulation: torch.Tensor) -> int:
 def test_the_split_is_kept_and_samples_come_from_it(tmp_path):
     """No simulation changes sides as others come and go, and samples come from their split only."""
     replay = filled(tmp_path, 10, validation=0.2)
-    held_out = {number_of(p) for p in replay.split("validation")}
-    training = {number_of(p) for p in replay.split("training")}
+    held_out = {number_of(p) for p in split(replay, "validation")}
+    training = {number_of(p) for p in split(replay, "training")}
     assert held_out == {2, 7} and training == {0, 4, 5, 9}
-    drawn = replay.sample(torch.Generator().manual_seed(0), 500)
+    drawn = sample(replay, 0, 500)
     assert {int(v) // 100 for v in drawn[:, 0, 0, 0]} == training
     assert {int(v) % 100 for v in drawn[:, 0, 0, 0]} == {0, 1, 2}
-    drawn = replay.sample(torch.Generator().manual_seed(0), 50, "validation")
+    drawn = sample(replay, 0, 50, "validation")
     assert {int(v) // 100 for v in drawn[:, 0, 0, 0]} == held_out
     later = filled(tmp_path / "later", 22, validation=0.2, simulations=6)
-    assert [number_of(p) for p in later.split("validation")] == [17]
+    assert [number_of(p) for p in split(later, "validation")] == [17]
 
 
 @pytest.mark.parametrize("validation", [0.05, 0.1, 0.2, 0.25])
@@ -75,7 +84,7 @@ def test_worlds_of_an_iteration_are_on_one_side(tmp_path):
     for iteration in range(8):
         for world in range(4):
             replay.add(4 * iteration + world, pictures(iteration))
-    training, validation = (torch.cat(replay.split(name)) for name in ("training", "validation"))
+    training, validation = (torch.cat(split(replay, name)) for name in ("training", "validation"))
     assert len(training) == 4 * 3 * 3 and len(validation) == 4 * 2 * 3  # iterations 0, 4, 5 and 2, 7
     assert not torch.isin(training.flatten(), validation.flatten()).any()
 
@@ -95,33 +104,59 @@ def test_many_worlds_leave_room_for_both_sides(tmp_path):
 def test_sampling_is_even_over_pictures(tmp_path):
     """Each frame of each simulation is drawn equally often."""
     replay = filled(tmp_path, 10, validation=0.2)
-    drawn = replay.sample(torch.Generator().manual_seed(0), 4000)[:, 0, 0, 0].long()
+    drawn = sample(replay, 0, 4000)[:, 0, 0, 0].long()
     counts = torch.bincount(100 * (drawn // 100) + drawn % 100)
     assert (counts > 0).sum() == 12 and (counts[counts > 0] / 4000 - 1 / 12).abs().max() < 0.02
 
 
 def test_memory_is_bounded(tmp_path):
-    """The oldest simulations go first, by number and by megabytes; the newest always stays."""
+    """The oldest simulations go first, by number and by megabytes; the newest always stays. The memory is never more or another."""
     assert filled(tmp_path / "a", 7, simulations=4).ids == [3, 4, 5, 6]
     size = pictures(0).contiguous().nbytes
-    replay = filled(tmp_path / "b", 7, megabytes=2.5e-6 * size)
-    assert replay.ids == [5, 6] and replay.nbytes == 2 * size
+    replay = filled(tmp_path / "b", 1, megabytes=2.5e-6 * size)
+    memory = replay.memory
+    for number in range(1, 7):
+        replay.add(number, pictures(number))
+    assert replay.ids == [5, 6] and replay.memory is memory and memory.nbytes == 2 * size
     assert filled(tmp_path / "c", 3, megabytes=1e-9).ids == [2]
+
+
+def test_pictures_are_those_of_the_newest_simulations(tmp_path):
+    """Whatever was overwritten in the ring, a place leads to the picture of its simulation and frame, oldest first."""
+    replay = Replay(tmp_path, SHAPE, simulations=5, validation=0.25, worlds=99)  # all are of one iteration
+    for number in range(13):
+        replay.add(number, pictures(number))
+        held = range(max(0, number - 4), number + 1)
+        assert replay.ids == list(held)
+        assert torch.equal(replay.pictures[replay.places("training")], torch.cat([pictures(k) for k in held]))
+    replay.clear()
+    assert replay.ids == [] and not len(replay.places("training")) and replay.seal == {}
+    replay.add(13, pictures(13))
+    assert torch.equal(replay.some("training"), pictures(13))
+
+
+def test_some_pictures_are_evenly_chosen(tmp_path):
+    """At most 512, at equal distances, from the first on."""
+    replay = Replay(tmp_path, (300, 1, 1), simulations=5)
+    for number in (0, 4, 5):
+        replay.add(number, 1000.0 * number + torch.arange(300.0).view(300, 1, 1))
+    everything = replay.pictures[replay.places("training")]
+    assert torch.equal(replay.some("training"), everything[::2]) and len(everything) == 900
+    assert len(replay.some("validation")) == 0
 
 
 def test_comes_back_from_disk_exactly(tmp_path):
     """A replay loaded by ids holds the same bits of the same simulations."""
-    replay = Replay(tmp_path, SHAPE, simulations=10)
+    replay = Replay(tmp_path, SHAPE, simulations=10, worlds=9)  # all are for training
     generator = torch.Generator().manual_seed(0)
     for number in range(4):
         replay.add(number, torch.randn(3, 2, 5, 4, generator=generator))
-    other = Replay(tmp_path, SHAPE, simulations=10)
+    other = Replay(tmp_path, SHAPE, simulations=10, worlds=9)
     seal = replay.seal
     del seal[0]
     other.load(seal)
     assert other.ids == [1, 2, 3] and other.seal == seal
-    for a, b in zip(replay.split("training")[1:], other.split("training"), strict=True):
-        assert torch.equal(a, b)
+    assert torch.equal(other.some("training"), replay.some("training")[SHAPE[0] :])
 
 
 def test_prune_keeps_what_a_checkpoint_may_name(tmp_path):
@@ -142,9 +177,9 @@ def test_numbers_go_up_and_empty_splits_say_so(tmp_path):
     with pytest.raises(ValueError, match="1 cannot follow 1"):
         replay.add(1, pictures(1))
     with pytest.raises(ValueError, match="no validation simulation"):
-        replay.sample(torch.Generator(), 1, "validation")
+        replay.draw(torch.Generator(), 1, "validation")
     with pytest.raises(ValueError, match="training or validation"):
-        replay.split("test")
+        replay.places("test")
 
 
 def sealed(path, **content) -> dict[int, str]:
