@@ -140,7 +140,11 @@ def test_damping_is_a_rate():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_turning_body_gains_no_spin_by_rounding(dim, scheme, device):
-    """In float32, 4,000 substeps: within 3e-6. Rounded weights in 3D gave 1.5e-5, a mass of 0.4 kg in 2D 4e-6, always upwards."""
+    """In float32, 4,000 substeps: within 3e-6. Rounded weights in 3D gave 1.5e-5, a mass of 0.4 kg in 2D 4e-6, always upwards.
+
+    The plain scheme on a GPU adds in another order each time: 24 runs in 3D on an H200 lost 1.9e-6 ± 1.2e-6, at most 4.9e-6.
+    """
+    limit = 8e-6 if (dim, scheme, device) == (3, "plain", "cuda") else 3e-6
     spacing = 0.04
     corner = np.full(dim, 4.5 * spacing)
     particles = softmpm.box(corner, corner + 4 * spacing, spacing / 2)
@@ -159,5 +163,5 @@ def test_a_turning_body_gains_no_spin_by_rounding(dim, scheme, device):
         affine = spacing**2 / 4 * (C[:, 1, 0] - C[:, 0, 1])
         return (arm[:, 0] * v[:, 1] - arm[:, 1] * v[:, 0] + affine).sum().item()
 
-    assert abs(spin(end) / spin(start) - 1) < 3e-6
+    assert abs(spin(end) / spin(start) - 1) < limit
     assert torch.equal(masses(model, model.params()), torch.ones_like(model.mass))
