@@ -66,8 +66,7 @@ def step_or_fall_back(run: Run, loss: float) -> bool:
     """Take the step along the gradient, or go back to the best; True for the latter."""
     conf = run.settings.optimizer
     if not run.fallback.is_due(loss, run.best["loss"], conf):
-        run.snapshot()
-        run.optimizer.step()
+        run.step()
         return False
     run.fall_back()
     logger.warning(

@@ -132,12 +132,23 @@ class Run:
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
 
+    def step(self) -> None:
+        """Take a step along the gradient, the next one with lower rates."""
+        self.snapshot()
+        self.optimizer.step()
+        halving = self.settings.optimizer.halving
+        if halving is not None:
+            self._scale_rates(0.5 ** (1 / halving))
+
+    def _scale_rates(self, factor: float) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] *= factor
+
     def fall_back(self) -> None:
         """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments."""
         self.load_policy(self.best)
         self.optimizer.state.clear()
-        for group in self.optimizer.param_groups:
-            group["lr"] *= self.settings.optimizer.fallback_rate
+        self._scale_rates(self.settings.optimizer.fallback_rate)
         self.snapshot()
 
     def draw_goals(self) -> Tensor | None:

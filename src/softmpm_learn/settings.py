@@ -155,6 +155,8 @@ class OptimizerConf:
     """Learning rate of the policy: 2e-2 suits the linear one, 5e-3 the mlp."""
     design_rate: float = 3e-2
     """Learning rate of the design, in the unbounded space before the sigmoid."""
+    halving: float | None = 40.0
+    """Iterations in which both rates fall by half, so that the last corrections are small; null: never. Our choice."""
     max_norm: float | None = 1.0
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
     fade: float | None = 0.1
@@ -177,7 +179,7 @@ class OptimizerConf:
     def __post_init__(self):
         OPTIMIZERS.need(self.name, self.options)
         _positive("optimizer", self, "policy_rate", "design_rate")
-        for name in ("max_norm", "fade"):
+        for name in ("halving", "max_norm", "fade"):
             if getattr(self, name) is not None:
                 _positive("optimizer", self, name)
         for name in ("retries", "fallback_from"):

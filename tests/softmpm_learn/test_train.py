@@ -548,3 +548,15 @@ def test_pictures_can_be_drawn_while_a_run_goes_on(task, model, settings, tmp_pa
             kept = recording.frames(row)
             for name in ("time", "x", "activation"):
                 np.testing.assert_allclose(frames[name], kept[name], rtol=1e-6)
+
+
+@pytest.mark.parametrize("halving, share", [(2.0, 0.25), (None, 1.0)])
+def test_rates_fall_by_half_in_so_many_iterations(task, model, settings, tmp_path, halving, share):
+    """A quarter is left after four iterations, also of a run that was stopped after the second."""
+    optimizer = dataclasses.replace(settings.optimizer, halving=halving)
+    for iterations in (2, 4):
+        conf = dataclasses.replace(settings.train, iterations=iterations, examine=False)
+        both = dataclasses.replace(settings, optimizer=optimizer, train=conf)
+        run = train.train(task, model, both, tmp_path).run
+    rates = [group["lr"] for group in run.optimizer.param_groups]
+    assert rates == pytest.approx([share * optimizer.policy_rate, share * optimizer.design_rate])
