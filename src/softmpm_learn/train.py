@@ -13,7 +13,8 @@ the same everywhere would take a replay buffer in each process, and bits that ag
 """
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -164,17 +165,10 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
         rows, observations = optimise(runs, work.loggers, seconds)
         with clock(seconds, "learn"):
             learn(runs, rows, observations)
-        shown = {k: (runs.all[k].iteration, row) for k, row in rows.items()}
-        for k, row in rows.items():
-            with group.fail_together():
-                if work.loggers:
-                    work.loggers[k].add(runs.all[k].iteration, row, seconds)
-            runs.all[k].iteration += 1
-        with clock(seconds, "save"), group.fail_together():
-            for k in rows if work.loggers else ():
-                work.loggers[k].save()
+        ended = {k: (runs.all[k].iteration, row) for k, row in rows.items()}
+        _write(work, ended)
         if progress and group.first and rows:
-            progress(shown)
+            progress(ended)
         for one, plan in zip(work.loggers, work.plans, strict=group.first):
             if one.frames:
                 plan.sketch(one.run, one.run.iteration - 1, one.take_frames())
@@ -192,6 +186,18 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
     ]
 
 
+def _write(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) -> None:
+    """End an iteration of some runs: rows of the tables, then a checkpoint."""
+    runs, group = work.runs, work.runs.group
+    loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
+    with group.fail_together():
+        at_once(lambda k: loggers[k].add(*ended[k], work.seconds), loggers)
+    for k in ended:
+        runs.all[k].iteration += 1
+    with clock(work.seconds, "save"), group.fail_together():
+        at_once(lambda k: loggers[k].save(), loggers)
+
+
 def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | None) -> None:
     """Add the observations to the replay buffers and run the learning phases that are due; in the first process alone.
 
@@ -200,16 +206,13 @@ def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | 
     if observations is None:
         return
     pictures, due = runs.group.gather(observations, dim=1), []
+    with runs.group.fail_together():
+        if pictures is not None:
+            at_once(lambda k: add_observations(runs, k, pictures), rows)
     for k, row in rows.items():
         run = runs.all[k]
         if run.learner is None:
             continue
-        with runs.group.fail_together():
-            if pictures is not None:
-                first = run.iteration * run.settings.train.worlds
-                run.learner.add_observations(
-                    first, pictures if len(runs.all) == 1 else pictures[:, runs.worlds(k)]
-                )
         row["replay"] = len(run.learner.replay.ids)
         if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
             due.append((run.learner, row))
@@ -217,6 +220,27 @@ def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | 
     for (learner, row), figures in zip(due, learned, strict=True):
         row |= figures
         runs.group.broadcast_(t for network in learner.networks for t in network.state_dict().values())
+
+
+def add_observations(runs: Runs, k: int, pictures: Tensor) -> None:
+    """Add those of a run, of the observations of all worlds."""
+    run = runs.all[k]
+    if run.learner is not None:
+        own = pictures if len(runs.all) == 1 else pictures[:, runs.worlds(k)]
+        run.learner.add_observations(run.iteration * run.settings.train.worlds, own)
+
+
+def at_once(work: Callable[[int], object], numbers: Collection[int]) -> None:
+    """Do the same for runs side by side, several in threads: most of the time they wait for the disk.
+
+    Raises the first error once all have ended.
+    """
+    if len(numbers) < 2:
+        for k in numbers:
+            work(k)
+        return
+    with ThreadPoolExecutor(len(numbers)) as pool:
+        list(pool.map(work, numbers))
 
 
 def learn_all(learners: Sequence[Learner]) -> list[dict[str, float]]:

@@ -94,6 +94,8 @@ def test_each_seed_has_the_folder_of_a_run(main):
         assert losses(place) == pytest.approx(losses(Path(f"one{seed}")), rel=1e-9)
         assert load(place).train == load(Path(f"one{seed}")).train
         assert float(row["loss"]) == min(losses(place))
+        sizes = [(folder / "checkpoint.pt").stat().st_size for folder in (place, Path(f"one{seed}"))]
+        assert sizes[0] == pytest.approx(sizes[1], rel=0.01)  # not the weights of the others as well
 
 
 def test_they_go_on_with_resume(main):
