@@ -55,33 +55,33 @@ def record(
         results: Those of the seeds of this process.
         about: Job, settings and folder.
     """
+    words = [
+        text for text in about["settings"].split() if not text.startswith(("train.seed=", "train.seeds="))
+    ]
     for result in results:
         seed = result.run.settings.train.seed
         place = folder(out, seed)
-        own = about | {
-            "seed": seed,
-            "folder": str(place),
-            "settings": f"{about['settings']} train.seed={seed}".strip(),
-        }
+        own = {"seed": seed, "folder": str(place), "settings": " ".join([*words, f"train.seed={seed}"])}
         if result.error or result.finished:
-            sweep.record(place, outcome(result, own))
-    group.any(False)  # all processes have written theirs
-    return group.broadcast(group.once(_of_all, conf, out, about))
+            sweep.record(place, outcome(result, about | own))
+    stopped = group.any(not all(result.error or result.finished for result in results))
+    found = group.broadcast(group.once(_of_all, conf, out, about))
+    return None if stopped else found
 
 
-def _of_all(conf: RunConf, out: Path, about: dict[str, Any]) -> sweep.Outcome | None:
+def _of_all(conf: RunConf, out: Path, about: dict[str, Any]) -> sweep.Outcome:
+    """Outcome of all seeds that have one; writes the table."""
     sweep.tabulate(out)
-    found = [sweep.outcome(folder(out, one.train.seed)) for one in split(conf)]
-    known = [one for one in found if one]
-    failed = [one for one in known if one.status == "failed"]
-    if len(known) < len(found):
-        return None
-    done = min(one.iterations for one in known)
+    found = [one for c in split(conf) if (one := sweep.outcome(folder(out, c.train.seed)))]
+    done = min((one.iterations for one in found), default=0)
+    failed = [one for one in found if one.status == "failed"]
     if failed:
-        seeds = ", ".join(str(one.seed) for one in failed)
-        problem = f"of {len(found)} seeds these failed: {seeds}. Seed {failed[0].seed}: {failed[0].error}"
+        numbers = ", ".join(str(one.seed) for one in failed)
+        problem = (
+            f"of {conf.train.seeds} seeds these failed: {numbers}. Seed {failed[0].seed}: {failed[0].error}"
+        )
         return sweep.Outcome(status="failed", error=problem, iterations=done, **about)
-    loss = statistics.median(one.loss for one in known)
+    loss = statistics.median([one.loss for one in found] or [math.inf])
     return sweep.Outcome(status="finished", loss=loss, iterations=done, **about)
 
 

@@ -13,7 +13,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, checkpoint
+from softmpm_learn import app, checkpoint, experiment
 from softmpm_learn.saved import load
 
 ROOT = Path(__file__).parents[2]
@@ -84,7 +84,7 @@ def test_each_seed_has_the_folder_of_a_run(main):
     assert [row["seed"] for row in table] == ["5", "6", "7"] and {row["status"] for row in table} == {
         "finished"
     }
-    assert all(row["settings"].endswith(f"train.seed={row['seed']}") for row in table)
+    assert all(row["settings"] == " ".join([*TINY, f"train.seed={row['seed']}"]) for row in table)
     assert objective == statistics.median(float(row["loss"]) for row in table)
     for row in table:
         seed, place = row["seed"], Path(row["folder"])
@@ -150,6 +150,27 @@ def test_a_sweep_has_a_row_for_each_seed(main, monkeypatch):
     real = []
     monkeypatch.setattr(app, "run_experiment", lambda *args: real.append(args))
     assert main(*words) == (0, objectives) and not real
+
+
+def test_seeds_that_were_stopped_are_no_outcome(main, monkeypatch):
+    """A sweep that is asked to end does so, also where the seeds had finished a shorter run; the same command goes on."""
+    words = (
+        "-m",
+        *(word for word in TINY if "iterations" not in word),
+        "train.seeds=2",
+        "optimizer.policy_rate=0.01,0.02",
+        "hydra.sweep.dir=sweep",
+    )
+    assert main(*words, "train.iterations=1")[0] == 0
+    real = experiment.train_side_by_side
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            experiment, "train_side_by_side", lambda *a, **k: real(*a, **k | {"stop": lambda: True})
+        )
+        code, objectives = main(*words, "train.iterations=2")
+    assert code == 0 and objectives == []
+    assert main(*words, "train.iterations=2")[0] == 0
+    assert [row["iterations"] for row in rows(Path("sweep/sweep.csv"))] == ["2"] * 4
 
 
 def torchrun(*words: str, cwd: Path, processes: int = 2) -> subprocess.CompletedProcess:
