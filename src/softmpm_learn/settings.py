@@ -252,8 +252,11 @@ class TrainConf:
     seed: int = 0
     """Everything random follows from it, in a stream of its own for each part: on a CPU, the same seed gives the same run to the last
     bit, and runs that differ in one part share the random numbers of the others."""
+    seeds: int = 1
+    """Number of seeds, from ``seed`` on, that learn side by side in one simulation, each as if it were alone; several processes share
+    them out."""
     worlds: int = 1
-    """Simulations side by side in each step, of all processes together; useful with random goals."""
+    """Simulations side by side in each step, of all processes together; useful with random goals. Of each seed as many."""
     goal_spread: list[float] = field(default_factory=list)
     """Half widths [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
     evaluate_every: int = 10
@@ -269,7 +272,16 @@ class TrainConf:
     """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid."""
 
     def __post_init__(self):
-        _positive("train", self, "iterations", "worlds", "frame_every", "evaluate_every", "evaluation_goals")
+        _positive(
+            "train",
+            self,
+            "iterations",
+            "seeds",
+            "worlds",
+            "frame_every",
+            "evaluate_every",
+            "evaluation_goals",
+        )
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
         if any(not (math.isfinite(s) and s >= 0) for s in self.goal_spread):

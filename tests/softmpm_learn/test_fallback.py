@@ -63,11 +63,11 @@ def scripted(monkeypatch):
     """Makes the losses those of :data:`LOSSES`; gives what moved the robot in each iteration and the rates."""
     seen, real = {}, optimisation.attempt
 
-    def attempt(run, *args):
-        episode, row = real(run, *args)
+    def attempt(runs, *args):
+        (episode, rows), (run,) = real(runs, *args), runs.all
         rates = [group["lr"] for group in run.optimizer.param_groups]
         seen[run.iteration] = (run.policy_snapshot(), rates, len(run.optimizer.state))
-        return episode, row | {"loss": LOSSES[run.iteration]}
+        return episode, {0: rows[0] | {"loss": LOSSES[run.iteration]}}
 
     monkeypatch.setattr(optimisation, "attempt", attempt)
     return seen

@@ -16,9 +16,10 @@ import torch
 import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
-from softmpm_learn.experiment import design
 from softmpm_learn.objective import Effort, Objective, Progress
 from softmpm_learn.optimisation import TrainingError
+from softmpm_learn.pictures import design
+from softmpm_learn.runs import Runs
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 
 HERE = Path(__file__).parent
@@ -99,7 +100,7 @@ def test_interrupted_anywhere_it_goes_on_as_if_nothing_had_been(
         "optimise": (train, "optimise", 2),
         "learn": (train, "learn", 2),
         "metrics": (Table, "append", 4),  # two tables
-        "checkpoint": (train.checkpoint, "save", 3),  # one save before the first iteration
+        "checkpoint": (checkpoint, "save", 3),  # one save before the first iteration
         "between renames": (os, "replace", None),
         "prune": (train.Run, "state_dict", 3),
     }[where]
@@ -524,11 +525,12 @@ def test_double_precision(task, settings, tmp_path):
 def test_a_run_that_nobody_uses_is_freed(task, settings, tmp_path):
     """At once, with its model and its loop, whose graph on a GPU is most of a run's memory: nothing waits for Python's collector."""
     run = train.Run(task, softmpm.build(task.scene, device="cpu"), settings, tmp_path)
-    run.loop(None)
-    seen = [weakref.ref(thing) for thing in (run, run.loop, run.loop._graph, run.model)]
+    runs = Runs([run])
+    runs.loop(None)
+    seen = [weakref.ref(thing) for thing in (run, runs, runs.loop, runs.loop._graph, run.model)]
     gc.disable()
     try:
-        del run
+        del run, runs
         assert not [thing for ref in seen if (thing := ref()) is not None]
     finally:
         gc.enable()
