@@ -41,7 +41,7 @@ def optimise(
     """One optimisation step of every run that goes on: simulate, differentiate, update policy and design.
 
     After a failure policy and design of the run in which it was go halfway back to the last simulation that succeeded, and all try
-    again. A run that has no retry left has failed and rests.
+    again. A run that has no retry left goes back to its best; if that fails too, it has failed and rests.
 
     Args:
         loggers: One for each run, or none.
@@ -71,15 +71,21 @@ def optimise(
 
 
 def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
-    """Halve the last step of a run whose simulation or gradient failed; a run without a way back, or without a retry, has failed.
+    """Halve the last step of a run whose simulation or gradient failed; after the last retry go back to its best. A run without a way
+    back, or whose best fails too, has failed.
 
     Raises:
         TrainingError: It was at rest.
     """
-    run = runs.all[k]
-    if run.safe and retries < run.settings.optimizer.retries and k in runs.active:
-        logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
-        run.backtrack()
+    run, most = runs.all[k], runs.all[k].settings.optimizer.retries
+    if run.safe and most and retries <= most and k in runs.active and run.best["iteration"] >= 0:
+        if retries < most:
+            logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
+            run.backtrack()
+        else:
+            best = run.best["iteration"]
+            logger.warning("Iteration %d: %s Going back to iteration %d.", run.iteration, error, best)
+            run.fall_back()
         return
     ended = TrainingError(run.iteration, in_full(error))
     ended.__cause__ = error

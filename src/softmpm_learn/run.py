@@ -65,6 +65,7 @@ class Run:
             raise ValueError(
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
+        settings = settings.suited(task.fade, task.gain)
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
         self.fallback = Fallback()

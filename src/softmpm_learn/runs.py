@@ -18,8 +18,9 @@ from softmpm import Failures, Inputs, Model, Params, State, UnstableError
 from softmpm_learn.design import Design
 from softmpm_learn.episode import ClosedLoop, Policy
 from softmpm_learn.observe import Observer
+from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.run import Run
-from softmpm_learn.settings import OptimizerConf, Settings
+from softmpm_learn.settings import Settings
 from softmpm_learn.stacking import Stacked
 
 
@@ -58,7 +59,7 @@ class Runs:
             [p for run in runs for p in run.design.parameters()],
             runs=len(runs),
             keep_every=first.settings.learning.frame_every if first.learner else 0,
-            fade=math.inf if first.settings.optimizer.fade is None else first.settings.optimizer.fade,
+            fade=first.settings.optimizer.fade or math.inf,
         )
 
     def _encoders(self) -> Stacked:

@@ -25,7 +25,7 @@ from softmpm import Model
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine
-from softmpm_learn.learner import Learner
+from softmpm_learn.learning_phase import learn_together
 from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.resuming import entered, resume
 from softmpm_learn.run import Run
@@ -216,7 +216,7 @@ def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | 
         row["replay"] = len(run.learner.replay.ids)
         if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
             due.append((run.learner, row))
-    learned = runs.group.once(learn_all, [learner for learner, _ in due]) or [{}] * len(due)
+    learned = runs.group.once(learn_together, [learner for learner, _ in due]) or [{}] * len(due)
     for (learner, row), figures in zip(due, learned, strict=True):
         row |= figures
         runs.group.broadcast_(t for network in learner.networks for t in network.state_dict().values())
@@ -241,11 +241,6 @@ def at_once(work: Callable[[int], object], numbers: Collection[int]) -> None:
         return
     with ThreadPoolExecutor(len(numbers)) as pool:
         list(pool.map(work, numbers))
-
-
-def learn_all(learners: Sequence[Learner]) -> list[dict[str, float]]:
-    """One learning phase of each; their figures for metrics.csv. They change their networks in place."""
-    return [learner.learn() for learner in learners]
 
 
 @torch.no_grad()

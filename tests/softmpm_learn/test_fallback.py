@@ -10,7 +10,7 @@ import torch
 
 from softmpm_learn import checkpoint, optimisation
 from softmpm_learn.fallback import Fallback
-from softmpm_learn.settings import OptimizerConf
+from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.train import train
 
 LOSSES = [-0.1, -0.5, -0.9, -0.4, -0.4, -0.4, -0.9, -0.8]

@@ -401,6 +401,22 @@ def test_a_failed_simulation_is_tried_again_from_halfway_back(
     ] and "Going halfway back" in caplog.text
 
 
+def test_a_run_without_a_retry_left_goes_back_to_its_best(
+    task, model, settings, tmp_path, monkeypatch, caplog
+):
+    """Of the whole step and of its half: the policy is that of the best iteration again, and the rates fall as in a fallback."""
+    optimizer = dict(retries=1, halving=None)
+    conf = copy_of(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=2))
+    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8, 9}))
+    second = train.train(task, model, conf, tmp_path / "two").run
+    for now, want in zip(second.safe, first.safe, strict=True):
+        assert torch.equal(now, want)
+    assert "Going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
+    now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
+    assert now == pytest.approx(before * conf.optimizer.fallback_rate)
+
+
 @pytest.mark.parametrize("at, iteration", [({0}, 0), (set(range(13, 99)), 2)])
 def test_a_run_that_cannot_go_on_names_the_iteration(
     task, model, settings, tmp_path, monkeypatch, at, iteration

@@ -18,6 +18,7 @@ BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
 WIDTH = (0.075, 0.050)  # at the clamp and at the tip [m]
 SEGMENTS = {"lower": (0.0, 0.34), "middle": (0.34, 0.67), "upper": (0.67, 1.01)}
+FADE = 0.25  # what a muscle did longer ago counts less [s]
 TIP = 0.92  # the tip's particles start this far along the arm
 
 
@@ -103,5 +104,6 @@ def arm(conf: ArmConf) -> Task:
         ),
         body_length=LENGTH,
         goal=goal,
+        fade=FADE,
         build=conf.build,
     )
