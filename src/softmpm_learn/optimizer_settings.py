@@ -23,7 +23,7 @@ class OptimizerConf:
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
     fade: float | None = None
     """Time constant with which gradients fade on their way back through the simulation [s]: what a muscle did long before a step has an
-    effect that changes of a useful size do not have (fading.py). null is the task's: walkers 0.1, the arm 0.25; .inf: never."""
+    effect that changes of a useful size do not have (fading.py). null is the task's, 0.1 for walkers and the arm; .inf: never."""
     retries: int = 4
     """Maximum number of times that a failed step is halved towards the last successful simulation; if it still fails, the run goes back
     to its best, and ends if that fails too. 0 ends the run at once."""

@@ -18,7 +18,8 @@ BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
 WIDTH = (0.075, 0.050)  # at the clamp and at the tip [m]
 SEGMENTS = {"lower": (0.0, 0.34), "middle": (0.34, 0.67), "upper": (0.67, 1.01)}
-FADE = 0.25  # what a muscle did longer ago counts less [s]
+FADE = 0.1  # what a muscle did longer ago counts less [s]
+QUIET = 0.3  # size of the first activations
 TIP = 0.92  # the tip's particles start this far along the arm
 
 
@@ -105,5 +106,6 @@ def arm(conf: ArmConf) -> Task:
         body_length=LENGTH,
         goal=goal,
         fade=FADE,
+        gain=QUIET,
         build=conf.build,
     )
