@@ -15,8 +15,8 @@ class Graph(Generic[Result]):
     """A function, which may call :func:`softmpm.simulate`, captured once as a CUDA graph and replayed without any launch from the host.
 
     On the CPU the function is called each time. After a replay that reports a failure the function is called again, which raises
-    the error; if a particle only left the allocated part of the grid, that part is enlarged first. The call after one that
-    succeeded captures again.
+    the error; the captured graph stays. If a particle only left the allocated part of the grid, that part is enlarged, the function is
+    called, and the next call captures again.
 
     Args:
         work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
@@ -59,7 +59,8 @@ class Graph(Generic[Result]):
         self._graph.replay()
         if self._failed is not None and self._failed.item():
             assert self._resources is not None
-            self._resources.widen()
+            if not self._resources.widen():
+                return self._run(self._stream)  # raises the error; the graph stays
             self._graph = self._resources = None
             self._warm = False
             return self()

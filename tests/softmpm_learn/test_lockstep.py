@@ -95,12 +95,13 @@ def test_memory_of_the_device_is_bounded(tmp_path):
 
 
 @pytest.mark.gpu
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode")  # PyTorch: a prototype
 def test_an_epoch_waits_for_no_number(tmp_path):
     """The device's part of an epoch does not synchronise with the host, which a capture would not survive."""
     learners = made(tmp_path, 2)
     learn_together(learners, capture=False)
-    torch.cuda.set_sync_debug_mode("error")
     try:
+        torch.cuda.set_sync_debug_mode("error")
         learners[0].lockstep._epoch()
     finally:
         torch.cuda.set_sync_debug_mode("default")

@@ -55,11 +55,12 @@ class GraphResources:
         self.words: list[tuple[torch.Tensor, Callable[[], None] | None]] = []
         self.uses: list[object] = []
 
-    def widen(self) -> None:
-        """Prepare the next capture, after a replay that failed: larger windows where a particle left one."""
-        for words, outgrow in self.words:
-            if outgrow and outgrown(words.tolist()):
-                outgrow()
+    def widen(self) -> bool:
+        """After a replay that failed: larger windows where a particle left one. True if there was such a one; capture anew then."""
+        left = [outgrow for words, outgrow in self.words if outgrow and outgrown(words.tolist())]
+        for outgrow in left:
+            outgrow()
+        return bool(left)
 
 
 _open: list[GraphResources] = []
