@@ -20,6 +20,7 @@ from softmpm_learn.config import RunConf
 from softmpm_learn.design import DESIGNABLE, declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
+from softmpm_learn.loggers import Loggers
 from softmpm_learn.progress import ProgressBar
 from softmpm_learn.run import Run
 from softmpm_learn.saved import save
@@ -29,6 +30,8 @@ from softmpm_learn.train import Result, train
 
 PICTURES = 4
 """Moments of the best episode in robot.png, the first and the last among them."""
+DRAWN = "loss", "robot", "latent"
+"""Pictures of a run at its end."""
 PAUSE = 60.0
 """Least time between pictures while a run goes on [s]."""
 DESIGN = {
@@ -74,7 +77,7 @@ def run_experiment(
         task = make_task(conf.task)
         model = make_model(task, conf, group)
     logger.info("%s", model.describe(task.substeps))
-    with contextlib.ExitStack() as held:
+    with Loggers(conf.train.log, out) as loggers, contextlib.ExitStack() as held:
         progress = held.enter_context(ProgressBar(conf.train.iterations)) if group.first else None
         stop = held.enter_context(signals.awaited(insist=group.size == 1))
 
@@ -93,10 +96,14 @@ def run_experiment(
             begin=begun,
             group=group,
             finer=finer(conf.task) if conf.train.examine else None,
-            sketch=Sketches(task, out),
+            sketch=Sketches(task, out, loggers),
+            loggers=loggers,
         )
+        held.close()  # a signal now ends the program
+        if group.first:
+            draw(result, task, out)
+            loggers.pictures(result.run.iteration, [out / f"{name}.png" for name in DRAWN])
     if group.first:
-        draw(result, task, out)
         logger.info("%s", farewell(result, task, out))
         signals.advice = f"The run had ended; everything is in {out}."
     return result
@@ -158,14 +165,15 @@ def draw_robot(run: Run, task: Task, out: Path, iteration: int, frames: dict[str
 class Sketches:
     """Pictures while a run goes on: of the first recorded episode, and then of such as come a while after the last picture."""
 
-    def __init__(self, task: Task, out: Path):
-        self.task, self.out, self._drawn = task, out, -math.inf
+    def __init__(self, task: Task, out: Path, loggers: Loggers):
+        self.task, self.out, self.loggers, self._drawn = task, out, loggers, -math.inf
 
     def __call__(self, run: Run, iteration: int, frames: dict[str, np.ndarray]) -> None:
         """Draw, if it is time; arguments as of :func:`draw_robot`."""
         if time.monotonic() - self._drawn > PAUSE:
             loss_figure(self.out / "loss.png", curves(self.out / "metrics.csv"))
             draw_robot(run, self.task, self.out, iteration, frames)
+            self.loggers.pictures(iteration, [self.out / "loss.png", self.out / "robot.png"])
             self._drawn = time.monotonic()
 
 

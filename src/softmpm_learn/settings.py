@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from softmpm import QUANTITIES
-from softmpm_learn.register import OBSERVERS, OPTIMIZERS, POLICIES
+from softmpm_learn.register import LOGGERS, OBSERVERS, OPTIMIZERS, POLICIES
 
 DESIGNS = ("particle", "region", "uniform")
 
@@ -265,8 +265,15 @@ class TrainConf:
     """Control steps between two recorded frames."""
     examine: bool = True
     """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid."""
+    log: list[str] = field(default_factory=list)
+    """Loggers beside the files of the run: tensorboard, wandb, or registered ones."""
 
     def __post_init__(self):
+        for name in self.log:
+            if name not in LOGGERS or self.log.count(name) > 1:
+                raise ValueError(
+                    f"train.log must have names of loggers, each once, out of {', '.join(LOGGERS)}; got {list(self.log)}."
+                )
         _positive("train", self, "iterations", "worlds", "frame_every", "evaluate_every", "evaluation_goals")
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")

@@ -25,6 +25,7 @@ from softmpm_learn import checkpoint, files
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine
+from softmpm_learn.loggers import Loggers
 from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.replay import ReplayError
 from softmpm_learn.run import Run, SettingsError
@@ -60,6 +61,7 @@ def train(
     group: Group | None = None,
     finer=None,
     sketch: Callable[[Run, int, dict], None] = lambda run, iteration, frames: None,
+    loggers: Loggers | None = None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
 
@@ -75,6 +77,8 @@ def train(
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
         finer: The task on the next finer grid, on which the motion is examined; None leaves that out.
         sketch: Called in the first process after an iteration whose episode was recorded, with its number and the frames.
+        loggers: Those of ``settings.train.log``, for a caller who has pictures for them at the end and closes them then; None closes
+            them here.
 
     Raises:
         softmpm_learn.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
@@ -91,7 +95,8 @@ def train(
         with group.fail_together():
             run = Run(task, model, settings, out, group)
         seals = _resume(run, out)
-        run_logger = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin)))
+        own = loggers or held.enter_context(Loggers(settings.train.log, out))
+        run_logger = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin, own)))
         return _loop(run, run_logger, progress, stop, finer, sketch)
 
 

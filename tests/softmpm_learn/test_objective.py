@@ -9,7 +9,19 @@ import torch
 from torch import Tensor
 
 from softmpm import State
-from softmpm_learn.objective import AtMost, Effort, Low, Objective, Path, Progress, Reach, Still, Strain, Term, Tilt
+from softmpm_learn.objective import (
+    AtMost,
+    Effort,
+    Low,
+    Objective,
+    Path,
+    Progress,
+    Reach,
+    Still,
+    Strain,
+    Term,
+    Tilt,
+)
 
 
 @pytest.fixture
