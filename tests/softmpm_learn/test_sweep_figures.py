@@ -203,9 +203,9 @@ def test_sweeps_together(swept, tmp_path):
     assert len(read(tmp_path / "out" / "jobs.csv")) == 12
 
 
-@pytest.mark.parametrize("own_table", [True, False])
-def test_seeds_side_by_side_are_runs(tmp_path, own_table):
-    """A job whose seeds have folders of their own; one that failed is known if the job has a table of them."""
+@pytest.mark.parametrize("listed", ["in the sweep", "in the job", "nowhere"])
+def test_seeds_side_by_side_are_runs(tmp_path, listed):
+    """A job whose seeds have folders of their own; one that failed is known if a table has them, of the sweep or of the job."""
     rows = []
     for job, observer in enumerate(("latent", "kmeans")):
         place, settings = tmp_path / str(job), f"observer={observer} train.seeds=3"
@@ -213,22 +213,23 @@ def test_seeds_side_by_side_are_runs(tmp_path, own_table):
             metrics(place / f"seed_{seed}", [1.0, -1.0 * seed], later=0.1 * seed)
         own = [
             {"job": 0, "status": "finished" if seed < 10 else "failed", "later": 0.1 * seed}
-            | {"settings": f"{settings} train.seed={seed}", "folder": str(place / f"seed_{seed}")}
+            | {"settings": settings, "seed": seed, "folder": f"/elsewhere/{job}/seed_{seed}"}
             for seed in (7, 8, 10)
         ]
-        if own_table:
-            table(place / "sweep.csv", COLUMNS, own)
-        rows.append({"job": job, "status": "finished", "settings": settings, "folder": str(place)})
-    table(tmp_path / "sweep.csv", COLUMNS, rows)
+        if listed == "in the job":
+            table(place / "sweep.csv", [*COLUMNS, "seed"], own)
+        of_job = {"job": job, "status": "finished", "settings": settings, "folder": str(place)}
+        rows += [row | {"job": job} for row in own] if listed == "in the sweep" else [of_job]
+    table(tmp_path / "sweep.csv", [*COLUMNS, "seed"], rows)
     program.make([tmp_path], tmp_path / "out")
     jobs = read(tmp_path / "out" / "jobs.csv")
     assert [(row["job"], row["seed"], row["observer"]) for row in jobs] == [
         (str(job), str(seed), name) for job, name in enumerate(("latent", "kmeans")) for seed in (7, 8, 10)
     ]
     assert [float(row["later"]) for row in jobs[:2]] == pytest.approx([0.7, 0.8])
-    assert jobs[2]["status"] == ("failed" if own_table else "finished")
+    assert jobs[2]["status"] == ("finished" if listed == "nowhere" else "failed")
     (row, *_) = read(tmp_path / "out" / "pairs.csv")
-    assert row["pairs"] == ("2" if own_table else "3")
+    assert row["pairs"] == ("3" if listed == "nowhere" else "2")
 
 
 def test_what_is_no_sweep_is_said_in_a_sentence(swept, tmp_path, capsys):

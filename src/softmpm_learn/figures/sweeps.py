@@ -90,8 +90,7 @@ def _runs(folder: Path, job: int | None = None) -> Iterator[SweptRun]:
         raise ValueError(f"{path} must have the columns {', '.join(sorted(need))} and a row for each job.")
     for row in rows:
         number = int(row["job"]) if job is None else job
-        place = folder / Path(row["folder"]).name  # a sweep may have been moved
-        place = place if place.is_dir() else Path(row["folder"])
+        place = _place(folder, Path(row["folder"]))
         if (place / sweep.TABLE).is_file() and place.resolve() != folder.resolve():
             yield from _runs(place, number)
             continue
@@ -103,10 +102,16 @@ def _runs(folder: Path, job: int | None = None) -> Iterator[SweptRun]:
             yield _run(folder, number, row, seeds[seed], seed)
 
 
+def _place(sweep: Path, folder: Path) -> Path:
+    """Folder of a job, or of a seed in that of its job, also where the sweep was moved."""
+    inside = (sweep.joinpath(*folder.parts[-count:]) for count in (1, 2))
+    return next((place for place in inside if place.is_dir()), folder)
+
+
 def _run(folder: Path, job: int, row: dict[str, str], place: Path, seed: int | None = None) -> SweptRun:
     settings = parse(row["settings"])
     try:
-        own = int(settings.get("train.seed", 0)) if seed is None else seed
+        own = int(row.get("seed") or settings.get("train.seed", 0)) if seed is None else seed
     except ValueError:
         own = 0  # such a job has failed
     run = SweptRun(
