@@ -17,6 +17,7 @@ from common import Table, arguments, median_seconds
 
 import softmpm
 from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 from softmpm_learn.settings import Settings
 from softmpm_learn.tasks.biped import BipedConf, biped
 from softmpm_learn.tasks.elephant import ElephantConf, elephant
@@ -76,9 +77,10 @@ def main():
         model = softmpm.build(task.scene, device=device, calls=task.control_steps, **task.build)
         with tempfile.TemporaryDirectory() as folder:
             run = Run(task, model, Settings(), Path(folder))
-            whole = median_seconds(lambda run=run: run.loop(None), device, args.repeats + 1)
+            loop = Runs([run]).loop
+            whole = median_seconds(lambda loop=loop: loop(None), device, args.repeats + 1)
             alone = median_seconds(physics(run), device, args.repeats + 1)
-            eager = median_seconds(run.loop._work, device, 2)
+            eager = median_seconds(loop._work, device, 2)
         table.add(
             {
                 "robot": task.name,

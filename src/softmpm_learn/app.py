@@ -24,7 +24,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from softmpm_learn import files, plugins, sweep
+from softmpm_learn import files, plugins, seeds, sweep
 from softmpm_learn.checkpoint import LockedError
 from softmpm_learn.config import RunConf, conf_dir, register, to_run, unknown_key
 from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
@@ -125,7 +125,14 @@ def job(config: DictConfig, group: Group, signals: Signals, failed: dict[int, Pa
         return _swept(config, out, group, signals, failed)
     try:
         conf = _configured(config, out, group)
-        return _experiment(conf, out, group, signals).best_loss
+        results = _experiment(conf, out, group, signals)
+        if conf.train.seeds > 1:
+            words = [text for text in hydra_config.overrides.task if not text.startswith("resume=")]
+            about = {"job": 0, "settings": " ".join(words), "folder": str(out)}
+            found = seeds.record(conf, out, results, group, about)
+            if found and found.status == "failed":
+                _end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
+        return seeds.median_loss(results)
     except JobError as failure:
         _end(1, str(failure))
 
@@ -142,13 +149,17 @@ def _swept(config: DictConfig, out: Path, group: Group, signals: Signals, failed
             group.once(sweep.tabulate, table.parent)  # a kill may have come between outcome and table
             logger.info("Job %d had finished with the loss %.5g: %s", number, before.loss, out)
             return before.loss
-        result = _experiment(conf, out, group, signals)
-        if not result.finished:
+        results = _experiment(conf, out, group, signals)
+        if conf.train.seeds > 1:
+            found = seeds.record(conf, out, results, group, about)
+        else:
+            found = seeds.outcome(results[0], about) if results[0].finished else None
+        if found is None:
             logger.info("The same command goes on with the sweep.")
             raise SystemExit(0)
-        loss, done = result.best_loss, result.run.iteration
-        about |= {"iteration": result.best_iteration, "iterations": done} | result.examination
-        found = sweep.Outcome(status="finished", loss=loss, **about)
+        if found.status == "failed":
+            raise JobError(found.error)
+        loss = found.loss
     except JobError as failure:
         if isinstance(failure, RefusedError):
             _end(1, str(failure))
@@ -194,7 +205,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
         raise JobError(sentence(error)) from error
 
 
-def _experiment(conf: RunConf, out: Path, group: Group, signals: Signals) -> Result:
+def _experiment(conf: RunConf, out: Path, group: Group, signals: Signals) -> list[Result]:
     """The run; an error leaves its traceback in the folder, from where it happened."""
     with log_file() as begin_log:
         try:

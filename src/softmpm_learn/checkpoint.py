@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,7 +43,7 @@ def save(folder: Path, content: dict) -> Path:
         content: Tensors, numbers, strings, lists and dicts: what ``torch.load(weights_only=True)`` reads.
     """
     buffer = io.BytesIO()
-    torch.save({"format": FORMAT, **content}, buffer)
+    torch.save({"format": FORMAT, **_compact(content)}, buffer)
     body = buffer.getvalue()
     body = body[:-2] + struct.pack("<H", _FOOTER)  # a zip archive ends with the length of its comment
     path = folder / NAME
@@ -53,6 +54,15 @@ def save(folder: Path, content: dict) -> Path:
         os.replace(draft, path)
         _sync(folder)
     return path
+
+
+def _compact(value: Any) -> Any:
+    """The same without the rest of the memory of tensors that are parts of larger ones, which PyTorch would write as well."""
+    if isinstance(value, Tensor):
+        return value.clone() if value.untyped_storage().nbytes() > value.nbytes else value
+    if isinstance(value, dict):
+        return {key: _compact(item) for key, item in value.items()}
+    return [_compact(item) for item in value] if isinstance(value, list) else value
 
 
 def exists(folder: Path) -> bool:

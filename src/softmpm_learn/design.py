@@ -65,10 +65,11 @@ class Design(nn.Module):
         return (low + width * torch.sigmoid(self.free[name]))[self._group[name]]
 
     @torch.no_grad()
-    def change(self) -> dict[str, float]:
-        """Mean over the particles or muscles of |now / start − 1| [-], of each material parameter and of each variable."""
+    def change(self) -> dict[str, Tensor]:
+        """Mean over the particles or muscles of |now / start − 1| [-], shape (), of each material parameter and of each variable."""
         change = {name: (self._value(name) / start - 1).abs() for name, start in self.start.items()}
-        return dict.fromkeys(Params._fields, 0.0) | {name: c.mean().item() for name, c in change.items()}
+        none = self._params.young.new_zeros(())
+        return dict.fromkeys(Params._fields, none) | {name: c.mean() for name, c in change.items()}
 
 
 def _scene_values(model: Model, name: str) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import softmpm
 from softmpm import Inputs, Model, Params, State
@@ -17,6 +17,10 @@ from softmpm_learn.term import Path
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
+
+
+Policy = Callable[[Tensor, Tensor, Tensor | None], Tensor]
+"""Features, time and goal to activation, see :class:`softmpm_learn.policy.Space`."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +45,8 @@ class Episode:
     end: State
     observations: Tensor | None
     """Observations at regular control steps, shape (frame, world, ...), detached; None if not requested."""
-    effort: Tensor
-    """Mean square of the activation [-], shape (), detached."""
+    activation: Tensor
+    """Activations during the control steps [-], shape (step, world, muscle), detached."""
     decisions: "Decisions"
 
     @property
@@ -70,7 +74,7 @@ def run_episode(
     task: "Task",
     model: Model,
     observer: Observer,
-    policy: nn.Module,
+    policy: Policy,
     params: Params,
     *,
     inputs: Inputs | None = None,
@@ -79,6 +83,7 @@ def run_episode(
     fade: float = math.inf,
     keep_every: int = 0,
     on_frame: Callable[[Frame], None] | None = None,
+    failures: softmpm.Failures | None = None,
 ) -> Episode:
     """Simulate a task under a policy. Under ``torch.no_grad`` it keeps nothing for a gradient.
 
@@ -89,6 +94,7 @@ def run_episode(
         fade: Time constant with which gradients fade on their way through the states [s], see :mod:`softmpm_learn.fading`.
         keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
+        failures: Collects the failures of worlds, while the others go on; None raises the first.
 
     Raises:
         softmpm.UnstableError: With a note that names the control step.
@@ -106,7 +112,13 @@ def run_episode(
             on_frame(Frame(step * period, state, features, activation))
         try:
             state = softmpm.simulate(
-                model, state, activation[None], params, substeps=task.substeps, inputs=inputs
+                model,
+                state,
+                activation[None],
+                params,
+                substeps=task.substeps,
+                inputs=inputs,
+                failures=failures,
             )
         except softmpm.UnstableError as error:
             when = f"which began at {step * period:.4g} s"
@@ -127,7 +139,7 @@ def run_episode(
         terms=task.objective(path),
         end=state,
         observations=torch.stack(observations) if observations else None,
-        effort=activations.detach().square().mean(),
+        activation=activations.detach(),
         decisions=made,
     )
 
@@ -142,8 +154,10 @@ class ClosedLoop:
     the model allows it.
 
     Args:
+        policy: The policy, which may be that of several runs side by side.
         design: Gives the material and the inputs, see :class:`softmpm_learn.design.Design`.
-        free: Parameters of the design.
+        weights, free: Parameters of the policy and of the design.
+        runs: Number of runs, each with as many worlds.
         keep_every, fade: As in :func:`run_episode`.
     """
 
@@ -152,15 +166,18 @@ class ClosedLoop:
         task: "Task",
         model: Model,
         observer: Observer,
-        policy: nn.Module,
+        policy: Policy,
         design: Callable[[], tuple[Params, Inputs]],
-        free: list[nn.Parameter],
+        weights: list[Tensor],
+        free: list[Tensor],
+        runs: int = 1,
         keep_every: int = 0,
         fade: float = math.inf,
     ):
         self.fade = fade
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
-        self.design, self.free, self.keep_every = design, free, keep_every
+        self.design, self.weights, self.free = design, weights, free
+        self.runs, self.keep_every = runs, keep_every
         self._goal: Tensor | None = None
         # Sums in the order of the particles wait for the device, see docs/conventions.md:
         self._captures = not (
@@ -172,8 +189,8 @@ class ClosedLoop:
     def __call__(
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
     ) -> tuple[Episode, tuple[Tensor, ...]]:
-        """The episode, detached, and the gradient of its mean loss with respect to the parameters of the policy, then to
-        ``free``; overwritten by the next call. With ``on_frame`` the CUDA graph is bypassed.
+        """The episode, detached, and the gradient of each run's mean loss with respect to ``weights``, then to ``free``; overwritten
+        by the next call. With ``on_frame`` the CUDA graph is bypassed.
 
         Raises:
             softmpm.UnstableError: As :func:`run_episode`.
@@ -197,7 +214,10 @@ class ClosedLoop:
             on_frame=on_frame,
         )
         activations = episode.decisions.activations
-        adj = torch.autograd.grad(episode.loss.mean(), [*activations, *self.free])
+        loss = (
+            episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()
+        )  # a run's parameters see its own worlds
+        adj = torch.autograd.grad(loss, [*activations, *self.free])
         adj_activations, adj_free = adj[: len(activations)], adj[len(activations) :]
         return episode.detach(), (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
 
@@ -205,4 +225,4 @@ class ClosedLoop:
         """Of all decisions at once: layer by layer and step by step it would be many small sums."""
         features, times = torch.stack(decisions.features).detach(), _times(self.task, self.model)[:, None]
         again = self.policy(features, times, self._goal)
-        return torch.autograd.grad(again, list(self.policy.parameters()), torch.stack(list(adj_activations)))
+        return torch.autograd.grad(again, self.weights, torch.stack(list(adj_activations)))

@@ -6,9 +6,9 @@ import math
 import torch
 
 import softmpm
-from softmpm_learn.distributed import OtherProcessError
 from softmpm_learn.episode import run_episode
 from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -20,18 +20,24 @@ def due(run: Run) -> bool:
 
 
 @torch.no_grad()
-def evaluate(run: Run) -> float:
-    """Mean loss of policy and design as they are over the evaluation goals; nan if one of these simulations failed."""
-    params, inputs = run.design()
-    losses = []
-    try:
-        for goal in run.evaluation_goals():
-            with run.failing_together():
-                episode = run_episode(
-                    run.task, run.model, run.observer, run.policy, params, inputs=inputs, goal=goal
-                )
-            losses += run.group.average([episode.loss.mean()])
-    except (softmpm.UnstableError, OtherProcessError) as error:
-        logger.warning("Iteration %d: the evaluation failed: %s", run.iteration, error)
-        return math.nan
-    return torch.stack(losses).mean().item()
+def evaluate(runs: Runs) -> list[float]:
+    """Mean loss of policy and design of each run as they are over the evaluation goals; nan if one of its simulations failed."""
+    params, inputs = runs.design()
+    losses, failures = [], softmpm.Failures("freeze")
+    for goal in runs.evaluation_goals():
+        episode = run_episode(
+            runs.task,
+            runs.model,
+            runs.observer,
+            runs.policy,
+            params,
+            inputs=inputs,
+            goal=goal,
+            failures=failures,
+        )
+        losses.append(episode.loss.unflatten(0, (len(runs.all), -1)).mean(dim=1))
+    for k, error in runs.failed(failures).items():
+        logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
+        losses[0][k] = math.nan
+    means = runs.group.average(losses)  # nan in every process if it is in one
+    return torch.stack(means).mean(dim=0).tolist()

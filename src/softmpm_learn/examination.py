@@ -14,18 +14,18 @@ A simulation that fails has no answer, and the log says why.
 import dataclasses
 import logging
 import math
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 import softmpm
-from softmpm import Model
+from softmpm import Failures, Model, State
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.episode import Frame, run_episode
 from softmpm_learn.objective import Tilt
 from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.term import Path, Term
 
@@ -41,77 +41,101 @@ logger = logging.getLogger("softmpm_learn")
 
 
 @torch.no_grad()
-def examine(run: Run, finer: Task | None = None) -> dict[str, float]:
-    """The answers by their names; nan where there is none.
+def examine(runs: Runs, finer: Task | None = None) -> list[dict[str, float]]:
+    """The answers of each run by their names; nan where there is none.
 
     Args:
-        run: With the policy and the design that are examined.
+        runs: With the policies and the designs that are examined.
         finer: The same task on a finer grid, None to leave that out.
     """
-    term, task = run.task.objective.terms[0], run.task
-    T = task.seconds
-    own = _asked(lambda: motion(run, task), "the episode itself")
+    task = runs.task
+    longer = dataclasses.replace(task, control_steps=LONGER * task.control_steps)
+    own = motion(runs, task, "the episode itself")
+    motions = {
+        "long": [motion(runs, longer, "later")],
+        "kicked": [motion(runs, task, "kicked", kick=v) for v in (KICK, -KICK)],
+        "friction": [motion(runs, rubbed(task, f), "friction") for f in FRICTION],
+        "finer": [replayed(runs, finer, own)] if finer is not None else [],
+    }
+    return [
+        _answers(
+            runs.task, finer, own[k], {name: [paths[k] for paths in found] for name, found in motions.items()}
+        )
+        for k in range(len(runs.all))
+    ]
+
+
+def _answers(
+    task: Task, finer: Task | None, own: Path | None, motions: dict[str, list[Path | None]]
+) -> dict[str, float]:
+    """Answers of one run, from its motion in the episode and from the others by their names."""
     if own is None:
         return dict.fromkeys(NAMES, math.nan)
-    found = {}
+    term, T, (long,) = task.objective.terms[0], task.seconds, motions["long"]
 
     def against(path: Path | None, like: Term = term) -> float:
         return math.nan if path is None else term.verdict(term.rate(own), like.rate(path))
 
-    long = _asked(
-        lambda: motion(run, dataclasses.replace(task, control_steps=LONGER * task.control_steps)), "later"
-    )
-    late, then = (dataclasses.replace(term, begin=a, end=b) for a, b in ((T / 2, T), (T, LONGER * T)))
-    found["later"] = math.nan if long is None else term.verdict(late.rate(own), then.rate(long))
-    kicks = [_asked(lambda v=v: motion(run, task, kick=v), "kicked") for v in (KICK, -KICK)]
-    found["kicked"] = term.worst([against(path) for path in kicks])
-    rough = [_asked(lambda f=f: motion(run, rubbed(task, f)), "friction") for f in FRICTION]
-    found["friction"] = term.worst([against(path) for path in rough])
-    found["finer"] = math.nan
+    found = dict.fromkeys(NAMES, math.nan)
+    if long is not None:
+        late, then = (dataclasses.replace(term, begin=a, end=b) for a, b in ((T / 2, T), (T, LONGER * T)))
+        found["later"] = term.verdict(late.rate(own), then.rate(long))
+    for name in ("kicked", "friction"):
+        found[name] = term.worst([against(path) for path in motions[name]])
     if finer is not None:
-        path = _asked(lambda: replayed(run, finer, own.activation), "finer")
-        found["finer"] = against(path, finer.objective.terms[0])
+        found["finer"] = against(motions["finer"][0], finer.objective.terms[0])
     tilts = [one for one in task.objective.terms if isinstance(one, Tilt)]
     found["tilt"] = tilts[0].degrees(long) if tilts and long is not None else math.nan
     return found
 
 
-def _asked(question: Callable[[], Path], name: str) -> Path | None:
-    """The motion, or None if its simulation failed."""
-    try:
-        return question()
-    except softmpm.UnstableError as error:
-        logger.warning("Examination, %s: %s", name, error)
-        return None
-
-
-def motion(run: Run, task: Task, kick: float = 0.0) -> Path:
-    """Motion under the policy of a run in a task with the same robot.
+def motion(runs: Runs, task: Task, name: str, kick: float = 0.0) -> list[Path | None]:
+    """Motion of each run under its policy in a task with the same robot; None where its simulation failed.
 
     Args:
+        name: Of the question, for the log.
         kick: Speed of the start along the first axis [m/s].
     """
-    model, (params, inputs) = built(task, run, run.model.worlds), run.design()
+    model, (params, inputs) = built(task, runs.all[0], runs.model.worlds), runs.design()
     start = model.rest()
     start = start._replace(v=start.v + kick * torch.eye(model.dim, dtype=model.dtype, device=model.device)[0])
-    frames: list[Frame] = []
-    policy, goal = run.policy, run.middle_goals()
-    settings = dict(inputs=inputs, goal=goal, start=start, on_frame=frames.append)
-    run_episode(task, model, run.observer, policy, params, **settings)
+    frames, failures = list[Frame](), Failures("freeze")
+    settings: dict[str, Any] = dict(inputs=inputs, goal=runs.middle_goals(), start=start, failures=failures)
+    run_episode(task, model, runs.observer, runs.policy, params, **settings, on_frame=frames.append)
     activation = torch.stack([frame.activation for frame in frames if frame.activation is not None])
-    return Path([frame.time for frame in frames], [frame.state for frame in frames], activation, goal)
+    times, states = [frame.time for frame in frames], [frame.state for frame in frames]
+    return _each(runs, name, failures, Path(times, states, activation, runs.middle_goals()))
 
 
-def replayed(run: Run, task: Task, activation: Tensor) -> Path:
-    """Motion of the robot of another task, with the same muscles, under these activations and the design of the run."""
-    model, (params, inputs) = built(task, run, run.model.worlds), transferred(run, task)
-    states = [model.rest()]
-    for row in activation:
-        states.append(
-            softmpm.simulate(model, states[-1], row[None], params, substeps=task.substeps, inputs=inputs)
-        )
-    goal = run.middle_goals()
-    return Path([task.control_period * k for k in range(len(states))], states, activation, goal)
+def replayed(runs: Runs, task: Task, own: list[Path | None]) -> list[Path | None]:
+    """Motion of the robots of another task, with the same muscles, under the activations of these motions and the runs' designs."""
+    model, (params, inputs) = built(task, runs.all[0], runs.model.worlds), transferred(runs, task)
+    known = next((path.activation for path in own if path is not None), None)
+    if known is None:
+        return own
+    rows = torch.cat([torch.zeros_like(known) if path is None else path.activation for path in own], dim=1)
+    states, failures = [model.rest()], Failures("freeze")
+    settings: dict[str, Any] = dict(substeps=task.substeps, inputs=inputs, failures=failures)
+    for row in rows:
+        states.append(softmpm.simulate(model, states[-1], row[None], params, **settings))
+    times = [task.control_period * k for k in range(len(states))]
+    return _each(runs, "finer", failures, Path(times, states, rows, runs.middle_goals()))
+
+
+def _each(runs: Runs, name: str, failures: Failures, path: Path) -> list[Path | None]:
+    """The part of a motion that each run has, None where one of its worlds failed, which the log tells."""
+    failed = runs.failed(failures)
+    for error in failed.values():
+        logger.warning("Examination, %s: %s", name, error)
+    return [None if k in failed else _of(path, runs.worlds(k)) for k in range(len(runs.all))]
+
+
+def _of(path: Path, worlds: slice) -> Path:
+    """The motion in some of the worlds."""
+    states = [State.of([tensor[worlds] for tensor in state[:4]]) for state in path.states]
+    return Path(
+        path.times, states, path.activation[:, worlds], None if path.goal is None else path.goal[worlds]
+    )
 
 
 def rubbed(task: Task, factor: float) -> Task:
@@ -126,8 +150,8 @@ def built(task: Task, run: Run, worlds: int = 1) -> Model:
     return softmpm.build(task.scene, device=run.model.device, dtype=run.model.dtype, **settings)
 
 
-def transferred(run: Run, task: Task) -> tuple[softmpm.Params, softmpm.Inputs]:
-    """The design of a run on the particles of a task of the same robot: values of the particle at the nearest place in the robot."""
+def transferred(run: Run | Runs, task: Task) -> tuple[softmpm.Params, softmpm.Inputs]:
+    """The design of a run, or of several, on the particles of a task of the same robot: values of the particle at the nearest place."""
     from scipy.spatial import KDTree
 
     places = [

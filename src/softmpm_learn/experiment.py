@@ -1,55 +1,30 @@
 """One experiment, from its settings to everything that it leaves in its folder. Nothing here knows Hydra."""
 
 import contextlib
-import csv
 import logging
 import math
 import os
 import shutil
-import time
-from collections.abc import Callable
+import statistics
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 import warp as wp
 
 import softmpm
-from softmpm_learn import plugins
+from softmpm_learn import plugins, seeds, sweep
 from softmpm_learn.config import RunConf
-from softmpm_learn.design import DESIGNABLE, declared_inputs
+from softmpm_learn.design import declared_inputs
 from softmpm_learn.distributed import Group
-from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
 from softmpm_learn.loggers import Loggers
+from softmpm_learn.pictures import DRAWN, Sketches, draw, last_episode, no_sketch
 from softmpm_learn.progress import ProgressBar
-from softmpm_learn.run import Run
+from softmpm_learn.resuming import entered
 from softmpm_learn.saved import save
 from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import Task, TaskConf, make_task
-from softmpm_learn.train import Result, train
-
-PICTURES = 4
-"""Moments of the best episode in robot.png, the first and the last among them."""
-DRAWN = "loss", "robot", "latent"
-"""Pictures of a run at its end."""
-PAUSE = 60.0
-"""Least time between pictures while a run goes on [s]."""
-DESIGN = {
-    "young": ("Young's modulus", "Pa"),
-    "poisson": ("Poisson's ratio", ""),
-    "density": ("density", "kg/m³"),
-    "strength": ("strength of the muscles", "Pa"),
-    "viscosity": ("viscosity", "Pa s"),
-}
-"""Title and unit of each quantity in robot.png."""
-CURVES = {
-    "loss": "loss",
-    "evaluation": "loss at the evaluation goals",
-    "validation_loss": "validation loss of the autoencoder",
-    "activation": "activation, root mean square",
-    "young_change": "mean change of Young's modulus",
-}
-"""Columns of metrics.csv in loss.png; those without numbers are left out."""
+from softmpm_learn.train import Plan, Result, train_side_by_side
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -60,10 +35,11 @@ def run_experiment(
     group: Group | None = None,
     signals: Signals | None = None,
     begin: Callable[[], None] = lambda: None,
-) -> Result:
+) -> list[Result]:
     """Train, draw and convert; goes on where a checkpoint in ``out`` ends. The last line says what to do next.
 
-    Of several processes, the first draws, converts and speaks.
+    Of several processes, the first draws, converts and speaks. With several seeds each has a folder of its own in ``out``, and each
+    process its share of them, of which it draws the pictures.
 
     Args:
         signals: What asks the run to end, None for nothing.
@@ -74,39 +50,63 @@ def run_experiment(
     torch.set_num_threads(conf.device.threads)
     need_determinism(conf.device.deterministic)
     with group.fail_together():
-        task = make_task(conf.task)
-        model = make_model(task, conf, group)
+        members, task = seeds.share(conf, out, group), make_task(conf.task)
+        alone = conf.train.seeds == 1
+        model = make_model(task, conf, group, len(members))
     logger.info("%s", model.describe(task.substeps))
-    with Loggers(conf.train.log, out) as loggers, contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as open_loggers, contextlib.ExitStack() as held:
+        loggers = [open_loggers.enter_context(Loggers(one.train.log, place)) for one, place in members]
         progress = held.enter_context(ProgressBar(conf.train.iterations)) if group.first else None
         stop = held.enter_context(signals.awaited(insist=group.size == 1))
+        if not alone:
+            group.once(lambda: held.enter_context(entered(out)))
 
-        def begun() -> None:
-            begin()
-            save(conf, out)
-            signals.advice = f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}"
+        def begun(number: int) -> None:
+            if group.first and number == 0:
+                begin()
+                save(conf, out)
+                signals.advice = (
+                    f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}"
+                )
+            if not alone:
+                save(*members[number])
 
-        result = train(
-            task,
-            model,
-            conf.settings,
-            out,
-            progress=(lambda iteration, row: progress(iteration, row["loss"])) if progress else None,
-            stop=stop,
-            begin=begun,
-            group=group,
-            finer=finer(conf.task) if conf.train.examine else None,
-            sketch=Sketches(task, out, loggers),
-            loggers=loggers,
-        )
+        plans = [
+            Plan(
+                settings=one.settings,
+                out=place,
+                begin=lambda k=k: begun(k),
+                sketch=no_sketch if k else Sketches(task, place, loggers[k]),
+                loggers=loggers[k],
+            )
+            for k, (one, place) in enumerate(members)
+        ]
+        with contextlib.nullcontext() if alone else group.fail_together():
+            results = train_side_by_side(
+                task,
+                model,
+                plans,
+                progress=progress and (lambda rows: progress(shown(rows)[0], *shown(rows)[1])),
+                stop=stop,
+                group=group if alone else Group(),
+                finer=finer(conf.task) if conf.train.examine else None,
+            )
         held.close()  # a signal now ends the program
-        if group.first:
-            draw(result, task, out)
-            loggers.pictures(result.run.iteration, [out / f"{name}.png" for name in DRAWN])
+        if alone and results[0].error:
+            raise results[0].error
+        for result, own, (_, place) in zip(results, loggers, members, strict=True):
+            if not result.error and (group.first or not alone):
+                draw(result, task, place)
+                own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
     if group.first:
-        logger.info("%s", farewell(result, task, out))
+        logger.info("%s", farewell(results[0], task, out) if alone else farewell_of_seeds(results, out))
         signals.advice = f"The run had ended; everything is in {out}."
-    return result
+    return results
+
+
+def shown(rows: dict[int, tuple[int, dict[str, float]]]) -> tuple[int, list[float]]:
+    """Iteration and losses for the progress bar."""
+    return max(k for k, _ in rows.values()), [row["loss"] for _, row in rows.values()]
 
 
 def finer(conf: TaskConf) -> Task | None:
@@ -122,8 +122,8 @@ def need_determinism(needed: bool) -> None:
     torch.use_deterministic_algorithms(needed)
 
 
-def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
-    """The task's scene on the device of the settings, with this process's share of the worlds."""
+def make_model(task: Task, conf: RunConf, group: Group, seeds: int = 1) -> softmpm.Model:
+    """The task's scene on the device of the settings, with this process's share of the worlds, or all worlds of its seeds."""
     device, memory = group.device(conf.device.name), conf.device.memory
     if device and device.startswith("cuda:"):
         torch.cuda.set_device(device)  # else every process takes memory of the first GPU too
@@ -131,113 +131,13 @@ def make_model(task: Task, conf: RunConf, group: Group) -> softmpm.Model:
         task.scene,
         device=device,
         dtype=getattr(torch, conf.device.dtype),
-        worlds=len(group.split(conf.train.worlds)),
+        worlds=len(group.split(conf.train.worlds)) if conf.train.seeds == 1 else seeds * conf.train.worlds,
         memory_budget=None if memory is None else round(1e6 * memory),
         inputs=declared_inputs(conf.design),
         calls=task.control_steps,
         deterministic=conf.device.deterministic,
         **task.build,
     )
-
-
-def draw(result: Result, task: Task, out: Path) -> None:
-    """Leave loss.png, latent.png where a latent was learned, and robot.png where something was recorded."""
-    loss_figure(out / "loss.png", curves(out / "metrics.csv"))
-    if result.run.learner is not None:
-        latent_figure(out / "latent.png", decoded(result.run))
-    episode = last_episode(out / "run.h5")
-    if episode is not None:
-        draw_robot(result.run, task, out, *episode)
-
-
-def draw_robot(run: Run, task: Task, out: Path, iteration: int, frames: dict[str, np.ndarray]) -> None:
-    """Leave robot.png: some moments of an episode, and the materials."""
-    moments = np.linspace(0, len(frames["time"]) - 1, PICTURES).round().astype(int)
-    active = frames["activation"][:-1]  # the last frame has none
-    pictures = [
-        (f"iteration {iteration}, {frames['time'][k]:.2f} s", frames["x"][k], active[min(k, len(active) - 1)])
-        for k in moments
-    ]
-    goal = None if any(run.settings.train.goal_spread) else task.goal
-    robot_figure(out / "robot.png", task.scene, pictures, design(run), goal=goal)
-
-
-class Sketches:
-    """Pictures while a run goes on: of the first recorded episode, and then of such as come a while after the last picture."""
-
-    def __init__(self, task: Task, out: Path, loggers: Loggers):
-        self.task, self.out, self.loggers, self._drawn = task, out, loggers, -math.inf
-
-    def __call__(self, run: Run, iteration: int, frames: dict[str, np.ndarray]) -> None:
-        """Draw, if it is time; arguments as of :func:`draw_robot`."""
-        if time.monotonic() - self._drawn > PAUSE:
-            loss_figure(self.out / "loss.png", curves(self.out / "metrics.csv"))
-            draw_robot(run, self.task, self.out, iteration, frames)
-            self.loggers.pictures(iteration, [self.out / "loss.png", self.out / "robot.png"])
-            self._drawn = time.monotonic()
-
-
-def curves(path: Path) -> dict[str, tuple[list[float], list[float]]]:
-    """Curves of loss.png from metrics.csv: iterations and values of each."""
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    found = {}
-    for column, title in CURVES.items():
-        points = [(int(row["iteration"]), float(row[column])) for row in rows if row.get(column)]
-        found[title] = ([k for k, _ in points], [value for _, value in points])
-    return found
-
-
-@torch.no_grad()
-def decoded(run: Run) -> np.ndarray:
-    """Velocity [m/s] that each latent feature stands for at ``VALUES``, shape (feature, value, *nodes, dim)."""
-    assert run.learner is not None
-    size = run.observer.size
-    features = torch.zeros(size, len(VALUES), size, dtype=run.model.dtype, device=run.model.device)
-    for k in range(size):
-        features[k, :, k] = torch.tensor(VALUES)
-    fields = run.learner.autoencoder.decode(features.flatten(end_dim=1))
-    return fields.unflatten(0, (size, len(VALUES))).movedim(2, -1).cpu().numpy()
-
-
-@torch.no_grad()
-def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
-    """Material of the best robot and the inputs that were designed: value on each particle and unit."""
-    now = run.policy_snapshot()
-    if run.best["iteration"] >= 0:
-        run.load_policy(run.best)
-    params, inputs = run.design()
-    run.load_policy(now)
-    found = params._asdict() | {name: value for name, value in inputs._asdict().items() if value is not None}
-    shown = {}
-    for name, value in found.items():
-        title, unit = DESIGN.get(name, (name, ""))
-        shown[title] = (_on_particles(run.model, name, value.cpu().numpy()), unit)
-    return shown
-
-
-def _on_particles(model: softmpm.Model, name: str, value: np.ndarray) -> np.ndarray:
-    """Value on each particle: of a quantity of the muscles the sum over those of the particle, NaN where there is none."""
-    if DESIGNABLE[name] == "particle":
-        return value
-    total, muscular = np.zeros(model.particle_count), np.zeros(model.particle_count, dtype=bool)
-    for muscle, one in zip(model.scene.muscles, value, strict=True):
-        total[muscle.particles] += one
-        muscular[muscle.particles] = True
-    return np.where(muscular, total, np.nan)
-
-
-def last_episode(path: Path) -> tuple[int, dict[str, np.ndarray]] | None:
-    """Iteration shown and frames of the last recorded simulation: the best, once a run is finished."""
-    if not path.exists():
-        return None
-    with softmpm.Recording(path) as recording:
-        if not recording.episodes:
-            return None
-        row = recording.episodes[-1]
-        frames = recording.frames(row)
-        shown = int(recording.attributes(row).get("of", row))
-    return (shown, frames) if len(frames["time"]) > 1 else None
 
 
 def farewell(result: Result, task: Task, out: Path) -> str:
@@ -262,6 +162,22 @@ def farewell(result: Result, task: Task, out: Path) -> str:
         lines.append(f"Everything is in {shown}; train.record_every=0, so nothing was recorded.")
     if not result.finished:
         lines.append(f"To go on: {plugins.command()} resume={shown}")
+    return "\n".join(lines)
+
+
+def farewell_of_seeds(results: Sequence[Result], out: Path) -> str:
+    """Summary of several seeds; its last line is what to do next."""
+    losses = [result.best_loss for result in results if math.isfinite(result.best_loss) and not result.error]
+    lines, place = [], _relative(out)
+    if losses:
+        middle, ends = statistics.median(losses), f"{min(losses):.5g} to {max(losses):.5g}"
+        lines.append(f"Best losses of {len(losses)} seeds: median {middle:.5g}, from {ends}.")
+    failed = [str(result.run.settings.train.seed) for result in results if result.error]
+    if failed:
+        lines.append(f"Failed: seed {', '.join(failed)}.")
+    lines.append(f"Each seed has a folder in {place}, and a row in {place}/{sweep.TABLE}.")
+    if failed or not all(result.finished for result in results):
+        lines.append(f"To go on: {plugins.command()} resume={place}")
     return "\n".join(lines)
 
 

@@ -6,7 +6,7 @@ Where contact changes, a step of the usual length may lead to a gait that is muc
 import math
 from dataclasses import dataclass
 
-from softmpm_learn.settings import OptimizerConf
+from softmpm_learn.optimizer_settings import OptimizerConf
 
 
 @dataclass

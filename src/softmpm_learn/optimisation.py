@@ -14,7 +14,8 @@ from softmpm_learn.distributed import OtherProcessError, in_full
 from softmpm_learn.episode import Episode
 from softmpm_learn.evaluation import due, evaluate
 from softmpm_learn.run import Run
-from softmpm_learn.run_logger import RunLogger
+from softmpm_learn.run_logger import RunLogger, recorded
+from softmpm_learn.runs import Runs
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -35,39 +36,84 @@ class NotFiniteError(RuntimeError):
 
 
 def optimise(
-    run: Run, run_logger: RunLogger | None, seconds: dict[str, float]
-) -> tuple[dict[str, float], Tensor | None]:
-    """One optimisation step: simulate, differentiate, update policy and design. Returns a row of metrics.csv and the observations.
+    runs: Runs, loggers: Sequence[RunLogger], seconds: dict[str, float]
+) -> tuple[dict[int, dict[str, float]], Tensor | None]:
+    """One optimisation step of every run that goes on: simulate, differentiate, update policy and design.
 
-    After a failure policy and design go halfway back to the last simulation that succeeded, and try again.
+    After a failure policy and design of the run in which it was go halfway back to the last simulation that succeeded, and all try
+    again. A run that has no retry left goes back to its best; if that fails too, it has failed and rests.
+
+    Args:
+        loggers: One for each run, or none.
+
+    Returns:
+        A row of metrics.csv for each run that goes on, by its number, and the observations of all worlds.
+
+    Raises:
+        TrainingError: The robot of a run failed that was at rest.
     """
-    goal, retries = run.draw_goals(), 0
-    while True:
+    goals, retries = runs.goals(runs.active), dict.fromkeys(runs.active, 0)
+    while runs.active:
+        runs.move(runs.active)
         try:
-            episode, row = attempt(run, goal, run_logger, seconds)
-            break
-        except (softmpm.UnstableError, OtherProcessError, NotFiniteError) as error:
-            if not run.safe or retries == run.settings.optimizer.retries:
-                raise TrainingError(run.iteration, in_full(error)) from error
+            episode, rows = attempt(runs, goals, loggers, seconds)
+            failed = {k: error for k, error in rows.items() if isinstance(error, NotFiniteError)}
+        except (softmpm.UnstableError, OtherProcessError) as error:
+            failed = {runs.owner(error) if isinstance(error, softmpm.UnstableError) else 0: error}
+        if not failed:
+            found = {k: row | {"retries": retries[k]} for k, row in rows.items() if isinstance(row, dict)}
+            update(runs, found)
+            return found, episode.observations
+        for k, error in failed.items():
+            go_back(runs, k, error, retries.get(k, 0))
+            retries[k] += 1
+    return {}, None
+
+
+def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
+    """Halve the last step of a run whose simulation or gradient failed; after the last retry go back to its best. A run without a way
+    back, or whose best fails too, has failed.
+
+    Raises:
+        TrainingError: It was at rest.
+    """
+    run, most = runs.all[k], runs.all[k].settings.optimizer.retries
+    if run.safe and most and retries <= most and k in runs.active and run.best["iteration"] >= 0:
+        if retries < most:
             logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
             run.backtrack()
-            retries += 1
-    row |= {f"{name}_change": change for name, change in run.design.change().items()}
-    value = row["loss"]
-    if run.random_goals:  # the loss is that of the goals drawn
-        value = row["evaluation"] = evaluate(run) if due(run) else math.nan
-    if value < run.best["loss"]:
-        run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
-    row |= {"retries": retries, "best": run.best["loss"], "fallbacks": int(step_or_fall_back(run, value))}
-    return row, episode.observations
+        else:
+            best = run.best["iteration"]
+            logger.warning("Iteration %d: %s Going back to iteration %d.", run.iteration, error, best)
+            run.fall_back()
+        return
+    ended = TrainingError(run.iteration, in_full(error))
+    ended.__cause__ = error
+    if k not in runs.active:
+        raise ended
+    runs.errors[k] = ended
+    if len(runs.all) > 1:
+        logger.warning("Seed %d has failed in %s", run.settings.train.seed, ended)
+
+
+def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
+    """Take the step of each run along its gradient, or go back to its best; keeps the best, and completes the rows."""
+    asked = [k for k in rows if due(runs.all[k])]
+    evaluations = evaluate(runs) if asked else []
+    for k, row in rows.items():
+        run, value = runs.all[k], row["loss"]
+        if run.random_goals:  # the loss is that of the goals drawn
+            value = row["evaluation"] = evaluations[k] if k in asked else math.nan
+        if value < run.best["loss"]:
+            run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
+        row |= {"best": run.best["loss"], "fallbacks": int(step_or_fall_back(run, value))}
 
 
 def step_or_fall_back(run: Run, loss: float) -> bool:
     """Take the step along the gradient, or go back to the best; True for the latter."""
     conf = run.settings.optimizer
     if not run.fallback.is_due(loss, run.best["loss"], conf):
-        run.snapshot()
-        run.optimizer.step()
+        run.step()
         return False
     run.fall_back()
     logger.warning(
@@ -77,57 +123,70 @@ def step_or_fall_back(run: Run, loss: float) -> bool:
     return True
 
 
-def attempt(run: Run, goal, run_logger: RunLogger | None, seconds) -> tuple[Episode, dict[str, float]]:
-    """Simulate and differentiate policy and design as they are, in every process, or fail in every one."""
-    recorded = (
-        run_logger.record(run.iteration)
-        if run_logger and run_logger.due(run.iteration)
-        else contextlib.nullcontext()
-    )
-    with clock(seconds, "episode"):
-        with run.failing_together(), recorded as on_frame:
-            episode, gradients = run.loop(goal, on_frame)
-        return episode, take_gradient(run, episode, gradients)
+def attempt(
+    runs: Runs, goals: Tensor | None, loggers: Sequence[RunLogger], seconds: dict[str, float]
+) -> tuple[Episode, dict[int, dict[str, float] | NotFiniteError]]:
+    """Simulate and differentiate policies and designs as they are, in every process, or fail in every one.
 
-
-def take_gradient(run: Run, episode: Episode, gradients: Sequence[Tensor]) -> dict[str, float]:
-    """Put the mean gradient of all worlds into ``.grad`` of policy and design; gives its length and the losses.
-
-    The encoder is left out: it learns from pictures, not from the loss.
-
-    Raises:
-        NotFiniteError: In every process, because the means are the same everywhere.
+    Gives the figures of each run that goes on, or an error in their place.
     """
-    policy, design = list(run.policy.parameters()), list(run.design.parameters())
-    gradients = run.group.average(gradients)
-    for parameter, gradient in zip(policy + design, gradients, strict=True):
-        parameter.grad = gradient
+    due = [loggers[k] for k in runs.active if loggers and loggers[k].due(runs.all[k].iteration)]
+    with clock(seconds, "episode"):
+        with runs.failing_together(), recorded(runs, due) as on_frame:
+            episode, gradients = runs.loop(goals, on_frame)
+        return episode, take_gradients(runs, episode, gradients)
+
+
+def take_gradients(
+    runs: Runs, episode: Episode, gradients: Sequence[Tensor]
+) -> dict[int, dict[str, float] | NotFiniteError]:
+    """Put the mean gradient of the worlds of each run into ``.grad`` of its policy and design; gives its length and the losses.
+
+    The encoder is left out: it learns from pictures, not from the loss. All processes find the same, because the means are the same
+    everywhere. The numbers of all runs are read from the device at once.
+    """
+    parts, measured = runs.split(runs.group.average(gradients)), {}
+    for k in runs.active:
+        run = runs.all[k]
+        for parameter, gradient in zip(run.parameters, parts[k], strict=True):
+            parameter.grad = gradient
+        measured[k] = _losses(runs, episode, k) | {
+            f"{name}_change": change for name, change in run.design.change().items()
+        }
+        measured[k] |= {
+            f"square_{n}": gradient.double().square().sum() for n, gradient in enumerate(parts[k])
+        }
+    numbers = iter(
+        torch.stack([t.double() for figures in measured.values() for t in figures.values()]).tolist()
+    )
+    read = {k: {name: next(numbers) for name in figures} for k, figures in measured.items()}
+    return {k: _judged(runs.all[k], figures) for k, figures in read.items()}
+
+
+def _judged(run: Run, figures: dict[str, float]) -> dict[str, float] | NotFiniteError:
+    """Row of a run; shortens a gradient that is longer than ``max_norm``."""
+    squares = [figures.pop(f"square_{n}") for n in range(len(run.parameters))]
+    count = len(list(run.policy.parameters()))
     lengths = {
-        "gradient_policy": _length(gradients[: len(policy)]),
-        "gradient_design": _length(gradients[len(policy) :]),
+        "gradient_policy": math.sqrt(sum(squares[:count])),
+        "gradient_design": math.sqrt(sum(squares[count:])),
     }
-    losses = _losses(run, episode)
-    if not all(math.isfinite(value) for value in (losses["loss"], *lengths.values())):
-        both = f"{losses['loss']:g} and {math.hypot(*lengths.values()):g}"
-        raise NotFiniteError(f"the loss or the norm of its gradient is not finite: {both}.")
+    if not all(math.isfinite(value) for value in (figures["loss"], *lengths.values())):
+        both = f"{figures['loss']:g} and {math.hypot(*lengths.values()):g}"
+        return NotFiniteError(f"the loss or the norm of its gradient is not finite: {both}.")
     limit, clipped = run.settings.optimizer.max_norm, 0
     if limit is not None and math.hypot(*lengths.values()) > limit:
-        torch.nn.utils.clip_grad_norm_(policy + design, limit)
+        torch.nn.utils.clip_grad_norm_(run.parameters, limit)
         clipped = 1
-    return losses | lengths | {"clipped": clipped}
+    return figures | lengths | {"clipped": clipped}
 
 
-def _losses(run: Run, episode: Episode) -> dict[str, float]:
-    """Means over all worlds; the activation is a root mean square."""
-    means = {name: term.mean() for name, term in ({"loss": episode.loss} | episode.terms).items()}
-    *losses, square = run.group.average([*means.values(), episode.effort])
-    return {name: loss.item() for name, loss in zip(means, losses, strict=True)} | {
-        "activation": square.sqrt().item()
-    }
-
-
-def _length(gradients: Sequence[Tensor]) -> float:
-    return math.sqrt(sum(g.double().square().sum().item() for g in gradients))
+def _losses(runs: Runs, episode: Episode, k: int) -> dict[str, Tensor]:
+    """Means over all worlds of a run; the activation is a root mean square."""
+    own = {name: term[runs.worlds(k)] for name, term in ({"loss": episode.loss} | episode.terms).items()}
+    means = [term.mean() for term in own.values()]
+    *losses, square = runs.group.average([*means, episode.activation[:, runs.worlds(k)].square().mean()])
+    return dict(zip(own, losses, strict=True)) | {"activation": square.sqrt()}
 
 
 @contextlib.contextmanager

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 
 from softmpm_learn import register
+from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.register import OPTIMIZERS
-from softmpm_learn.settings import OptimizerConf
 
 
 @register.optimizer("adam")

@@ -151,18 +151,23 @@ def mlp(conf: PolicyConf, space: Space) -> nn.Module:
 @register.policy("sinusoids")
 def sinusoids(conf: PolicyConf, space: Space) -> nn.Module:
     """Open loop: sinusoids."""
-    return Sinusoids(space.muscles, conf.gain, clock(conf))
+    return Sinusoids(space.muscles, _gain(conf), clock(conf))
 
 
 @register.policy("knots")
 def knots(conf: PolicyConf, space: Space) -> nn.Module:
     """Open loop: straight lines between knots."""
-    return Knots(space.muscles, conf.gain, conf.knots, space.seconds)
+    return Knots(space.muscles, _gain(conf), conf.knots, space.seconds)
 
 
 def _feedback(conf: PolicyConf, space: Space, hidden: list[int]) -> nn.Module:
     seen = clock(conf) if conf.clock else None
-    return Feedback(space.features, space.muscles, hidden, conf.gain, seen, space.goal)
+    return Feedback(space.features, space.muscles, hidden, _gain(conf), seen, space.goal)
+
+
+def _gain(conf: PolicyConf) -> float:
+    """That of the settings; 1 for a policy without a task (:meth:`softmpm_learn.settings.Settings.suited`)."""
+    return 1.0 if conf.gain is None else conf.gain
 
 
 def make_policy(

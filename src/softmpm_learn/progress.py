@@ -1,6 +1,7 @@
 """Progress report of a run: a bar with loss and remaining time on a terminal, a few log lines elsewhere."""
 
 import logging
+import statistics
 import sys
 import time
 from types import TracebackType
@@ -21,15 +22,16 @@ class ProgressBar:
         self._began = time.monotonic()
         self._bar = tqdm(total=total, dynamic_ncols=True, smoothing=0.1) if sys.stderr.isatty() else None
 
-    def __call__(self, iteration: int, loss: float) -> None:
-        """Iteration number ``iteration``, counted from 0, has ended with this loss."""
+    def __call__(self, iteration: int, *losses: float) -> None:
+        """Iteration number ``iteration``, counted from 0, has ended with these losses, one for each run side by side."""
         if self._first is None:
             self._first = iteration
             if self._bar is not None:
                 self._bar.initial = self._bar.n = self._bar.last_print_n = iteration
-        self.best = min(self.best, loss)
-        done = iteration + 1
-        text = f"loss {loss:.5g}, best {self.best:.5g}"
+        self.best = min(self.best, *losses)
+        done, loss = iteration + 1, statistics.median(losses)
+        all_of = f" ({min(losses):.5g} to {max(losses):.5g})" if len(losses) > 1 else ""
+        text = f"loss {loss:.5g}{all_of}, best {self.best:.5g}"
         if self._bar is not None:
             self._bar.set_postfix_str(text, refresh=False)
             self._bar.update(1)

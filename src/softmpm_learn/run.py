@@ -1,10 +1,8 @@
 """Components of a run: observer, policy, design, optimiser and learner, built from settings, saved and restored together."""
 
-import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,11 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from softmpm import Model, UnstableError
+from softmpm import Model
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
-from softmpm_learn.episode import ClosedLoop
 from softmpm_learn.fallback import Fallback
 from softmpm_learn.identity import identity, identity_of_settings
 from softmpm_learn.learner import Learner
@@ -48,17 +45,27 @@ class Run:
         safe: Values of policy and design in the last simulation that did not fail.
         best: The lowest loss so far, at the evaluation goals if goals are drawn at random, and what gave it.
         fallback: Decides when the run goes back to its best.
-        loop: Simulates and differentiates what is above as it is.
     """
 
-    def __init__(self, task: "Task", model: Model, settings: Settings, out: Path, group: Group | None = None):
+    def __init__(
+        self,
+        task: "Task",
+        model: Model,
+        settings: Settings,
+        out: Path,
+        group: Group | None = None,
+        runs: int = 1,
+    ):
+        """``runs`` is the number of runs that share the worlds of the model, see :class:`softmpm_learn.runs.Runs`."""
         self.group = group or Group()
         self.worlds = self.group.split(settings.train.worlds)
-        if len(self.worlds) != model.worlds:
+        if runs * len(self.worlds) != model.worlds:
             share = f", {len(self.worlds)} for each process" if self.group.size > 1 else ""
+            share += f", for each of {runs} runs" if runs > 1 else ""
             raise ValueError(
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
+        settings = settings.suited(task.fade, task.gain)
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
         self.fallback = Fallback()
@@ -76,10 +83,6 @@ class Run:
         rates = list(self.policy.parameters()), list(self.design.parameters())
         self.optimizer = make_optimizer(settings.optimizer, *rates)
         self.safe: list[Tensor] = []
-        every = settings.learning.frame_every if self.learner else 0
-        parts = (task, model, self.observer, self.policy, self.design, list(self.design.parameters()))
-        fade = settings.optimizer.fade
-        self.loop = ClosedLoop(*parts, keep_every=every, fade=math.inf if fade is None else fade)
 
     def _make_observer(self, out: Path) -> Observer:
         seed, task = self.settings.train.seed, self.task
@@ -132,12 +135,23 @@ class Run:
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
 
+    def step(self) -> None:
+        """Take a step along the gradient, the next one with lower rates."""
+        self.snapshot()
+        self.optimizer.step()
+        halving = self.settings.optimizer.halving
+        if halving is not None:
+            self._scale_rates(0.5 ** (1 / halving))
+
+    def _scale_rates(self, factor: float) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] *= factor
+
     def fall_back(self) -> None:
         """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments."""
         self.load_policy(self.best)
         self.optimizer.state.clear()
-        for group in self.optimizer.param_groups:
-            group["lr"] *= self.settings.optimizer.fallback_rate
+        self._scale_rates(self.settings.optimizer.fallback_rate)
         self.snapshot()
 
     def draw_goals(self) -> Tensor | None:
@@ -175,23 +189,9 @@ class Run:
         """True if every simulation draws its own goal."""
         return self._goal is not None
 
-    @contextlib.contextmanager
-    def failing_together(self) -> Iterator[None]:
-        """A simulation that fails in one process fails in every one; the message has the world's number among all worlds."""
-        with self.group.fail_together(UnstableError):
-            try:
-                yield
-            except UnstableError as error:
-                if self.group.size > 1:
-                    world = self.worlds[error.world]
-                    error.add_note(
-                        f"This was in process {self.group.rank}, whose world {error.world} is world {world} of the run."
-                    )
-                raise
-
     def middle_goals(self) -> Tensor | None:
         """As :meth:`draw_goals`, without chance: the middle of the box."""
-        return None if self._goal is None else self._goal.centre.expand(self.model.worlds, -1)
+        return None if self._goal is None else self._goal.centre.expand(len(self.worlds), -1)
 
     def policy_snapshot(self) -> dict:
         """Copies of what decides how the robot moves, policy, design and what the policy sees through, and of the autoencoder."""

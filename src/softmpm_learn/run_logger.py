@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -19,6 +19,7 @@ from softmpm_learn.episode import Frame
 from softmpm_learn.examination import NAMES
 from softmpm_learn.loggers import Loggers
 from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -140,6 +141,11 @@ class RunLogger:
             self.run.learner.replay.prune(self._named + ids)
             self._named = ids
 
+    @property
+    def records(self) -> bool:
+        """True if there is a recording."""
+        return self._recorder is not None
+
     def due(self, iteration: int) -> bool:
         """True if the episode of this iteration is recorded."""
         conf = self.run.settings.train
@@ -148,25 +154,19 @@ class RunLogger:
         )
 
     @contextlib.contextmanager
-    def record(self, iteration: int, **about) -> Iterator[Callable[[Frame], None] | None]:
-        """Record an episode: gives what to call at each frame, or None if nothing is recorded."""
-        if self._recorder is None:
-            yield None
-            return
-        with self._recorder.episode(iteration, task=self.run.task.name, **about) as episode:
+    def episode(self, world: int, **about) -> Iterator[Callable[..., None]]:
+        """Record an episode of this world: gives what to call at each frame, with grid velocity and contact forces."""
+        assert self._recorder is not None
+        self.frames.clear()
+        with self._recorder.episode(self.run.iteration, task=self.run.task.name, **about) as episode:
 
-            def on_frame(frame: Frame) -> None:
-                model, state = self.run.model, frame.state
-                with torch.no_grad():
-                    velocity, forces = softmpm.rasterize(model, state).velocity, None
-                    if state.surface is not None or (model.surface is not None and state.nodes is not None):
-                        forces = softmpm.contact_forces(model, state)
-                    episode.frame(frame.time, state, frame.activation, velocity, frame.features, forces)
-                activation = None if frame.activation is None else frame.activation[0].detach()
-                self.frames.append((frame.time, state.x[0].detach(), activation))
+            def keep(frame: Frame, velocity: Tensor, forces: softmpm.ContactForces | None) -> None:
+                seen = frame.state, frame.activation, velocity, frame.features, forces
+                episode.frame(frame.time, *seen, world=world)
+                activation = None if frame.activation is None else frame.activation[world].detach()
+                self.frames.append((frame.time, frame.state.x[world].detach(), activation))
 
-            self.frames.clear()
-            yield on_frame
+            yield keep
 
     def take_frames(self) -> dict[str, np.ndarray]:
         """Time [s], positions [m] and activation [-] of each of these frames, by the names of a recording."""
@@ -185,3 +185,31 @@ class RunLogger:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._recorder:
             self._recorder.close()
+
+
+@contextlib.contextmanager
+def recorded(
+    runs: Runs, loggers: Sequence[RunLogger], about: Sequence[dict] = ()
+) -> Iterator[Callable[[Frame], None] | None]:
+    """Record an episode of some runs: gives what to call at each frame, or None if nothing is recorded.
+
+    Args:
+        about: What to keep with the episode of each.
+    """
+    with contextlib.ExitStack() as open_episodes:
+        keep = [
+            open_episodes.enter_context(one.episode(runs.worlds(runs.all.index(one.run)).start, **note))
+            for one, note in zip(loggers, about or [{}] * len(loggers), strict=True)
+            if one.records
+        ]
+
+        @torch.no_grad()
+        def on_frame(frame: Frame) -> None:
+            model, state = runs.model, frame.state
+            velocity, forces = softmpm.rasterize(model, state).velocity, None
+            if state.surface is not None or (model.surface is not None and state.nodes is not None):
+                forces = softmpm.contact_forces(model, state)
+            for one in keep:
+                one(frame, velocity, forces)
+
+        yield on_frame if keep else None

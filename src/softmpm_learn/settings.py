@@ -4,33 +4,17 @@ Numbers that the 2019 paper "Learning-in-the-loop optimization" does not state a
 elsewhere name their source. A wrong value fails where the settings are made, in a sentence.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from softmpm import QUANTITIES
-from softmpm_learn.register import LOGGERS, OBSERVERS, OPTIMIZERS, POLICIES
+from softmpm_learn.optimizer_settings import OptimizerConf
+from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
+from softmpm_learn.setting_checks import one_of, positive, share
 
 DESIGNS = ("particle", "region", "uniform")
-
-
-def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ValueError(f"{name} must be one of {', '.join(known)}; got {value!r}.")
-
-
-def _positive(group: str, settings, *names: str) -> None:
-    for name in names:
-        value = getattr(settings, name)
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{group}.{name} must be > 0, got {value}.")
-
-
-def _share(group: str, settings, *names: str) -> None:
-    for name in names:
-        value = getattr(settings, name)
-        if not 0.0 < value <= 1.0:
-            raise ValueError(f"{group}.{name} must lie in (0, 1], got {value}.")
 
 
 @dataclass(kw_only=True)
@@ -55,7 +39,7 @@ class ObserverConf:
 
     def __post_init__(self):
         OBSERVERS.need(self.name, self.options)
-        _positive("observer", self, "clusters", "latent_size")
+        positive("observer", self, "clusters", "latent_size")
         if not self.channels or min(self.channels) < 1:
             raise ValueError(
                 f"observer.channels needs at least one positive number, got {list(self.channels)}."
@@ -80,19 +64,19 @@ class PolicyConf:
     """Number of periods: period, period/2, period/3, …"""
     knots: int = 16
     """knots: values of each muscle along the episode, joined by straight lines."""
-    gain: float = 3.0
-    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest, 3 moves vigorously at random."""
+    gain: float | None = None
+    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest. null is the task's: walkers 3, the arm 0.3."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of a policy of one's own."""
 
     def __post_init__(self):
         POLICIES.need(self.name, self.options)
-        _positive("policy", self, "period", "harmonics")
+        positive("policy", self, "period", "harmonics")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
         if self.knots < 2:
             raise ValueError(f"policy.knots must be at least 2, got {self.knots}.")
-        if not (math.isfinite(self.gain) and self.gain >= 0):
+        if self.gain is not None and not (math.isfinite(self.gain) and self.gain >= 0):
             raise ValueError(f"policy.gain must be ≥ 0, got {self.gain}.")
 
 
@@ -129,7 +113,7 @@ class DesignConf:
     """Lowest and highest viscosity, in units of the scene's. Our choice: a higher one takes a smaller step."""
 
     def __post_init__(self):
-        _one_of("design.per", self.per, DESIGNS)
+        one_of("design.per", self.per, DESIGNS)
         for name, quantity in QUANTITIES.items():
             if hasattr(self, f"{name}_factor"):
                 bounds = list(getattr(self, f"{name}_factor"))
@@ -143,50 +127,6 @@ class DesignConf:
                     raise ValueError(
                         f"design.{name}_range must be [low, high] with {low:g} < low < high < {high:g}, got {bounds}."
                     )
-
-
-@dataclass(kw_only=True)
-class OptimizerConf:
-    """Optimiser that updates policy and design by the gradient of a simulation."""
-
-    name: str = "adam"
-    """adam or sgd (plain gradient descent)."""
-    policy_rate: float = 2e-2
-    """Learning rate of the policy: 2e-2 suits the linear one, 5e-3 the mlp."""
-    design_rate: float = 3e-2
-    """Learning rate of the design, in the unbounded space before the sigmoid."""
-    max_norm: float | None = 1.0
-    """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
-    fade: float | None = 0.1
-    """Time constant with which gradients fade on their way back through the simulation [s]: what a muscle did long before a step has an
-    effect that changes of a useful size do not have (fading.py). null: never."""
-    retries: int = 4
-    """Maximum number of times that a failed step is halved towards the last successful simulation; 0 ends the run at once."""
-    fallback_share: float = 0.5
-    """Go back to the best policy and design where the progress since the first iteration is below this share of the best; 0: never."""
-    fallback_after: int = 5
-    """Iterations in a row below that share before the run goes back. Our choice: of twelve runs in docs/results none that was so long
-    below a half came to a better one within its 100 iterations."""
-    fallback_from: int = 20
-    """First iterations, which do not count: progress is small by then, and the best of it is chance."""
-    fallback_rate: float = 0.5
-    """Factor of both learning rates at each fallback."""
-    options: dict[str, Any] = field(default_factory=dict)
-    """Further arguments of the optimiser, such as betas of adam."""
-
-    def __post_init__(self):
-        OPTIMIZERS.need(self.name, self.options)
-        _positive("optimizer", self, "policy_rate", "design_rate")
-        for name in ("max_norm", "fade"):
-            if getattr(self, name) is not None:
-                _positive("optimizer", self, name)
-        for name in ("retries", "fallback_from"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"optimizer.{name} must be ≥ 0, got {getattr(self, name)}.")
-        _positive("optimizer", self, "fallback_after")
-        _share("optimizer", self, "fallback_rate")
-        if not 0.0 <= self.fallback_share < 1.0:
-            raise ValueError(f"optimizer.fallback_share must lie in [0, 1), got {self.fallback_share}.")
 
 
 @dataclass(kw_only=True)
@@ -230,9 +170,9 @@ class LearningConf:
     """Fraction by which the copy moves to the trained network after a learning phase; 1 copies it, as does the first phase."""
 
     def __post_init__(self):
-        _positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")
-        _positive("learning", self, "simulations", "megabytes", "frame_every")
-        _share("learning", self, "target_rate")
+        positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")
+        positive("learning", self, "simulations", "megabytes", "frame_every")
+        share("learning", self, "target_rate")
         if not 0.0 <= self.improvement < 1.0:
             raise ValueError(f"learning.improvement must lie in [0, 1), got {self.improvement}.")
         if not 0.0 < self.validation <= 0.25:
@@ -250,8 +190,11 @@ class TrainConf:
     seed: int = 0
     """Everything random follows from it, in a stream of its own for each part: on a CPU, the same seed gives the same run to the last
     bit, and runs that differ in one part share the random numbers of the others."""
+    seeds: int = 1
+    """Number of seeds, from ``seed`` on, that learn side by side in one simulation, each as if it were alone; several processes share
+    them out."""
     worlds: int = 1
-    """Simulations side by side in each step, of all processes together; useful with random goals."""
+    """Simulations side by side in each step, of all processes together; useful with random goals. Of each seed as many."""
     goal_spread: list[float] = field(default_factory=list)
     """Half widths [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
     evaluate_every: int = 10
@@ -274,7 +217,16 @@ class TrainConf:
                 raise ValueError(
                     f"train.log must have names of loggers, each once, out of {', '.join(LOGGERS)}; got {list(self.log)}."
                 )
-        _positive("train", self, "iterations", "worlds", "frame_every", "evaluate_every", "evaluation_goals")
+        positive(
+            "train",
+            self,
+            "iterations",
+            "seeds",
+            "worlds",
+            "frame_every",
+            "evaluate_every",
+            "evaluation_goals",
+        )
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
         if any(not (math.isfinite(s) and s >= 0) for s in self.goal_spread):
@@ -291,3 +243,12 @@ class Settings:
     optimizer: OptimizerConf = field(default_factory=OptimizerConf)
     learning: LearningConf = field(default_factory=LearningConf)
     train: TrainConf = field(default_factory=TrainConf)
+
+    def suited(self, fade: float, gain: float) -> "Settings":
+        """With a task's ``optimizer.fade`` [s] and ``policy.gain`` where these leave them to it."""
+        optimizer, policy = self.optimizer, self.policy
+        if optimizer.fade is None:
+            optimizer = dataclasses.replace(optimizer, fade=fade)
+        if policy.gain is None:
+            policy = dataclasses.replace(policy, gain=gain)
+        return dataclasses.replace(self, optimizer=optimizer, policy=policy)

@@ -14,6 +14,8 @@ from pathlib import Path
 from softmpm_learn import files
 
 OUTCOME, TABLE = "outcome.json", "sweep.csv"
+SEED = "seed_"
+"""Folder of a seed that learns beside others, without its number."""
 LONGEST = 80
 """Characters of a folder's name, without its digest."""
 _MOST = 2**16  # bytes of an outcome
@@ -25,6 +27,8 @@ class Outcome:
 
     job: int
     """Number in the sweep."""
+    seed: int | None = None
+    """Seed, where a job has several side by side."""
     status: str
     """finished or failed."""
     loss: float = math.inf
@@ -81,9 +85,11 @@ def record(folder: Path, found: Outcome) -> None:
 
 
 def tabulate(sweep: Path) -> None:
-    """Write the table of all jobs of the sweep that have an outcome."""
-    known = [outcome(path.parent) for path in sweep.rglob(OUTCOME)]
-    rows = sorted((one for one in known if one), key=lambda one: one.job)
+    """Write the table of all jobs of the sweep that have an outcome; of a job with several seeds, a row for each of them."""
+    folders = [path.parent for path in sweep.rglob(OUTCOME)]
+    with_seeds = {folder.parent for folder in folders if folder.name.startswith(SEED)}
+    known = [outcome(folder) for folder in folders if folder not in with_seeds]
+    rows = sorted((one for one in known if one), key=lambda one: (one.job, one.seed or 0))
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, [field.name for field in dataclasses.fields(Outcome)], lineterminator="\n")
     table.writeheader()

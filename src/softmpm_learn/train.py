@@ -7,32 +7,32 @@ for each iteration:
                and let the target network, which the policy uses, follow it
     save       metrics, recording, checkpoint
 
-Several processes may share the worlds (see :mod:`softmpm_learn.distributed`); the first of them alone learns, from the pictures of
-all, and saves. To learn the same everywhere would take a replay buffer in each process, and bits that agree between GPUs.
+Runs with different seeds may go side by side in one simulation (see :mod:`softmpm_learn.runs`). Or several processes may share the
+worlds of one run (see :mod:`softmpm_learn.distributed`); the first of them alone learns, from the pictures of all, and saves. To learn
+the same everywhere would take a replay buffer in each process, and bits that agree between GPUs.
 """
 
 import contextlib
-import logging
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from softmpm import Model
-from softmpm_learn import checkpoint, files
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine
+from softmpm_learn.learning_phase import learn_together
 from softmpm_learn.loggers import Loggers
 from softmpm_learn.optimisation import clock, optimise
-from softmpm_learn.replay import ReplayError
-from softmpm_learn.run import Run, SettingsError
-from softmpm_learn.run_logger import TIMING, RunLogger
+from softmpm_learn.resuming import entered, resume
+from softmpm_learn.run import Run
+from softmpm_learn.run_logger import TIMING, RunLogger, recorded
+from softmpm_learn.runs import Runs
 from softmpm_learn.settings import Settings
-
-logger = logging.getLogger("softmpm_learn")
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,40 @@ class Result:
     run: Run
     """Observer, policy, design and learner as they are now."""
     finished: bool
-    """False if it was stopped before the last iteration."""
+    """False if it was stopped before the last iteration, or failed."""
     best_loss: float
     best_iteration: int
     examination: dict[str, float]
     """What :func:`softmpm_learn.examination.examine` found, in the first process once the run is finished."""
+    error: Exception | None = None
+    """Why it failed: a :class:`softmpm_learn.optimisation.TrainingError`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """A run to begin, or to go on with."""
+
+    settings: Settings
+    out: Path
+    """Folder for checkpoint.pt, metrics.csv, timing.csv, run.h5 and replay/."""
+    begin: Callable[[], None] = lambda: None
+    """Called once, in the first process only, when the folder is locked and what is in it was found to be of this run."""
+    sketch: Callable[[Run, int, dict], None] = lambda run, iteration, frames: None
+    """Called in the first process after an iteration whose episode was recorded, with its number and the frames."""
+    loggers: Loggers | None = None
+    """Those of ``settings.train.log``, for a caller who has pictures for them at the end and closes them then; None: they are made here
+    and closed with the training."""
+
+
+@dataclass
+class _Work:
+    """What the loop works on."""
+
+    runs: Runs
+    plans: Sequence[Plan]
+    loggers: list[RunLogger]
+    """One for each run in the first process, none in the others."""
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMING, 0.0))
 
 
 def train(
@@ -61,7 +90,6 @@ def train(
     group: Group | None = None,
     finer=None,
     sketch: Callable[[Run, int, dict], None] = lambda run, iteration, frames: None,
-    loggers: Loggers | None = None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
 
@@ -70,15 +98,11 @@ def train(
     Args:
         task: A :class:`softmpm_learn.tasks.task.Task`.
         model: Built from ``task.scene`` with ``settings.train.worlds`` worlds, or with this process's share of them.
-        out: Folder for checkpoint.pt, metrics.csv, timing.csv, run.h5 and replay/.
+        out, begin, sketch: See :class:`Plan`.
         progress: Called after each iteration with its number and metrics; in the first process only.
         stop: Asked after each iteration; once it says True in any process the run ends, ready to resume.
-        begin: Called once, in the first process only, when the folder is locked and what is in it was found to be of this run.
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
         finer: The task on the next finer grid, on which the motion is examined; None leaves that out.
-        sketch: Called in the first process after an iteration whose episode was recorded, with its number and the frames.
-        loggers: Those of ``settings.train.log``, for a caller who has pictures for them at the end and closes them then; None closes
-            them here.
 
     Raises:
         softmpm_learn.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
@@ -88,122 +112,182 @@ def train(
         softmpm_learn.checkpoint.CheckpointError: Every checkpoint in ``out`` is damaged.
         softmpm_learn.checkpoint.LockedError: Another run writes to ``out``.
     """
-    out = Path(out)
+    plan = Plan(settings=settings, out=Path(out), begin=begin, sketch=sketch)
+    shown = (lambda rows: [progress(*row) for row in rows.values()]) if progress else None
+    (result,) = train_side_by_side(task, model, [plan], progress=shown, stop=stop, group=group, finer=finer)
+    if result.error:
+        raise result.error
+    return result
+
+
+def train_side_by_side(
+    task,
+    model: Model,
+    plans: Sequence[Plan],
+    *,
+    progress: Callable[[dict[int, tuple[int, dict[str, float]]]], object] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    group: Group | None = None,
+    finer=None,
+) -> list[Result]:
+    """Optimise a robot several times in one simulation, with the results that :func:`train` gives one after another, up to rounding.
+
+    A run that fails has an error in its result, and the others go on. Arguments and errors are those of :func:`train`, but for:
+
+    Args:
+        model: Built with ``settings.train.worlds`` worlds for each plan.
+        plans: Their settings differ only in what :class:`softmpm_learn.runs.Runs` allows.
+        progress: Called after each iteration with (iteration, metrics) of each run that goes on, by its number.
+        group: Of several processes only if there is one plan.
+    """
     group = group or Group()
+    if any(plan.settings.train.seeds != 1 for plan in plans):
+        raise ValueError(
+            "train.seeds must be 1 in the settings of a run; softmpm_learn.seeds.split gives those of each seed."
+        )
+    if len(plans) > 1 and group.size > 1:
+        raise ValueError(
+            "several processes share the worlds of one run, or each of them has runs of its own."
+        )
     with contextlib.ExitStack() as held:
-        group.once(lambda: held.enter_context(_entered(out)))
+        for plan in plans:
+            group.once(lambda plan=plan: held.enter_context(entered(plan.out)))
         with group.fail_together():
-            run = Run(task, model, settings, out, group)
-        seals = _resume(run, out)
-        own = loggers or held.enter_context(Loggers(settings.train.log, out))
-        run_logger = group.once(lambda: held.enter_context(RunLogger(run, out, seals, begin, own)))
-        return _loop(run, run_logger, progress, stop, finer, sketch)
+            runs = Runs([Run(task, model, plan.settings, plan.out, group, len(plans)) for plan in plans])
+        seals = [resume(run, plan.out) for run, plan in zip(runs.all, plans, strict=True)]
+        own = [
+            plan.loggers or held.enter_context(Loggers(plan.settings.train.log, plan.out)) for plan in plans
+        ]
+        loggers = [
+            group.once(
+                lambda r=run, p=plan, s=seal, o=one: held.enter_context(RunLogger(r, p.out, s, p.begin, o))
+            )
+            for run, plan, seal, one in zip(runs.all, plans, seals, own, strict=True)
+        ]
+        work = _Work(runs, plans, [one for one in loggers if one is not None])
+        return _loop(work, progress, stop, finer)
 
 
-@contextlib.contextmanager
-def _entered(out: Path) -> Iterator[None]:
-    """The folder is there, has no links in it, and no other run writes to it."""
-    with files.named("make the folder", out):
-        out.mkdir(parents=True, exist_ok=True)
-    files.check_folder(out)
-    with checkpoint.locked(out):
-        yield
-
-
-def _resume(run: Run, out: Path) -> dict:
-    """Go on where the checkpoint ends, if there is one; the replay buffer is for the first process. Gives what the checkpoint knows of
-    the other files.
-    """
-    group = run.group
-    content = group.broadcast(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
-    if content is None:
-        return {}
-    with group.fail_together():
-        seals = _restore(run, content, out)
-    logger.info("Going on after iteration %d of %s.", run.iteration, out)
-    return seals
-
-
-def _restore(run: Run, content: dict, out: Path) -> dict:
-    try:
-        if content["learner"] and not run.group.first:
-            content["learner"]["replay"] = {}
-        run.load_state_dict(content)
-        return dict(content["seals"])
-    except SettingsError as error:
-        raise SettingsError(
-            f"the checkpoint in {out} was {error}; config.yaml and command line must be those of the run."
-        ) from error
-    except ReplayError:
-        raise
-    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
-        text = " ".join(str(error).split())
-        raise checkpoint.CheckpointError(
-            f"the checkpoint in {out} does not hold this run: {text}."
-        ) from error
-
-
-def _loop(run: Run, run_logger: RunLogger | None, progress, stop, finer, sketch) -> Result:
-    group, last, seconds = run.group, run.settings.train.iterations, dict.fromkeys(TIMING, 0.0)
-    examination: dict[str, float] = {}
-    while run.iteration < last and not group.any(stop()):
-        k = run.iteration
-        row, observations = optimise(run, run_logger, seconds)
+def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result]:
+    runs, group, seconds = work.runs, work.runs.group, work.seconds
+    while runs.active and not group.any(stop()):
+        rows, observations = optimise(runs, work.loggers, seconds)
         with clock(seconds, "learn"):
-            row |= learn(run, observations)
-        with group.fail_together():
-            if run_logger:
-                run_logger.add(k, row, seconds)
-        run.iteration += 1
-        with clock(seconds, "save"), group.fail_together():
-            if run_logger:
-                run_logger.save()
-        if progress and group.first:
-            progress(k, row)
-        if run_logger and run_logger.frames:
-            sketch(run, k, run_logger.take_frames())
-    if run.iteration >= last and run_logger and run.best["iteration"] >= 0:
-        examination = finish(run, run_logger, finer)
-    return Result(run, run.iteration >= last, run.best["loss"], run.best["iteration"], examination)
+            learn(runs, rows, observations)
+        ended = {k: (runs.all[k].iteration, row) for k, row in rows.items()}
+        _write(work, ended)
+        if progress and group.first and rows:
+            progress(ended)
+        for one, plan in zip(work.loggers, work.plans, strict=group.first):
+            if one.frames:
+                plan.sketch(one.run, one.run.iteration - 1, one.take_frames())
+    found = finish(work, finer) if work.loggers else {}
+    return [
+        Result(
+            run,
+            finished=k not in runs.errors and run.iteration >= run.settings.train.iterations,
+            best_loss=run.best["loss"],
+            best_iteration=run.best["iteration"],
+            examination=found.get(k, {}),
+            error=runs.errors.get(k),
+        )
+        for k, run in enumerate(runs.all)
+    ]
 
 
-def learn(run: Run, observations: Tensor | None) -> dict[str, float]:
-    """Add the observations to the replay buffer and run a learning phase if one is due; in the first process alone.
+def _write(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) -> None:
+    """End an iteration of some runs: rows of the tables, then a checkpoint."""
+    runs, group = work.runs, work.runs.group
+    loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
+    with group.fail_together():
+        at_once(lambda k: loggers[k].add(*ended[k], work.seconds), loggers)
+    for k in ended:
+        runs.all[k].iteration += 1
+    with clock(work.seconds, "save"), group.fail_together():
+        at_once(lambda k: loggers[k].save(), loggers)
 
-    Returns its figures for metrics.csv.
+
+def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | None) -> None:
+    """Add the observations to the replay buffers and run the learning phases that are due; in the first process alone.
+
+    Adds their figures to the rows of metrics.csv.
     """
-    if run.learner is None or observations is None:
-        return {}
-    pictures = run.group.gather(observations, dim=1)
-    with run.group.fail_together():
+    if observations is None:
+        return
+    pictures, due = runs.group.gather(observations, dim=1), []
+    with runs.group.fail_together():
         if pictures is not None:
-            run.learner.add_observations(run.iteration * run.settings.train.worlds, pictures)
-    row: dict[str, float] = {"replay": len(run.learner.replay.ids)}
-    if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
-        row |= run.group.once(run.learner.learn) or {}
-        run.group.broadcast_(t for network in run.learner.networks for t in network.state_dict().values())
-    return row
+            at_once(lambda k: add_observations(runs, k, pictures), rows)
+    for k, row in rows.items():
+        run = runs.all[k]
+        if run.learner is None:
+            continue
+        row["replay"] = len(run.learner.replay.ids)
+        if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
+            due.append((run.learner, row))
+    learned = runs.group.once(learn_together, [learner for learner, _ in due]) or [{}] * len(due)
+    for (learner, row), figures in zip(due, learned, strict=True):
+        row |= figures
+        runs.group.broadcast_(t for network in learner.networks for t in network.state_dict().values())
+
+
+def add_observations(runs: Runs, k: int, pictures: Tensor) -> None:
+    """Add those of a run, of the observations of all worlds."""
+    run = runs.all[k]
+    if run.learner is not None:
+        own = pictures if len(runs.all) == 1 else pictures[:, runs.worlds(k)]
+        run.learner.add_observations(run.iteration * run.settings.train.worlds, own)
+
+
+def at_once(work: Callable[[int], object], numbers: Collection[int]) -> None:
+    """Do the same for runs side by side, several in threads: most of the time they wait for the disk.
+
+    Raises the first error once all have ended.
+    """
+    if len(numbers) < 2:
+        for k in numbers:
+            work(k)
+        return
+    with ThreadPoolExecutor(len(numbers)) as pool:
+        list(pool.map(work, numbers))
 
 
 @torch.no_grad()
-def finish(run: Run, run_logger: RunLogger, finer) -> dict[str, float]:
-    """Record the best policy and design once more, as the episode after the last, and examine them."""
-    now, found = run.policy_snapshot(), {}
-    run.load_policy(run.best)
-    params, inputs = run.design()
-    with run_logger.record(run.iteration, of=run.best["iteration"], kind="best") as on_frame:
+def finish(work: _Work, finer) -> dict[int, dict[str, float]]:
+    """Record the best policy and design of each finished run once more, as the episode after the last, and examine them."""
+    runs, loggers = work.runs, work.loggers
+    done = [
+        k
+        for k, run in enumerate(runs.all)
+        if run.iteration >= run.settings.train.iterations
+        and k not in runs.errors
+        and run.best["iteration"] >= 0
+    ]
+    if not done:
+        return {}
+    now = [run.policy_snapshot() for run in runs.all]
+    for k in done:
+        runs.all[k].load_policy(runs.all[k].best)
+    runs.move(done)
+    params, inputs = runs.design()
+    about = [{"of": runs.all[k].best["iteration"], "kind": "best"} for k in done]
+    with recorded(runs, [loggers[k] for k in done], about) as on_frame:
         run_episode(
-            run.task,
-            run.model,
-            run.observer,
-            run.policy,
+            runs.task,
+            runs.model,
+            runs.observer,
+            runs.policy,
             params,
             inputs=inputs,
-            goal=run.middle_goals(),
+            goal=runs.middle_goals(),
             on_frame=on_frame,
         )
-    if run.settings.train.examine:
-        found = examine(run, finer)
-        run_logger.add_figures(run.iteration, found)
-    run.load_policy(now)
+    found = {}
+    if runs.all[0].settings.train.examine:
+        answers = examine(runs, finer)
+        found = {k: answers[k] for k in done}
+        for k in done:
+            loggers[k].add_figures(runs.all[k].iteration, found[k])
+    for run, before in zip(runs.all, now, strict=True):
+        run.load_policy(before)
     return found

@@ -27,6 +27,15 @@ def test_what_is_saved_comes_back(tmp_path):
     assert same(checkpoint.read(tmp_path / checkpoint.PREVIOUS), content(1.0))
 
 
+def test_a_part_of_a_larger_tensor_takes_its_own_memory(tmp_path):
+    """Also within lists and dicts; PyTorch alone would write the whole tensor with each part."""
+    large = torch.arange(1e5)
+    alone = checkpoint.save(tmp_path, {"a": {"b": [large[7:9].clone()]}}).stat().st_size
+    path = checkpoint.save(tmp_path, {"a": {"b": [large[7:9]]}})
+    assert path.stat().st_size == alone < 1e5
+    assert torch.equal(checkpoint.load(tmp_path)["a"]["b"][0], large[7:9])
+
+
 def test_every_flipped_bit_is_noticed(tmp_path):
     """One bit anywhere, a file cut short or emptied: the one before is loaded instead, with a warning in the log."""
     checkpoint.save(tmp_path, content(1.0))

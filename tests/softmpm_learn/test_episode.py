@@ -39,7 +39,8 @@ def test_equals_one_call_of_simulate(task, model):
     torch.testing.assert_close(episode.terms["progress"], (start.x - end.x)[..., 0].mean(dim=1))
     torch.testing.assert_close(episode.terms["effort"], torch.full((1,), 1e-3 * (0.25 + 0.09) / 2))
     torch.testing.assert_close(episode.loss, episode.terms["progress"] + episode.terms["effort"])
-    assert episode.effort.item() == pytest.approx((0.25 + 0.09) / 2) and episode.observations is None
+    torch.testing.assert_close(episode.activation, activation)
+    assert episode.observations is None
 
 
 def viscous(task):
@@ -96,7 +97,7 @@ def test_the_loop_gives_the_gradient_of_all_parameters(task, name):
     policy = make_policy(PolicyConf(name=name), observer.size, 2, 0.1, seed=0)
     design = Design(DesignConf(strength=True, viscosity=True), model, task.regions)
     free = list(design.parameters())
-    episode, got = ClosedLoop(task, model, observer, policy, design, free)(None)
+    episode, got = ClosedLoop(task, model, observer, policy, design, list(policy.parameters()), free)(None)
     assert not episode.loss.requires_grad and not episode.decisions.activations
     params, inputs = design()
     loss = run_episode(task, model, observer, policy, params, inputs=inputs).loss.mean()
@@ -111,7 +112,8 @@ def test_sums_in_order_are_not_captured(task, dtype, deterministic):
     model = softmpm.build(task.scene, device="cpu", dtype=getattr(torch, dtype), deterministic=deterministic)
     observer = Centroids(model, list(task.regions.values()), task.body_length)
     policy = make_policy(PolicyConf(name="linear"), observer.size, 2, 0.1, seed=0).to(model.dtype)
-    loop = ClosedLoop(task, model, observer, policy, lambda: (model.params(), softmpm.Inputs()), [])
+    weights = list(policy.parameters())
+    loop = ClosedLoop(task, model, observer, policy, lambda: (model.params(), softmpm.Inputs()), weights, [])
     work, calls = loop._graph, []
     loop._graph = lambda: calls.append(1) or work()
     loop(None)

@@ -13,6 +13,7 @@ import softmpm
 from softmpm_learn import evaluation, optimisation
 from softmpm_learn.objective import Objective, Reach
 from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 from softmpm_learn.train import train
 
 
@@ -74,15 +75,16 @@ def test_the_best_policy_is_that_of_the_best_evaluation(reaching, model, drawn, 
     assert result.best_loss == np.nanmin(found) != min(loss)
     assert result.best_iteration == int(np.nanargmin(found))
     result.run.load_policy(result.run.best)
-    assert evaluation.evaluate(result.run) == result.best_loss
+    assert evaluation.evaluate(Runs([result.run])) == [result.best_loss]
 
 
 def test_an_evaluation_is_the_mean_over_its_goals(reaching, model, drawn, tmp_path):
     """Of the losses that the loop has with each goal alone; it keeps no gradient and leaves the goals to come as they were."""
     run = Run(reaching, model, drawn, tmp_path)
     state = run.goals.get_state()
-    losses = [run.loop(goal)[0].loss.item() for goal in run.evaluation_goals()]
-    assert evaluation.evaluate(run) == pytest.approx(np.mean(losses), rel=1e-6)
+    runs = Runs([run])
+    losses = [runs.loop(goal)[0].loss.item() for goal in run.evaluation_goals()]
+    assert evaluation.evaluate(runs) == [pytest.approx(np.mean(losses), rel=1e-6)]
     assert torch.equal(run.goals.get_state(), state) and len(set(losses)) == 4
 
 
@@ -90,12 +92,15 @@ def test_a_failed_evaluation_is_no_best(reaching, model, drawn, tmp_path, monkey
     """The run goes on; its cell is empty, and the log says why."""
     run = Run(reaching, model, drawn, tmp_path)
 
-    def fails(*args, **kwargs):
+    real = evaluation.run_episode
+
+    def fails(*args, failures, **kwargs):
         kind = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
-        raise softmpm.UnstableError("particle 3 is inverted.", **kind)
+        failures.errors.append(softmpm.UnstableError("particle 3 is inverted.", **kind))
+        return real(*args, **kwargs)
 
     monkeypatch.setattr(evaluation, "run_episode", fails)
-    row, _ = optimisation.optimise(run, None, {})
+    row = optimisation.optimise(Runs([run]), [], {})[0][0]
     assert math.isnan(row["evaluation"]) and run.best["iteration"] == -1
     assert "the evaluation failed: particle 3 is inverted" in caplog.text
 

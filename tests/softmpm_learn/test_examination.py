@@ -13,6 +13,7 @@ from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine, rubbed
 from softmpm_learn.objective import Objective, Progress, Tilt
 from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 from softmpm_learn.train import train
 
 
@@ -41,7 +42,7 @@ def positions(run: Run, task, kick: float = 0.0) -> tuple[torch.Tensor, float]:
 
 def test_answers_are_those_of_simulations_by_hand(run, task):
     """Quotients of mean speeds: from T to 3T over from T/2 to T; the worse of two kicks, and of two floors, over the episode."""
-    found, n = examine(run), task.control_steps
+    found, n = examine(Runs([run]))[0], task.control_steps
     longer = dataclasses.replace(task, control_steps=3 * n)
     x, _ = positions(run, longer)
     later = (x[3 * n] - x[n]) / (2 * n) / ((x[n] - x[n // 2]) / (n - n // 2))
@@ -58,7 +59,7 @@ def test_answers_are_those_of_simulations_by_hand(run, task):
 
 def test_the_finer_grid_replays_the_activations(run, task, make_block):
     """On the same grid the motion is the same: the answer is 1."""
-    assert examine(run, finer=task)["finer"] == pytest.approx(1.0, rel=1e-4)
+    assert examine(Runs([run]), finer=task)[0]["finer"] == pytest.approx(1.0, rel=1e-4)
 
 
 def test_the_tilt_is_the_largest_until_the_end(run, task):
@@ -79,14 +80,14 @@ def test_the_tilt_is_the_largest_until_the_end(run, task):
         )
     slopes = [(state.x[0, :, 1].double().numpy() - rest[:, 1]) @ tilt.lever for state in states]
     want = math.degrees(math.atan(max(map(abs, slopes))))
-    assert examine(run)["tilt"] == pytest.approx(want, rel=1e-4) and want > 0.1
+    assert examine(Runs([run]))[0]["tilt"] == pytest.approx(want, rel=1e-4) and want > 0.1
 
 
 def test_a_simulation_that_fails_has_no_answer(run, monkeypatch, caplog):
     """The others do; the log says which one failed."""
     monkeypatch.setattr(examination, "KICK", 1e6)
     with caplog.at_level("WARNING", logger="softmpm_learn"):
-        found = examine(run)
+        found = examine(Runs([run]))[0]
     assert (
         math.isnan(found["kicked"])
         and math.isfinite(found["later"])

@@ -10,7 +10,7 @@ import torch
 
 from softmpm_learn import checkpoint, optimisation
 from softmpm_learn.fallback import Fallback
-from softmpm_learn.settings import OptimizerConf
+from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.train import train
 
 LOSSES = [-0.1, -0.5, -0.9, -0.4, -0.4, -0.4, -0.9, -0.8]
@@ -63,11 +63,11 @@ def scripted(monkeypatch):
     """Makes the losses those of :data:`LOSSES`; gives what moved the robot in each iteration and the rates."""
     seen, real = {}, optimisation.attempt
 
-    def attempt(run, *args):
-        episode, row = real(run, *args)
+    def attempt(runs, *args):
+        (episode, rows), (run,) = real(runs, *args), runs.all
         rates = [group["lr"] for group in run.optimizer.param_groups]
         seen[run.iteration] = (run.policy_snapshot(), rates, len(run.optimizer.state))
-        return episode, row | {"loss": LOSSES[run.iteration]}
+        return episode, {0: rows[0] | {"loss": LOSSES[run.iteration]}}
 
     monkeypatch.setattr(optimisation, "attempt", attempt)
     return seen
@@ -75,7 +75,7 @@ def scripted(monkeypatch):
 
 @pytest.fixture
 def falling(settings):
-    optimizer = dataclasses.replace(settings.optimizer, fallback_after=3, fallback_from=0)
+    optimizer = dataclasses.replace(settings.optimizer, halving=None, fallback_after=3, fallback_from=0)
     learning = dataclasses.replace(settings.learning, every=2)
     conf = dataclasses.replace(settings.train, iterations=len(LOSSES), examine=False)
     return dataclasses.replace(settings, optimizer=optimizer, learning=learning, train=conf)

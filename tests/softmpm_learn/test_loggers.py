@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from softmpm_learn import app, checkpoint, register, train
 from softmpm_learn.loggers import Loggers
+from softmpm_learn.pictures import DRAWN
 from softmpm_learn.register import LOGGERS
 from softmpm_learn.settings import TrainConf
 
@@ -300,22 +301,51 @@ def test_names_are_checked():
         register.logger("mine")(lambda out: None)
 
 
-def test_an_experiment_shows_its_last_pictures(tmp_path, monkeypatch):
-    """From the command line: tables, examination and the three pictures, at the iteration after the last."""
+@pytest.fixture
+def main(monkeypatch):
+    """``python -m softmpm_learn`` in this process, with a tiny task unless a run is resumed."""
     monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
-    words = "task=arm task.seconds=0.05 task.control_period=0.025 device=cpu policy=linear train.iterations=2".split()
-    words += ["train.log=[tensorboard]", "learning.epochs=1", f"hydra.run.dir={tmp_path}/run"]
-    monkeypatch.setattr(
-        sys, "argv", ["softmpm_learn", *words, "hydra/job_logging=none", "hydra/hydra_logging=none"]
-    )
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    tiny = "task=arm task.seconds=0.05 task.control_period=0.025 device=cpu policy=linear learning.epochs=1"
+
+    def go(*words: str) -> None:
+        words = (*tiny.split(), *words) if not words[0].startswith("resume=") else words
+        quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+        monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words, *quiet])
+        GlobalHydra.instance().clear()
+        app.main()
+
+    yield go
     GlobalHydra.instance().clear()
-    app.main()
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_an_experiment_shows_its_pictures(tmp_path, main, seeds):
+    """From the command line: tables, examination and the three pictures, at the iteration after the last; each of several seeds its
+    own, the first one alone also while it learns.
+    """
     out = tmp_path / "run"
-    assert shown(out) == rounded(written(out)) and ("later", 2) in shown(out)
-    found = events(out)
-    for name in ("loss", "robot", "latent"):
-        assert found.Images(f"pictures/{name}")[-1].step == 2
+    main("train.iterations=2", "train.log=[tensorboard]", f"train.seeds={seeds}", f"hydra.run.dir={out}")
+    places = [out] if seeds == 1 else [out / f"seed_{k}" for k in range(seeds)]
+    for k, place in enumerate(places):
+        assert shown(place) == rounded(written(place)) and ("later", 2) in shown(place)
+        found = events(place)
+        steps = {name: [one.step for one in found.Images(f"pictures/{name}")] for name in DRAWN}
+        sketched = [] if k else [0]
+        assert steps == {"loss": [*sketched, 2], "robot": [*sketched, 2], "latent": [2]}
+    assert len({shown(place)["loss", 0] for place in places}) == seeds
+    assert seeds == 1 or not (out / "tensorboard").exists()
+
+
+def test_seeds_that_go_on_with_a_logger_have_all_rows(tmp_path, main):
+    """It may come when all of them are resumed, or one alone."""
+    words = "train.seeds=2", "train.examine=false", "train.record_every=0"
+    main("train.iterations=1", *words, f"hydra.run.dir={tmp_path}")
+    main(f"resume={tmp_path}/seed_1", "train.iterations=2", "train.log=[tensorboard]")
+    main(f"resume={tmp_path}", "train.iterations=3", "train.log=[tensorboard]")
+    for k in range(2):
+        place = tmp_path / f"seed_{k}"
+        assert shown(place) == rounded(written(place)) and ("loss", 2) in shown(place)
 
 
 def test_the_logger_of_the_documentation_works(task, model, settings, tmp_path, capsys):

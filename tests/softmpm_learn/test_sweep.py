@@ -137,7 +137,7 @@ def test_the_same_command_goes_on_after_a_kill(run, monkeypatch, where):
             run("train.seed=0,1")
     steps, step = [], optimisation.attempt
     monkeypatch.setattr(
-        optimisation, "attempt", lambda run, *args: steps.append(run.iteration) or step(run, *args)
+        optimisation, "attempt", lambda runs, *args: steps.append(runs.all[0].iteration) or step(runs, *args)
     )
     assert run("train.seed=0,1")[0] == 0
     assert steps == {"first step": [0, 1], "second step": [1]}.get(where, [])

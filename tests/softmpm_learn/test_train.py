@@ -16,9 +16,10 @@ import torch
 import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
-from softmpm_learn.experiment import design
 from softmpm_learn.objective import Effort, Objective, Progress
 from softmpm_learn.optimisation import TrainingError
+from softmpm_learn.pictures import design
+from softmpm_learn.runs import Runs
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 
 HERE = Path(__file__).parent
@@ -99,7 +100,7 @@ def test_interrupted_anywhere_it_goes_on_as_if_nothing_had_been(
         "optimise": (train, "optimise", 2),
         "learn": (train, "learn", 2),
         "metrics": (Table, "append", 4),  # two tables
-        "checkpoint": (train.checkpoint, "save", 3),  # one save before the first iteration
+        "checkpoint": (checkpoint, "save", 3),  # one save before the first iteration
         "between renames": (os, "replace", None),
         "prune": (train.Run, "state_dict", 3),
     }[where]
@@ -400,6 +401,22 @@ def test_a_failed_simulation_is_tried_again_from_halfway_back(
     ] and "Going halfway back" in caplog.text
 
 
+def test_a_run_without_a_retry_left_goes_back_to_its_best(
+    task, model, settings, tmp_path, monkeypatch, caplog
+):
+    """Of the whole step and of its half: the policy is that of the best iteration again, and the rates fall as in a fallback."""
+    optimizer = dict(retries=1, halving=None)
+    conf = copy_of(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=2))
+    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8, 9}))
+    second = train.train(task, model, conf, tmp_path / "two").run
+    for now, want in zip(second.safe, first.safe, strict=True):
+        assert torch.equal(now, want)
+    assert "Going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
+    now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
+    assert now == pytest.approx(before * conf.optimizer.fallback_rate)
+
+
 @pytest.mark.parametrize("at, iteration", [({0}, 0), (set(range(13, 99)), 2)])
 def test_a_run_that_cannot_go_on_names_the_iteration(
     task, model, settings, tmp_path, monkeypatch, at, iteration
@@ -524,11 +541,12 @@ def test_double_precision(task, settings, tmp_path):
 def test_a_run_that_nobody_uses_is_freed(task, settings, tmp_path):
     """At once, with its model and its loop, whose graph on a GPU is most of a run's memory: nothing waits for Python's collector."""
     run = train.Run(task, softmpm.build(task.scene, device="cpu"), settings, tmp_path)
-    run.loop(None)
-    seen = [weakref.ref(thing) for thing in (run, run.loop, run.loop._graph, run.model)]
+    runs = Runs([run])
+    runs.loop(None)
+    seen = [weakref.ref(thing) for thing in (run, runs, runs.loop, runs.loop._graph, run.model)]
     gc.disable()
     try:
-        del run
+        del run, runs
         assert not [thing for ref in seen if (thing := ref()) is not None]
     finally:
         gc.enable()
@@ -548,3 +566,15 @@ def test_pictures_can_be_drawn_while_a_run_goes_on(task, model, settings, tmp_pa
             kept = recording.frames(row)
             for name in ("time", "x", "activation"):
                 np.testing.assert_allclose(frames[name], kept[name], rtol=1e-6)
+
+
+@pytest.mark.parametrize("halving, share", [(2.0, 0.25), (None, 1.0)])
+def test_rates_fall_by_half_in_so_many_iterations(task, model, settings, tmp_path, halving, share):
+    """A quarter is left after four iterations, also of a run that was stopped after the second."""
+    optimizer = dataclasses.replace(settings.optimizer, halving=halving)
+    for iterations in (2, 4):
+        conf = dataclasses.replace(settings.train, iterations=iterations, examine=False)
+        both = dataclasses.replace(settings, optimizer=optimizer, train=conf)
+        run = train.train(task, model, both, tmp_path).run
+    rates = [group["lr"] for group in run.optimizer.param_groups]
+    assert rates == pytest.approx([share * optimizer.policy_rate, share * optimizer.design_rate])

@@ -19,7 +19,9 @@ log = logging.getLogger("softmpm_learn")
 
 
 class Logger(Protocol):
-    """Receives what a run writes, in the order of the iterations."""
+    """Receives what a run writes, in the order of the iterations. Seeds side by side have one each, whose calls come one after another,
+    but from different threads.
+    """
 
     def scalars(self, iteration: int, row: Mapping[str, float]) -> None:
         """A row of metrics.csv without empty cells, and one of timing.csv as ``seconds/NAME`` [s]; or the answers of the examination.

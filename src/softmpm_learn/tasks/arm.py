@@ -18,6 +18,8 @@ BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
 WIDTH = (0.075, 0.050)  # at the clamp and at the tip [m]
 SEGMENTS = {"lower": (0.0, 0.34), "middle": (0.34, 0.67), "upper": (0.67, 1.01)}
+FADE = 0.1  # what a muscle did longer ago counts less [s]
+QUIET = 0.3  # size of the first activations
 TIP = 0.92  # the tip's particles start this far along the arm
 
 
@@ -26,6 +28,8 @@ class ArmConf(TaskConf):
     """An arm that reaches a place."""
 
     name: str = "arm"
+    seconds: float = 2.0
+    """Length of an episode [s]: long enough to come to rest, or the arm drifts through the goal."""
     gravity: float = 0.0
     """Downward acceleration [m/s²]; 0: the arm lies on a table."""
     damping: float = 6.0
@@ -36,7 +40,7 @@ class ArmConf(TaskConf):
     """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
     """Goal of the tip: x and y [m]; at rest it is at (0.45, 0.41)."""
-    hold: float = 0.3
+    hold: float = 1.2
     """Time at the end of the episode during which the tip should stay at the goal [s], at most all of it."""
     still: float = 1e-2
     """Weight of the tip's mean squared speed during that time in the loss [s²]."""
@@ -101,5 +105,7 @@ def arm(conf: ArmConf) -> Task:
         ),
         body_length=LENGTH,
         goal=goal,
+        fade=FADE,
+        gain=QUIET,
         build=conf.build,
     )

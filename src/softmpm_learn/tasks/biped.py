@@ -6,7 +6,17 @@ import numpy as np
 
 from softmpm import Body, Muscle, Scene
 from softmpm_learn.tasks.outline import Limb, smooth
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, neo_hookean, track, walking
+from softmpm_learn.tasks.task import (
+    STEP,
+    VIGOROUS,
+    Task,
+    WalkerConf,
+    clock,
+    filled,
+    neo_hookean,
+    track,
+    walking,
+)
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -67,4 +77,6 @@ def biped(conf: BipedConf) -> Task:
         objective=walking(conf, rest, regions["body"]),
         body_length=float(np.ptp(rest[:, 0])),
         build=conf.build,
+        fade=STEP,
+        gain=VIGOROUS,
     )

@@ -10,7 +10,17 @@ import numpy as np
 
 from softmpm import Body, Muscle, Scene
 from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, filled, neo_hookean, track, walking
+from softmpm_learn.tasks.task import (
+    STEP,
+    VIGOROUS,
+    Task,
+    WalkerConf,
+    clock,
+    filled,
+    neo_hookean,
+    track,
+    walking,
+)
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -94,6 +104,8 @@ def elephant(conf: ElephantConf) -> Task:
         objective=walking(conf, rest, regions["body"]),
         body_length=float(np.ptp(rest[:, 0])),
         build=conf.build,
+        fade=STEP,
+        gain=VIGOROUS,
     )
 
 

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.tasks.task import Task, WalkerConf, clock, neo_hookean, track, walking
+from softmpm_learn.tasks.task import STEP, VIGOROUS, Task, WalkerConf, clock, neo_hookean, track, walking
 
 START = 0.2
 """Rear end of the robot on the track [m]."""
@@ -137,6 +137,8 @@ def walker(
         objective=walking(conf, rest, np.flatnonzero(rest[:, 1] >= np.median(rest[:, 1]))),
         body_length=float(np.ptp(rest[:, 0])),
         build=conf.build,
+        fade=STEP,
+        gain=VIGOROUS,
     )
 
 

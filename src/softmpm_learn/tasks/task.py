@@ -16,6 +16,10 @@ FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
 WIDTH = 0.01
 """Distance over which surface contact sets in while a robot learns [cells]."""
+STEP = 0.1
+"""Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
+VIGOROUS = 3.0
+"""Size of the first activations of a robot on legs, with which it steps from the beginning."""
 SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""
 STRAIN = 0.5
@@ -160,7 +164,7 @@ class WalkerConf(TaskConf):
     """Weight of the mean squared activation in the loss [m]; with less, gaits stretch the robot until it breaks."""
     upright: float = 1.0
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
-    strain: float = 10.0
+    strain: float = 100.0
     """Weight of strains beyond a half in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
@@ -211,6 +215,10 @@ class Task:
     """Extent of the robot at rest along x, or its reach [m]."""
     goal: np.ndarray | None = None
     """Goal position [m], shape (dim,), if the task has one."""
+    fade: float = math.inf
+    """Time after which the robot has forgotten what a muscle did [s]; see ``optimizer.fade``, which goes before."""
+    gain: float = 1.0
+    """Size of the first activations; see ``policy.gain``, which goes before."""
     build: dict[str, Any] = field(default_factory=dict)
     """Arguments of :func:`softmpm.build` that the task decides: formulation and contact."""
 

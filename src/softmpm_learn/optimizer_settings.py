@@ -1,0 +1,56 @@
+"""Settings of the optimiser. Numbers without a source are ours."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from softmpm_learn.register import OPTIMIZERS
+from softmpm_learn.setting_checks import positive, share
+
+
+@dataclass(kw_only=True)
+class OptimizerConf:
+    """Optimiser that updates policy and design by the gradient of a simulation."""
+
+    name: str = "adam"
+    """adam or sgd (plain gradient descent)."""
+    policy_rate: float = 2e-2
+    """Learning rate of the policy: 2e-2 suits the linear one, 5e-3 the mlp."""
+    design_rate: float = 3e-2
+    """Learning rate of the design, in the unbounded space before the sigmoid."""
+    halving: float | None = 40.0
+    """Iterations in which both rates fall by half, so that the last corrections are small; null: never. Our choice."""
+    max_norm: float | None = 1.0
+    """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
+    fade: float | None = None
+    """Time constant with which gradients fade on their way back through the simulation [s]: what a muscle did long before a step has an
+    effect that changes of a useful size do not have (fading.py). null is the task's, 0.1 for walkers and the arm; .inf: never."""
+    retries: int = 4
+    """Maximum number of times that a failed step is halved towards the last successful simulation; if it still fails, the run goes back
+    to its best, and ends if that fails too. 0 ends the run at once."""
+    fallback_share: float = 0.5
+    """Go back to the best policy and design where the progress since the first iteration is below this share of the best; 0: never."""
+    fallback_after: int = 5
+    """Iterations in a row below that share before the run goes back. Our choice: of twelve runs in docs/results none that was so long
+    below a half came to a better one within its 100 iterations."""
+    fallback_from: int = 20
+    """First iterations, which do not count: progress is small by then, and the best of it is chance."""
+    fallback_rate: float = 0.5
+    """Factor of both learning rates at each fallback."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Further arguments of the optimiser, such as betas of adam."""
+
+    def __post_init__(self):
+        OPTIMIZERS.need(self.name, self.options)
+        positive("optimizer", self, "policy_rate", "design_rate")
+        for name in ("halving", "max_norm"):
+            if getattr(self, name) is not None:
+                positive("optimizer", self, name)
+        if self.fade is not None and not self.fade > 0:
+            raise ValueError(f"optimizer.fade must be > 0, .inf or null, got {self.fade}.")
+        for name in ("retries", "fallback_from"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"optimizer.{name} must be ≥ 0, got {getattr(self, name)}.")
+        positive("optimizer", self, "fallback_after")
+        share("optimizer", self, "fallback_rate")
+        if not 0.0 <= self.fallback_share < 1.0:
+            raise ValueError(f"optimizer.fallback_share must lie in [0, 1), got {self.fallback_share}.")

@@ -1,0 +1,55 @@
+"""Folders of runs: entered by one run at a time, which goes on where the checkpoint in it ends."""
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+from softmpm_learn import checkpoint, files
+from softmpm_learn.replay import ReplayError
+from softmpm_learn.run import Run, SettingsError
+
+logger = logging.getLogger("softmpm_learn")
+
+
+@contextlib.contextmanager
+def entered(out: Path) -> Iterator[None]:
+    """The folder is there, has no links in it, and no other run writes to it."""
+    with files.named("make the folder", out):
+        out.mkdir(parents=True, exist_ok=True)
+    files.check_folder(out)
+    with checkpoint.locked(out):
+        yield
+
+
+def resume(run: Run, out: Path) -> dict:
+    """Go on where the checkpoint ends, if there is one; the replay buffer is for the first process. Gives what the checkpoint knows of
+    the other files.
+    """
+    group = run.group
+    content = group.broadcast(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
+    if content is None:
+        return {}
+    with group.fail_together():
+        seals = _restore(run, content, out)
+    logger.info("Going on after iteration %d of %s.", run.iteration, out)
+    return seals
+
+
+def _restore(run: Run, content: dict, out: Path) -> dict:
+    try:
+        if content["learner"] and not run.group.first:
+            content["learner"]["replay"] = {}
+        run.load_state_dict(content)
+        return dict(content["seals"])
+    except SettingsError as error:
+        raise SettingsError(
+            f"the checkpoint in {out} was {error}; config.yaml and command line must be those of the run."
+        ) from error
+    except ReplayError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+        text = " ".join(str(error).split())
+        raise checkpoint.CheckpointError(
+            f"the checkpoint in {out} does not hold this run: {text}."
+        ) from error

@@ -1,0 +1,410 @@
+"""Seeds side by side: each is the run that it would be alone."""
+
+import csv
+import dataclasses
+import itertools
+import math
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import softmpm
+from softmpm_learn import checkpoint, optimisation, register
+from softmpm_learn.optimisation import TrainingError
+from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
+from softmpm_learn.seeds import split
+from softmpm_learn.settings import Settings, TrainConf
+from softmpm_learn.train import Plan, Result, train, train_side_by_side
+
+HERE = Path(__file__).parent
+SOURCE = HERE.parents[1] / "src"
+SEEDS = 3
+CLOSE = 1e-9
+
+
+def changed(settings: Settings, **changes) -> Settings:
+    """Settings with other values, given as group=dict(name=value)."""
+    parts = {
+        group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()
+    }
+    return dataclasses.replace(settings, **parts)
+
+
+@pytest.fixture
+def conf(settings) -> Settings:
+    """Three seeds of the crawler with a network as policy and every particle's material designed."""
+    return changed(settings, policy=dict(name="mlp", hidden=[8]), train=dict(seeds=SEEDS, seed=4))
+
+
+def built(task, conf: Settings, runs: int = 1, device: str = "cpu") -> softmpm.Model:
+    return softmpm.build(task.scene, device=device, dtype=torch.float64, worlds=runs * conf.train.worlds)
+
+
+def alone(task, conf: Settings, out: Path, finer=None) -> list[Result]:
+    """Each seed in a simulation of its own, in ``out/K``."""
+    return [
+        train(task, built(task, one), one, out / str(k), finer=finer) for k, one in enumerate(split(conf))
+    ]
+
+
+def together(task, conf: Settings, out: Path, device: str = "cpu", **options) -> list[Result]:
+    """All seeds in one simulation, in ``out/K``."""
+    plans = [Plan(settings=one, out=out / str(k)) for k, one in enumerate(split(conf))]
+    return train_side_by_side(task, built(task, conf, len(plans), device), plans, **options)
+
+
+def metrics(folder: Path) -> list[dict[str, float]]:
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{name: float(cell or "nan") for name, cell in row.items()} for row in csv.DictReader(file)]
+
+
+def assert_same(folder: Path, want: Path, tolerance: float = CLOSE) -> None:
+    """Metrics, weights, encoder, moments, best and random streams agree."""
+    rows = metrics(folder)
+    assert len(rows) == len(metrics(want))
+    for row, other in zip(rows, metrics(want), strict=True):
+        assert row == pytest.approx(other, rel=tolerance, abs=tolerance, nan_ok=True)
+    now, then = checkpoint.load(folder), checkpoint.load(want)
+    assert torch.equal(now["goals"], then["goals"]) and now["iteration"] == then["iteration"]
+    assert now["about"] == then["about"] and now["best"]["iteration"] == then["best"]["iteration"]
+    for part in ("policy", "design", "safe"):
+        torch.testing.assert_close(now[part], then[part], rtol=tolerance, atol=tolerance)
+    close = dict(rtol=1e-6, atol=1e-6) if tolerance == CLOSE else dict(rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(now["optimizer"]["state"], then["optimizer"]["state"], **close)
+    if then["learner"]:
+        for part in ("autoencoder", "target"):
+            torch.testing.assert_close(
+                now["learner"][part], then["learner"][part], rtol=tolerance, atol=tolerance
+            )
+
+
+CASES = {
+    "latent": dict(),
+    "two worlds": dict(train=dict(seeds=SEEDS, worlds=2, goal_spread=[0.2, 0.1], evaluation_goals=4, evaluate_every=2)),
+    "centroids": dict(observer=dict(name="centroids"), design=dict(per="region", strength=True)),
+    "control only": dict(design=dict(enabled=False), policy=dict(name="knots"), observer=dict(name="kmeans", clusters=3)),
+    "no target": dict(learning=dict(target_network=False, variational=False)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_three_seeds_side_by_side_are_three_runs(task, conf, tmp_path, case):
+    """Five iterations with learning phases: metrics and weights agree to 1e-9, whatever is observed, designed or drawn."""
+    conf = changed(conf, **CASES[case])
+    together(task, conf, tmp_path / "together")
+    alone(task, conf, tmp_path / "alone")
+    losses = [metrics(tmp_path / "together" / str(k))[-1]["loss"] for k in range(SEEDS)]
+    assert len(set(losses)) == SEEDS
+    for k in range(SEEDS):
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+
+
+def test_weights_are_evaluated_at_once(task, conf, tmp_path):
+    """Policies and encoders are batched, and a change of one run in place is what the batched evaluation sees."""
+    model = built(task, conf, SEEDS)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    assert [stack.batched for stack in runs._stacks] == [True, True]
+    before = runs.loop(None)[0].loss
+    with torch.no_grad():
+        for p in runs.all[1].policy.parameters():
+            p.add_(0.1)
+    after = runs.loop(None)[0].loss
+    assert torch.equal(before[[0, 2]], after[[0, 2]]) and before[1] != after[1]
+
+
+def test_finished_seeds_are_recorded_and_examined(task, conf, tmp_path):
+    """The answers of an examination and the recorded motion of each seed are those of its run alone."""
+    conf = changed(
+        conf, observer=dict(name="centroids"), train=dict(seeds=SEEDS, examine=True, record_every=2)
+    )
+    found = together(task, conf, tmp_path / "together", finer=task)
+    want = alone(task, conf, tmp_path / "alone", finer=task)
+    for k, (one, other) in enumerate(zip(found, want, strict=True)):
+        assert one.finished and one.examination == pytest.approx(other.examination, rel=1e-6, nan_ok=True)
+        assert one.examination["finer"] == pytest.approx(1.0, rel=1e-6)
+        folders = [tmp_path / name / str(k) / "run.h5" for name in ("together", "alone")]
+        with softmpm.Recording(folders[0]) as a, softmpm.Recording(folders[1]) as b:
+            assert list(a.episodes) == list(b.episodes) == [0, 2, 4, 5]
+            for name in ("x", "activation"):
+                np.testing.assert_allclose(a.frames(5)[name], b.frames(5)[name], rtol=1e-5, atol=1e-6)
+
+
+# Failures
+
+
+def diverges(monkeypatch, seed: int, iterations: set[int], forever: bool) -> None:
+    """Simulations of a seed fail at the start of some iterations, once or always, as long as its robot moves."""
+    real, failed = softmpm.simulate, set()
+
+    def simulate(model, state, activation, *args, **kwargs):
+        for k, run in enumerate(RUNS):
+            worlds = model.worlds // len(RUNS)
+            moves = bool(activation[:, k * worlds : (k + 1) * worlds].abs().max() > 0)
+            due = run.settings.train.seed == seed and run.iteration in iterations and moves
+            if due and (forever or run.iteration not in failed) and run.model is model:
+                failed.add(run.iteration)
+                what = dict(kind="inverted", particle=3, substep=1, value=-1.0, limit="det F > 0")
+                raise softmpm.UnstableError("particle 3 is inverted.", world=k * worlds, **what)
+        return real(model, state, activation, *args, **kwargs)
+
+    monkeypatch.setattr(softmpm, "simulate", simulate)
+    optimise = optimisation.optimise
+
+    def noted(runs, *args):
+        RUNS[:] = runs.all
+        return optimise(runs, *args)
+
+    monkeypatch.setattr("softmpm_learn.train.optimise", noted)
+
+
+RUNS: list[Run] = []
+
+
+def test_a_retry_of_one_seed_leaves_the_others_as_they_are(task, conf, tmp_path, monkeypatch, caplog):
+    """It goes halfway back as it would alone; the others neither count a retry nor change."""
+    conf = changed(conf, observer=dict(name="centroids"))
+    diverges(monkeypatch, seed=5, iterations={2}, forever=False)
+    together(task, conf, tmp_path / "together")
+    monkeypatch.undo()
+    diverges(monkeypatch, seed=5, iterations={2}, forever=False)
+    alone(task, conf, tmp_path / "alone")
+    for k in range(SEEDS):
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+        retries = [row["retries"] for row in metrics(tmp_path / "together" / str(k))]
+        assert retries == ([0, 0, 1, 0, 0] if k == 1 else [0] * 5)
+    assert "World 1 is world 0 of seed 5" in "".join(
+        "".join(getattr(record.args[1], "__notes__", ()))
+        for record in caplog.records
+        if len(record.args) == 2
+    )
+
+
+def test_a_seed_that_fails_ends_alone(task, conf, tmp_path, monkeypatch):
+    """Its result has the error, its folder what was done before; the others are those of runs alone. Resumed, it is tried again."""
+    conf = changed(conf, optimizer=dict(retries=1))
+    alone(task, conf, tmp_path / "alone")
+    diverges(monkeypatch, seed=5, iterations={2}, forever=True)
+    first, failed, last = together(task, conf, tmp_path / "together")
+    assert isinstance(failed.error, TrainingError) and failed.error.iteration == 2 and not failed.finished
+    assert "iteration 2: particle 3 is inverted." in str(failed.error)
+    assert first.finished and last.finished and first.error is None
+    for k in (0, 2):
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+    assert len(metrics(tmp_path / "together" / "1")) == 2
+    monkeypatch.undo()
+    assert all(result.finished for result in together(task, conf, tmp_path / "together"))
+    for k in range(SEEDS):
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+
+
+def test_a_robot_at_rest_has_the_material_of_the_scene(task, conf, tmp_path):
+    """And no activation, so that a seed that failed cannot fail again; the worlds of the others are as before."""
+    model = built(task, conf, SEEDS)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    with torch.no_grad():
+        for run in runs.all:
+            for p in run.parameters:
+                p.add_(0.3)
+    before, params = runs.loop(None)[0], runs.design()[0]
+    with torch.no_grad():
+        for p in runs.all[1].parameters:
+            p.fill_(math.nan)
+    runs.move([0, 2])
+    episode, gradients = runs.loop(None)
+    assert (episode.activation[:, 1] == 0).all() and torch.equal(
+        episode.activation[:, 0], before.activation[:, 0]
+    )
+    torch.testing.assert_close(runs.design()[0].young[1], model.params().young, rtol=1e-12, atol=0)
+    assert torch.equal(runs.design()[0].young[[0, 2]], params.young[[0, 2]])
+    assert all(g.isfinite().all() for k in (0, 2) for g in runs.split(gradients)[k])
+    assert episode.loss.isfinite().all()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_gradient_that_is_not_finite_is_that_of_one_seed(task, conf, tmp_path, monkeypatch, value):
+    """Its step is halved, those of the others are not."""
+    conf = changed(conf, observer=dict(name="centroids"), train=dict(seeds=SEEDS, iterations=3))
+    alone(task, conf, tmp_path / "alone")
+    real, calls = Runs.split, itertools.count()
+
+    def spoilt(runs, gradients):
+        parts = real(runs, gradients)
+        if next(calls) == 1:
+            parts[1][0] = value * torch.ones_like(parts[1][0])
+        return parts
+
+    monkeypatch.setattr(Runs, "split", spoilt)
+    together(task, conf, tmp_path / "together")
+    assert [[row["retries"] for row in metrics(tmp_path / "together" / str(k))] for k in range(SEEDS)] == [
+        [0, 0, 0],
+        [0, 1, 0],
+        [0, 0, 0],
+    ]
+    for k in (0, 2):
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+
+
+# Resuming
+
+
+@pytest.mark.parametrize("nth", [0, 7, 8, 11])
+def test_killed_between_two_checkpoints_it_goes_on(task, conf, tmp_path, monkeypatch, nth):
+    """Seeds may then be at different iterations; resumed, all end as they would have."""
+    real, count = checkpoint.save, itertools.count()
+
+    def dies(*args):
+        if next(count) == nth:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(checkpoint, "save", dies)
+    with pytest.raises(KeyboardInterrupt):
+        together(task, conf, tmp_path / "killed")
+    monkeypatch.undo()
+    assert all(result.finished for result in together(task, conf, tmp_path / "killed"))
+    together(task, conf, tmp_path / "whole")
+    for k in range(SEEDS):
+        assert_same(tmp_path / "killed" / str(k), tmp_path / "whole" / str(k))
+
+
+def test_a_killed_process_resumes(task, conf, tmp_path):
+    """Killed by SIGKILL within an iteration, in the folder of a seed too, the seeds end as those that were not."""
+    script = f"""
+import os, signal, sys
+sys.path[:0] = [{str(SOURCE)!r}, {str(HERE)!r}]
+import torch
+torch.set_num_threads(1)
+import conftest, test_seeds, softmpm
+task, conf = conftest.task.__wrapped__(), test_seeds.conf.__wrapped__(conftest.settings.__wrapped__())
+kill_at, calls, real = int(sys.argv[1]), iter(range(999)), softmpm.simulate
+def simulate(*args, **kwargs):
+    if next(calls) == kill_at:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(*args, **kwargs)
+softmpm.simulate = simulate
+from pathlib import Path
+test_seeds.together(task, conf, Path({str(tmp_path / "killed")!r}))
+"""
+    ends = [subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode for n in (9, 999)]
+    assert ends == [-signal.SIGKILL, 0]
+    together(task, conf, tmp_path / "whole")
+    for k in range(SEEDS):
+        assert_same(tmp_path / "killed" / str(k), tmp_path / "whole" / str(k))
+
+
+def test_a_seed_goes_on_alone(task, conf, tmp_path):
+    """The folder of a seed is that of a run."""
+    conf = changed(conf, train=dict(seeds=SEEDS, iterations=3))
+    together(task, conf, tmp_path / "together")
+    longer = changed(conf, train=dict(seeds=SEEDS, iterations=5))
+    one = split(longer)[1]
+    assert train(task, built(task, one), one, tmp_path / "together" / "1").finished
+    alone(task, longer, tmp_path / "alone")
+    assert_same(tmp_path / "together" / "1", tmp_path / "alone" / "1")
+
+
+# Modules of a user
+
+
+class Stubborn(nn.Module):
+    """A policy that :func:`torch.vmap` cannot batch: it reads a number."""
+
+    def __init__(self, size: int, muscles: int):
+        super().__init__()
+        self.layer = nn.Linear(size, muscles)
+
+    def forward(self, z, time, goal=None):
+        return torch.tanh(self.layer(z) * (1.0 if float(self.layer.weight.detach().sum()) < 1e9 else 2.0))
+
+
+class Tuned(Stubborn):
+    """One with a number of its own that is no weight."""
+
+    def __init__(self, size: int, muscles: int):
+        super().__init__(size, muscles)
+        self.factor = torch.rand(()).item()
+
+    def forward(self, z, time, goal=None):
+        return torch.tanh(self.factor * self.layer(z))
+
+
+@pytest.mark.parametrize("kind", [Stubborn, Tuned])
+def test_policies_that_cannot_be_batched_are_evaluated_in_turn(task, conf, tmp_path, monkeypatch, kind):
+    """With the same values."""
+    monkeypatch.setattr(register.POLICIES, "_entries", dict(register.POLICIES._all()))
+    register.policy("odd")(lambda conf, space: kind(space.features, space.muscles))
+    conf = changed(conf, policy=dict(name="odd"))
+    model = built(task, conf, SEEDS)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    assert [stack.batched for stack in runs._stacks] == [True, False]
+    together(task, conf, tmp_path / "together")
+    alone(task, conf, tmp_path / "alone")
+    for k in range(SEEDS):
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+
+
+# Settings
+
+
+def test_rates_may_differ(task, conf, tmp_path):
+    """A sweep over rates goes side by side as well; what is part of the simulation may not differ."""
+    conf = changed(conf, observer=dict(name="centroids"), train=dict(seeds=1, iterations=3))
+    rates = [changed(conf, optimizer=dict(policy_rate=rate)) for rate in (1e-3, 1e-2)]
+    model = built(task, conf, 2)
+    plans = [Plan(settings=one, out=tmp_path / f"rate{k}") for k, one in enumerate(rates)]
+    train_side_by_side(task, model, plans)
+    for k, one in enumerate(rates):
+        train(task, built(task, one), one, tmp_path / str(k))
+        assert_same(tmp_path / f"rate{k}", tmp_path / str(k))
+    other = changed(conf, optimizer=dict(fade=0.1))
+    plans = [Plan(settings=one, out=tmp_path / f"fade{k}") for k, one in enumerate((conf, other))]
+    with pytest.raises(ValueError, match=r"runs side by side share optimizer\.fade; here it is inf and 0\.1"):
+        train_side_by_side(task, model, plans)
+
+
+def test_the_code_of_the_docs_sweeps_over_rates(task, conf, tmp_path):
+    """Two rates give two runs, each with its own rate."""
+    text, names = (HERE.parents[1] / "docs" / "learning.md").read_text(), {}
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Plan(" in block)
+    exec(code, names)
+    conf = changed(conf, observer=dict(name="centroids"), train=dict(seeds=1, iterations=2))
+    results = names["sweep_over_rates"](task, conf, tmp_path, [1e-3, 1e-2])
+    assert [result.run.settings.optimizer.policy_rate for result in results] == [1e-3, 1e-2]
+    assert all(result.finished for result in results) and (tmp_path / "0.01" / "checkpoint.pt").exists()
+
+
+def test_the_number_of_seeds_is_checked(task, settings, tmp_path):
+    """At least one; the settings of one run have one."""
+    with pytest.raises(ValueError, match=r"train\.seeds must be > 0, got 0"):
+        TrainConf(seeds=0)
+    with pytest.raises(ValueError, match=r"train\.seeds must be 1 in the settings of a run"):
+        train(task, built(task, settings), changed(settings, train=dict(seeds=2)), tmp_path)
+    one, two = split(changed(settings, train=dict(seeds=2, seed=7)))
+    assert [(c.train.seed, c.train.seeds) for c in (one, two)] == [(7, 1), (8, 1)]
+
+
+@pytest.mark.gpu
+def test_seeds_go_through_one_captured_graph(task, conf, tmp_path):
+    """On a GPU the closed loop of all seeds is one CUDA graph, and they are the runs that they would be alone."""
+    conf = changed(conf, train=dict(seeds=SEEDS, iterations=5))
+    model = built(task, conf, SEEDS, "cuda")
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    first = [runs.loop(None)[0].loss.clone() for _ in range(3)]
+    assert runs.loop._graph._graph is not None
+    torch.testing.assert_close(first[0], first[2], rtol=CLOSE, atol=CLOSE)
+    with torch.no_grad():
+        for p in runs.all[1].policy.parameters():
+            p.add_(0.1)
+    assert runs.loop(None)[0].loss[1] != first[2][1]
+    together(task, conf, tmp_path / "together", "cuda")
+    for k, one in enumerate(split(conf)):
+        train(task, built(task, one, device="cuda"), one, tmp_path / "alone" / str(k))
+        assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k), tolerance=1e-7)

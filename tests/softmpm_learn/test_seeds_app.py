@@ -1,0 +1,193 @@
+"""Seeds side by side from the command line: folders, table, failures, going on, sweeps and several processes."""
+
+import csv
+import logging
+import math
+import os
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+import softmpm
+from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.saved import load
+
+ROOT = Path(__file__).parents[2]
+TINY = [
+    *("task=arm", "observer=centroids", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
+    *("policy=linear", "train.iterations=2", "train.examine=false", "device.dtype=float64"),
+]
+
+
+@pytest.fixture(autouse=True)
+def fresh_hydra(monkeypatch, tmp_path):
+    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
+    monkeypatch.chdir(tmp_path)
+    GlobalHydra.instance().clear()
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def main(monkeypatch):
+    """``python -m softmpm_learn`` in this process; gives the exit code and the objectives."""
+    real = app.job
+
+    def go(*words: str) -> tuple[int, list[float]]:
+        objectives = []
+        monkeypatch.setattr(app, "job", lambda *args: objectives.append(real(*args)) or objectives[-1])
+        quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+        monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words, *quiet])
+        GlobalHydra.instance().clear()
+        try:
+            app.main()
+        except SystemExit as stop:
+            return stop.code, objectives
+        return 0, objectives
+
+    return go
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def losses(folder: Path) -> list[float]:
+    return [float(row["loss"]) for row in rows(folder / "metrics.csv")]
+
+
+def fails_in(monkeypatch, world: int) -> None:
+    """Simulations fail in this world as long as its muscles are active."""
+    real = softmpm.simulate
+
+    def simulate(model, state, activation, *args, **kwargs):
+        if model.worlds > world and activation[:, world].abs().max() > 0:
+            what = dict(kind="inverted", world=world, particle=3, substep=1, value=-1.0, limit="det F > 0")
+            raise softmpm.UnstableError("particle 3 is inverted.", **what)
+        return real(model, state, activation, *args, **kwargs)
+
+    monkeypatch.setattr(softmpm, "simulate", simulate)
+
+
+def test_each_seed_has_the_folder_of_a_run(main):
+    """What it leaves is what the seed alone leaves; the table has a row for each, and the objective is the median."""
+    code, (objective,) = main(*TINY, "train.seeds=3", "train.seed=5", "hydra.run.dir=all")
+    assert code == 0 and load(Path("all")).train.seeds == 3
+    table = rows(Path("all/sweep.csv"))
+    assert [row["seed"] for row in table] == ["5", "6", "7"] and {row["status"] for row in table} == {
+        "finished"
+    }
+    assert all(row["settings"] == " ".join([*TINY, f"train.seed={row['seed']}"]) for row in table)
+    assert objective == statistics.median(float(row["loss"]) for row in table)
+    for row in table:
+        seed, place = row["seed"], Path(row["folder"])
+        assert main(*TINY, f"train.seed={seed}", f"hydra.run.dir=one{seed}")[0] == 0
+        names = {path.name for path in Path(f"one{seed}").iterdir()} - {"run.rrd", "softmpm_learn.log"}
+        assert names - {path.name for path in place.iterdir()} == set()
+        assert losses(place) == pytest.approx(losses(Path(f"one{seed}")), rel=1e-9)
+        assert load(place).train == load(Path(f"one{seed}")).train
+        assert float(row["loss"]) == min(losses(place))
+        sizes = [(folder / "checkpoint.pt").stat().st_size for folder in (place, Path(f"one{seed}"))]
+        assert sizes[0] == pytest.approx(sizes[1], rel=0.01)  # not the weights of the others as well
+
+
+def test_they_go_on_with_resume(main):
+    """All with the folder of all, or one with its own."""
+    main(*TINY, "train.seeds=2", "train.iterations=1", "hydra.run.dir=all")
+    assert main("resume=all/seed_1", "train.iterations=2")[0] == 0
+    assert [len(losses(Path(f"all/seed_{k}"))) for k in range(2)] == [1, 2]
+    assert main("resume=all", "train.iterations=3")[0] == 0
+    assert [row["iterations"] for row in rows(Path("all/sweep.csv"))] == ["3", "3"]
+    main(*TINY, "train.seeds=2", "train.iterations=3", "hydra.run.dir=whole")
+    for k in range(2):
+        assert losses(Path(f"all/seed_{k}")) == pytest.approx(losses(Path(f"whole/seed_{k}")), rel=1e-9)
+
+
+def test_a_seed_that_fails_is_a_row_that_says_so(main, monkeypatch, capsys):
+    """The exit code tells it, the others finish; the same folder tries it again."""
+    with monkeypatch.context() as patch:
+        fails_in(patch, world=1)
+        code, _ = main(*TINY, "train.seeds=3", "hydra.run.dir=all")
+    said = capsys.readouterr().err
+    assert code == 1 and "of 3 seeds these failed: 1. Seed 1: iteration 0: particle 3 is inverted." in said
+    table = rows(Path("all/sweep.csv"))
+    assert [row["status"] for row in table] == ["finished", "failed", "finished"]
+    assert table[1]["loss"] == "inf" and "particle 3 is inverted" in table[1]["error"]
+    assert checkpoint.load(Path("all/seed_1"))["iteration"] == 0
+    assert main("resume=all")[0] == 0
+    assert [row["status"] for row in rows(Path("all/sweep.csv"))] == ["finished"] * 3
+
+
+def test_a_sweep_has_a_row_for_each_seed(main, monkeypatch):
+    """A job whose seeds have finished is skipped; one in which a seed failed is tried again, and has no objective."""
+    words = ("-m", *TINY, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
+    with monkeypatch.context() as patch:
+        fails_in(patch, world=1)
+        code, objectives = main(*words)
+    assert code == 1 and objectives == [math.inf] * 2
+    assert [row["status"] for row in rows(Path("sweep/sweep.csv"))] == ["finished", "failed"] * 2
+    code, objectives = main(*words)
+    table = rows(Path("sweep/sweep.csv"))
+    assert code == 0 and [(row["job"], row["seed"]) for row in table] == [
+        ("0", "0"),
+        ("0", "1"),
+        ("1", "0"),
+        ("1", "1"),
+    ]
+    assert all(
+        row["status"] == "finished" and "optimizer.policy_rate=0.0" in row["settings"] for row in table
+    )
+    for job, objective in enumerate(objectives):
+        own = [float(row["loss"]) for row in table if row["job"] == str(job)]
+        assert objective == pytest.approx(statistics.median(own))
+    real = []
+    monkeypatch.setattr(app, "run_experiment", lambda *args: real.append(args))
+    assert main(*words) == (0, objectives) and not real
+
+
+def test_seeds_that_were_stopped_are_no_outcome(main, monkeypatch):
+    """A sweep that is asked to end does so, also where the seeds had finished a shorter run; the same command goes on."""
+    words = (
+        "-m",
+        *(word for word in TINY if "iterations" not in word),
+        "train.seeds=2",
+        "optimizer.policy_rate=0.01,0.02",
+        "hydra.sweep.dir=sweep",
+    )
+    assert main(*words, "train.iterations=1")[0] == 0
+    real = experiment.train_side_by_side
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            experiment, "train_side_by_side", lambda *a, **k: real(*a, **k | {"stop": lambda: True})
+        )
+        code, objectives = main(*words, "train.iterations=2")
+    assert code == 0 and objectives == []
+    assert main(*words, "train.iterations=2")[0] == 0
+    assert [row["iterations"] for row in rows(Path("sweep/sweep.csv"))] == ["2"] * 4
+
+
+def torchrun(*words: str, cwd: Path, processes: int = 2) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    start = (sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}")
+    command = [*start, "-m", "softmpm_learn", *words]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+
+
+def test_processes_share_the_seeds(main, tmp_path):
+    """Each has its own, without an exchange of gradients: three seeds in two processes are those of one."""
+    done = torchrun(*TINY, "train.seeds=3", "hydra.run.dir=two", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert main(*TINY, "train.seeds=3", "hydra.run.dir=one")[0] == 0
+    assert [row["seed"] for row in rows(Path("two/sweep.csv"))] == ["0", "1", "2"]
+    for k in range(3):
+        assert losses(Path(f"two/seed_{k}")) == pytest.approx(losses(Path(f"one/seed_{k}")), rel=1e-9)
+    refused = torchrun(*TINY, "train.seeds=2", "hydra.run.dir=three", cwd=tmp_path, processes=3)
+    assert refused.returncode != 0
+    assert "train.seeds must be 1, or at least the 3 processes that share the seeds; got 2" in refused.stderr
