@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import logging
 import math
 import re
@@ -14,6 +15,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 
 from softmpm_learn import app, checkpoint, register, train
 from softmpm_learn.loggers import Loggers
@@ -108,6 +110,17 @@ def test_tensorboard_of_a_killed_run_that_goes_on(task, model, settings, tmp_pat
     train.train(task, model, settings, tmp_path)
     assert shown(tmp_path) == rounded(written(tmp_path))
     assert {k for name, k in shown(tmp_path) if name == "loss"} == set(range(5))
+
+
+def test_tensorboard_reads_sessions_in_their_order(tmp_path, monkeypatch):
+    """Also where two begin in the same second, as the tenth and the eleventh of a process, whose names sort the other way round."""
+    numbers = itertools.count(9)
+    monkeypatch.setattr(event_file_writer._global_uid, "get", lambda: next(numbers))
+    for iteration in range(2):
+        with Loggers(["tensorboard"], tmp_path) as loggers:
+            loggers.open(iteration, {"tensorboard": iteration}, {})
+            loggers.scalars(iteration, {"loss": 0.5}, None)
+    assert shown(tmp_path) == {("loss", 0): 0.5, ("loss", 1): 0.5}
 
 
 def test_a_logger_that_comes_later_gets_what_was_before(task, model, settings, tmp_path):

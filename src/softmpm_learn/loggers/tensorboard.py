@@ -1,5 +1,6 @@
 """TensorBoard: event files in the folder ``tensorboard`` of a run; ``tensorboard --logdir outputs`` shows those of all runs."""
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ class TensorBoard:
             raise ImportError(
                 f'train.log=[tensorboard] needs a package: pip install "softmpm[tensorboard]". {error}'
             ) from error
+        _await_later_name(out / FOLDER)
         self._writer = SummaryWriter(str(out / FOLDER), purge_step=first)
         self._writer.flush()
 
@@ -45,6 +47,14 @@ class TensorBoard:
 
     def close(self) -> None:
         self._writer.close()
+
+
+def _await_later_name(folder: Path) -> None:
+    """Sleep until the name of a new event file sorts after those in the folder, at most 1 s: TensorBoard reads files in the order of
+    their names, which have the second of their creation, then a number without leading zeros.
+    """
+    seconds = [int(path.name.split(".")[3]) for path in folder.glob("events.out.tfevents.*")]
+    time.sleep(min(1.0, max(0.0, max(seconds, default=0) + 1 - time.time())))
 
 
 @register.logger("tensorboard")
