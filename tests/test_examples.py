@@ -93,7 +93,7 @@ def test_the_code_on_quantities_runs():
 def test_the_code_on_objectives_runs():
     """Three terms by name, the constraint among them."""
     text = (README.parent / "docs" / "learning.md").read_text()
-    code, _ = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    code, *_ = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict = {}
     exec(code, names)
     assert names["objective"].names == ["progress", "effort", "spread_beyond"]

@@ -37,8 +37,15 @@ from softmpm_learn.train import Result
 
 logger = logging.getLogger("softmpm_learn")
 
-CHANGEABLE = ("train.iterations", "train.record_every", "train.frame_every", "train.examine", "device")
-"""Settings that may differ when a run is resumed: its length, the recorded episodes and the device."""
+CHANGEABLE = (
+    "train.iterations",
+    "train.record_every",
+    "train.frame_every",
+    "train.examine",
+    "train.log",
+    "device",
+)
+"""Settings that may differ when a run is resumed: its length, the recorded episodes, the loggers and the device."""
 EXPECTED = (
     ValueError,
     RuntimeError,

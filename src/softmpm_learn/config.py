@@ -14,7 +14,7 @@ from pathlib import Path
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from softmpm_learn import sweep
-from softmpm_learn.register import TABLES
+from softmpm_learn.register import CHOICES
 from softmpm_learn.settings import (
     DesignConf,
     LearningConf,
@@ -100,7 +100,7 @@ def register(began: float | None = None) -> None:
     store.store(group="_schema", name="run", node=RunConf)
     for name, (conf, _) in TASKS.items():
         store.store(group="_schema/task", name=name, node=conf)
-    for table in TABLES:
+    for table in CHOICES:
         for name in table.added:
             own = {"name": name, "options": table.defaults(name)} if table is not TASKS else TASKS[name].kind
             store.store(group=table.what, name=name, node=own)

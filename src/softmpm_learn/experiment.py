@@ -17,7 +17,8 @@ from softmpm_learn import plugins, seeds, sweep
 from softmpm_learn.config import RunConf
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.distributed import Group
-from softmpm_learn.pictures import Sketches, draw, last_episode, no_sketch
+from softmpm_learn.loggers import Loggers
+from softmpm_learn.pictures import DRAWN, Sketches, draw, last_episode, no_sketch
 from softmpm_learn.progress import ProgressBar
 from softmpm_learn.resuming import entered
 from softmpm_learn.saved import save
@@ -53,7 +54,8 @@ def run_experiment(
         alone = conf.train.seeds == 1
         model = make_model(task, conf, group, len(members))
     logger.info("%s", model.describe(task.substeps))
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as open_loggers, contextlib.ExitStack() as held:
+        loggers = [open_loggers.enter_context(Loggers(one.train.log, place)) for one, place in members]
         progress = held.enter_context(ProgressBar(conf.train.iterations)) if group.first else None
         stop = held.enter_context(signals.awaited(insist=group.size == 1))
         if not alone:
@@ -74,7 +76,8 @@ def run_experiment(
                 settings=one.settings,
                 out=place,
                 begin=lambda k=k: begun(k),
-                sketch=no_sketch if k else Sketches(task, place),
+                sketch=no_sketch if k else Sketches(task, place, loggers[k]),
+                loggers=loggers[k],
             )
             for k, (one, place) in enumerate(members)
         ]
@@ -88,11 +91,13 @@ def run_experiment(
                 group=group if alone else Group(),
                 finer=finer(conf.task) if conf.train.examine else None,
             )
-    if alone and results[0].error:
-        raise results[0].error
-    for result, (_, place) in zip(results, members, strict=True):
-        if not result.error and (group.first or not alone):
-            draw(result, task, place)
+        held.close()  # a signal now ends the program
+        if alone and results[0].error:
+            raise results[0].error
+        for result, own, (_, place) in zip(results, loggers, members, strict=True):
+            if not result.error and (group.first or not alone):
+                draw(result, task, place)
+                own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
     if group.first:
         logger.info("%s", farewell(results[0], task, out) if alone else farewell_of_seeds(results, out))
         signals.advice = f"The run had ended; everything is in {out}."

@@ -11,12 +11,15 @@ import torch
 import softmpm
 from softmpm_learn.design import DESIGNABLE
 from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
+from softmpm_learn.loggers import Loggers
 from softmpm_learn.run import Run
 from softmpm_learn.tasks import Task
 from softmpm_learn.train import Result
 
 PICTURES = 4
 """Moments of the best episode in robot.png, the first and the last among them."""
+DRAWN = "loss", "robot", "latent"
+"""Pictures of a run at its end."""
 PAUSE = 60.0
 """Least time between pictures while a run goes on [s]."""
 DESIGN = {
@@ -62,14 +65,15 @@ def draw_robot(run: Run, task: Task, out: Path, iteration: int, frames: dict[str
 class Sketches:
     """Pictures while a run goes on: of the first recorded episode, and then of such as come a while after the last picture."""
 
-    def __init__(self, task: Task, out: Path):
-        self.task, self.out, self._drawn = task, out, -math.inf
+    def __init__(self, task: Task, out: Path, loggers: Loggers):
+        self.task, self.out, self.loggers, self._drawn = task, out, loggers, -math.inf
 
     def __call__(self, run: Run, iteration: int, frames: dict[str, np.ndarray]) -> None:
-        """Draw, if it is time; arguments as of :func:`draw_robot`."""
+        """Draw, if it is time, for the loggers as well; arguments as of :func:`draw_robot`."""
         if time.monotonic() - self._drawn > PAUSE:
             loss_figure(self.out / "loss.png", curves(self.out / "metrics.csv"))
             draw_robot(run, self.task, self.out, iteration, frames)
+            self.loggers.pictures(iteration, [self.out / "loss.png", self.out / "robot.png"])
             self._drawn = time.monotonic()
 
 

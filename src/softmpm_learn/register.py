@@ -1,4 +1,4 @@
-"""Tables of tasks, observers, policies and optimisers by name; users add theirs without editing the package (docs/robots.md).
+"""Tables of tasks, observers, policies, optimisers and loggers by name; users add theirs without editing the package (docs/robots.md).
 
     @softmpm_learn.register.task("hopper", HopperConf)
     def hopper(conf: HopperConf) -> Task: ...
@@ -11,6 +11,9 @@
 
     @softmpm_learn.register.optimizer("lion")
     def lion(groups: list[dict], *, decay: float = 0.0) -> torch.optim.Optimizer: ...
+
+    @softmpm_learn.register.logger("printer")
+    def printer(out: Path, first: int, settings: Mapping[str, Any]) -> Logger: ...
 
 What follows the ``*`` are options, from ``observer.options``, ``policy.options`` and ``optimizer.options`` of the settings: keywords
 with defaults, or one dataclass, which also checks their types. Nothing heavy is imported here.
@@ -162,7 +165,10 @@ TASKS = Table("task", ("conf",), "softmpm_learn.tasks")
 OBSERVERS = Table("observer", ("conf", "model", "task"), "softmpm_learn.observe")
 POLICIES = Table("policy", ("conf", "space"), "softmpm_learn.policy")
 OPTIMIZERS = Table("optimizer", ("groups",), "softmpm_learn.optimizers")
-TABLES = (TASKS, OBSERVERS, POLICIES, OPTIMIZERS)
+LOGGERS = Table("logger", ("out", "first", "settings"), "softmpm_learn.loggers")
+CHOICES = (TASKS, OBSERVERS, POLICIES, OPTIMIZERS)
+"""Tables of which a run has one name each, in a group of the settings."""
+TABLES = (*CHOICES, LOGGERS)
 
 
 def task(name: str, kind: type) -> Callable[[Builder], Builder]:
@@ -197,6 +203,13 @@ def policy(name: str, options: type | None = None) -> Callable[[Builder], Builde
 def optimizer(name: str, options: type | None = None) -> Callable[[Builder], Builder]:
     """Register an optimiser: a builder groups → ``torch.optim.Optimizer``; each group has ``params`` and ``lr``."""
     return _decorator(OPTIMIZERS, name, options)
+
+
+def logger(name: str) -> Callable[[Builder], Builder]:
+    """Register a logger: a builder (out, first, settings) → :class:`softmpm_learn.loggers.Logger`, of the run's folder, the first
+    iteration that the logger has not seen yet, and the plain settings by group, with the task's name.
+    """
+    return _decorator(LOGGERS, name, None)
 
 
 def added() -> str:

@@ -1,6 +1,7 @@
 """Files that a run writes while it trains: metrics.csv and timing.csv, recording, checkpoint and replay buffer."""
 
 import contextlib
+import dataclasses
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +17,7 @@ from softmpm_learn import checkpoint
 from softmpm_learn.csv_log import Table
 from softmpm_learn.episode import Frame
 from softmpm_learn.examination import NAMES
+from softmpm_learn.loggers import Loggers
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 
@@ -47,6 +49,7 @@ class RunLogger:
         out: Its folder.
         seals: What the checkpoint knows of the other files, see :attr:`seals`; empty for a new run.
         begin: Called once they are found to be those of the run, before the first checkpoint.
+        loggers: Loggers of the run, still to be opened; who made them closes them.
 
     Attributes:
         frames: Time, positions and activation of the first world in the episode that was recorded last, until they are taken.
@@ -55,14 +58,27 @@ class RunLogger:
         ValueError: A file is not the one that the checkpoint knows.
     """
 
-    def __init__(self, run: Run, out: Path, seals: dict, begin: Callable[[], None] = lambda: None):
-        self.run, self.out = run, out
+    def __init__(
+        self,
+        run: Run,
+        out: Path,
+        seals: dict,
+        begin: Callable[[], None] = lambda: None,
+        loggers: Loggers | None = None,
+    ):
+        self.run, self.out, self._loggers = run, out, loggers or Loggers([], out)
         self._named = run.learner.replay.ids if run.learner else []
         self._metrics = Table(out / "metrics.csv", metrics(run), seals.get("metrics.csv"))
         self._timing = Table(out / "timing.csv", TIMING, seals.get("timing.csv"))
         self._recorded = seals.get("run.h5")
         self._recorder = self._open_recorder() if run.settings.train.record_every else None
         self.frames: list[tuple[float, Tensor, Tensor | None]] = []
+        try:
+            settings = {"task": run.task.name} | dataclasses.asdict(run.settings)
+            self._loggers.open(run.iteration, seals.get("loggers", {}), settings)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
         begin()
         if run.iteration == 0:
             self.save()
@@ -99,19 +115,23 @@ class RunLogger:
             "metrics.csv": self._metrics.seal,
             "timing.csv": self._timing.seal,
             "run.h5": self._recorded,
+            "loggers": self._loggers.known(self.run.iteration),
         }
 
     def add(self, iteration: int, row: dict[str, float], seconds: dict[str, float]) -> None:
-        """A row of either table, and the figures to the recording."""
+        """A row of either table, and the figures to the recording and the loggers."""
         self._timing.append(iteration, seconds)
-        self.add_figures(iteration, row)
+        self.add_figures(iteration, row, seconds)
 
-    def add_figures(self, iteration: int, row: dict[str, float]) -> None:
-        """A row of metrics.csv alone, and its figures to the recording."""
+    def add_figures(
+        self, iteration: int, row: dict[str, float], seconds: dict[str, float] | None = None
+    ) -> None:
+        """A row of metrics.csv alone, and its figures to the recording and, with times [s], to the loggers."""
         self._metrics.append(iteration, row)
         if self._recorder:
             known = {name: value for name, value in row.items() if math.isfinite(value)}
             self._recorder.scalars(iteration, known)
+        self._loggers.scalars(iteration, row, seconds)
 
     def save(self) -> None:
         """Write a checkpoint, then drop the simulations that neither it nor the one before names."""

@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from softmpm_learn import files, plugins
 from softmpm_learn.config import RunConf, to_run
-from softmpm_learn.register import TABLES
+from softmpm_learn.register import CHOICES, LOGGERS
 from softmpm_learn.tasks import TASKS
 
 NAME = "config.yaml"
@@ -74,8 +74,9 @@ def _need_files(saved: DictConfig, folder: Path) -> None:
     """
     names = [path for path in saved.get("files") or [] if isinstance(path, str)]
     missing = [path for path in names if path not in plugins.files()]
-    for table in TABLES if missing else ():
-        name = OmegaConf.select(saved, f"{table.what}.name")
+    named = [(table, OmegaConf.select(saved, f"{table.what}.name")) for table in CHOICES if missing]
+    named += [(LOGGERS, name) for name in OmegaConf.select(saved, "train.log") or [] if missing]
+    for table, name in named:
         if name not in table:
             raise MissingFileError(
                 f"the {table.what} {name!r} of the run in {folder} was registered by a file: "

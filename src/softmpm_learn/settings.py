@@ -11,7 +11,7 @@ from typing import Any
 
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
-from softmpm_learn.register import OBSERVERS, POLICIES
+from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
 from softmpm_learn.setting_checks import one_of, positive, share
 
 DESIGNS = ("particle", "region", "uniform")
@@ -208,8 +208,15 @@ class TrainConf:
     """Control steps between two recorded frames."""
     examine: bool = True
     """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid."""
+    log: list[str] = field(default_factory=list)
+    """Loggers beside the files of the run: tensorboard, wandb, or registered ones."""
 
     def __post_init__(self):
+        for name in self.log:
+            if name not in LOGGERS or self.log.count(name) > 1:
+                raise ValueError(
+                    f"train.log must have names of loggers, each once, out of {', '.join(LOGGERS)}; got {list(self.log)}."
+                )
         positive(
             "train",
             self,

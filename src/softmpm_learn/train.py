@@ -26,6 +26,7 @@ from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine
 from softmpm_learn.learning_phase import learn_together
+from softmpm_learn.loggers import Loggers
 from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.resuming import entered, resume
 from softmpm_learn.run import Run
@@ -61,6 +62,9 @@ class Plan:
     """Called once, in the first process only, when the folder is locked and what is in it was found to be of this run."""
     sketch: Callable[[Run, int, dict], None] = lambda run, iteration, frames: None
     """Called in the first process after an iteration whose episode was recorded, with its number and the frames."""
+    loggers: Loggers | None = None
+    """Those of ``settings.train.log``, for a caller who has pictures for them at the end and closes them then; None: they are made here
+    and closed with the training."""
 
 
 @dataclass
@@ -151,9 +155,14 @@ def train_side_by_side(
         with group.fail_together():
             runs = Runs([Run(task, model, plan.settings, plan.out, group, len(plans)) for plan in plans])
         seals = [resume(run, plan.out) for run, plan in zip(runs.all, plans, strict=True)]
+        own = [
+            plan.loggers or held.enter_context(Loggers(plan.settings.train.log, plan.out)) for plan in plans
+        ]
         loggers = [
-            group.once(lambda r=run, p=plan, s=seal: held.enter_context(RunLogger(r, p.out, s, p.begin)))
-            for run, plan, seal in zip(runs.all, plans, seals, strict=True)
+            group.once(
+                lambda r=run, p=plan, s=seal, o=one: held.enter_context(RunLogger(r, p.out, s, p.begin, o))
+            )
+            for run, plan, seal, one in zip(runs.all, plans, seals, own, strict=True)
         ]
         work = _Work(runs, plans, [one for one in loggers if one is not None])
         return _loop(work, progress, stop, finer)

@@ -1,17 +1,12 @@
-"""The pictures of a run: the loss, the latent space and the robot. Plain arrays in, PNG files out.
+"""The pictures of a run: the loss, the latent space and the robot. Plain arrays in, PNG files out."""
 
-matplotlib is imported where it is used and without pyplot, so that nothing global changes.
-"""
-
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from softmpm import Scene
-from softmpm_learn.files import replace
+from softmpm_learn.figures import canvas
 
 VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Values of each latent feature in ``latent_figure``, the others being 0."""
@@ -21,19 +16,6 @@ AROUND = 0.3
 """Margin around the places where a robot comes, over the height of the picture."""
 SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _save(figure: Any, path: Path, dpi: int) -> None:
-    """Whole or not at all: a run that is killed leaves the picture of the iteration before."""
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=dpi, format="png")
-    replace(Path(path), picture.getvalue())
 
 
 def loss_figure(
@@ -47,7 +29,7 @@ def loss_figure(
     names = [
         name for name, (_, values) in curves.items() if np.isfinite(np.asarray(values, dtype=float)).any()
     ]
-    figure, first = _figure(7.0, 1.2 + 2.0 * max(1, len(names))), None
+    figure, first = canvas.figure(7.0, 1.2 + 2.0 * max(1, len(names))), None
     for place, name in enumerate(names):
         iteration, value = (np.asarray(array, dtype=float) for array in curves[name])
         axes = figure.add_subplot(len(names), 1, place + 1, sharex=first)
@@ -62,7 +44,7 @@ def loss_figure(
         if place == len(names) - 1:
             axes.set_xlabel("iteration")
             axes.xaxis.get_major_locator().set_params(integer=True)
-    _save(figure, path, dpi=120)
+    canvas.save(figure, path, dpi=120)
 
 
 def latent_figure(path: Path, fields: np.ndarray) -> None:
@@ -77,7 +59,7 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
     fields = _moving(fields)
     features, steps, nx, ny, _ = fields.shape
     width = 1.1 * (nx / ny) ** 0.5
-    figure = _figure(2 * steps * width + 0.4, features * (width * ny / nx + 0.08) + 0.4)
+    figure = canvas.figure(2 * steps * width + 0.4, features * (width * ny / nx + 0.08) + 0.4)
     axes = figure.subplots(features, 2 * steps, squeeze=False)
     for feature in range(features):
         limit = max(float(np.abs(fields[feature, ..., :2]).max()), 1e-12)  # each row has a scale of its own
@@ -94,7 +76,7 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
             if column == 0:
                 panel.set_ylabel(f"feature {feature + 1}", fontsize=8)
     figure.supxlabel("red: to the left, down; blue: to the right, up; a scale for each feature", fontsize=7)
-    _save(figure, path, dpi=120)
+    canvas.save(figure, path, dpi=120)
 
 
 def _moving(fields: np.ndarray) -> np.ndarray:
@@ -135,7 +117,7 @@ def robot_figure(
     columns = 1 if ratio < 0.45 else 2  # a high world is drawn half as wide
     rows = -(-len(frames) // columns)
     above, below = rows * (7.4 / columns * ratio + 0.25), 2.3 if design else 0.0
-    figure = _figure(8.0, above + below + 0.3)
+    figure = canvas.figure(8.0, above + below + 0.3)
     parts = figure.subfigures(2, 1, height_ratios=[above, below]) if design else np.array([figure])
     panels = parts[0].subplots(rows, columns, squeeze=False).ravel()
     for panel, (title, positions, activation) in zip(panels, frames, strict=False):
@@ -148,7 +130,7 @@ def robot_figure(
     parts[0].supxlabel("m; muscles are red where they pull, blue where they push", fontsize=7)
     if design:
         _draw_design(parts[1], scene, design)
-    _save(figure, path, dpi=130)
+    canvas.save(figure, path, dpi=130)
 
 
 def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]]) -> None:

@@ -1,0 +1,96 @@
+"""``python -m softmpm_learn.figures FOLDER``: tables and figures of one or more sweeps."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from softmpm_learn import files
+from softmpm_learn.figures import sweeps, tables
+from softmpm_learn.figures.intervals import interval, pairs
+from softmpm_learn.figures.of_sweep import curves_figure, grouped, pairs_figure, shown, values, values_figure
+
+CURVES, VALUES, PAIRS = "curves.png", "values.png", "pairs.png"
+HELP = """Tables and figures of sweeps.
+
+  runs.csv     a row for each run and iteration: seed, settings that differ, all columns of metrics.csv
+  jobs.csv     a row for each run: value at one iteration, lowest loss, examination, status
+  pairs.csv    every two settings, paired by seed: mean difference with its bootstrap interval of 95 %
+  curves.png   median and quartiles over seeds at each iteration
+  values.png   values of each seed, with the bootstrap interval of 95 % of their median
+  pairs.png    the differences of pairs.csv
+
+Runs that failed are in the tables and counted in the figures, and have no part in medians and differences."""
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Exit code 0, or 1 after one sentence on what went wrong."""
+    parser = argparse.ArgumentParser(
+        "python -m softmpm_learn.figures", description=HELP, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("folder", nargs="+", type=Path, help="folder of a sweep, with sweep.csv")
+    parser.add_argument("--value", default="loss", help="column of metrics.csv to compare (loss)")
+    parser.add_argument(
+        "--at", type=int, help="iteration to compare at (the last that all finished runs have)"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="folder of the results (figures in the first sweep's folder)"
+    )
+    asked = parser.parse_args(words)
+    try:
+        out = asked.out or asked.folder[0] / "figures"
+        print(make(asked.folder, out, asked.value, asked.at))
+    except (ValueError, OSError) as error:
+        print(f"softmpm_learn.figures: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def make(folders: Sequence[Path], out: Path, quantity: str = "loss", at: int | None = None) -> str:
+    """Write the tables, then draw the figures from what they have; gives a summary.
+
+    Raises:
+        ValueError: A folder is no sweep, or there is nothing to compare.
+    """
+    runs = sweeps.read(folders)
+    settings = list(runs[0].settings)
+    at = tables.last_iteration(runs) if at is None else at
+    rows = tables.by_iteration(runs), tables.by_run(runs, quantity, at)
+    with files.named("make the folder", out):
+        out.mkdir(parents=True, exist_ok=True)
+    for name, table in zip((tables.RUNS, tables.JOBS), rows, strict=True):
+        tables.write(out / name, table)
+    return draw(out, settings)
+
+
+def draw(out: Path, settings: Sequence[str]) -> str:
+    """Draw the figures from runs.csv and jobs.csv, write pairs.csv; gives a summary."""
+    runs, jobs = (tables.load(out / name, settings) for name in (tables.RUNS, tables.JOBS))
+    groups = grouped(jobs, settings)
+    compared = [
+        row
+        for name in shown(jobs)
+        for row in pairs({setting: values(members, name) for setting, members in groups.items()}, name)
+    ]
+    curves_figure(out / CURVES, runs, groups)
+    values_figure(out / VALUES, jobs, groups)
+    names = [tables.RUNS, tables.JOBS, CURVES, VALUES]
+    for name in (tables.PAIRS, PAIRS):
+        (out / name).unlink(missing_ok=True)  # of other sweeps
+    if compared:
+        tables.write(out / tables.PAIRS, compared)
+        names.append(tables.PAIRS)
+    if pairs_figure(out / PAIRS, compared, jobs):
+        names.append(PAIRS)
+    lines = [f"Median of {jobs[0]['quantity']} at iteration {jobs[0]['at']:.0f}, with its interval of 95 %:"]
+    for setting, members in groups.items():
+        found = list(values(members, "final").values())
+        low, high = interval(found, np.median)
+        middle = f"{np.median(found):.4g} [{low:.4g}, {high:.4g}]" if found else "none"
+        lines.append(f"  {setting}: {middle}, {len(found)} of {len(members)} seeds")
+    return "\n".join([*lines, f"{', '.join(names)} are in {out}."])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Bootstrap intervals, and comparisons of settings paired by their seeds."""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+RESAMPLES = 10_000
+LEVEL = 0.95
+SEED = 0
+"""Of the resampling, so that a table is the same each time."""
+
+
+def interval(values: Sequence[float], statistic: Callable[..., np.ndarray] = np.mean) -> tuple[float, float]:
+    """Percentile interval of 95 % of a statistic (bootstrap, Efron 1979); nan for fewer than two values. Too narrow for few:
+    of the mean of five normal ones it covers about 83 %, of ten about 90 %.
+
+    Args:
+        statistic: Takes an array (resample, value) and ``axis``.
+    """
+    if len(values) < 2:
+        return math.nan, math.nan
+    drawn = np.random.default_rng(SEED).integers(len(values), size=(RESAMPLES, len(values)))
+    found = statistic(np.asarray(values, dtype=float)[drawn], axis=1)
+    low, high = np.quantile(found, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)
+
+
+def pairs(groups: Mapping[str, Mapping[int, float]], quantity: str) -> list[dict[str, Any]]:
+    """Every two settings, compared over the seeds for which both have a value.
+
+    Args:
+        groups: For each setting the values by seed.
+
+    Returns:
+        Rows of pairs.csv: mean of ``first - second``, its paired bootstrap interval, and in how many pairs the first is lower.
+    """
+    rows = []
+    for (first, a), (second, b) in itertools.combinations(groups.items(), 2):
+        seeds = [s for s in a if s in b and math.isfinite(a[s]) and math.isfinite(b[s])]
+        difference = [a[seed] - b[seed] for seed in seeds]
+        low, high = interval(difference)
+        rows.append(
+            {
+                "quantity": quantity,
+                "first": first,
+                "second": second,
+                "pairs": len(seeds),
+                "difference": float(np.mean(difference)) if seeds else math.nan,
+                "low": low,
+                "high": high,
+                "first_lower": sum(d < 0 for d in difference),
+            }
+        )
+    return rows

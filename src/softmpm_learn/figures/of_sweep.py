@@ -1,0 +1,188 @@
+"""The pictures of sweeps, from the rows of their tables: learning curves, values of each seed, comparisons of settings."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softmpm_learn.figures import canvas
+from softmpm_learn.figures.canvas import COLOURS
+from softmpm_learn.figures.intervals import interval
+from softmpm_learn.figures.sweeps import EXAMINED
+from softmpm_learn.figures.tables import Row
+
+LINES = "-", "--", ":"
+MOST_ROWS = 60
+"""Rows of a picture; more can be read in the table only."""
+COLUMNS = 3
+"""Panels side by side."""
+TITLES = {
+    "final": "training",
+    "later": "continued to three times its length",
+    "kicked": "kicked at the start",
+    "friction": "friction ± 25 %",
+    "finer": "next finer grid",
+    "tilt": "tilt while it continues",
+}
+ANSWERS = {"progress": "speed over that in the episode [1]", "reach": "distance from the goal [m]"}
+"""Meaning of the examination, by the first term of the objective."""
+
+
+def name_of(row: Row, settings: Sequence[str]) -> str:
+    """Name of a setting in legends and in pairs.csv: short keys where they are unambiguous."""
+    ends = [key.rpartition(".")[2] for key in settings]
+    keys = [end if ends.count(end) == 1 else key for key, end in zip(settings, ends, strict=True)]
+    words = [
+        f"{key}={row[full]}" if row[full] else f"{key} by default"
+        for key, full in zip(keys, settings, strict=True)
+    ]
+    return ", ".join(words) or "all runs"
+
+
+def grouped(jobs: Sequence[Row], settings: Sequence[str]) -> dict[str, list[Row]]:
+    """Rows of jobs.csv for each setting."""
+    found: dict[str, list[Row]] = {}
+    for row in jobs:
+        found.setdefault(name_of(row, settings), []).append(row)
+    return found
+
+
+def values(rows: Sequence[Row], name: str) -> dict[int, float]:
+    """Finite values of the finished runs of a setting, by seed."""
+    known = {int(row["seed"]): row[name] for row in rows if row["status"] == "finished"}
+    return {seed: value for seed, value in known.items() if math.isfinite(value)}
+
+
+def shown(jobs: Sequence[Row]) -> list[str]:
+    """Columns of jobs.csv that have a panel: those with a number."""
+    columns = ["final", *EXAMINED]
+    return [name for name in columns if any(math.isfinite(row[name]) for row in jobs)]
+
+
+def label(name: str, jobs: Sequence[Row]) -> str:
+    """Axis label of a column of jobs.csv, with its unit."""
+    if name == "final":
+        return f"{jobs[0]['quantity']} at iteration {jobs[0]['at']:.0f}"
+    if name == "tilt":
+        return "largest tilt [degrees]"
+    terms = {row["term"] for row in jobs if row["term"]}
+    return ANSWERS.get(terms.pop(), "answer") if len(terms) == 1 else "answer"
+
+
+def curves_figure(path: Path, runs: Sequence[Row], groups: Mapping[str, Sequence[Row]]) -> None:
+    """Median and interquartile range over the seeds of each setting, at each iteration up to the last that all have.
+
+    Args:
+        runs: Rows of runs.csv.
+        groups: Rows of jobs.csv for each setting; runs that failed are counted in the legend and not drawn.
+    """
+    first = next(iter(groups.values()))[0]
+    quantity, last = first["quantity"], first["at"]
+    series: dict[int, dict[int, float]] = {}
+    for row in runs:
+        if row["iteration"] <= last and math.isfinite(row[quantity]):
+            series.setdefault(int(row["run"]), {})[int(row["iteration"])] = row[quantity]
+    widest = max(len(_count(name, members)) for name, members in groups.items())
+    columns = 2 if widest <= 42 else 1
+    rows = -(-len(groups) // columns)
+    figure = canvas.figure(7.2, 3.6 + 0.22 * rows)
+    axes = figure.add_subplot()
+    for (name, members), (colour, style) in zip(groups.items(), _styles(), strict=False):
+        finished = [int(row["run"]) for row in members if row["status"] == "finished"]
+        lines = [series.get(number, {}) for number in finished]
+        iterations = sorted({k for line in lines for k in line})
+        table = np.array([[line.get(k, math.nan) for k in iterations] for line in lines])
+        low, middle, high = np.nanquantile(table, [0.25, 0.5, 0.75], axis=0) if table.size else ([], [], [])
+        marker = "o" if len(iterations) < 3 else None
+        axes.plot(
+            *(iterations, middle, style),
+            color=colour,
+            marker=marker,
+            linewidth=2,
+            label=_count(name, members),
+        )
+        if len(lines) > 1:
+            axes.fill_between(iterations, low, high, color=colour, alpha=0.18, linewidth=0)
+    axes.set(xlabel="iteration", ylabel=f"{quantity}, median and quartiles over seeds")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.margins(x=0.01)
+    figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=min(9, 800 / widest))
+    canvas.save(figure, path, dpi=130)
+
+
+def _count(name: str, members: Sequence[Row]) -> str:
+    failed = sum(row["status"] != "finished" for row in members)
+    words = f"{len(members) - failed} of {len(members)} seeds, {failed} failed"
+    return f"{name} ({words if failed else f'{len(members)} seed' + 's' * (len(members) > 1)})"
+
+
+def _styles():
+    return ((colour, style) for style in itertools.cycle(LINES) for colour in COLOURS)
+
+
+def values_figure(path: Path, jobs: Sequence[Row], groups: Mapping[str, Sequence[Row]]) -> None:
+    """Each seed as a point, for each setting and quantity, and the median with its bootstrap interval of 95 %."""
+    names = [_count(name, members) for name, members in groups.items()]
+    panels = {name: label(name, jobs) for name in shown(jobs)}
+
+    def draw(axes, name: str) -> None:
+        for place, (members, (colour, _)) in enumerate(zip(groups.values(), _styles(), strict=False)):
+            found = list(values(members, name).values())
+            if not found:
+                continue
+            beside = place - 0.28 + 0.16 * np.arange(len(found)) / max(1, len(found) - 1)
+            axes.scatter(found, beside, s=14, color=colour, alpha=0.7, linewidths=0)
+            low, high = interval(found, np.median)
+            axes.plot([low, high], [place + 0.1] * 2, color=colour, linewidth=2)
+            axes.plot(np.median(found), place + 0.1, "D", color=colour, markersize=5)
+
+    _panels(
+        path, names, panels, draw, "points: seeds; diamonds: their median with a bootstrap interval of 95 %"
+    )
+
+
+def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[Row]) -> bool:
+    """Mean difference of every two settings, paired by seed, with its interval; False if there is nothing to draw, or too much."""
+    names = list(dict.fromkeys(f"{row['first']}  −  {row['second']}" for row in pairs))
+    panels = {name: f"difference of {label(name, jobs)}" for name in shown(jobs)}
+    if not names or len(names) > MOST_ROWS:
+        return False
+
+    def draw(axes, name: str) -> None:
+        axes.axvline(0.0, color="0.6", linewidth=0.8)
+        for place, row in enumerate(row for row in pairs if row["quantity"] == name):
+            colour = COLOURS[0] if row["low"] > 0 or row["high"] < 0 else "0.45"
+            axes.plot([row["low"], row["high"]], [place] * 2, color=colour, linewidth=2)
+            axes.plot(row["difference"], place, "o", color=colour, markersize=5)
+
+    _panels(
+        path, names, panels, draw, "mean over pairs of seeds, bootstrap interval of 95 %; blue: without zero"
+    )
+    return True
+
+
+def _panels(path: Path, names: Sequence[str], panels: Mapping[str, str], draw, note: str) -> None:
+    """Panels with one row for each name, from top to bottom."""
+    columns = min(COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = canvas.figure(
+        2.7 * columns + 0.075 * max(map(len, names)) + 0.3, rows * (0.34 * len(names) + 1.15) + 0.3
+    )
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes, (name, text) in zip(grid.ravel(), panels.items(), strict=False):
+        draw(axes, name)
+        axes.set_xlabel(text, fontsize=8)
+        axes.set_title(TITLES[name], fontsize=9, loc="left")
+        axes.xaxis.get_major_locator().set_params(nbins=5)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in grid.ravel()[len(panels) :]:
+        axes.set_axis_off()
+    grid[0, 0].set_yticks(range(len(names)), names)
+    grid[0, 0].set_ylim(len(names) - 0.5, -0.5)
+    figure.supxlabel(note, fontsize=7)
+    canvas.save(figure, path, dpi=130)

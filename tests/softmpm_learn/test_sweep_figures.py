@@ -1,0 +1,268 @@
+"""Tables and figures of sweeps: made by hand, with medians, differences and intervals known from elsewhere."""
+
+import csv
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.stats
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from softmpm_learn.figures import __main__ as program
+from softmpm_learn.figures.intervals import interval, pairs
+from softmpm_learn.figures.sweeps import EXAMINED, parse
+
+LATENT, KMEANS = (-1.0, -2.0, -4.0), (-0.5, -2.5, -1.0)
+"""Losses of three seeds at the last iteration of each setting: medians -2 and -1, mean of the paired differences -1."""
+COLUMNS = ["job", "status", "loss", "iteration", "iterations", *EXAMINED, "settings", "folder", "error"]
+
+
+def table(path: Path, columns, rows) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def metrics(folder: Path, losses, **examination) -> None:
+    """A row for each loss, with a best so far that is lower, and one of the examination."""
+    rows = [
+        {"iteration": k, "loss": v, "progress": v - 0.25, "effort": 0.25, "best": -9.0}
+        for k, v in enumerate(losses)
+    ]
+    rows += [{"iteration": len(losses), **examination}] if examination else []
+    table(folder / "metrics.csv", ["iteration", "loss", "progress", "effort", "best", *EXAMINED], rows)
+
+
+def make_sweep(folder: Path, groups, *, failing=(), **more) -> Path:
+    """A sweep of jobs that take three iterations: loss 1, 0.5, and that of the group."""
+    rows = []
+    for (name, losses), seed in itertools.product(groups.items(), range(3)):
+        job = len(rows)
+        settings = f"task=elephant {name} train.seed={seed}"
+        row = {"job": job, "status": "finished", "settings": settings, "folder": f"/elsewhere/{job}"}
+        row |= {"later": 0.9 + 0.01 * job, "tilt": 5.0 + job, "loss": -9.0, "iterations": 3, **more}
+        last = [1.0, 0.5, losses[seed]]
+        if job in failing:
+            row |= {"status": "failed", "loss": "inf", "later": "", "tilt": "", "error": "it broke"}
+            last = [1.0]
+        metrics(folder / str(job), last, **({} if job in failing else {"later": 0.9}))
+        rows.append(row)
+    table(folder / "sweep.csv", COLUMNS, rows)
+    return folder
+
+
+@pytest.fixture
+def swept(tmp_path) -> Path:
+    return make_sweep(tmp_path / "sweep", {"observer=latent": LATENT, "observer=kmeans": KMEANS})
+
+
+@pytest.fixture
+def drawn(monkeypatch) -> dict[str, Figure]:
+    """Figures by the name of their file."""
+    found, real = {}, Figure.savefig
+
+    def save(self, *args, **kwargs):
+        found[len(found)] = self
+        return real(self, *args, **kwargs)
+
+    monkeypatch.setattr(Figure, "savefig", save)
+    return found
+
+
+def test_a_row_for_each_run_and_iteration(swept, tmp_path):
+    """With what differs between the jobs, and nothing that does not; moved folders are found."""
+    program.make([swept], tmp_path / "out")
+    rows, jobs = read(tmp_path / "out" / "runs.csv"), read(tmp_path / "out" / "jobs.csv")
+    assert len(rows) == 18 and len(jobs) == 6
+    assert list(rows[0]) == [
+        *("run", "sweep", "job", "seed", "observer", "iteration", "loss", "progress", "effort", "best")
+    ]
+    last = [row for row in rows if row["iteration"] == "2"]
+    assert [(row["observer"], row["seed"], float(row["loss"])) for row in last] == [
+        *(("latent", str(k), LATENT[k]) for k in range(3)),
+        *(("kmeans", str(k), KMEANS[k]) for k in range(3)),
+    ]
+    assert [(float(row["final"]), float(row["best"]), float(row["later"]), row["at"]) for row in jobs] == [
+        (loss, min(loss, 0.5), pytest.approx(0.9 + 0.01 * k), "2") for k, loss in enumerate(LATENT + KMEANS)
+    ]
+    assert {row["term"] for row in jobs} == {"progress"} and jobs[0]["kicked"] == ""
+
+
+def test_settings_are_compared_seed_by_seed(swept, tmp_path):
+    """Mean differences by hand; the interval of three pairs lies between the extremes."""
+    program.make([swept], tmp_path)
+    final, later, tilt = read(tmp_path / "pairs.csv")
+    differences = [a - b for a, b in zip(LATENT, KMEANS, strict=True)]
+    assert (final["first"], final["second"]) == ("observer=latent", "observer=kmeans")
+    assert float(final["difference"]) == pytest.approx(np.mean(differences))
+    assert (final["pairs"], final["first_lower"]) == ("3", "2")
+    assert min(differences) <= float(final["low"]) < float(final["high"]) <= max(differences)
+    assert (later["quantity"], tilt["quantity"]) == ("later", "tilt")
+    assert float(tilt["difference"]) == float(tilt["low"]) == float(tilt["high"]) == -3.0
+
+
+def test_the_interval_is_that_of_scipy_and_of_enumeration():
+    """Paired by scipy from other random numbers, within their scatter; of three values from all 27 samples."""
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=10), rng.normal(1.0, size=10)
+    (row,) = pairs({"a": dict(enumerate(a)), "b": dict(enumerate(b))}, "final")
+    other = scipy.stats.bootstrap(
+        *((a, b), lambda x, y, axis: np.mean(x - y, axis=axis)),
+        paired=True,
+        n_resamples=100_000,
+        method="percentile",
+        rng=np.random.default_rng(1),
+    )
+    scatter = 0.03 * np.std(a - b)  # of a quantile of 10,000 means of ten: about 0.008
+    assert (row["low"], row["high"]) == pytest.approx(tuple(other.confidence_interval), abs=scatter)
+    medians = [np.median(sample) for sample in itertools.product(LATENT, repeat=3)]
+    expected = np.quantile(np.repeat(medians, 1000), [0.025, 0.975])
+    assert interval(LATENT, np.median) == pytest.approx(tuple(expected))
+    assert all(map(math.isnan, interval([1.0])))
+
+
+def test_pairs_take_only_seeds_that_both_have():
+    """A seed that failed in one setting counts in neither; without a common seed there is no difference."""
+    groups = {"a": {0: 1.0, 1: 2.0, 3: math.nan}, "b": {1: 5.0, 2: 7.0, 3: 1.0}, "c": {9: 0.0}}
+    rows = pairs(groups, "final")
+    assert [(row["first"], row["second"], row["pairs"]) for row in rows] == [
+        ("a", "b", 1),
+        ("a", "c", 0),
+        ("b", "c", 0),
+    ]
+    assert rows[0]["difference"] == -3.0 and math.isnan(rows[0]["low"]) and math.isnan(rows[1]["difference"])
+
+
+def line(axes: Axes, label: str):
+    (found,) = [one for one in axes.lines if str(one.get_label()).startswith(label)]
+    return found
+
+
+def test_curves_are_medians_at_each_iteration(tmp_path, drawn):
+    """Not best so far; a run that failed is counted in the legend and has no part in the curve."""
+    groups = {"observer=latent": (-1.0, -2.0, -4.0), "observer=kmeans": (-1.0, -3.0, 5.0)}
+    folder = make_sweep(tmp_path, groups, failing=[4])
+    said = program.make([folder], tmp_path / "out")
+    (axes,) = drawn[0].axes
+    latent, kmeans = line(axes, "observer=latent"), line(axes, "observer=kmeans")
+    assert list(latent.get_xdata()) == [0, 1, 2] and list(latent.get_ydata()) == [1.0, 0.5, -2.0]
+    assert list(kmeans.get_ydata()) == [1.0, 0.5, 2.0]
+    assert latent.get_label() == "observer=latent (3 seeds)"
+    assert kmeans.get_label() == "observer=kmeans (2 of 3 seeds, 1 failed)"
+    low, high = axes.collections[0].get_datalim(axes.transData).intervaly
+    assert low == pytest.approx(-3.0) and high == pytest.approx(1.0)  # quartile of -4, -2, -1
+    assert "observer=kmeans: 2 [-1, 5], 2 of 3 seeds" in said
+    failed = read(tmp_path / "out" / "jobs.csv")[4]
+    assert (failed["status"], failed["final"], failed["error"]) == ("failed", "", "it broke")
+
+
+def test_every_seed_is_a_point(swept, tmp_path, drawn):
+    """In a panel for each quantity that has numbers, with a label that has the unit."""
+    program.make([swept], tmp_path)
+    final, later, tilt = [axes for axes in drawn[1].axes if axes.axison]
+    assert [axes.get_xlabel() for axes in (final, later, tilt)] == [
+        "loss at iteration 2",
+        "speed over that in the episode [1]",
+        "largest tilt [degrees]",
+    ]
+    assert [tuple(dots.get_offsets()[:, 0]) for dots in final.collections] == [LATENT, KMEANS]
+    assert [one.get_xdata()[0] for one in final.lines if len(one.get_xdata()) == 1] == [-2.0, -1.0]
+    assert [text.get_text() for text in final.get_yticklabels()] == [
+        "observer=latent (3 seeds)",
+        "observer=kmeans (3 seeds)",
+    ]
+    assert len(drawn) == 3 and drawn[2].axes[0].get_xlabel() == "difference of loss at iteration 2"
+
+
+def test_another_column_at_another_iteration(swept, tmp_path):
+    """Chosen on the command line."""
+    program.main([str(swept), "--value", "progress", "--at", "1", "--out", str(tmp_path)])
+    assert {row["final"] for row in read(tmp_path / "jobs.csv")} == {"0.25"}
+
+
+def test_sweeps_together(swept, tmp_path):
+    """A setting that one of them leaves at its default; and two of the same command, told apart by their folders."""
+    other = make_sweep(tmp_path / "b", {"": (-1.0, -1.0, -1.0)})
+    program.make([swept, other], tmp_path / "out")
+    firsts = {(row["first"], row["second"]) for row in read(tmp_path / "out" / "pairs.csv")}
+    assert ("observer=latent", "observer by default") in firsts and len(firsts) == 3
+    again = make_sweep(tmp_path / "again", {"observer=latent": KMEANS, "observer=kmeans": LATENT})
+    program.make([swept, again], tmp_path / "out")
+    (row, *_) = read(tmp_path / "out" / "pairs.csv")
+    assert (row["first"], row["second"]) == ("sweep=sweep, observer=latent", "sweep=sweep, observer=kmeans")
+    assert len(read(tmp_path / "out" / "jobs.csv")) == 12
+
+
+@pytest.mark.parametrize("listed", ["in the sweep", "in the job", "nowhere"])
+def test_seeds_side_by_side_are_runs(tmp_path, listed):
+    """A job whose seeds have folders of their own; one that failed is known if a table has them, of the sweep or of the job."""
+    rows = []
+    for job, observer in enumerate(("latent", "kmeans")):
+        place, settings = tmp_path / str(job), f"observer={observer} train.seeds=3"
+        for seed in (7, 8, 10):
+            metrics(place / f"seed_{seed}", [1.0, -1.0 * seed], later=0.1 * seed)
+        own = [
+            {"job": 0, "status": "finished" if seed < 10 else "failed", "later": 0.1 * seed}
+            | {"settings": settings, "seed": seed, "folder": f"/elsewhere/{job}/seed_{seed}"}
+            for seed in (7, 8, 10)
+        ]
+        if listed == "in the job":
+            table(place / "sweep.csv", [*COLUMNS, "seed"], own)
+        of_job = {"job": job, "status": "finished", "settings": settings, "folder": str(place)}
+        rows += [row | {"job": job} for row in own] if listed == "in the sweep" else [of_job]
+    table(tmp_path / "sweep.csv", [*COLUMNS, "seed"], rows)
+    program.make([tmp_path], tmp_path / "out")
+    jobs = read(tmp_path / "out" / "jobs.csv")
+    assert [(row["job"], row["seed"], row["observer"]) for row in jobs] == [
+        (str(job), str(seed), name) for job, name in enumerate(("latent", "kmeans")) for seed in (7, 8, 10)
+    ]
+    assert [float(row["later"]) for row in jobs[:2]] == pytest.approx([0.7, 0.8])
+    assert jobs[2]["status"] == ("finished" if listed == "nowhere" else "failed")
+    (row, *_) = read(tmp_path / "out" / "pairs.csv")
+    assert row["pairs"] == ("3" if listed == "nowhere" else "2")
+
+
+def test_what_is_no_sweep_is_said_in_a_sentence(swept, tmp_path, capsys):
+    """Also columns and iterations that are not there, and jobs that lost their files."""
+
+    def refused(*words) -> str:
+        with pytest.raises(SystemExit) as stop:
+            program.main([str(word) for word in words])
+        said = capsys.readouterr().err.strip().splitlines()
+        assert stop.value.code == 1 and len(said) == 1
+        return said[0]
+
+    assert "is no sweep: it has no sweep.csv" in refused(tmp_path)
+    assert "is no sweep: it has no sweep.csv" in refused(swept / "0")
+    assert "metrics.csv has no column speed; it has loss, progress" in refused(swept, "--value", "speed")
+    assert "no run has a value of loss at iteration 3" in refused(swept, "--at", "3")
+    assert "have the same settings and the same seed, 0" in refused(swept, swept)
+    (swept / "0" / "metrics.csv").write_text("iteration,loss\n0,much\n")
+    assert "0/metrics.csv, line 2: could not convert" in refused(swept)
+    (swept / "0" / "metrics.csv").unlink()
+    assert "job 0" in (said := refused(swept)) and "metrics.csv is missing" in said
+    none = make_sweep(tmp_path / "none", {"observer=latent": LATENT}, failing=[0, 1, 2])
+    assert "none of 3 runs has finished" in refused(none)
+    (none / "sweep.csv").write_text("a,b\n1,2\n")
+    assert "must have the columns folder, job, settings, status" in refused(none)
+
+
+def test_command_lines_are_read_with_their_brackets():
+    """White space in lists and quotes does not separate; the last value of a key counts."""
+    assert parse("task=arm +task.goal=[0.5, 0.3] task.note='a b' train.seed=1 train.seed=2") == {
+        "task": "arm",
+        "task.goal": "[0.5, 0.3]",
+        "task.note": "'a b'",
+        "train.seed": "2",
+    }
+    assert parse("") == {}
