@@ -80,7 +80,7 @@ def run_episode(
     inputs: Inputs | None = None,
     goal: Tensor | None = None,
     start: State | None = None,
-    fade: float = math.inf,
+    fade: float | Tensor = math.inf,
     keep_every: int = 0,
     on_frame: Callable[[Frame], None] | None = None,
     failures: softmpm.Failures | None = None,
@@ -91,7 +91,8 @@ def run_episode(
         params, inputs: Material of the robot and what else is not the scene's, see :class:`softmpm_learn.design.Design`.
         goal: Goal of each world [m], shape (world, dim), where it is not the task's own.
         start: Initial state, None for rest.
-        fade: Time constant with which gradients fade on their way through the states [s], see :mod:`softmpm_learn.fading`.
+        fade: Time constant with which gradients fade on their way through the states [s], or that of each world, shape (world,), see
+            :mod:`softmpm_learn.fading`.
         keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
         failures: Collects the failures of worlds, while the others go on; None raises the first.
@@ -172,7 +173,7 @@ class ClosedLoop:
         free: list[Tensor],
         runs: int = 1,
         keep_every: int = 0,
-        fade: float = math.inf,
+        fade: float | Tensor = math.inf,
     ):
         self.fade = fade
         self.task, self.model, self.observer, self.policy = task, model, observer, policy

@@ -19,33 +19,40 @@ from softmpm import State
 
 
 class _Fade(torch.autograd.Function):
-    """Tensors as they are, whose gradients are multiplied by a factor."""
+    """Tensors as they are, whose gradients are multiplied by a factor, or by one for each world."""
 
     @staticmethod
-    def forward(ctx, factor: float, *tensors: Tensor):
+    def forward(ctx, factor: float | Tensor, *tensors: Tensor):
         ctx.factor = factor
         return tuple(tensor.view_as(tensor) for tensor in tensors)
 
     @staticmethod
     def backward(ctx, *adj: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return None, *(None if one is None else ctx.factor * one for one in adj)
+        return None, *(None if one is None else _times(ctx.factor, one) for one in adj)
+
+
+def _times(factor: float | Tensor, adj: Tensor) -> Tensor:
+    if isinstance(factor, Tensor):
+        factor = factor.view(-1, *[1] * (adj.dim() - 1))
+    return factor * adj
 
 
 class Fading:
     """Fading along one episode.
 
     Args:
-        time: τ [s]; infinite for gradients that do not fade.
+        time: τ [s], or that of each world, shape (world,); infinite for gradients that do not fade.
         period: Duration of a control step [s].
     """
 
-    def __init__(self, time: float, period: float):
-        self.factor = math.exp(-period / time)
+    def __init__(self, time: float | Tensor, period: float):
+        worlds = isinstance(time, Tensor)
+        self.factor = torch.exp(-period / time) if worlds else math.exp(-period / time)
         self._carry: Tensor | None = None
 
     def __call__(self, state: State) -> tuple[State, State]:
         """The state from which the simulation goes on, and the state as the objective sees it."""
-        if self.factor == 1.0 or not state.x.requires_grad:
+        if not state.x.requires_grad or (isinstance(self.factor, float) and self.factor == 1.0):
             return state, state
         seen = state if self._carry is None else state._replace(x=state.x + self._carry)
         lost = _Fade.apply(1.0 - self.factor, state.x)[0] - state.x.detach()

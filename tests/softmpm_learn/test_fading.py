@@ -72,6 +72,28 @@ def test_the_gradient_is_that_of_weighted_states(exact, task, time):
     torch.testing.assert_close(got[-1], all_of_it[-1], rtol=1e-12, atol=0)
 
 
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+def test_every_world_has_its_own_time(formulation, make_block, task):
+    """With a time for each world its gradient is that of a simulation of its own: ≤ 1e-12; also with one that is infinite."""
+    times = torch.tensor([0.02, 0.1, math.inf], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    observer = torch.nn.Identity()
+    observer.observe, observer.encode = lambda model, state: state.v, lambda v: v.mean(dim=1)
+    build = dict(device="cpu", dtype=torch.float64, formulation=formulation)
+    model = softmpm.build(make_block(), worlds=len(times), **build)
+    rows = torch.rand(task.control_steps, len(times), model.muscle_count, generator=generator).double()
+
+    def gradient(model, rows, fade):
+        rows = rows.clone().requires_grad_()
+        episode = run_episode(task, model, observer, Replay(rows), model.params(), fade=fade)
+        return torch.autograd.grad(episode.terms["progress"].sum(), rows)[0]
+
+    got, alone = gradient(model, rows, times), softmpm.build(make_block(), **build)
+    for k, time in enumerate(times.tolist()):
+        want = gradient(alone, rows[:, k : k + 1], time)
+        torch.testing.assert_close(got[:, k : k + 1], want, rtol=1e-12, atol=1e-15)
+
+
 def test_a_distance_counts_every_step(exact, task):
     """With a very short time constant the first activation still moves the body by what it adds in its own step."""
     rows = torch.full((task.control_steps, 1, exact.muscle_count), 0.3, dtype=torch.float64).requires_grad_()
