@@ -184,7 +184,7 @@ class ClosedLoop:
         self._captures = not (
             model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64)
         )
-        loop = weakref.proxy(self)  # or the graph would hold what holds it
+        loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
         self._graph = softmpm.Graph(lambda: loop._work(), model.device)
 
     def __call__(

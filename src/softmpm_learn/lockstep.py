@@ -57,7 +57,7 @@ class LockStep:
         self._lay_out(count, scale.dtype)
         self._make_minibatches(first, count, scale.dtype)
         self._validation: tuple[Tensor, dict[str, Tensor]] | None = None
-        lockstep = weakref.proxy(self)  # or the graph would hold what holds it
+        lockstep = weakref.proxy(self)  # a strong reference would be a cycle through the graph
         graph = softmpm.Graph(lambda: lockstep._epoch(), self.device)
         self._run = graph if self._capturing else graph.work
 
@@ -225,5 +225,5 @@ class LockStep:
         self.kept[:, k].copy_(self.rows[:, k])
 
     def reset(self, k: int) -> None:
-        """Bring learner ``k`` back to what is kept: one that is not finite must not reach the others through a shared kernel."""
+        """Restore the kept weights of learner ``k``, since values that are not finite could reach others through a shared kernel."""
         self.rows[:, k].copy_(self.kept[:, k])

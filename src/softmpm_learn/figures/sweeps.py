@@ -46,10 +46,10 @@ def read(folders: Sequence[Path]) -> list[SweptRun]:
     varying = differing(found)
     for run in found:
         run.settings = {key: run.settings.get(key, "") for key in varying}
-    if len({run.sweep for run in found}) > 1 and _twins(found):
+    if len({run.sweep for run in found}) > 1 and _repeated(found):
         for run in found:
             run.settings = {"sweep": run.sweep} | run.settings
-    for one, other in _twins(found)[:1]:
+    for one, other in _repeated(found)[:1]:
         raise ValueError(
             f"{one.folder} and {other.folder} have the same settings and the same seed, {one.seed}; leave one of them out."
         )
@@ -66,14 +66,15 @@ def differing(runs: Sequence[SweptRun]) -> list[str]:
     return [key for key in keys if len({run.settings.get(key) for run in runs}) > 1]
 
 
-def _twins(runs: Sequence[SweptRun]) -> list[tuple[SweptRun, SweptRun]]:
+def _repeated(runs: Sequence[SweptRun]) -> list[tuple[SweptRun, SweptRun]]:
+    """Each run whose settings and seed an earlier one has, after that one."""
     first: dict[tuple, SweptRun] = {}
-    twins = []
+    found = []
     for run in runs:
         before = first.setdefault((tuple(run.settings.items()), run.seed), run)
         if before is not run:
-            twins.append((before, run))
-    return twins
+            found.append((before, run))
+    return found
 
 
 def _runs(folder: Path, job: int | None = None) -> Iterator[SweptRun]:
