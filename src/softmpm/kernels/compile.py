@@ -43,9 +43,14 @@ def in_order(module: str, records: int) -> str:
     return name
 
 
+def runs_in_order(kernel: wp.Kernel) -> bool:
+    """True for a kernel of a module of :func:`in_order`."""
+    return kernel.module.name in _in_order
+
+
 def launch(kernel, dim, inputs: Sequence, device: wp.Device, **settings):
     """``wp.launch``, never recorded on a tape. The first launch of a kernel on a device, which loads its module, holds the lock."""
-    if device.is_cuda and kernel.module.name in _in_order:
+    if device.is_cuda and runs_in_order(kernel):
         return _launch_in_order(kernel, dim, inputs, **settings)
     key = kernel, device.alias, settings.get("block_dim")
     if key in _loaded:

@@ -167,6 +167,8 @@ class Accumulators:
 
     def __init__(self, model: Model, wanted: RequestedGrads, rows: int, nodes: int):
         self.model, self.wanted, self.row_count, self.nodes = model, wanted, rows, nodes
+        self._particle_structs: dict[tuple[int, int], Any] = {}
+        self._grid_structs: dict[int, Any] = {}
         whole = InputsAdj(model, wanted, rows)
         self.inputs, self.scalars = whole.inputs, whole.scalars
         self.tensors: Values = {}
@@ -207,19 +209,23 @@ class Accumulators:
 
     def particle_struct(self, p2g: int = 0, g2p: int = 0):
         """Struct of the accumulators of the inputs of particles, in the rows of :func:`particle_struct`."""
-        struct = input_adj_types(self.model.spec, self.wanted).ParticleInputsAdj()
-        for one in self.inputs:
-            if one.stage != "grid":
-                self._set(struct, one, {"p2g": p2g, "g2p": g2p}[one.stage])
-        return struct
+        if (p2g, g2p) not in self._particle_structs:
+            struct = input_adj_types(self.model.spec, self.wanted).ParticleInputsAdj()
+            for one in self.inputs:
+                if one.stage != "grid":
+                    self._set(struct, one, {"p2g": p2g, "g2p": g2p}[one.stage])
+            self._particle_structs[p2g, g2p] = struct
+        return self._particle_structs[p2g, g2p]
 
     def grid_struct(self, row: int = 0):
         """Struct of the accumulators of the inputs of nodes, in a row."""
-        struct = input_adj_types(self.model.spec, self.wanted).GridInputsAdj()
-        for one in self.inputs:
-            if one.stage == "grid":
-                self._set(struct, one, row)
-        return struct
+        if row not in self._grid_structs:
+            struct = input_adj_types(self.model.spec, self.wanted).GridInputsAdj()
+            for one in self.inputs:
+                if one.stage == "grid":
+                    self._set(struct, one, row)
+            self._grid_structs[row] = struct
+        return self._grid_structs[row]
 
     def _set(self, struct, one: Input, row: int) -> None:
         t, tensor = types(self.model.spec.dim, self.model.spec.dtype), self.tensors[one.name]

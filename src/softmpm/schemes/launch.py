@@ -1,14 +1,17 @@
 """Repeated kernel launches: single ones that are rebound to new arrays, and lists on fixed arrays, as CUDA graphs or CPU programs."""
 
+import copy
+import ctypes
 import functools
 import math
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 import warp as wp
 
-from softmpm.kernels.compile import launch
+from softmpm.kernels.compile import launch, runs_in_order
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
 from softmpm.schemes.program import Program
@@ -19,6 +22,7 @@ class KernelLauncher:
 
     def __init__(self, model: Model, stream: wp.Stream | None, collected: list | None = None):
         self.device, self.stream, self.collected = model.wp_device, stream, collected
+        self._templates: dict[tuple, LaunchTemplate] = {}
 
     def __call__(self, kernel, dim, *inputs, block_dim: int = 256, part: int | None = None) -> None:
         """Launch a kernel.
@@ -28,13 +32,55 @@ class KernelLauncher:
                 kernel needs the build options :func:`softmpm.kernels.parts.in_parts`.
         """
         divided = self.collected is None and self.device.is_cpu and part is not None and math.prod(dim) > part
-        collect = self.collected is not None or divided
-        settings = dict(stream=self.stream, block_dim=block_dim, record_cmd=collect)
-        made = launch(kernel, dim, inputs, self.device, **settings)
-        if divided:
-            Program([(made, part)]).run()
-        elif self.collected is not None:
+        if self.device.is_cuda and runs_in_order(kernel):
+            launch(kernel, dim, inputs, self.device, stream=self.stream, block_dim=block_dim)
+            return
+        made = self._recorded(kernel, dim, inputs, block_dim)
+        if self.collected is not None:
             self.collected.append((made, part))
+        elif divided:
+            Program([(made, part)]).run()
+        else:
+            made.launch(self.stream)
+
+    def _recorded(self, kernel, dim, inputs: Sequence, block_dim: int) -> wp.Launch:
+        """A launch that has not run yet."""
+        key = kernel, dim, block_dim
+        if key in self._templates:
+            return self._templates[key].on(inputs)
+        made: Any = launch(kernel, dim, inputs, self.device, block_dim=block_dim, record_cmd=True)
+        self._templates[key] = LaunchTemplate(made)
+        return made
+
+
+class LaunchTemplate:
+    """A recorded launch, to be repeated on other inputs: the checks and look-ups of ``wp.launch`` take ten times as long as a launch.
+
+    The inputs must have the types of the first ones, which Warp has checked.
+    """
+
+    def __init__(self, made: Any):
+        self._made, self._kinds = made, [type(value) for value in made.params[1:]]
+
+    def on(self, inputs: Sequence) -> wp.Launch:
+        """The same launch on other inputs, which it keeps alive."""
+        made: Any = copy.copy(self._made)
+        values = [_packed(kind, value) for kind, value in zip(self._kinds, inputs, strict=True)]
+        made.params, made.fwd_args = [made.bounds, *values], inputs
+        if made.params_addr is not None:
+            made.params_addr = (ctypes.c_void_p * len(made.params))(*map(ctypes.addressof, made.params))
+        return made
+
+
+def _packed(kind: type, value: Any) -> Any:
+    """An input of a launch as the native value of a type."""
+    if isinstance(value, kind):
+        return value
+    if not issubclass(kind, ctypes.Structure):
+        return kind(value)
+    found = value.__ctype__()
+    assert type(found) is kind, f"a repeated launch got {type(found)}, the first one {kind}"
+    return found
 
 
 class RebindableLaunch:

@@ -1,5 +1,7 @@
 """Inputs of a chunk graph in fixed buffers. Inputs of particles are permuted to the particle order, the others are copied unchanged."""
 
+from typing import Any
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -59,6 +61,8 @@ class SortedInputs:
         self._indices = [one.name for one in found if one.sorted and one.kind == "index"]
         self._vectors = [one.name for one in found if one.per == "particle" and one.kind == "vector"]
         self._given: tuple[Tensor, ...] = ()  # source of the sorted scalars, if it needs no gradient
+        self._particle_structs: dict[tuple[int, int], Any] = {}
+        self._grid_structs: dict[int, Any] = {}
 
         def tensor(*shape: int, dtype=model.dtype) -> Tensor:
             return torch.empty(shape, dtype=dtype, device=model.device)
@@ -110,12 +114,19 @@ class SortedInputs:
 
     def particle_struct(self, p2g: int, g2p: int):
         """Struct for P2G of substep ``p2g`` and G2P of substep ``g2p``, both clamped to the chunk."""
-        row = [self.chunk.row(min(max(s, 0), self.chunk.length - 1)) for s in (p2g, g2p)]
-        return particle_struct(self.model, self.values, *row)
+        first, second = (self.chunk.row(min(max(s, 0), self.chunk.length - 1)) for s in (p2g, g2p))
+        if (first, second) not in self._particle_structs:
+            made = particle_struct(self.model, self.values, first, second)
+            self._particle_structs[first, second] = made
+        return self._particle_structs[first, second]
 
     def grid_struct(self, s: int):
         """Struct for the grid stage of substep ``s``."""
-        return grid_struct(self.model, self.values, self.chunk.row(s), s)
+        row = self.chunk.row(s)
+        key = s if self.model.spec.moving else row
+        if key not in self._grid_structs:
+            self._grid_structs[key] = grid_struct(self.model, self.values, row, s)
+        return self._grid_structs[key]
 
 
 def unsort(

@@ -10,7 +10,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
-from softmpm.schemes.fast.contact_views import packed_nodes
+from softmpm.schemes.fast.contact_views import packed_nodes, vectors
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.sorted_state import SortedAdj
 from softmpm.schemes.inputs import Accumulators, InputsAdj
@@ -53,6 +53,8 @@ class SharedAdjoint:
             self.gained, self.adj_loads = tensor(buffers.held, 4), torch.empty_like(buffers.loads)
             self.gained_array = view(self.gained, t.aligned)
             self.gained_view = packed_nodes(model, self.gained)
+            self.velocity_vectors = [vectors(model, velocity) for velocity in self.velocity]
+            self.node_vectors = [vectors(model, nodes) for nodes in self.nodes]
             self.adj_load_arrays = [view(load, t.real) for load in self.adj_loads]
         self.exact = None
         if model.spec.deterministic:

@@ -19,7 +19,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import passing, placeholder, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.carried import Nodes, SurfaceContact
-from softmpm.schemes.fast.contact_views import contact_nodes
+from softmpm.schemes.fast.contact_views import packed_nodes, vectors
 from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.launch_size import LaunchSize
 from softmpm.schemes.fast.particle_order import ParticleLayout
@@ -82,6 +82,8 @@ class ChunkBuffers:
             self.contact = SurfaceContact(model, self.window, chunk, keep, packed=True)
             self.loads = tensor(2, model.worlds, layout.node_count)
             self.load_arrays = [view(load, t.real) for load in self.loads]
+            self.velocity_vectors = [vectors(model, velocity) for velocity in self.velocity]
+            self._contact_nodes = [packed_nodes(model, nodes) for nodes in self.nodes]
         self._prepare_loading(places)
 
     def _view(self) -> None:
@@ -138,9 +140,10 @@ class ChunkBuffers:
         """Packed state before substep ``s``."""
         return self.packed[s if self.keep else 0]
 
-    def contact_nodes(self, s: int) -> Nodes:
-        """Nodes of substep ``s`` as contact at surface points takes them."""
-        return contact_nodes(self.model, self.nodes[s % len(self.nodes)], self.velocity, self.loads[s % 2])
+    def contact_nodes(self, s: int, velocities: Sequence[wp.array]) -> Nodes:
+        """Nodes of substep ``s`` as contact at surface points takes them, with velocities after and before contact."""
+        velocity, free = velocities
+        return Nodes(self._contact_nodes[s % len(self.nodes)], free, velocity, self.load_arrays[s % 2])
 
     def reset_status(self) -> None:
         """Reset all status words."""

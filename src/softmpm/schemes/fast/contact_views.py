@@ -6,13 +6,6 @@ from torch import Tensor
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import view
-from softmpm.schemes.carried import Nodes
-
-
-def contact_nodes(model: Model, node: Tensor, velocities: Tensor, load: Tensor) -> Nodes:
-    """Views of mass and momentum, of the velocities after and before contact, and of the loads."""
-    velocity, free = (vectors(model, one) for one in velocities)
-    return Nodes(packed_nodes(model, node), free, velocity, view(load, types(2, model.spec.dtype).real))
 
 
 def packed_nodes(model: Model, nodes: Tensor) -> wp.array:

@@ -72,7 +72,8 @@ def _contact(buffers: ChunkBuffers, contact: SurfaceContact, s: int, launch: Ker
     out = (free, velocity, then, loads[(s + 1) % 2], loads[s % 2])
     kernel = contact_stage(model.spec).grid_and_loads
     launch(kernel, threads, *parameters, packed, now, *out, block_dim=BLOCK)
-    contact.press(s, inputs, packed, buffers.contact_nodes(s), buffers.words_array, launch)
+    nodes = buffers.contact_nodes(s, buffers.velocity_vectors)
+    contact.press(s, inputs, packed, nodes, buffers.words_array, launch)
 
 
 def point_threads(buffers: ChunkBuffers) -> tuple[int, int]:

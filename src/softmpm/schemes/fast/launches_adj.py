@@ -6,9 +6,7 @@ from softmpm.kernels.carried.grid_stage import contact_stage, contact_stage_adj
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK
-from softmpm.schemes.carried import Nodes
 from softmpm.schemes.fast.adjoint_buffers import ChunkAdjoint
-from softmpm.schemes.fast.contact_views import contact_nodes, vectors
 from softmpm.schemes.fast.launches import point_threads
 from softmpm.schemes.launch import KernelLauncher
 
@@ -80,8 +78,8 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
         launch(kernel, threads, *parameters, *states, *out, *sums, block_dim=BLOCK)
     if not first:
         inputs, states = forward.inputs.grid_struct(s - 1), forward.packed[s - 1]
-        about = (states, _contact_nodes(adjoint, s - 1), forward.words_array, launch)
-        shared.contact.press_again(contact, s - 1, inputs, *about)
+        nodes = forward.contact_nodes(s - 1, shared.velocity_vectors)
+        shared.contact.press_again(contact, s - 1, inputs, states, nodes, forward.words_array, launch)
 
 
 def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
@@ -89,19 +87,9 @@ def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     assert forward.contact is not None and shared.contact is not None
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
-    states = (inputs, adj_inputs, forward.packed[s], _contact_nodes(adjoint, s))
-    adj_nodes = (
-        vectors(adjoint.model, shared.nodes[s % 2]),
-        shared.adj_load_arrays[s % 2],
-        shared.gained_view,
-    )
+    states = (inputs, adj_inputs, forward.packed[s], forward.contact_nodes(s, shared.velocity_vectors))
+    adj_nodes = (shared.node_vectors[s % 2], shared.adj_load_arrays[s % 2], shared.gained_view)
     shared.contact.press_adj(forward.contact, s, *states, *adj_nodes, shared.adj_array, launch)
-
-
-def _contact_nodes(adjoint: ChunkAdjoint, s: int) -> Nodes:
-    """Nodes of substep ``s`` as contact takes them."""
-    forward = adjoint.forward
-    return contact_nodes(adjoint.model, forward.nodes[s], adjoint.shared.velocity, forward.loads[s % 2])
 
 
 def _adj_nodes(adjoint: ChunkAdjoint, s: int) -> tuple[wp.array, wp.array]:
