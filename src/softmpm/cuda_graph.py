@@ -29,6 +29,9 @@ class Graph(Generic[Result]):
         ...     return loss.detach(), grad(loss, list(policy.parameters()))
         >>> graph = softmpm.Graph(work, model.device)
         >>> loss, gradients = graph()  # overwritten by the next call
+
+    Attributes:
+        failed: Worlds in which the last replay failed; the error that was raised is of one of them.
     """
 
     def __init__(self, work: Callable[[], Result], device: torch.device):
@@ -37,7 +40,8 @@ class Graph(Generic[Result]):
         self._graph: torch.cuda.CUDAGraph | None = None
         self._resources: GraphResources | None = None
         self._warm = False
-        self._failed: torch.Tensor | None = None
+        self._any_failed: torch.Tensor | None = None
+        self.failed: list[int] = []
 
     def __call__(self) -> Result:
         """The result of the function; once captured, in the same tensors each time.
@@ -45,6 +49,7 @@ class Graph(Generic[Result]):
         Raises:
             UnstableError: As ``simulate`` does.
         """
+        self.failed = []
         if self._stream is None:
             return self.work()
         if not self._warm:
@@ -57,8 +62,9 @@ class Graph(Generic[Result]):
             self._graph = self._capture(self._stream)
             self._warm = True
         self._graph.replay()
-        if self._failed is not None and self._failed.item():
+        if self._any_failed is not None and self._any_failed.item():
             assert self._resources is not None
+            self.failed = self._resources.failed()
             if not self._resources.widen():
                 return self._run(self._stream)  # raises the error; the graph stays
             self._graph = self._resources = None
@@ -86,6 +92,6 @@ class Graph(Generic[Result]):
             with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
                 words = [words for words, _ in resources.words]
-                self._failed = (torch.cat(words) != NEVER).any() if words else None
+                self._any_failed = (torch.cat(words) != NEVER).any() if words else None
         self._resources = resources
         return graph

@@ -200,6 +200,11 @@ class ClosedLoop:
             self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
         return self._graph() if self._captures and not on_frame else self._work(on_frame)
 
+    @property
+    def failed(self) -> list[int]:
+        """Worlds in which the last call failed, where a captured graph knows of more than the error says."""
+        return self._graph.failed
+
     def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
         params, inputs = self.design()
         episode = run_episode(

@@ -15,7 +15,7 @@ from softmpm_learn.episode import Episode
 from softmpm_learn.evaluation import due, evaluate
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs import AlsoFailedError, Runs
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -59,12 +59,17 @@ def optimise(
             episode, rows = attempt(runs, goals, loggers, seconds)
             failed = {k: error for k, error in rows.items() if isinstance(error, NotFiniteError)}
         except (softmpm.UnstableError, OtherProcessError) as error:
-            failed = {runs.owner(error) if isinstance(error, softmpm.UnstableError) else 0: error}
+            failed = runs.blamed(error) if isinstance(error, softmpm.UnstableError) else {0: error}
         if not failed:
             found = {k: row | {"retries": retries[k]} for k, row in rows.items() if isinstance(row, dict)}
             update(runs, found)
             return found, episode.observations
         for k, error in failed.items():
+            if (
+                isinstance(error, AlsoFailedError)
+                and retries.get(k, 0) >= runs.all[k].settings.optimizer.retries
+            ):
+                continue  # more than half a step back takes an error of its own
             go_back(runs, k, error, retries.get(k, 0))
             retries[k] += 1
     return {}, None

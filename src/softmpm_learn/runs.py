@@ -24,6 +24,13 @@ from softmpm_learn.settings import Settings
 from softmpm_learn.stacking import Stacked
 
 
+class AlsoFailedError(RuntimeError):
+    """The robot of a run failed in the same replay as that of another run, whose error says how."""
+
+    def __init__(self, run: Run):
+        super().__init__(f"the robot of seed {run.settings.train.seed} failed in the same simulation.")
+
+
 class Runs:
     """Runs of one task in the worlds of one model: run k has the k-th share of them.
 
@@ -98,6 +105,13 @@ class Runs:
     def owner(self, error: UnstableError) -> int:
         """Number of the run in whose world a simulation failed."""
         return error.world // self.share
+
+    def blamed(self, error: UnstableError) -> dict[int, Exception]:
+        """Runs that a failure is of, by their number: the one that it names, and those whose robots failed in the same replay."""
+        first = self.owner(error)
+        others = {world // self.share for world in self.loop.failed} - {first}
+        found: dict[int, Exception] = {first: error}
+        return found | {k: AlsoFailedError(self.all[k]) for k in sorted(others)}
 
     def failed(self, failures: Failures) -> dict[int, UnstableError]:
         """The first of some failures in the worlds of each run that has one, by its number."""

@@ -17,6 +17,7 @@ from torch import nn
 
 import softmpm
 from softmpm_learn import checkpoint, optimisation, register
+from softmpm_learn.episode import ClosedLoop
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -185,6 +186,27 @@ def test_a_retry_of_one_seed_leaves_the_others_as_they_are(task, conf, tmp_path,
         for record in caplog.records
         if len(record.args) == 2
     )
+
+
+def test_seeds_that_fail_in_one_replay_go_back_at_once(task, conf, tmp_path, monkeypatch):
+    """The error names one world; the graph knows all. One more simulation serves every seed that failed."""
+    conf, calls = changed(conf, observer=dict(name="centroids")), []
+    real = ClosedLoop.__call__
+
+    def counted(self, goal, on_frame=None):
+        calls.append(1)
+        self._graph.failed = []
+        if len(calls) == 3:
+            self._graph.failed = [0, 2]
+            what = dict(kind="inverted", particle=3, substep=1, value=-1.0, limit="det F > 0")
+            raise softmpm.UnstableError("particle 3 is inverted.", world=0, **what)
+        return real(self, goal, on_frame)
+
+    monkeypatch.setattr(ClosedLoop, "__call__", counted)
+    together(task, conf, tmp_path)
+    retries = [[row["retries"] for row in metrics(tmp_path / str(k))] for k in range(SEEDS)]
+    assert retries == [[0, 0, 1, 0, 0], [0] * 5, [0, 0, 1, 0, 0]]
+    assert len(calls) == 5 + 1
 
 
 def test_a_seed_that_fails_ends_alone(task, conf, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import torch
 
 from softmpm.model import Model
-from softmpm.schemes.failure_report import outgrown
+from softmpm.schemes.failure_report import failed_worlds, outgrown
 
 
 def is_capturing(model: Model) -> bool:
@@ -54,6 +54,11 @@ class GraphResources:
     def __init__(self):
         self.words: list[tuple[torch.Tensor, Callable[[], None] | None]] = []
         self.uses: list[object] = []
+
+    def failed(self) -> list[int]:
+        """Worlds that the last replay reports as failed."""
+        reports = [words.tolist() for words, _ in self.words]
+        return sorted({world for words in reports for world in failed_worlds(words)})
 
     def widen(self) -> bool:
         """After a replay that failed: larger windows where a particle left one. True if there was such a one; capture anew then."""
