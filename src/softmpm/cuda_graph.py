@@ -9,12 +9,13 @@ from softmpm.errors import NEVER
 from softmpm.schemes.capture import GraphResources, collected_resources, exclusive_capture
 
 Result = TypeVar("Result")
+Called = TypeVar("Called")
 
 
 class Graph(Generic[Result]):
     """A function, which may call :func:`softmpm.simulate`, captured once as a CUDA graph and replayed without any launch from the host.
 
-    On the CPU the function is called each time. After a replay that reports a failure the function is called again, which raises
+    On the CPU the function is called each time. After a replay that reports a failure ``again`` is called, which raises
     the error; the captured graph stays. If a particle only left the allocated part of the grid, that part is enlarged, the function is
     called, and the next call captures again.
 
@@ -22,6 +23,7 @@ class Graph(Generic[Result]):
         work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
             for a number: what changes between calls is written into tensors that it reads. Gradients are taken inside it.
         device: Where it runs.
+        again: Does the same simulations, without gradients at best, and gives nothing; None: ``work`` itself.
 
     Example:
         >>> def work():
@@ -34,8 +36,10 @@ class Graph(Generic[Result]):
         failed: Worlds in which the last replay failed; the error that was raised is of one of them.
     """
 
-    def __init__(self, work: Callable[[], Result], device: torch.device):
-        self.work, self.device = work, device
+    def __init__(
+        self, work: Callable[[], Result], device: torch.device, again: Callable[[], object] | None = None
+    ):
+        self.work, self.device, self.again = work, device, again
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._resources: GraphResources | None = None
@@ -53,7 +57,7 @@ class Graph(Generic[Result]):
         if self._stream is None:
             return self.work()
         if not self._warm:
-            result = self._run(self._stream)
+            result = self._run(self._stream, self.work)
             # It created what a capture must not: kernels, buffers, an order of the particles.
             self._warm = True
             return result
@@ -66,17 +70,19 @@ class Graph(Generic[Result]):
             assert self._resources is not None
             self.failed = self._resources.failed()
             if not self._resources.widen():
-                return self._run(self._stream)  # raises the error; the graph stays
+                if self.again is not None:
+                    self._run(self._stream, self.again)
+                return self._run(self._stream, self.work)  # where sums in another order did not fail
             self._graph = self._resources = None
             self._warm = False
             return self()
         return self._result
 
-    def _run(self, stream: torch.cuda.Stream) -> Result:
-        """Call the function on the stream of the capture, for which the buffers exist."""
+    def _run(self, stream: torch.cuda.Stream, work: Callable[[], Called]) -> Called:
+        """Call a function on the stream of the capture, for which the buffers exist."""
         stream.wait_stream(torch.cuda.current_stream(self.device))
         with torch.cuda.stream(stream):
-            result = self.work()
+            result = work()
         torch.cuda.current_stream(self.device).wait_stream(stream)
         return result
 

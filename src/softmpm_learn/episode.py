@@ -185,7 +185,7 @@ class ClosedLoop:
             model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64)
         )
         loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
-        self._graph = softmpm.Graph(lambda: loop._work(), model.device)
+        self._graph = softmpm.Graph(lambda: loop._work(), model.device, again=lambda: loop._simulate())
 
     def __call__(
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
@@ -205,20 +205,18 @@ class ClosedLoop:
         """Worlds in which the last call failed, where a captured graph knows of more than the error says."""
         return self._graph.failed
 
-    def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
+    @torch.no_grad()
+    def _simulate(self) -> None:
+        """The episode alone."""
+        self._episode()
+
+    def _episode(self, **about) -> Episode:
         params, inputs = self.design()
-        episode = run_episode(
-            self.task,
-            self.model,
-            self.observer,
-            self.policy,
-            params,
-            inputs=inputs,
-            goal=self._goal,
-            keep_every=self.keep_every,
-            fade=self.fade,
-            on_frame=on_frame,
-        )
+        about |= dict(inputs=inputs, goal=self._goal, fade=self.fade)
+        return run_episode(self.task, self.model, self.observer, self.policy, params, **about)
+
+    def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
+        episode = self._episode(keep_every=self.keep_every, on_frame=on_frame)
         activations = episode.decisions.activations
         loss = (
             episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()

@@ -61,7 +61,7 @@ def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
         did.append("record")
         raise RuntimeError("not now")
 
-    monkeypatch.setattr(softmpm.Graph, "_run", lambda self, stream: did.append("run"))
+    monkeypatch.setattr(softmpm.Graph, "_run", lambda self, stream, work: did.append("run"))
     monkeypatch.setattr(softmpm.Graph, "_capture", record)
     for _ in range(2):
         graph()

@@ -18,6 +18,7 @@ from torch import nn
 import softmpm
 from softmpm_learn import checkpoint, optimisation, register
 from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.observe import VelocityImage
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -136,6 +137,23 @@ def test_finished_seeds_are_recorded_and_examined(task, conf, tmp_path):
             assert list(a.episodes) == list(b.episodes) == [0, 2, 4, 5]
             for name in ("x", "activation"):
                 np.testing.assert_allclose(a.frames(5)[name], b.frames(5)[name], rtol=1e-5, atol=1e-6)
+
+
+def test_what_equal_observers_see_is_computed_once_though_it_is_rounded(task, conf, tmp_path, monkeypatch):
+    """On a GPU two equal pictures differ by rounding, which depends on the order of sums."""
+    model, real = built(task, conf, SEEDS), VelocityImage.__call__
+    seen, generator = [], torch.Generator().manual_seed(1)
+
+    def rounded(self, model, state):
+        seen.append(1)
+        picture = real(self, model, state)
+        return picture * (1 + 1e-14 * torch.randn(picture.shape, generator=generator, dtype=picture.dtype))
+
+    monkeypatch.setattr(VelocityImage, "__call__", rounded)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    seen.clear()
+    runs.observer.observe(model, model.rest())
+    assert len(seen) == 1
 
 
 # Failures
