@@ -4,11 +4,14 @@ import contextlib
 import gc
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
 import torch
 
 from softmpm.model import Model
 from softmpm.schemes.failure_report import failed_worlds, outgrown
+
+T = TypeVar("T")
 
 
 def is_capturing(model: Model) -> bool:
@@ -49,11 +52,13 @@ class GraphResources:
             that a particle left the window; None in its place without a window.
         uses: Buffers that the graph reads and writes and that existed before the capture. Tensors that are created during the
             capture lie in the graph's own memory pool.
+        made: Objects that parts of the capture share, by a key.
     """
 
     def __init__(self):
         self.words: list[tuple[torch.Tensor, Callable[[], None] | None]] = []
         self.uses: list[object] = []
+        self.made: dict[object, Any] = {}
 
     def failed(self) -> list[int]:
         """Worlds that the last replay reports as failed."""
@@ -90,6 +95,14 @@ def defer_status_check(words: torch.Tensor, outgrow: Callable[[], None] | None =
 def keep_alive(used: object) -> None:
     """Keep an object alive for as long as the graph that is being captured."""
     _resources().uses.append(used)
+
+
+def once_in_capture(key: object, make: Callable[[], T]) -> T:
+    """An object of the graph that is being captured, made on first use."""
+    made = _resources().made
+    if key not in made:
+        made[key] = make()
+    return made[key]
 
 
 def _resources() -> GraphResources:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
-from softmpm.schemes.capture import is_capturing, keep_alive
+from softmpm.schemes.capture import is_capturing, keep_alive, once_in_capture
 
 
 class CachedGraph(NamedTuple):
@@ -86,7 +86,9 @@ class GraphCache(ABC):
         """The adjoint of a graph for the requested gradients, built on first use."""
         graph, adjoints = cached
         if is_capturing(self.model):
-            return self.new_adjoint(graph, self.new_shared(graph, wanted))
+            # Shared with the other chunks of the capture, but not with calls outside of it:
+            shared = once_in_capture((self, wanted), lambda: self.new_shared(graph, wanted))
+            return self.new_adjoint(graph, shared)
         if wanted not in self._shared_adjoints:
             self._shared_adjoints[wanted] = self.new_shared(graph, wanted)
         if wanted not in adjoints:
