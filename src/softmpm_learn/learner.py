@@ -62,11 +62,16 @@ class Learner:
         """Bring what the policy sees up to date with the autoencoder."""
         self.autoencoder.standardise(self.pictures("training"))
         if self.target is not None:
-            rate = self.conf.target_rate if self.phases else 1.0  # what it copies at first is only noise
-            self.target.follow(self.autoencoder.encoder, rate)
+            self.target.follow(self.autoencoder.encoder, self._target_rate())
         self.phases += 1
         if not self.conf.replay:
             self.replay.clear()
+
+    def _target_rate(self) -> float:
+        if self.phases == 0:
+            return 1.0  # what it copies from is only noise
+        halving = self.conf.target_halving
+        return self.conf.target_rate * (1.0 if halving is None else 0.5 ** (self.phases / halving))
 
     def state_dict(self) -> dict:
         return {

@@ -168,11 +168,16 @@ class LearningConf:
     """Refinement 3: the policy uses a copy of the encoder that follows slowly; False, the encoder in training."""
     target_rate: float = 0.3
     """Fraction by which the copy moves to the trained network after a learning phase; 1 copies it, as does the first phase."""
+    target_halving: float | None = None
+    """Learning phases in which ``target_rate`` falls by half, so that the policy's last corrections rest on features that hardly change;
+    null: never."""
 
     def __post_init__(self):
         positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")
         positive("learning", self, "simulations", "megabytes", "frame_every")
         share("learning", self, "target_rate")
+        if self.target_halving is not None:
+            positive("learning", self, "target_halving")
         if not 0.0 <= self.improvement < 1.0:
             raise ValueError(f"learning.improvement must lie in [0, 1), got {self.improvement}.")
         if not 0.0 < self.validation <= 0.25:

@@ -42,6 +42,17 @@ def test_the_policy_uses_the_target(tmp_path):
     assert subject.encoder is subject.autoencoder.encoder
 
 
+def test_the_target_follows_ever_more_slowly(tmp_path):
+    """With a rate of 0.5 and a halving in two phases: after the first, which copies, it moves by 0.35, then by 0.25."""
+    subject, _ = taught(tmp_path, target_halving=2.0)
+    for share in (0.5 * 0.5**0.5, 0.25):
+        before = copy.deepcopy(subject.target.copy.state_dict())
+        subject.learn()
+        source = subject.autoencoder.encoder.state_dict()
+        for name, tensor in subject.target.copy.state_dict().items():
+            torch.testing.assert_close(tensor, before[name] + share * (source[name] - before[name]))
+
+
 def test_features_are_standardised(tmp_path):
     """After a phase the features of the training pictures have about mean 0 and deviation 1."""
     subject, _ = taught(tmp_path, simulations=8)

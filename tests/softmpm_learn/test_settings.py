@@ -28,6 +28,7 @@ from softmpm_learn import settings
         ("LearningConf", {"improvement": 1.0}, "improvement"),
         ("LearningConf", {"validation": 0.3}, "validation"),
         ("LearningConf", {"target_rate": 0.0}, "target_rate"),
+        ("LearningConf", {"target_halving": 0.0}, "target_halving"),
         ("TrainConf", {"iterations": 0}, "iterations"),
         ("TrainConf", {"evaluate_every": 0}, "evaluate_every"),
         ("TrainConf", {"evaluation_goals": 0}, "evaluation_goals"),
