@@ -49,6 +49,18 @@ def test_features_are_standardised(tmp_path):
     assert z.mean(dim=0).abs().max() < 0.7 and (z.std(dim=0) - 1).abs().max() < 0.5
 
 
+def test_without_epochs_the_weights_stay(tmp_path):
+    """A phase then changes scale and standardisation alone, of the network that the policy uses too; moments stay empty."""
+    first = dict(learner(tmp_path / "first").autoencoder.named_parameters())
+    subject, figures = taught(tmp_path / "taught", simulations=8, epochs=0)
+    assert figures["epochs"] == 0 and not subject.optimizer.state
+    for name, parameter in subject.autoencoder.named_parameters():
+        assert torch.equal(parameter, first[name]), name
+    z = subject.encoder(subject.pictures("training"))
+    assert z.mean(dim=0).abs().max() < 1e-4 and (z.std(dim=0) - 1).abs().max() < 0.1
+    assert subject.encoder.copy.scale != 1.0
+
+
 def test_validation_needs_an_iteration_held_out(tmp_path):
     """With one simulation there is no validation loss; with both splits filled there is one."""
     _, figures = taught(tmp_path / "one", simulations=1)
