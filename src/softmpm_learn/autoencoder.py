@@ -13,7 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 QUIET = 0.1
-"""A latent that deviates less than this, in units of the prior, is not blown up to deviation 1: it says next to nothing."""
+"""A trained latent that deviates less than this, in units of the prior, is not blown up to deviation 1: it says next to nothing."""
+FAINT = 1e-4
+"""The same for one that is not trained, whose deviation is a matter of the first weights: 0.002 to 0.02 in a run of the biped."""
 
 
 def _halvings(shape: tuple[int, ...], times: int) -> list[tuple[int, ...]]:
@@ -115,11 +117,11 @@ class Autoencoder(nn.Module):
             self.encoder.scale.copy_(moving.square().mean().sqrt())
 
     @torch.no_grad()
-    def standardise(self, pictures: Tensor) -> None:
-        """Bring the latent of these pictures to mean 0 and deviation 1, quiet ones to less."""
+    def standardise(self, pictures: Tensor, quiet: float = QUIET) -> None:
+        """Bring the latent of these pictures to mean 0 and deviation 1, one that deviates by less than ``quiet`` to less."""
         mean = self.encoder.moments(pictures)[0]
         self.encoder.centre.copy_(mean.mean(dim=0))
-        self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=QUIET))
+        self.encoder.spread.copy_(mean.std(dim=0, correction=0).clamp(min=quiet))
 
     def loss(
         self, pictures: Tensor, kl: float | None, *, noise: Tensor | None = None, share: Tensor | None = None

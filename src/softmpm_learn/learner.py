@@ -6,7 +6,7 @@ Its three refinements, early stopping, replay and target network, each have a sw
 import torch
 from torch import Tensor, nn
 
-from softmpm_learn.autoencoder import Autoencoder
+from softmpm_learn.autoencoder import FAINT, QUIET, Autoencoder
 from softmpm_learn.learning_phase import learn_together
 from softmpm_learn.lockstep import LockStep
 from softmpm_learn.replay import Replay
@@ -60,7 +60,7 @@ class Learner:
 
     def finish_phase(self) -> None:
         """Bring what the policy sees up to date with the autoencoder."""
-        self.autoencoder.standardise(self.pictures("training"))
+        self.autoencoder.standardise(self.pictures("training"), QUIET if self.conf.epochs else FAINT)
         if self.target is not None:
             self.target.follow(self.autoencoder.encoder, self._target_rate())
         self.phases += 1

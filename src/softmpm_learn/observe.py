@@ -1,4 +1,4 @@
-"""State → features: centroids of hand-picked regions, of k-means clusters, or a learned latent of the grid velocity.
+"""State → features: centroids of hand-picked regions, of k-means clusters, a learned latent of the grid velocity, or nothing.
 
 An observer works in two steps, ``observe`` (state → observation) and ``encode`` (observation → features), because a learned
 observer also trains on the observations. Both are differentiable.
@@ -150,11 +150,15 @@ def _window(model: Model) -> int:
 
 
 class Latent(Observer):
-    """Features that an encoder finds in the picture of the grid velocity; which encoder is not this class's business."""
+    """Features that an encoder finds in the picture of the grid velocity; which encoder is not this class's business.
+
+    Attributes:
+        trained: False if learning phases leave the encoder its weights and only standardise what it finds.
+    """
 
     def __init__(self, picture: VelocityImage, encoder: nn.Module, size: int):
         super().__init__()
-        self.picture, self.encoder, self.size = picture, encoder, size
+        self.picture, self.encoder, self.size, self.trained = picture, encoder, size, True
 
     def observe(self, model: Model, state: State) -> Tensor:
         """The picture, shape (world, dim, *nodes) [m/s]."""
@@ -162,6 +166,19 @@ class Latent(Observer):
 
     def encode(self, observation: Tensor) -> Tensor:
         return self.encoder(observation)
+
+
+class Nothing(Observer):
+    """No view of the robot: one feature that is always 0. A policy with a clock acts by the time alone, one without is constant."""
+
+    size = 1
+
+    def observe(self, model: Model, state: State) -> Tensor:
+        """Zeros, shape (world, 1)."""
+        return state.x.new_zeros(len(state.x), self.size)
+
+    def encode(self, observation: Tensor) -> Tensor:
+        return observation
 
 
 @register.observer("latent")
@@ -183,6 +200,20 @@ def kmeans(conf: ObserverConf, model: Model, task: "Task") -> Centroids:
     """Centroids of clusters at rest."""
     found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
     return Centroids(model, found, task.body_length)
+
+
+@register.observer("untrained")
+def untrained(conf: ObserverConf, model: Model, task: "Task") -> Latent:
+    """Random features: as :func:`latent`, with the first weights of the encoder."""
+    observer = latent(conf, model, task)
+    observer.trained = False
+    return observer
+
+
+@register.observer("nothing")
+def nothing(conf: ObserverConf, model: Model, task: "Task") -> Nothing:
+    """The control of all others."""
+    return Nothing()
 
 
 def make_observer(conf: ObserverConf, model: Model, task: "Task") -> Observer:

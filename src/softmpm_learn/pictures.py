@@ -43,7 +43,7 @@ CURVES = {
 def draw(result: Result, task: Task, out: Path) -> None:
     """Leave loss.png, latent.png where a latent was learned, and robot.png where something was recorded."""
     loss_figure(out / "loss.png", curves(out / "metrics.csv"))
-    if result.run.learner is not None:
+    if result.run.learner is not None and result.run.learner.conf.epochs:
         latent_figure(out / "latent.png", decoded(result.run))
     episode = last_episode(out / "run.h5")
     if episode is not None:

@@ -40,7 +40,7 @@ class Run:
         worlds: Which of the worlds of the run are those of this process's model.
         iteration: Iterations done.
         observer, policy, design, optimizer: What is optimised, and how.
-        learner: The learning phase, None unless the observer is learned.
+        learner: The learning phase, None unless the observer has an encoder.
         goals: Random stream of the goals.
         safe: Values of policy and design in the last simulation that did not fail.
         best: The lowest loss so far, at the evaluation goals if goals are drawn at random, and what gave it.
@@ -91,6 +91,8 @@ class Run:
         if not isinstance(observer, Latent):
             return observer.to(self.model.device, self.model.dtype)
         learning = self.settings.learning
+        if not observer.trained:
+            learning = dataclasses.replace(learning, epochs=0)
         since_last = learning.every * self.settings.train.worlds
         replay = Replay(
             out / "replay",

@@ -22,7 +22,9 @@ class ObserverConf:
     """Observation of the robot by the policy."""
 
     name: str = "latent"
-    """latent (learned from grid velocity), centroids (hand-picked regions of the task) or kmeans (clusters found at rest)."""
+    """latent (learned from grid velocity), centroids (hand-picked regions of the task) or kmeans (clusters found at rest). For
+    comparison: untrained (as latent, whose settings it has, with the random first weights) or nothing (a policy acts by its clock
+    alone; without one it is constant)."""
     clusters: int = 8
     """kmeans: number of clusters."""
     latent_size: int = 8
@@ -136,7 +138,8 @@ class LearningConf:
     every: int = 5
     """Optimisation steps between two learning phases."""
     epochs: int = 100
-    """Most epochs in a learning phase. Early stopping ends most phases before; where nothing is held out yet it allows ``patience``."""
+    """Most epochs in a learning phase. Early stopping ends most phases before; where nothing is held out yet it allows ``patience``. 0
+    trains nothing: a phase then only brings the latent to mean 0 and deviation 1."""
     batches: int = 8
     """Minibatches in an epoch."""
     batch: int = 32
@@ -169,15 +172,17 @@ class LearningConf:
     target_rate: float = 0.3
     """Fraction by which the copy moves to the trained network after a learning phase; 1 copies it, as does the first phase."""
     target_halving: float | None = None
-    """Learning phases in which ``target_rate`` falls by half, so that the policy's last corrections rest on features that hardly change;
-    null: never."""
+    """Learning phases in which ``target_rate`` falls by half, so that the policy's last corrections rest on features that hardly
+    change; null: never."""
 
     def __post_init__(self):
-        positive("learning", self, "every", "epochs", "batches", "batch", "rate", "patience")
+        positive("learning", self, "every", "batches", "batch", "rate", "patience")
         positive("learning", self, "simulations", "megabytes", "frame_every")
         share("learning", self, "target_rate")
         if self.target_halving is not None:
             positive("learning", self, "target_halving")
+        if self.epochs < 0:
+            raise ValueError(f"learning.epochs must be ≥ 0, got {self.epochs}.")
         if not 0.0 <= self.improvement < 1.0:
             raise ValueError(f"learning.improvement must lie in [0, 1), got {self.improvement}.")
         if not 0.0 < self.validation <= 0.25:

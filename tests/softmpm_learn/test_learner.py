@@ -60,6 +60,24 @@ def test_features_are_standardised(tmp_path):
     assert z.mean(dim=0).abs().max() < 0.7 and (z.std(dim=0) - 1).abs().max() < 0.5
 
 
+def test_without_epochs_the_weights_stay(tmp_path):
+    """A phase then changes scale and standardisation alone, of the network that the policy uses too; moments stay empty. However
+    small the features of the first weights are, they become of order one."""
+    subject = learner(tmp_path, epochs=0)
+    with torch.no_grad():
+        subject.autoencoder.encoder.head.weight.mul_(1e-2)
+    first = copy.deepcopy(dict(subject.autoencoder.named_parameters()))
+    for number in range(8):
+        subject.add_observations(number, seen(number))
+    assert subject.learn()["epochs"] == 0 and not subject.optimizer.state
+    for name, parameter in subject.autoencoder.named_parameters():
+        assert torch.equal(parameter, first[name]), name
+    z = subject.encoder(subject.pictures("training"))
+    assert z.mean(dim=0).abs().max() < 1e-3 and (z.std(dim=0, correction=0) - 1).abs().max() < 0.05
+    assert subject.autoencoder.encoder.moments(subject.pictures("training"))[0].std(dim=0).max() < 0.05
+    assert subject.encoder.copy.scale != 1.0
+
+
 def test_validation_needs_an_iteration_held_out(tmp_path):
     """With one simulation there is no validation loss; with both splits filled there is one."""
     _, figures = taught(tmp_path / "one", simulations=1)

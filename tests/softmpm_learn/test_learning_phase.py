@@ -157,7 +157,7 @@ def test_together_each_learns_what_it_learns_alone(tmp_path, variational):
             for k, content in enumerate(CONTENTS)
         ]
         spoil(learners[2], 2, math.nan)
-        learners[2].autoencoder.standardise = lambda pictures: None  # of spoilt pictures
+        learners[2].autoencoder.standardise = lambda pictures, quiet: None  # of spoilt pictures
         phases = []
         for phase in range(2):
             if phase:

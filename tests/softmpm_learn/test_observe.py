@@ -7,7 +7,7 @@ import torch
 from helpers import busy_scene
 
 import softmpm
-from softmpm_learn.observe import Centroids, Latent, VelocityImage, clusters
+from softmpm_learn.observe import Centroids, Latent, Nothing, VelocityImage, clusters
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +31,12 @@ def test_centroids_at_rest_and_in_translation(exact):
     moved = rest._replace(x=rest.x + 0.1, v=rest.v + torch.tensor([0.2, 0.0], dtype=torch.float64))
     want = torch.tensor([0.0, 0.0, 0.5, 0.0], dtype=torch.float64).repeat(2, 2)
     torch.testing.assert_close(observer(exact, moved), want)
+
+
+def test_nothing_is_seen(exact):
+    """Whatever the robot does, in each world the one feature is 0, in the precision of the model."""
+    found = Nothing()(exact, moving(exact))
+    assert found.shape == (2, Nothing.size) and found.dtype == torch.float64 and not found.any()
 
 
 def test_clusters_split_the_particles_evenly_the_same_way_each_time():

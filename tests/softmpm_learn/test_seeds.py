@@ -93,6 +93,9 @@ CASES = {
     "two worlds": dict(train=dict(seeds=SEEDS, worlds=2, goal_spread=[0.2, 0.1], evaluation_goals=4, evaluate_every=2)),
     "centroids": dict(observer=dict(name="centroids"), design=dict(per="region", strength=True)),
     "control only": dict(design=dict(enabled=False), policy=dict(name="knots"), observer=dict(name="kmeans", clusters=3)),
+    "untrained": dict(observer=dict(name="untrained"), policy=dict(clock=False)),
+    "nothing": dict(observer=dict(name="nothing")),
+    "constant": dict(observer=dict(name="nothing"), policy=dict(clock=False)),
     "no target": dict(learning=dict(target_network=False, variational=False)),
 }  # fmt: skip
 
@@ -432,9 +435,10 @@ def test_the_number_of_seeds_is_checked(task, settings, tmp_path):
 
 
 @pytest.mark.gpu
-def test_seeds_go_through_one_captured_graph(task, conf, tmp_path):
+@pytest.mark.parametrize("observer", ["latent", "untrained", "nothing"])
+def test_seeds_go_through_one_captured_graph(task, conf, tmp_path, observer):
     """On a GPU the closed loop of all seeds is one CUDA graph, and they are the runs that they would be alone."""
-    conf = changed(conf, train=dict(seeds=SEEDS, iterations=5))
+    conf = changed(conf, observer=dict(name=observer), train=dict(seeds=SEEDS, iterations=5))
     model = built(task, conf, SEEDS, "cuda")
     runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
     first = [runs.loop(None)[0].loss.clone() for _ in range(3)]

@@ -14,6 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.figures import __main__ as figures
 from softmpm_learn.saved import load
 
 ROOT = Path(__file__).parents[2]
@@ -74,6 +75,27 @@ def fails_in(monkeypatch, world: int) -> None:
         return real(model, state, activation, *args, **kwargs)
 
     monkeypatch.setattr(softmpm, "simulate", simulate)
+
+
+def test_the_comparison_is_a_sweep(main):
+    """One word runs it, without ``-m``; what the command line names replaces its values. Figures are made of what it leaves."""
+    words = ("experiment=comparison", *TINY, "observer=nothing,untrained", "policy.clock=false")
+    words += ("learning.every=1", "observer.channels=[4]", "train.seeds=2")
+    assert main(*words)[0] == 0
+    (folder,) = Path("outputs/sweep").iterdir()
+    found = rows(folder / "sweep.csv")
+    assert [(row["job"], row["seed"]) for row in found] == [
+        (str(k), f"10{n}") for k in range(4) for n in (0, 1)
+    ]
+    assert {row["status"] for row in found} == {"finished"}
+    conf = [load(folder / str(k)) for k in range(4)]
+    assert [(one.design.enabled, one.observer.name) for one in conf] == [
+        *((True, "nothing"), (True, "untrained"), (False, "nothing"), (False, "untrained"))
+    ]
+    assert {one.task.name for one in conf} == {"arm"} and not any(one.policy.clock for one in conf)
+    assert not list(folder.rglob("run.h5")) and not (folder / "1" / "seed_100" / "latent.png").exists()
+    figures.make([folder], folder / "figures")
+    assert "| off | untrained |" in (folder / "figures" / "summary.md").read_text()
 
 
 def test_each_seed_has_the_folder_of_a_run(main):

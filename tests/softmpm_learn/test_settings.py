@@ -6,7 +6,7 @@ from softmpm_learn import settings
 @pytest.mark.parametrize(
     ("conf", "wrong", "says"),
     [
-        ("ObserverConf", {"name": "latnt"}, "latent, centroids, kmeans"),
+        ("ObserverConf", {"name": "latnt"}, "latent, centroids, kmeans, untrained, nothing"),
         ("ObserverConf", {"channels": []}, "channels"),
         ("ObserverConf", {"nodes": 2}, "nodes"),
         ("PolicyConf", {"name": "rnn"}, "linear, mlp, sinusoids, knots"),
@@ -25,6 +25,7 @@ from softmpm_learn import settings
         ("OptimizerConf", {"fallback_after": 0}, "fallback_after"),
         ("OptimizerConf", {"fallback_rate": 0.0}, "fallback_rate"),
         ("LearningConf", {"every": 0}, "every"),
+        ("LearningConf", {"epochs": -1}, "epochs"),
         ("LearningConf", {"improvement": 1.0}, "improvement"),
         ("LearningConf", {"validation": 0.3}, "validation"),
         ("LearningConf", {"target_rate": 0.0}, "target_rate"),

@@ -12,7 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from softmpm_learn.figures import __main__ as program
+from softmpm_learn.figures.canvas import COLOURS
 from softmpm_learn.figures.intervals import interval, pairs
+from softmpm_learn.figures.summary import passes
 from softmpm_learn.figures.sweeps import EXAMINED, parse
 
 LATENT, KMEANS = (-1.0, -2.0, -4.0), (-0.5, -2.5, -1.0)
@@ -131,6 +133,21 @@ def test_the_interval_is_that_of_scipy_and_of_enumeration():
     assert all(map(math.isnan, interval([1.0])))
 
 
+def test_answers_are_compared_by_medians(tmp_path, drawn):
+    """One quotient out of bounds neither carries the difference away nor squeezes the others in the picture."""
+    folder = make_sweep(tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS})
+    rows = read(folder / "sweep.csv")
+    for row, later in zip(rows, (0.9, 0.8, 900.0, 0.6, 0.6, 0.6), strict=True):
+        row |= {"later": later}
+    table(folder / "sweep.csv", COLUMNS, rows)
+    program.make([folder], tmp_path / "out")
+    found = {row["quantity"]: row for row in read(tmp_path / "out" / "pairs.csv")}
+    assert float(found["later"]["difference"]) == pytest.approx(0.3)
+    assert float(found["final"]["difference"]) == pytest.approx(-7 / 3 + 4 / 3)
+    assert drawn[1].axes[1].get_xlim()[1] == drawn[2].axes[1].get_xlim()[1] == 3.0
+    assert drawn[1].axes[2].get_xlim()[1] > 10.0  # degrees are no quotients
+
+
 def test_pairs_take_only_seeds_that_both_have():
     """A seed that failed in one setting counts in neither; without a common seed there is no difference."""
     groups = {"a": {0: 1.0, 1: 2.0, 3: math.nan}, "b": {1: 5.0, 2: 7.0, 3: 1.0}, "c": {9: 0.0}}
@@ -188,6 +205,106 @@ def test_another_column_at_another_iteration(swept, tmp_path):
     """Chosen on the command line."""
     program.main([str(swept), "--value", "progress", "--at", "1", "--out", str(tmp_path)])
     assert {row["final"] for row in read(tmp_path / "jobs.csv")} == {"0.25"}
+
+
+def test_each_robot_has_a_folder(tmp_path):
+    """Losses of different tasks are not compared; a task of which nothing has finished does no harm to the others."""
+    groups = {
+        f"task={task} observer={name}": LATENT for task in ("arm", "biped") for name in ("latent", "none")
+    }
+    folder = make_sweep(tmp_path / "sweep", groups, failing=range(6))
+    said = program.make([folder], tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["biped"]
+    assert "arm:\nNone of 6 runs has finished." in said and "biped:\nMedian of loss" in said
+    assert {row["observer"] for row in read(tmp_path / "out" / "biped" / "jobs.csv")} == {"latent", "none"}
+    assert (tmp_path / "out" / "biped" / "summary.md").exists()
+
+
+def summaries(folder: Path) -> list[list[list[str]]]:
+    """Cells of the tables of summary.md."""
+    found = [[]]
+    for text in (folder / "summary.md").read_text().splitlines():
+        if text.startswith("| ") and "---" not in text:
+            found[-1].append([cell.strip() for cell in text.strip("|").split("|")])
+        elif not text.startswith("|") and found[-1]:
+            found.append([])
+    return [table for table in found if table]
+
+
+def test_the_summary_has_a_row_for_each_setting(tmp_path):
+    """Medians, failures and runs that stood the examination; differences from the first setting."""
+    folder = make_sweep(tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS}, failing=[4])
+    rows = read(folder / "sweep.csv")
+    for row, later, tilt in zip(rows, (0.7, 0.69, 0.8, 0.9, 0.9, ""), (5, 5, 30, 5, 5, 5), strict=True):
+        row |= {"later": later, "tilt": tilt}
+    table(folder / "sweep.csv", COLUMNS, rows)
+    program.make([folder], tmp_path / "out")
+    medians, differences = summaries(tmp_path / "out")
+    assert medians == [
+        ["observer", "loss at 2", "later", "tilt", "failed", "passed"],
+        ["latent", "-2 [-4, -1]", "0.7", "5", "0 of 3", "1 of 3"],
+        ["kmeans", "-0.75 [-1, -0.5]", "0.9 (1)", "5", "1 of 3", "1 of 3"],
+    ]
+    (row,) = differences[1:]
+    assert differences[0] == medians[0][:-2] and row[:2] == ["kmeans", "**-1.75 [-3, -0.5]** (2)"]
+
+
+@pytest.mark.parametrize(
+    "changes, passed",
+    [
+        ({}, True),
+        ({"status": "failed"}, False),
+        ({"later": 0.69}, False),
+        ({"later": math.nan}, False),
+        ({"tilt": 30.0}, False),
+        ({"tilt": math.nan}, False),
+        ({"best": 0.01}, False),  # it went backwards
+        ({"term": "reach"}, False),
+        ({"term": "reach", "later": 0.005, "best": 0.01, "tilt": math.nan}, True),
+        ({"term": "reach", "later": math.nan}, False),
+        ({"term": "own"}, False),
+    ],
+)
+def test_what_passes_the_examination(changes, passed):
+    """Walkers go on forward and level, what reaches stays at its goal; without an answer nothing passes."""
+    row = {"status": "finished", "term": "progress", "later": 0.7, "tilt": 29.0, "best": -0.5}
+    assert passes(row | changes) == passed
+
+
+def test_earlier_iterations_are_compared_too(tmp_path):
+    """Values after a while and the last, each with its paired differences; figures show the last."""
+    folder = make_sweep(tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS})
+    for job in range(6):
+        metrics(folder / str(job), [job + 0.5 * k for k in range(22)])
+    program.make([folder], tmp_path / "out")
+    jobs, pairs = (read(tmp_path / "out" / f"{name}.csv") for name in ("jobs", "pairs"))
+    assert [(row["at_10"], row["at_20"], row["final"]) for row in jobs[:2]] == [
+        ("5.0", "10.0", "10.5"),
+        ("6.0", "11.0", "11.5"),
+    ]
+    assert [row["quantity"] for row in pairs] == ["at_10", "at_20", "final", "later", "tilt"]
+    assert [row["difference"] for row in pairs[:3]] == ["-3.0"] * 3
+    assert summaries(tmp_path / "out")[0][0][1:4] == ["loss at 10", "loss at 20", "loss at 21"]
+
+
+def test_many_settings_have_panels(tmp_path, drawn):
+    """A panel for each combination but of what has most values, with the same colours; differences from the first setting alone."""
+    clocks, observers = ("true", "false"), ("latent", "centroids", "kmeans", "none")
+    groups = {
+        f"policy.clock={c} design={d} observer={o}": LATENT for c in clocks for d in clocks for o in observers
+    }
+    program.make([make_sweep(tmp_path, groups, failing=[3])], tmp_path / "out")
+    curves, _, differences = drawn.values()
+    assert [axes.get_title(loc="left") for axes in curves.axes] == [
+        f"clock={c}, design={d}" for c in clocks for d in clocks
+    ]
+    colours = [[one.get_color() for one in axes.lines] for axes in curves.axes]
+    assert all(found == COLOURS[:4] for found in colours)
+    assert line(curves.axes[0], "observer=centroids").get_label().endswith("(2 of 3 seeds, 1 failed)")
+    names = [text.get_text() for text in differences.axes[0].get_yticklabels()]
+    assert len(names) == 15 and all(
+        name.startswith("clock=true, design=true, observer=latent  −") for name in names
+    )
 
 
 def test_sweeps_together(swept, tmp_path):

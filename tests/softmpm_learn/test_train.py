@@ -19,6 +19,7 @@ from softmpm_learn.csv_log import Table
 from softmpm_learn.objective import Effort, Objective, Progress
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.pictures import design
+from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
 
@@ -500,6 +501,31 @@ def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path)
     assert not (tmp_path / "replay").exists() and all(
         r["replay"] == r["epochs"] == "" for r in rows(tmp_path)
     )
+
+
+@pytest.mark.parametrize("observer", ["untrained", "nothing"])
+@pytest.mark.parametrize("clock", [True, False])
+def test_what_others_are_compared_with(task, model, settings, tmp_path, observer, clock):
+    """A random encoder keeps its weights in learning phases; without a view activations are those of the clock, or constant. Stopped
+    and resumed, such a run ends as an unbroken one, recorded and examined."""
+    conf = copy_of(settings, observer=dict(name=observer), policy=dict(name="mlp", hidden=[8], clock=clock))
+    conf = copy_of(conf, train=dict(record_every=4, examine=True))
+    first = Run(task, model, conf, tmp_path / "first")
+    done = []
+    words = dict(progress=lambda k, row: done.append(k), stop=lambda: len(done) == 3)
+    assert not train.train(task, model, conf, tmp_path / "run", **words).finished
+    result, whole = (train.train(task, model, conf, tmp_path / name) for name in ("run", "whole"))
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole") and result.examination["later"]
+    if observer == "untrained":
+        assert result.run.learner.phases == 3
+        for one in (result.run, whole.run):
+            for name, parameter in one.observer.named_parameters():
+                assert torch.equal(parameter, dict(first.observer.named_parameters())[name]), name
+        return
+    assert result.run.learner is None and not (tmp_path / "run" / "replay").exists()
+    with softmpm.Recording(tmp_path / "run" / "run.h5") as recording:
+        activation = recording.frames(recording.episodes[-1])["activation"][:-1]
+    assert bool(np.ptp(activation, axis=0).max() > 1e-3) == clock and abs(activation).max() > 0
 
 
 def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):

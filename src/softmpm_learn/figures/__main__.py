@@ -10,18 +10,22 @@ import numpy as np
 from softmpm_learn import files
 from softmpm_learn.figures import sweeps, tables
 from softmpm_learn.figures.intervals import interval, pairs
-from softmpm_learn.figures.of_sweep import curves_figure, grouped, pairs_figure, shown, values, values_figure
+from softmpm_learn.figures.of_sweep import curves_figure, grouped, pairs_figure, values, values_figure
+from softmpm_learn.figures.summary import summary
+from softmpm_learn.figures.sweeps import EXAMINED, SweptRun
 
-CURVES, VALUES, PAIRS = "curves.png", "values.png", "pairs.png"
+CURVES, VALUES, PAIRS, SUMMARY = "curves.png", "values.png", "pairs.png", "summary.md"
 HELP = """Tables and figures of sweeps.
 
   runs.csv     a row for each run and iteration: seed, settings that differ, all columns of metrics.csv
-  jobs.csv     a row for each run: value at one iteration, lowest loss, examination, status
-  pairs.csv    every two settings, paired by seed: mean difference with its bootstrap interval of 95 %
+  jobs.csv     a row for each run: values at fixed iterations, lowest loss, examination, status
+  pairs.csv    every two settings, paired by seed: mean difference, of the examination the median, with its bootstrap interval of 95 %
+  summary.md   a row for each setting: medians, examination, failures, differences from the first setting
   curves.png   median and quartiles over seeds at each iteration
   values.png   values of each seed, with the bootstrap interval of 95 % of their median
-  pairs.png    the differences of pairs.csv
+  pairs.png    the differences of pairs.csv, those from the first setting if there are many
 
+Sweeps over several tasks leave that in a folder for each task. The first setting is that of the first job.
 Runs that failed are in the tables and counted in the figures, and have no part in medians and differences."""
 
 
@@ -53,7 +57,19 @@ def make(folders: Sequence[Path], out: Path, quantity: str = "loss", at: int | N
     Raises:
         ValueError: A folder is no sweep, or there is nothing to compare.
     """
-    runs = sweeps.read(folders)
+    found = sweeps.by_task(sweeps.read(folders))
+    texts = []
+    for name, runs in found.items():
+        if any(run.status == "finished" for run in runs):
+            text = _make_task(runs, out / name, quantity, at)
+        else:
+            text = f"None of {len(runs)} runs has finished."
+        texts.append(f"{name}:\n{text}" if name else text)
+    return "\n".join(texts)
+
+
+def _make_task(runs: Sequence[SweptRun], out: Path, quantity: str, at: int | None) -> str:
+    """Tables and figures of runs of one task."""
     settings = list(runs[0].settings)
     at = tables.last_iteration(runs) if at is None else at
     rows = tables.by_iteration(runs), tables.by_run(runs, quantity, at)
@@ -70,10 +86,14 @@ def draw(out: Path, settings: Sequence[str]) -> str:
     groups = grouped(jobs, settings)
     compared = [
         row
-        for name in shown(jobs)
-        for row in pairs({setting: values(members, name) for setting, members in groups.items()}, name)
+        for name in tables.compared(jobs)
+        for row in pairs(
+            {setting: values(members, name) for setting, members in groups.items()},
+            name,
+            np.median if name in EXAMINED else np.mean,  # quotients of small speeds know no bounds
+        )
     ]
-    curves_figure(out / CURVES, runs, groups)
+    curves_figure(out / CURVES, runs, groups, settings)
     values_figure(out / VALUES, jobs, groups)
     names = [tables.RUNS, tables.JOBS, CURVES, VALUES]
     for name in (tables.PAIRS, PAIRS):
@@ -83,6 +103,8 @@ def draw(out: Path, settings: Sequence[str]) -> str:
         names.append(tables.PAIRS)
     if pairs_figure(out / PAIRS, compared, jobs):
         names.append(PAIRS)
+    files.replace(out / SUMMARY, summary(settings, groups, compared).encode())
+    names.append(SUMMARY)
     lines = [f"Median of {jobs[0]['quantity']} at iteration {jobs[0]['at']:.0f}, with its interval of 95 %:"]
     for setting, members in groups.items():
         found = list(values(members, "final").values())

@@ -28,27 +28,33 @@ def interval(values: Sequence[float], statistic: Callable[..., np.ndarray] = np.
     return float(low), float(high)
 
 
-def pairs(groups: Mapping[str, Mapping[int, float]], quantity: str) -> list[dict[str, Any]]:
+def pairs(
+    groups: Mapping[str, Mapping[int, float]],
+    quantity: str,
+    statistic: Callable[..., np.ndarray] = np.mean,
+) -> list[dict[str, Any]]:
     """Every two settings, compared over the seeds for which both have a value.
 
     Args:
         groups: For each setting the values by seed.
+        statistic: Of the differences, as of :func:`interval`.
 
     Returns:
-        Rows of pairs.csv: mean of ``first - second``, its paired bootstrap interval, and in how many pairs the first is lower.
+        Rows of pairs.csv: mean, or the statistic, of ``first - second``, its paired bootstrap interval, and in how many pairs the first
+        is lower.
     """
     rows = []
     for (first, a), (second, b) in itertools.combinations(groups.items(), 2):
         seeds = [s for s in a if s in b and math.isfinite(a[s]) and math.isfinite(b[s])]
         difference = [a[seed] - b[seed] for seed in seeds]
-        low, high = interval(difference)
+        low, high = interval(difference, statistic)
         rows.append(
             {
                 "quantity": quantity,
                 "first": first,
                 "second": second,
                 "pairs": len(seeds),
-                "difference": float(np.mean(difference)) if seeds else math.nan,
+                "difference": float(statistic(np.array(difference), axis=0)) if seeds else math.nan,
                 "low": low,
                 "high": high,
                 "first_lower": sum(d < 0 for d in difference),

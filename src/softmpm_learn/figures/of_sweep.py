@@ -11,8 +11,7 @@ import numpy as np
 from softmpm_learn.figures import canvas
 from softmpm_learn.figures.canvas import COLOURS
 from softmpm_learn.figures.intervals import interval
-from softmpm_learn.figures.sweeps import EXAMINED
-from softmpm_learn.figures.tables import Row
+from softmpm_learn.figures.tables import Row, compared
 
 LINES = "-", "--", ":"
 MOST_ROWS = 60
@@ -29,6 +28,8 @@ TITLES = {
 }
 ANSWERS = {"progress": "speed over that in the episode [1]", "reach": "distance from the goal [m]"}
 """Meaning of the examination, by the first term of the objective."""
+QUOTIENTS = -2.0, 3.0
+"""Part of the axis of a quotient of speeds that is drawn at most; where a robot hardly moved it can be any number."""
 
 
 def name_of(row: Row, settings: Sequence[str]) -> str:
@@ -57,9 +58,8 @@ def values(rows: Sequence[Row], name: str) -> dict[int, float]:
 
 
 def shown(jobs: Sequence[Row]) -> list[str]:
-    """Columns of jobs.csv that have a panel: those with a number."""
-    columns = ["final", *EXAMINED]
-    return [name for name in columns if any(math.isfinite(row[name]) for row in jobs)]
+    """Columns of jobs.csv that have a panel."""
+    return [name for name in compared(jobs) if name in TITLES]
 
 
 def label(name: str, jobs: Sequence[Row]) -> str:
@@ -72,12 +72,15 @@ def label(name: str, jobs: Sequence[Row]) -> str:
     return ANSWERS.get(terms.pop(), "answer") if len(terms) == 1 else "answer"
 
 
-def curves_figure(path: Path, runs: Sequence[Row], groups: Mapping[str, Sequence[Row]]) -> None:
+def curves_figure(
+    path: Path, runs: Sequence[Row], groups: Mapping[str, Sequence[Row]], settings: Sequence[str]
+) -> None:
     """Median and interquartile range over the seeds of each setting, at each iteration up to the last that all have.
 
     Args:
         runs: Rows of runs.csv.
         groups: Rows of jobs.csv for each setting; runs that failed are counted in the legend and not drawn.
+        settings: Columns of jobs.csv in which runs differ.
     """
     first = next(iter(groups.values()))[0]
     quantity, last = first["quantity"], first["at"]
@@ -85,33 +88,66 @@ def curves_figure(path: Path, runs: Sequence[Row], groups: Mapping[str, Sequence
     for row in runs:
         if row["iteration"] <= last and math.isfinite(row[quantity]):
             series.setdefault(int(row["run"]), {})[int(row["iteration"])] = row[quantity]
-    widest = max(len(_count(name, members)) for name, members in groups.items())
+    panels = curve_panels(groups, settings)
+    names = dict.fromkeys(name for lines in panels.values() for name in lines)
+    styles = dict(zip(names, _styles(), strict=False))
+    widest = max(len(_count(name, members)) for lines in panels.values() for name, members in lines.items())
     columns = 2 if widest <= 42 else 1
-    rows = -(-len(groups) // columns)
-    figure = canvas.figure(7.2, 3.6 + 0.22 * rows)
-    axes = figure.add_subplot()
-    for (name, members), (colour, style) in zip(groups.items(), _styles(), strict=False):
-        finished = [int(row["run"]) for row in members if row["status"] == "finished"]
-        lines = [series.get(number, {}) for number in finished]
-        iterations = sorted({k for line in lines for k in line})
-        table = np.array([[line.get(k, math.nan) for k in iterations] for line in lines])
-        low, middle, high = np.nanquantile(table, [0.25, 0.5, 0.75], axis=0) if table.size else ([], [], [])
-        marker = "o" if len(iterations) < 3 else None
-        axes.plot(
-            *(iterations, middle, style),
-            color=colour,
-            marker=marker,
-            linewidth=2,
-            label=_count(name, members),
-        )
-        if len(lines) > 1:
-            axes.fill_between(iterations, low, high, color=colour, alpha=0.18, linewidth=0)
-    axes.set(xlabel="iteration", ylabel=f"{quantity}, median and quartiles over seeds")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.margins(x=0.01)
-    figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=min(9, 800 / widest))
+    figure, grid = _curve_axes(len(panels), -(-len(groups) // columns))
+    for axes, (title, lines) in zip(grid, panels.items(), strict=False):
+        for name, members in lines.items():
+            _curve(axes, members, series, styles[name], _count(name, members))
+        axes.set_title(title, fontsize=9, loc="left")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.margins(x=0.01)
+        if len(panels) > 1:
+            axes.legend(frameon=False, fontsize=7)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    figure.supxlabel("iteration", fontsize=10)
+    figure.supylabel(f"{quantity}, median and quartiles over seeds", fontsize=10)
+    if len(panels) == 1:
+        figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=min(9, 800 / widest))
     canvas.save(figure, path, dpi=130)
+
+
+def curve_panels(
+    groups: Mapping[str, Sequence[Row]], settings: Sequence[str]
+) -> dict[str, dict[str, Sequence[Row]]]:
+    """Settings of each panel of curves.png: all in one, or where colours do not suffice a panel for each combination of all but the one
+    with the most values."""
+    if len(groups) <= len(COLOURS) or len(settings) < 2:
+        return {"": dict(groups)}
+    firsts = [members[0] for members in groups.values()]
+    widest = max(reversed(settings), key=lambda key: len({row[key] for row in firsts}))
+    others, found = [key for key in settings if key != widest], {}
+    for row, members in zip(firsts, groups.values(), strict=True):
+        found.setdefault(name_of(row, others), {})[name_of(row, [widest])] = members
+    return found
+
+
+def _curve_axes(panels: int, rows: int) -> tuple[Any, np.ndarray]:
+    """A figure with so many panels, or with one and room for a legend of so many rows below."""
+    if panels == 1:
+        figure = canvas.figure(7.2, 3.6 + 0.22 * rows)
+        return figure, figure.subplots(1, 1, squeeze=False).ravel()
+    high = -(-panels // 2)
+    figure = canvas.figure(9.0, 0.4 + 3.0 * high)
+    return figure, figure.subplots(high, 2, squeeze=False, sharex=True, sharey=True).ravel()
+
+
+def _curve(axes, members: Sequence[Row], series: Mapping[int, dict[int, float]], style, text: str) -> None:
+    """The curve of one setting, from the values of each run by iteration."""
+    finished = [int(row["run"]) for row in members if row["status"] == "finished"]
+    lines = [series.get(number, {}) for number in finished]
+    iterations = sorted({k for line in lines for k in line})
+    table = np.array([[line.get(k, math.nan) for k in iterations] for line in lines])
+    low, middle, high = np.nanquantile(table, [0.25, 0.5, 0.75], axis=0) if table.size else ([], [], [])
+    (colour, dashes), marker = style, "o" if len(iterations) < 3 else None
+    axes.plot(iterations, middle, dashes, color=colour, marker=marker, linewidth=2, label=text)
+    if len(lines) > 1:
+        axes.fill_between(iterations, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
 def _count(name: str, members: Sequence[Row]) -> str:
@@ -146,7 +182,10 @@ def values_figure(path: Path, jobs: Sequence[Row], groups: Mapping[str, Sequence
 
 
 def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[Row]) -> bool:
-    """Mean difference of every two settings, paired by seed, with its interval; False if there is nothing to draw, or too much."""
+    """Difference of every two settings, paired by seed, with its interval, or of the first and every other one if that would be
+    too many; False if there is nothing to draw, or still too much."""
+    if len({(row["first"], row["second"]) for row in pairs}) > MOST_ROWS:
+        pairs = [row for row in pairs if row["first"] == pairs[0]["first"]]
     names = list(dict.fromkeys(f"{row['first']}  −  {row['second']}" for row in pairs))
     panels = {name: f"difference of {label(name, jobs)}" for name in shown(jobs)}
     if not names or len(names) > MOST_ROWS:
@@ -160,9 +199,20 @@ def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[
             axes.plot(row["difference"], place, "o", color=colour, markersize=5)
 
     _panels(
-        path, names, panels, draw, "mean over pairs of seeds, bootstrap interval of 95 %; blue: without zero"
+        path,
+        names,
+        panels,
+        draw,
+        "mean over pairs of seeds, of the examination the median; bootstrap interval of 95 %; blue: without zero",
     )
     return True
+
+
+def _limit(axes, low: float, high: float) -> None:
+    """Show no more of the horizontal axis than this, unless everything lies outside."""
+    left, right = axes.get_xlim()
+    if left < high and right > low:
+        axes.set_xlim(max(left, low), min(right, high))
 
 
 def _panels(path: Path, names: Sequence[str], panels: Mapping[str, str], draw, note: str) -> None:
@@ -177,6 +227,8 @@ def _panels(path: Path, names: Sequence[str], panels: Mapping[str, str], draw, n
         draw(axes, name)
         axes.set_xlabel(text, fontsize=8)
         axes.set_title(TITLES[name], fontsize=9, loc="left")
+        if ANSWERS["progress"] in text:
+            _limit(axes, *QUOTIENTS)
         axes.xaxis.get_major_locator().set_params(nbins=5)
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)

@@ -66,6 +66,20 @@ def differing(runs: Sequence[SweptRun]) -> list[str]:
     return [key for key in keys if len({run.settings.get(key) for run in runs}) > 1]
 
 
+def by_task(runs: Sequence[SweptRun]) -> dict[str, list[SweptRun]]:
+    """Runs of each task, whose losses cannot be compared with those of another; of one task alone under an empty name."""
+    found: dict[str, list[SweptRun]] = {}
+    for run in runs:
+        found.setdefault(run.settings.get("task", ""), []).append(run)
+    if len(found) == 1:
+        return {"": list(runs)}
+    for members in found.values():
+        varying = differing(members)
+        for run in members:
+            run.settings = {key: run.settings[key] for key in varying}
+    return {name or "default": members for name, members in found.items()}
+
+
 def _repeated(runs: Sequence[SweptRun]) -> list[tuple[SweptRun, SweptRun]]:
     """Each run whose settings and seed an earlier one has, after that one."""
     first: dict[tuple, SweptRun] = {}

@@ -12,6 +12,8 @@ from softmpm_learn.files import replace
 
 RUNS, JOBS, PAIRS = "runs.csv", "jobs.csv", "pairs.csv"
 Row = dict[str, Any]
+FIXED = 10, 20, 40
+"""Iterations whose values are compared besides the last."""
 TEXTS = "sweep", "status", "quantity", "term", "folder", "error"
 """Columns of words; of the others, those of settings are words and all else are numbers."""
 
@@ -31,7 +33,8 @@ def by_iteration(runs: Sequence[SweptRun]) -> list[Row]:
 
 
 def by_run(runs: Sequence[SweptRun], quantity: str, at: int) -> list[Row]:
-    """A row for each run: ``final`` is the value of a column of metrics.csv at one iteration; then the lowest loss and the examination.
+    """A row for each run: ``final`` is the value of a column of metrics.csv at one iteration, and ``at_10`` that at an earlier one of
+    :data:`FIXED`; then the lowest loss and the examination.
 
     Raises:
         ValueError: No run has the column, or a value at this iteration.
@@ -51,6 +54,9 @@ def by_run(runs: Sequence[SweptRun], quantity: str, at: int) -> list[Row]:
                 "quantity": quantity,
                 "at": at,
                 "final": run.rows.get(at, {}).get(quantity, math.nan),
+            }
+            | {f"at_{k}": run.rows.get(k, {}).get(quantity, math.nan) for k in FIXED if k < at}
+            | {
                 "best": math.nan if best is None else losses[best],
                 "best_iteration": math.nan if best is None else best,
                 "term": run.columns[1] if len(run.columns) > 1 else "",
@@ -61,6 +67,17 @@ def by_run(runs: Sequence[SweptRun], quantity: str, at: int) -> list[Row]:
     if not any(math.isfinite(row["final"]) for row in rows):
         raise ValueError(f"no run has a value of {quantity} at iteration {at}; choose another one with --at.")
     return rows
+
+
+def compared(jobs: Sequence[Row]) -> list[str]:
+    """Columns of jobs.csv in which settings are compared: those with a number, of the values at fixed iterations and the answers."""
+    columns = [*(f"at_{k}" for k in FIXED), "final", *EXAMINED]
+    return [name for name in columns if any(math.isfinite(row.get(name, math.nan)) for row in jobs)]
+
+
+def iteration_of(name: str, row: Row) -> int:
+    """The iteration of a column of jobs.csv that has values at one."""
+    return int(row["at"] if name == "final" else name.removeprefix("at_"))
 
 
 def _named(number: int, run: SweptRun) -> Row:

@@ -1,0 +1,110 @@
+"""The tables of a comparison in Markdown: values at fixed iterations, examination, and differences from the first setting."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from softmpm_learn.figures.intervals import interval
+from softmpm_learn.figures.of_sweep import values
+from softmpm_learn.figures.sweeps import EXAMINED
+from softmpm_learn.figures.tables import Row, compared, iteration_of
+
+LASTING = 0.7
+"""Least share of its speed that a walker goes on with to pass."""
+LEVEL = 30.0
+"""Tilt that a walker stays below to pass [degrees]."""
+NEAR = 0.005
+"""Largest distance from the goal at which what reaches for it passes [m], root mean square."""
+
+NOTE = (
+    "Medians over the finished runs, in brackets with their bootstrap interval of 95 %; in parentheses the number of runs with an "
+    f"answer, where some have none. Passed: a walker goes forward (a loss below 0), then keeps at least {LASTING:g} of its speed and "
+    f"tilts by less than {LEVEL:g}°; what reaches for a goal is within {1000 * NEAR:g} mm of it after the episode."
+)
+DIFFERENCES = (
+    "The first setting minus this one, paired by seed: the mean, of the examination the median, with its bootstrap interval of 95 %; "
+    "bold where that does not contain zero. In parentheses the number of pairs, where it is not that of all seeds."
+)
+
+
+def passes(row: Row) -> bool:
+    """True if the best motion of a run stood the examination; a row of jobs.csv."""
+    if row["status"] != "finished":
+        return False
+    if row["term"] == "reach":
+        return row["later"] <= NEAR
+    forward = row["term"] == "progress" and row["best"] < 0  # a quotient of two ways back is positive too
+    return forward and row["later"] >= LASTING and row["tilt"] < LEVEL
+
+
+def summary(
+    settings: Sequence[str], groups: Mapping[str, Sequence[Row]], pairs: Sequence[Mapping[str, Any]]
+) -> str:
+    """Both tables.
+
+    Args:
+        settings: Columns of jobs.csv in which runs differ.
+        groups: Rows of jobs.csv for each setting.
+        pairs: Rows of pairs.csv.
+    """
+    first, *others = groups.values()
+    jobs = [row for members in groups.values() for row in members]
+    quantities = compared(jobs)
+    examined = [name for name in quantities if name in EXAMINED]
+    heads = [*settings, *(_head(name, first[0]) for name in quantities)]
+    rows = [
+        [*_named(members, settings), *(_median(members, name, name not in examined) for name in quantities)]
+        + [_count(members, lambda row: row["status"] != "finished"), _count(members, passes)]
+        for members in groups.values()
+    ]
+    text = f"{_table([*heads, 'failed', 'passed'], rows)}\n{NOTE}\n"
+    if not others:
+        return text
+    base = next(iter(groups))
+    known = {(row["second"], row["quantity"]): row for row in pairs if row["first"] == base}
+    rows = [
+        [*_named(members, settings), *(_difference(known[name, one], members) for one in quantities)]
+        for name, members in groups.items()
+        if name != base
+    ]
+    return f"{text}\n{_table(heads, rows)}\n{DIFFERENCES}\n"
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _head(name: str, row: Row) -> str:
+    return f"{row['quantity']} at {iteration_of(name, row)}" if name not in EXAMINED else name
+
+
+def _named(members: Sequence[Row], settings: Sequence[str]) -> list[str]:
+    return [members[0][key] or "default" for key in settings]
+
+
+def _median(members: Sequence[Row], name: str, bracketed: bool) -> str:
+    found = list(values(members, name).values())
+    if not found:
+        return "none"
+    low, high = interval(found, np.median)
+    text = f"{np.median(found):.3g}"
+    if bracketed and not math.isnan(low):
+        text += f" [{low:.3g}, {high:.3g}]"
+    finished = sum(row["status"] == "finished" for row in members)
+    return text if len(found) == finished else f"{text} ({len(found)})"
+
+
+def _difference(row: Mapping[str, Any], members: Sequence[Row]) -> str:
+    if not row["pairs"]:
+        return "none"
+    text = f"{row['difference']:.3g} [{row['low']:.3g}, {row['high']:.3g}]"
+    if row["low"] > 0 or row["high"] < 0:
+        text = f"**{text}**"
+    return text if row["pairs"] == len(members) else f"{text} ({row['pairs']})"
+
+
+def _count(members: Sequence[Row], condition) -> str:
+    return f"{sum(map(condition, members))} of {len(members)}"
