@@ -178,9 +178,9 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
         _write(work, ended)
         if progress and group.first and rows:
             progress(ended)
-        for one, plan in zip(work.loggers, work.plans, strict=group.first):
-            if one.frames:
-                plan.sketch(one.run, one.run.iteration - 1, one.take_frames())
+        for k in ended if work.loggers else ():  # a run that failed may have frames, but of no iteration
+            if work.loggers[k].frames:
+                work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     found = finish(work, finer) if work.loggers else {}
     return [
         Result(
