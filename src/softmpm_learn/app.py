@@ -108,7 +108,11 @@ def _load(own: Sequence[str]) -> None:
 
 
 class JobError(Exception):
-    """A run that failed: the sentence for people, empty where another process has it."""
+    """A run that failed: the sentence for people, empty where another process has it, and the iterations done before."""
+
+    def __init__(self, text: str = "", iterations: int = 0):
+        super().__init__(text)
+        self.iterations = iterations
 
 
 class RefusedError(JobError):
@@ -158,7 +162,7 @@ def _swept(config: DictConfig, out: Path, group: Group, signals: Signals, failed
             logger.info("The same command goes on with the sweep.")
             raise SystemExit(0)
         if found.status == "failed":
-            raise JobError(found.error)
+            raise JobError(found.error, found.iterations)
         loss = found.loss
     except JobError as failure:
         if isinstance(failure, RefusedError):
@@ -166,7 +170,7 @@ def _swept(config: DictConfig, out: Path, group: Group, signals: Signals, failed
         if str(failure):
             print(f"softmpm_learn: job {number}: {failure}", file=sys.stderr)
         failed[number] = table
-        found = sweep.Outcome(status="failed", error=str(failure), **about)
+        found = sweep.Outcome(status="failed", error=str(failure), iterations=failure.iterations, **about)
     except (ValueError, OSError) as error:
         _give_up(error)
     if group.first:
@@ -214,7 +218,8 @@ def _experiment(conf: RunConf, out: Path, group: Group, signals: Signals) -> lis
             if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
                 raise JobError from None
             kind = RefusedError if isinstance(error, LockedError) else JobError
-            raise kind(f"{sentence(error)}{_left(error, out, group)}") from error
+            done = error.iteration if isinstance(error, TrainingError) else 0
+            raise kind(f"{sentence(error)}{_left(error, out, group)}", done) from error
 
 
 def _fixed(conf: RunConf) -> dict:

@@ -25,7 +25,7 @@ from softmpm import Model
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine
-from softmpm_learn.learning_phase import learn_together
+from softmpm_learn.learning_phase import learn_side_by_side
 from softmpm_learn.loggers import Loggers
 from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.resuming import entered, resume
@@ -178,9 +178,9 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
         _write(work, ended)
         if progress and group.first and rows:
             progress(ended)
-        for one, plan in zip(work.loggers, work.plans, strict=group.first):
-            if one.frames:
-                plan.sketch(one.run, one.run.iteration - 1, one.take_frames())
+        for k in ended if work.loggers else ():  # a run that failed may have frames, but of no iteration
+            if work.loggers[k].frames:
+                work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     found = finish(work, finer) if work.loggers else {}
     return [
         Result(
@@ -225,7 +225,7 @@ def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | 
         row["replay"] = len(run.learner.replay.ids)
         if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
             due.append((run.learner, row))
-    learned = runs.group.once(learn_together, [learner for learner, _ in due]) or [{}] * len(due)
+    learned = runs.group.once(learn_side_by_side, [learner for learner, _ in due]) or [{}] * len(due)
     for (learner, row), figures in zip(due, learned, strict=True):
         row |= figures
         runs.group.broadcast_(t for network in learner.networks for t in network.state_dict().values())

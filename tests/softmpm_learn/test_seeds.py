@@ -300,7 +300,7 @@ def test_a_gradient_that_is_not_finite_is_that_of_one_seed(task, conf, tmp_path,
 
 @pytest.mark.parametrize("nth", [0, 7, 8, 11])
 def test_killed_between_two_checkpoints_it_goes_on(task, conf, tmp_path, monkeypatch, nth):
-    """Seeds may then be at different iterations; resumed, all end as they would have."""
+    """Seeds may then be at different iterations; resumed, all end as they would have, to the last bit."""
     real, count = checkpoint.save, itertools.count()
 
     def dies(*args):
@@ -316,6 +316,8 @@ def test_killed_between_two_checkpoints_it_goes_on(task, conf, tmp_path, monkeyp
     together(task, conf, tmp_path / "whole")
     for k in range(SEEDS):
         assert_same(tmp_path / "killed" / str(k), tmp_path / "whole" / str(k))
+        killed, whole = (tmp_path / name / str(k) / "metrics.csv" for name in ("killed", "whole"))
+        assert killed.read_bytes() == whole.read_bytes()
 
 
 def test_a_killed_process_resumes(task, conf, tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+import softmpm
 from softmpm_learn import app, checkpoint, optimisation, sweep, train
 from softmpm_learn.saved import load
 
@@ -26,6 +27,7 @@ TINY = [
 ]
 FAILS, WORKS = "task.poisson=0.45", "task.poisson=0.3"
 """The design's bounds of Poisson's ratio end at 0.4."""
+INVERTED = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +84,23 @@ def test_a_failed_job_is_a_row_and_the_next_one_runs(run, capsys):
     said = capsys.readouterr().err
     assert "softmpm_learn: job 0: " in said and "failed: 0; the same command tries them again." in said
     assert "Traceback" in (Path(failed["folder"]) / "error.txt").read_text()
+
+
+def test_a_failed_job_says_how_many_iterations_it_has_done(run, monkeypatch):
+    """Those in metrics.csv, before the one in which its simulation failed; tried again, it gives the same row."""
+    real, words = optimisation.attempt, ("train.seed=0", "optimizer.retries=0")
+
+    def fails(runs, *args):
+        if runs.all[0].iteration == 1:
+            raise softmpm.UnstableError("particle 3 is inverted.", **INVERTED)
+        return real(runs, *args)
+
+    monkeypatch.setattr(optimisation, "attempt", fails)
+    for _ in range(2):
+        assert run(*words)[0] == 1
+        (row,) = table()
+        assert (row["status"], row["iterations"]) == ("failed", "1") and len(losses(Path(row["folder"]))) == 1
+        assert row["error"].startswith("iteration 1: particle 3 is inverted.")
 
 
 def test_a_setting_that_no_run_accepts_is_a_row_too(run):

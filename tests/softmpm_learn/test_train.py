@@ -594,6 +594,18 @@ def test_pictures_can_be_drawn_while_a_run_goes_on(task, model, settings, tmp_pa
                 np.testing.assert_allclose(frames[name], kept[name], rtol=1e-6)
 
 
+def test_an_episode_that_failed_is_no_picture(task, model, settings, tmp_path, monkeypatch):
+    """It was drawn with the number of the iteration before."""
+    conf = copy_of(
+        settings, observer=dict(name="centroids"), optimizer=dict(retries=0), train=dict(record_every=1)
+    )
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8}))
+    seen = []
+    with pytest.raises(TrainingError, match="iteration 1: particle 3 is inverted"):
+        train.train(task, model, conf, tmp_path, sketch=lambda run, iteration, frames: seen.append(iteration))
+    assert seen == [0]
+
+
 @pytest.mark.parametrize("halving, share", [(2.0, 0.25), (None, 1.0)])
 def test_rates_fall_by_half_in_so_many_iterations(task, model, settings, tmp_path, halving, share):
     """A quarter is left after four iterations, also of a run that was stopped after the second."""
