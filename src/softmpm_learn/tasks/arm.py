@@ -36,7 +36,7 @@ class ArmConf(TaskConf):
     """Rate at which velocity decays [1/s]: an arm that swings for long is hard to stop at its goal."""
     effort: float = 1e-5
     """Weight of the mean squared activation in the loss [m²]; decides between motions that are equally good."""
-    strength: float = 4e3
+    strength: float = 8e3
     """Stress of a muscle at full activation [Pa]."""
     goal: list[float] = field(default_factory=lambda: [0.60, 0.35])
     """Goal of the tip: x and y [m]; at rest it is at (0.45, 0.41)."""
