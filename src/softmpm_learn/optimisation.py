@@ -107,7 +107,7 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
     evaluations = evaluate(runs) if asked else []
     for k, row in rows.items():
         run, value = runs.all[k], row["loss"]
-        if run.random_goals:  # the loss is that of the goals drawn
+        if run.evaluated:
             value = row["evaluation"] = evaluations[k] if k in asked else math.nan
         if value < run.best["loss"]:
             run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}

@@ -43,7 +43,7 @@ class Run:
         learner: The learning phase, None unless the observer has an encoder.
         goals: Random stream of the goals.
         safe: Values of policy and design in the last simulation that did not fail.
-        best: The lowest loss so far, at the evaluation goals if goals are drawn at random, and what gave it.
+        best: The lowest loss so far, that of the evaluations if there are any, and what gave it.
         fallback: Decides when the run goes back to its best.
     """
 
@@ -65,7 +65,7 @@ class Run:
             raise ValueError(
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
-        settings = settings.suited(task.fade, task.gain)
+        settings = settings.suited(task.fade, task.gain, task.endurance)
         self.task, self.model, self.settings = task, model, settings
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
         self.fallback = Fallback()
@@ -190,6 +190,11 @@ class Run:
     def random_goals(self) -> bool:
         """True if every simulation draws its own goal."""
         return self._goal is not None
+
+    @property
+    def evaluated(self) -> bool:
+        """True if evaluations choose the best, and not the loss of the episodes."""
+        return self.random_goals or (self.settings.train.endurance or 1) > 1
 
     def middle_goals(self) -> Tensor | None:
         """As :meth:`draw_goals`, without chance: the middle of the box."""

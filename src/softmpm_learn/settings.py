@@ -207,9 +207,12 @@ class TrainConf:
     """Simulations side by side in each step, of all processes together; useful with random goals. Of each seed as many."""
     goal_spread: list[float] = field(default_factory=list)
     """Half widths [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
-    evaluate_every: int = 10
-    """Random goals: iterations between two evaluations at fixed goals, by which the best policy is chosen; each takes the time of a few
-    simulations without gradient."""
+    evaluate_every: int = 5
+    """Iterations between two evaluations, by which the best policy is chosen where goals are drawn at random or an evaluation is longer
+    than an episode; each takes the time of a few simulations without gradient."""
+    endurance: int | None = None
+    """Length of these evaluations, in episodes: a gait that does not last is not the best. null is the task's, 3 for walkers; 1: the
+    best is that of the lowest loss."""
     evaluation_goals: int = 8
     """Random goals: least number of fixed goals in the box, the same in every run; rounded up to fill all worlds."""
     record_every: int = 10
@@ -237,6 +240,8 @@ class TrainConf:
             "evaluate_every",
             "evaluation_goals",
         )
+        if self.endurance is not None:
+            positive("train", self, "endurance")
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
         if any(not (math.isfinite(s) and s >= 0) for s in self.goal_spread):
@@ -254,11 +259,13 @@ class Settings:
     learning: LearningConf = field(default_factory=LearningConf)
     train: TrainConf = field(default_factory=TrainConf)
 
-    def suited(self, fade: float, gain: float) -> "Settings":
-        """With a task's ``optimizer.fade`` [s] and ``policy.gain`` where these leave them to it."""
-        optimizer, policy = self.optimizer, self.policy
+    def suited(self, fade: float, gain: float, endurance: int) -> "Settings":
+        """With a task's ``optimizer.fade`` [s], ``policy.gain`` and ``train.endurance`` where these leave them to it."""
+        optimizer, policy, train = self.optimizer, self.policy, self.train
         if optimizer.fade is None:
             optimizer = dataclasses.replace(optimizer, fade=fade)
         if policy.gain is None:
             policy = dataclasses.replace(policy, gain=gain)
-        return dataclasses.replace(self, optimizer=optimizer, policy=policy)
+        if train.endurance is None:
+            train = dataclasses.replace(train, endurance=endurance)
+        return dataclasses.replace(self, optimizer=optimizer, policy=policy, train=train)

@@ -179,7 +179,7 @@ def test_help_does_not_wait_for_pytorch():
         ("task.resolution=huge", "task.resolution: Invalid value 'huge', expected one of [draft, standard, fine]."),
         ("task.goal=[1", "cannot read 'task.goal=[1': write key=value"),
         ("resume=nowhere", "there is no run to resume in nowhere"),
-        ("experiment=nope", "there is no experiment called nope; choose one of smoke."),
+        ("experiment=nope", "there is no experiment called nope; choose one of comparison, smoke."),
     ],
 )  # fmt: skip
 def test_a_wrong_word_ends_in_one_sentence(monkeypatch, capsys, tmp_path, override, sentence):

@@ -7,6 +7,7 @@ import numpy as np
 from softmpm import Body, Muscle, Scene
 from softmpm_learn.tasks.outline import Limb, smooth
 from softmpm_learn.tasks.task import (
+    LASTING,
     STEP,
     VIGOROUS,
     Task,
@@ -79,4 +80,5 @@ def biped(conf: BipedConf) -> Task:
         build=conf.build,
         fade=STEP,
         gain=VIGOROUS,
+        endurance=LASTING,
     )

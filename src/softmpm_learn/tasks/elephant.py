@@ -11,6 +11,7 @@ import numpy as np
 from softmpm import Body, Muscle, Scene
 from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
 from softmpm_learn.tasks.task import (
+    LASTING,
     STEP,
     VIGOROUS,
     Task,
@@ -106,6 +107,7 @@ def elephant(conf: ElephantConf) -> Task:
         build=conf.build,
         fade=STEP,
         gain=VIGOROUS,
+        endurance=LASTING,
     )
 
 

@@ -13,7 +13,17 @@ from typing import Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.tasks.task import STEP, VIGOROUS, Task, WalkerConf, clock, neo_hookean, track, walking
+from softmpm_learn.tasks.task import (
+    LASTING,
+    STEP,
+    VIGOROUS,
+    Task,
+    WalkerConf,
+    clock,
+    neo_hookean,
+    track,
+    walking,
+)
 
 START = 0.2
 """Rear end of the robot on the track [m]."""
@@ -139,6 +149,7 @@ def walker(
         build=conf.build,
         fade=STEP,
         gain=VIGOROUS,
+        endurance=LASTING,
     )
 
 

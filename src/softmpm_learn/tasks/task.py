@@ -19,6 +19,8 @@ WIDTH = 0.01
 STEP = 0.1
 """Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
 VIGOROUS = 3.0
+LASTING = 3
+"""A gait counts as the best by what it is over so many episodes in a row."""
 """Size of the first activations of a robot on legs, with which it steps from the beginning."""
 SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""
@@ -219,6 +221,8 @@ class Task:
     """Time after which the robot has forgotten what a muscle did [s]; see ``optimizer.fade``, which goes before."""
     gain: float = 1.0
     """Size of the first activations; see ``policy.gain``, which goes before."""
+    endurance: int = 1
+    """Length of the evaluations that choose the best policy, in episodes; see ``train.endurance``, which goes before."""
     build: dict[str, Any] = field(default_factory=dict)
     """Arguments of :func:`softmpm.build` that the task decides: formulation and contact."""
 
