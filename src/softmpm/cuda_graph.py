@@ -63,11 +63,13 @@ class Graph(Generic[Result]):
             return result
         if self._graph is None:
             self._warm = False  # should it fail, whatever was missing
-            self._graph = self._capture(self._stream)
+            self._graph, self._resources = self._capture(self._stream)
             self._warm = True
+        assert self._resources is not None
         self._graph.replay()
+        for changed in self._resources.changed:
+            changed()
         if self._any_failed is not None and self._any_failed.item():
-            assert self._resources is not None
             self.failed = self._resources.failed()
             if not self._resources.widen():
                 if self.again is not None:
@@ -86,7 +88,7 @@ class Graph(Generic[Result]):
         torch.cuda.current_stream(self.device).wait_stream(stream)
         return result
 
-    def _capture(self, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
+    def _capture(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, GraphResources]:
         if torch.cuda.is_current_stream_capturing():
             raise RuntimeError(
                 "a softmpm.Graph is being captured already: call the inner graph's function instead."
@@ -99,5 +101,4 @@ class Graph(Generic[Result]):
                 self._result = self.work()
                 words = [words for words, _ in resources.words]
                 self._any_failed = (torch.cat(words) != NEVER).any() if words else None
-        self._resources = resources
-        return graph
+        return graph, resources

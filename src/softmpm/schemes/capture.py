@@ -53,12 +53,14 @@ class GraphResources:
         uses: Buffers that the graph reads and writes and that existed before the capture. Tensors that are created during the
             capture lie in the graph's own memory pool.
         made: Objects that parts of the capture share, by a key.
+        changed: To be called after each replay, since the graph changes on the device what calls outside of it go by.
     """
 
     def __init__(self):
         self.words: list[tuple[torch.Tensor, Callable[[], None] | None]] = []
         self.uses: list[object] = []
         self.made: dict[object, Any] = {}
+        self.changed: list[Callable[[], None]] = []
 
     def failed(self) -> list[int]:
         """Worlds that the last replay reports as failed."""
@@ -95,6 +97,11 @@ def defer_status_check(words: torch.Tensor, outgrow: Callable[[], None] | None =
 def keep_alive(used: object) -> None:
     """Keep an object alive for as long as the graph that is being captured."""
     _resources().uses.append(used)
+
+
+def after_replay(changed: Callable[[], None]) -> None:
+    """Call this after each replay of the graph that is being captured."""
+    _resources().changed.append(changed)
 
 
 def once_in_capture(key: object, make: Callable[[], T]) -> T:

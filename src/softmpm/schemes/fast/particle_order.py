@@ -151,6 +151,10 @@ class ParticleLayout:
         """A layout with a larger window."""
         return ParticleLayout(self.model, x, before=self)
 
+    def changed(self) -> None:
+        """A captured graph has sorted the particles: calls outside of it must load their order anew."""
+        self.version += 1
+
     def outgrow(self) -> None:
         """Request a larger window for the next call outside of a capture, after a particle left it inside a captured graph."""
         self.outgrown = True

@@ -12,7 +12,7 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import LONGEST, Footprint
 from softmpm.schemes.alarm_check import StartCheck
-from softmpm.schemes.capture import is_capturing, keep_alive
+from softmpm.schemes.capture import after_replay, is_capturing, keep_alive
 from softmpm.schemes.carried import check_start
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import outgrown
@@ -163,6 +163,7 @@ class Fast:
         resorted = self._since_sort >= LONGEST or self.model.deterministic
         if resorted:
             self._pool.layout.resort(start.x)
+            after_replay(self._pool.layout.changed)
             self._since_sort = 0
         self._since_sort += chunk.length
         return resorted

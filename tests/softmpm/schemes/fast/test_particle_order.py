@@ -425,3 +425,24 @@ def test_a_replay_that_fails_otherwise_leaves_the_window_as_it_is(watched, recor
         for got, wanted in zip(graph()[0], want, strict=True):
             torch.testing.assert_close(got.cpu(), wanted, rtol=1e-12, atol=1e-12)
     assert len(recordings) == 1 and len(watched.made) == 1
+
+
+@pytest.mark.parametrize("device", ["cpu"])
+def test_a_call_after_a_replay_has_neighbours_in_its_own_order(recordings, device):
+    """A replay sorts the particles on the device: the lists of neighbours at rest that a later call finds are in another order."""
+    model = robot(2, [(15, 28)], grid=(80, 64), device=device)
+    _, fly = flight(model, WANDERS, 25, calls=2)
+    graph = softmpm.Graph(fly, CUDA)
+    for _ in range(2):
+        graph()
+    fly()
+    pool = fast_scheme.Fast.of(model)._pool
+    assert pool is not None and graph._graph is not None
+
+    def replay():  # what the graph does on a GPU, where no Python runs
+        pool.layout.order.copy_(pool.layout.order.roll(6, dims=1))
+        pool.layout.place_neighbours()
+
+    graph._graph.replay = replay
+    graph()
+    assert_same(fly(), end_and_gradient(model, WANDERS, 25, calls=2), 1e-12)
