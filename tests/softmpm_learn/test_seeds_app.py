@@ -85,7 +85,7 @@ def test_the_comparison_is_a_sweep(main):
     (folder,) = Path("outputs/sweep").iterdir()
     found = rows(folder / "sweep.csv")
     assert [(row["job"], row["seed"]) for row in found] == [
-        (str(k), f"10{n}") for k in range(4) for n in (0, 1)
+        (str(k), f"30{n}") for k in range(4) for n in (0, 1)
     ]
     assert {row["status"] for row in found} == {"finished"}
     conf = [load(folder / str(k)) for k in range(4)]
@@ -93,7 +93,7 @@ def test_the_comparison_is_a_sweep(main):
         *((True, "nothing"), (True, "untrained"), (False, "nothing"), (False, "untrained"))
     ]
     assert {one.task.name for one in conf} == {"arm"} and not any(one.policy.clock for one in conf)
-    assert not list(folder.rglob("run.h5")) and not (folder / "1" / "seed_100" / "latent.png").exists()
+    assert not list(folder.rglob("run.h5")) and not (folder / "1" / "seed_300" / "latent.png").exists()
     figures.make([folder], folder / "figures")
     assert "| off | untrained |" in (folder / "figures" / "summary.md").read_text()
 

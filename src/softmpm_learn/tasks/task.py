@@ -166,7 +166,7 @@ class WalkerConf(TaskConf):
     """Weight of the mean squared activation in the loss [m]; with less, gaits stretch the robot until it breaks."""
     upright: float = 1.0
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
-    strain: float = 1e3
+    strain: float = 1e4
     """Weight of strains beyond a half in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
