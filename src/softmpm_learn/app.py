@@ -12,26 +12,19 @@ from pathlib import Path
 from typing import NoReturn
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    InterpolationResolutionError,
-    OmegaConfBaseException,
-)
 
 from softmpm_learn import files, plugins, seeds, sweep
 from softmpm_learn.checkpoint import LockedError
-from softmpm_learn.config import RunConf, conf_dir, register, to_run, unknown_key
-from softmpm_learn.distributed import Group, OtherProcessError, in_full, joined
+from softmpm_learn.config import RunConf, conf_dir, register, to_run
+from softmpm_learn.distributed import Group, OtherProcessError, joined
 from softmpm_learn.experiment import run_experiment
 from softmpm_learn.log_file import log_file
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.saved import load as saved_configuration
+from softmpm_learn.sentences import EXPECTED, sentence
 from softmpm_learn.stop import Signals
 from softmpm_learn.train import Result
 
@@ -46,16 +39,6 @@ CHANGEABLE = (
     "device",
 )
 """Settings that may differ when a run is resumed: its length, the recorded episodes, the loggers and the device."""
-EXPECTED = (
-    ValueError,
-    RuntimeError,
-    OSError,
-    ImportError,
-    MemoryError,
-    HydraException,
-    OmegaConfBaseException,
-)
-"""Errors whose message is meant for people; any other is a fault of the program."""
 
 
 def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
@@ -268,42 +251,3 @@ def _end(code: int, said: str) -> NoReturn:
     if said:
         print(f"softmpm_learn: {said}", file=sys.stderr)
     raise SystemExit(code)
-
-
-def sentence(error: BaseException) -> str:
-    """Error message in one line, with the remedy where it is known."""
-    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
-        return sentence(error.__cause__)
-    cause = error.__cause__ or error.__context__
-    if isinstance(error, InterpolationResolutionError) and isinstance(cause, ValueError):
-        return sentence(cause)  # from a resolver of ours
-    if isinstance(error, OverrideParseException):
-        return f"cannot read {error.override!r}: write key=value, in quotes if it has spaces or brackets."
-    if isinstance(error, (ConfigAttributeError, ConfigKeyError)):
-        kind = error.object_type
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            return unknown_key(str(error.full_key), kind)
-    if isinstance(error, OmegaConfBaseException) and error.full_key:
-        return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
-    if isinstance(error, MissingConfigException) and error.options:
-        group, _, name = str(error.missing_cfg_file).rpartition("/")
-        file = (
-            ""
-            if plugins.loaded
-            else f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
-        )
-        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
-    text = in_full(error).strip() or "no details"
-    if isinstance(error, OSError) and error.strerror:
-        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
-    if isinstance(error, torch.OutOfMemoryError) or "memory_budget" in text:  # as the simulator calls it
-        text += " Settings for that: train.worlds, task.resolution and device.memory."
-    return _line(
-        text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
-    )
-
-
-def _line(text: str) -> str:
-    """A message on one line, without Hydra's list of search paths."""
-    text = " ".join(text.partition("Config search path:")[0].split())
-    return text if text.endswith((".", "!", "?")) else f"{text}."

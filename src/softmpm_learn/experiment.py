@@ -144,8 +144,9 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     """Summary of the result; its last line is the command to view the recording or to resume the run."""
     lines = []
     if math.isfinite(result.best_loss):
+        what = "evaluation" if result.run.evaluated else "loss"
         lines.append(
-            f"Best loss {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}."
+            f"Best {what} {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}."
         )
     if count := result.run.fallback.count:
         lines.append(

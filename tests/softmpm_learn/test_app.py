@@ -21,6 +21,7 @@ from softmpm_learn.__main__ import help_text
 from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
 from softmpm_learn.saved import load, save
+from softmpm_learn.sentences import sentence
 from softmpm_learn.tasks import TASKS, ArmConf, Resolution, make_task
 
 ROOT = Path(__file__).parents[2]
@@ -221,21 +222,21 @@ def test_a_wrong_value_says_what_must_hold(overrides, message):
 
 def test_a_fault_of_the_program_is_called_so():
     """Errors that are not meant for people give their type; messages of several lines become one, and notes follow."""
-    assert app.sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
-    assert app.sentence(RuntimeError("first\n  second")) == "first second."
-    assert app.sentence(RuntimeError()) == "no details."
+    assert sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
+    assert sentence(RuntimeError("first\n  second")) == "first second."
+    assert sentence(RuntimeError()) == "no details."
     noted = RuntimeError("No memory.")
     noted.add_note("Buy some")
-    assert app.sentence(noted) == "No memory. Buy some."
+    assert sentence(noted) == "No memory. Buy some."
 
 
 def test_too_little_memory_names_the_settings_that_help(tmp_path):
     """This holds if the device is full, and if the simulator's budget is."""
-    full = app.sentence(torch.OutOfMemoryError("CUDA out of memory."))
+    full = sentence(torch.OutOfMemoryError("CUDA out of memory."))
     assert full.startswith("CUDA out of memory. Settings for that: train.worlds") and "device.memory" in full
     with pytest.raises(ValueError, match="memory_budget is 1,000 bytes") as refused:
         experiment.run_experiment(to_run(composed(*TINY, "device.memory=0.001")), tmp_path)
-    assert "device.memory" in app.sentence(refused.value)
+    assert "device.memory" in sentence(refused.value)
 
 
 def test_cuda_without_a_gpu_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):
@@ -257,7 +258,7 @@ def test_a_run_leaves_everything(finished):
     assert len(rows(folder / "metrics.csv")) == 2
     assert said.splitlines()[-1].endswith(f"rerun {folder / 'run.rrd'}")
     assert "after 2 of 2 iterations: loss" in said and "mm from the goal" in said
-    assert "2 calls of 51 substeps with gradient" in said  # which share the memory
+    assert "2 calls of 52 substeps with gradient" in said  # which share the memory
     with softmpm.Recording(folder / "run.h5") as recording:
         assert len(recording.episodes) == 3  # both iterations and the best once more
 

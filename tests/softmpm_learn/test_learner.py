@@ -11,7 +11,11 @@ from softmpm_learn.settings import LearningConf
 
 def learner(folder, **changes) -> Learner:
     conf = LearningConf(
-        **({"epochs": 2, "batches": 2, "batch": 4, "validation": 0.25, "target_rate": 0.5} | changes)
+        **(
+            {"epochs": 2, "batches": 2, "batch": 4, "validation": 0.25, "target_rate": 0.5}
+            | {"target_halving": None}
+            | changes
+        )
     )
     with seeded(0):
         autoencoder = Autoencoder(2, (6, 5), 2, [4])

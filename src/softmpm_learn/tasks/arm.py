@@ -12,7 +12,7 @@ import numpy as np
 from softmpm import Body, Grid, Muscle, Scene, Wall
 from softmpm_learn.objective import Effort, Objective, Reach, Still
 from softmpm_learn.tasks.outline import Limb
-from softmpm_learn.tasks.task import Task, TaskConf, clock, filled, neo_hookean
+from softmpm_learn.tasks.task import LASTING, Task, TaskConf, clock, filled, neo_hookean
 
 BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
@@ -107,5 +107,6 @@ def arm(conf: ArmConf) -> Task:
         goal=goal,
         fade=FADE,
         gain=QUIET,
+        endurance=LASTING,
         build=conf.build,
     )

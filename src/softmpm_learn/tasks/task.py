@@ -20,7 +20,7 @@ STEP = 0.1
 """Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
 VIGOROUS = 3.0
 LASTING = 3
-"""A gait counts as the best by what it is over so many episodes in a row."""
+"""A motion counts as the best by what it is over so many episodes in a row."""
 """Size of the first activations of a robot on legs, with which it steps from the beginning."""
 SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""

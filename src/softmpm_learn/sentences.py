@@ -1,0 +1,66 @@
+"""What the command line says when something goes wrong: one sentence for people in place of a traceback."""
+
+import dataclasses
+
+import torch
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+)
+
+from softmpm_learn import plugins
+from softmpm_learn.config import unknown_key
+from softmpm_learn.distributed import in_full
+
+EXPECTED = (
+    ValueError,
+    RuntimeError,
+    OSError,
+    ImportError,
+    MemoryError,
+    HydraException,
+    OmegaConfBaseException,
+)
+"""Errors whose message is meant for people; any other is a fault of the program."""
+
+
+def sentence(error: BaseException) -> str:
+    """Error message in one line, with the remedy where it is known."""
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return sentence(error.__cause__)
+    cause = error.__cause__ or error.__context__
+    if isinstance(error, InterpolationResolutionError) and isinstance(cause, ValueError):
+        return sentence(cause)  # from a resolver of ours
+    if isinstance(error, OverrideParseException):
+        return f"cannot read {error.override!r}: write key=value, in quotes if it has spaces or brackets."
+    if isinstance(error, (ConfigAttributeError, ConfigKeyError)):
+        kind = error.object_type
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            return unknown_key(str(error.full_key), kind)
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        file = (
+            ""
+            if plugins.loaded
+            else f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
+        )
+        return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
+    text = in_full(error).strip() or "no details"
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    if isinstance(error, torch.OutOfMemoryError) or "memory_budget" in text:  # as the simulator calls it
+        text += " Settings for that: train.worlds, task.resolution and device.memory."
+    return _line(
+        text if isinstance(error, EXPECTED) else f"{type(error).__name__}: {text} (a fault of the program)"
+    )
+
+
+def _line(text: str) -> str:
+    """A message on one line, without Hydra's list of search paths."""
+    text = " ".join(text.partition("Config search path:")[0].split())
+    return text if text.endswith((".", "!", "?")) else f"{text}."
