@@ -37,7 +37,7 @@ settings = Settings(
     observer=ObserverConf(name="centroids"),
     policy=PolicyConf(name="linear"),
     design=DesignConf(enabled=False),
-    train=TrainConf(iterations=3 if quick else 30, record_every=1, examine=False),
+    train=TrainConf(iterations=3 if quick else 30, record_every=1, examine=False, endurance=1),
 )
 model = softmpm.build(task.scene, calls=task.control_steps, **task.build)
 out = File("objective_run")

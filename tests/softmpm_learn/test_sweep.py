@@ -72,11 +72,21 @@ def losses(folder: Path) -> list[float]:
         return [float(row["loss"]) for row in csv.DictReader(file)]
 
 
+def evaluations(folder: Path) -> list[float]:
+    """Those of a run, which choose the best."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [float(row["evaluation"]) for row in csv.DictReader(file) if row["evaluation"]]
+
+
 def test_a_failed_job_is_a_row_and_the_next_one_runs(run, capsys):
     """Its objective is infinite, the reason is in the table and on stderr, and the exit code tells that something failed."""
     code, objectives = run(f"task.poisson={FAILS[-4:]},{WORKS[-3:]}")
     failed, finished = table()
-    assert code == 1 and objectives[0] == math.inf and objectives[1] == min(losses(Path(finished["folder"])))
+    assert (
+        code == 1
+        and objectives[0] == math.inf
+        and objectives[1] == min(evaluations(Path(finished["folder"])))
+    )
     assert (failed["status"], failed["loss"], failed["job"]) == ("failed", "inf", "0")
     assert "design.poisson_range" in failed["error"] and FAILS in failed["settings"]
     assert (finished["status"], finished["iterations"], finished["error"]) == ("finished", "2", "")
