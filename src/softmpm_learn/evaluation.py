@@ -27,9 +27,10 @@ def due(run: Run) -> bool:
 @torch.no_grad()
 def evaluate(runs: Runs) -> list[float]:
     """Mean loss of policy and design of each run as they are over the evaluation goals, ``train.endurance`` times as long as an
-    episode; nan if one of its simulations failed."""
+    episode; nan if one of its simulations failed. A robot that fails goes on from rest: frozen, it would fail again in every control
+    step, and each time the simulation of all robots would be repeated."""
     params, inputs = runs.design()
-    losses, failures = [], softmpm.Failures("freeze")
+    losses, failures = [], softmpm.Failures("reset")
     steps = runs.task.control_steps * (runs.all[0].settings.train.endurance or 1)
     task = dataclasses.replace(runs.task, control_steps=steps)
     for goal in runs.evaluation_goals() or [None]:

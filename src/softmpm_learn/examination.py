@@ -8,7 +8,8 @@ Each answer compares the first term of the objective with what it was in the epi
     finer     the same activations on the next finer grid
     tilt      largest tilt until 3T [degrees]
 
-A simulation that fails has no answer, and the log says why.
+A simulation that fails has no answer, and the log says why. The robot goes on from rest, so that it does not fail again in every
+control step.
 """
 
 import dataclasses
@@ -99,7 +100,7 @@ def motion(runs: Runs, task: Task, name: str, kick: float = 0.0) -> list[Path | 
     model, (params, inputs) = built(task, runs.all[0], runs.model.worlds), runs.design()
     start = model.rest()
     start = start._replace(v=start.v + kick * torch.eye(model.dim, dtype=model.dtype, device=model.device)[0])
-    frames, failures = list[Frame](), Failures("freeze")
+    frames, failures = list[Frame](), Failures("reset")
     settings: dict[str, Any] = dict(inputs=inputs, goal=runs.middle_goals(), start=start, failures=failures)
     run_episode(task, model, runs.observer, runs.policy, params, **settings, on_frame=frames.append)
     activation = torch.stack([frame.activation for frame in frames if frame.activation is not None])
@@ -114,7 +115,7 @@ def replayed(runs: Runs, task: Task, own: list[Path | None]) -> list[Path | None
     if known is None:
         return own
     rows = torch.cat([torch.zeros_like(known) if path is None else path.activation for path in own], dim=1)
-    states, failures = [model.rest()], Failures("freeze")
+    states, failures = [model.rest()], Failures("reset")
     settings: dict[str, Any] = dict(substeps=task.substeps, inputs=inputs, failures=failures)
     for row in rows:
         states.append(softmpm.simulate(model, states[-1], row[None], params, **settings))

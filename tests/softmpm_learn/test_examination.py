@@ -10,7 +10,7 @@ import torch
 import softmpm
 from softmpm_learn import examination
 from softmpm_learn.episode import run_episode
-from softmpm_learn.examination import examine, rubbed
+from softmpm_learn.examination import examine, motion, rubbed
 from softmpm_learn.objective import Objective, Progress, Tilt
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -93,6 +93,20 @@ def test_a_simulation_that_fails_has_no_answer(run, monkeypatch, caplog):
         and math.isfinite(found["later"])
         and "Examination, kicked:" in caplog.text
     )
+
+
+def test_a_robot_that_fails_does_so_once(run, task, monkeypatch):
+    """It goes on from rest; frozen before its failure it would fail in every control step."""
+    collected = []
+
+    class Kept(softmpm.Failures):
+        def __init__(self, policy):
+            super().__init__(policy)
+            collected.append(self)
+
+    monkeypatch.setattr(examination, "Failures", Kept)
+    assert motion(Runs([run]), task, "kicked", kick=1e6) == [None]
+    assert [len(failures) for failures in collected] == [1] and task.control_steps > 1
 
 
 def test_a_run_ends_with_its_examination(task, model, settings, tmp_path):
