@@ -72,13 +72,17 @@ class EarlyStopping:
 
 
 def learn_side_by_side(learners: "Sequence[Learner]") -> list[dict[str, float]]:
-    """One learning phase of each learner, on a GPU in lock step.
+    """One learning phase of each learner, on a GPU those with equal settings and architectures in lock step.
 
     On a CPU that is no faster; one after another, each learns the same to the last bit, whoever learns beside it.
     """
-    if learners and learners[0].replay.memory.is_cuda:
-        return learn_together(learners)
-    return [figures for learner in learners for figures in learn_together([learner])]
+    if not (learners and learners[0].replay.memory.is_cuda):
+        return [figures for learner in learners for figures in learn_together([learner])]
+    kinds, found = [_kind(learner) for learner in learners], dict[int, dict[str, float]]()
+    for first in (k for k, kind in enumerate(kinds) if kind not in kinds[:k]):
+        alike = [k for k, kind in enumerate(kinds) if kind == kinds[first]]
+        found |= dict(zip(alike, learn_together([learners[k] for k in alike]), strict=True))
+    return [found[k] for k in range(len(learners))]
 
 
 def learn_together(learners: "Sequence[Learner]", *, capture: bool = True) -> list[dict[str, float]]:
@@ -128,13 +132,14 @@ def _train(learners: "Sequence[Learner]", capture: bool) -> list[EarlyStopping]:
     return stops
 
 
+def _kind(learner: "Learner") -> tuple:
+    """What learners in lock step have in common."""
+    return learner.conf, learner.replay.shape, [p.shape for p in learner.autoencoder.parameters()]
+
+
 def _check_alike(learners: "Sequence[Learner]") -> None:
-    kinds = [
-        (learner.conf, learner.replay.shape, [p.shape for p in learner.autoencoder.parameters()])
-        for learner in learners
-    ]
-    for k, kind in enumerate(kinds):
-        if kind != kinds[0]:
+    for k, learner in enumerate(learners):
+        if _kind(learner) != _kind(learners[0]):
             raise ValueError(
                 f"learners in one phase must have equal settings and architectures; learner {k} differs from learner 0."
             )

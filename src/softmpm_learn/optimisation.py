@@ -98,7 +98,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
         raise ended
     runs.errors[k] = ended
     if len(runs.all) > 1:
-        logger.warning("Seed %d has failed in %s", run.settings.train.seed, ended)
+        logger.warning("The run of %s has failed in %s", runs.name(k), ended)
 
 
 def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:

@@ -37,6 +37,7 @@ class Run:
 
     Attributes:
         group: The processes that share the run; all but the first do without its replay buffer.
+        out: Its folder.
         worlds: Which of the worlds of the run are those of this process's model.
         iteration: Iterations done.
         observer, policy, design, optimizer: What is optimised, and how.
@@ -66,7 +67,7 @@ class Run:
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
         settings = settings.suited(task.fade, task.gain, task.endurance)
-        self.task, self.model, self.settings = task, model, settings
+        self.task, self.model, self.settings, self.out = task, model, settings, out
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
         self.fallback = Fallback()
         self.goals = stream(settings.train.seed, "goals")

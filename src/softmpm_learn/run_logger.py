@@ -161,7 +161,8 @@ class RunLogger:
         with self._recorder.episode(self.run.iteration, task=self.run.task.name, **about) as episode:
 
             def keep(frame: Frame, velocity: Tensor, forces: softmpm.ContactForces | None) -> None:
-                seen = frame.state, frame.activation, velocity, frame.features, forces
+                features = frame.features[:, : self.run.observer.size]  # beside it may be a run with more
+                seen = frame.state, frame.activation, velocity, features, forces
                 episode.frame(frame.time, *seen, world=world)
                 activation = None if frame.activation is None else frame.activation[world].detach()
                 self.frames.append((frame.time, frame.state.x[world].detach(), activation))

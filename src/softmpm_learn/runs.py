@@ -1,43 +1,37 @@
 """Runs side by side in one simulation: each has worlds of its own, and none of them sees the others.
 
-On a GPU one robot of a few thousand particles leaves most of the device idle, so many seeds in one simulation cost far less than one
-after another.
-Policies and encoders of all runs are evaluated at once (:mod:`softmpm_learn.stacking`). What is learned, drawn at random and saved
-belongs to the runs, as if each were alone; a single run is the case of one.
+On a GPU one robot of a few thousand particles leaves most of the device idle, so many runs in one simulation cost far less than one
+after another. Policies and encoders are evaluated at once (:mod:`softmpm_learn.side_by_side`). What is learned, drawn at random and
+saved belongs to the runs, as if each were alone; a single run is the case of one.
 """
 
 import contextlib
-import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from softmpm import Failures, Inputs, Model, Params, State, UnstableError
-from softmpm_learn.design import Design
-from softmpm_learn.episode import ClosedLoop, Policy
-from softmpm_learn.observe import Observer
-from softmpm_learn.optimizer_settings import OptimizerConf
+from softmpm import Failures, UnstableError
+from softmpm_learn.design import declared_inputs
+from softmpm_learn.episode import ClosedLoop
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
+from softmpm_learn.side_by_side import Designs, Observers, Policies
 from softmpm_learn.stacking import Stacked
-
-ROUNDING = {torch.float32: 1e-5, torch.float64: 1e-12}
-"""Largest difference of two equal observations, relative to the largest value: a GPU adds up the particles at a node in any order."""
 
 
 class AlsoFailedError(RuntimeError):
     """The robot of a run failed in the same replay as that of another run, whose error says how."""
 
-    def __init__(self, run: Run):
-        super().__init__(f"the robot of seed {run.settings.train.seed} failed in the same simulation.")
+    def __init__(self, name: str):
+        super().__init__(f"the robot of {name} failed in the same simulation.")
 
 
 class Runs:
     """Runs of one task in the worlds of one model: run k has the k-th share of them.
 
-    Settings may differ in the seed and in the numbers of the optimiser, but for its fading, which is part of the simulation.
+    Settings may differ in what is no part of the simulation or of the loop, see :func:`shared`.
 
     Attributes:
         all: The runs.
@@ -53,46 +47,42 @@ class Runs:
         self.errors: dict[int, Exception] = {}
         for run in runs:
             need_equal(first.settings, run.settings)
-        alone = len(runs) == 1
         self._resting = torch.zeros(len(runs), dtype=torch.bool, device=self.model.device)
-        self._stacks = [] if alone else [self._encoders(), self._policies()]
-        self.observer = first.observer if alone else _Observers(runs, self._stacks[0])
-        self.policy: Policy = first.policy if alone else _Policies(self._stacks[1], self._resting)
-        self.design = first.design if alone else _Designs(runs, self._resting, self.share)
+        self.observer, self.policy, self.design = first.observer, first.policy, first.design
+        self._together: tuple[Observers, Policies] | None = None
+        if len(runs) > 1:
+            self._together = Observers(runs, self.share), Policies(runs, self.share, self._resting)
+            self.observer, self.policy = self._together
+            self.design = Designs(runs, self.share, self._resting)
         self.loop = ClosedLoop(
             self.task,
             self.model,
             self.observer,
             self.policy,
             self.design,
-            list(first.policy.parameters()) if alone else self._stacks[1].weights,
+            self._together[1].weights if self._together else list(first.policy.parameters()),
             [p for run in runs for p in run.design.parameters()],
             runs=len(runs),
-            keep_every=first.settings.learning.frame_every if first.learner else 0,
+            keep_every=first.settings.learning.frame_every if any(run.learner for run in runs) else 0,
             fade=first.settings.optimizer.fade or math.inf,
         )
 
-    def _encoders(self) -> Stacked:
-        with torch.no_grad():
-            seen = self.all[0].observer.observe(self.model, _probe(self.model))
-        return Stacked(
-            [_Encoder(run.observer) for run in self.all], (0,), (seen.unflatten(0, (len(self.all), -1)),)
-        )
-
-    def _policies(self) -> Stacked:
-        first, place = self.all[0], {"dtype": self.model.dtype, "device": self.model.device}
-        shape = len(self.all), self.share, first.observer.size
-        features = torch.linspace(-1.0, 1.0, math.prod(shape), **place).view(shape)
-        goal = first.middle_goals()
-        goals = None if goal is None else goal.expand(len(self.all), *goal.shape)
-        probe = features, torch.tensor(0.3, **place), goals
-        return Stacked([run.policy for run in self.all], (0, None, 0), probe)
+    @property
+    def stacks(self) -> list[Stacked]:
+        """Encoders and policies that are evaluated at once, of each kind."""
+        return [stack for part in self._together or () for stack in part.stacks]
 
     @property
     def active(self) -> list[int]:
         """Numbers of the runs that go on: not at their last iteration, not failed."""
         last = self.all[0].settings.train.iterations
         return [k for k, run in enumerate(self.all) if run.iteration < last and k not in self.errors]
+
+    def name(self, k: int) -> str:
+        """What people call a run: its seed, and its folder where several have that seed."""
+        run = self.all[k]
+        alike = sum(one.settings.train.seed == run.settings.train.seed for one in self.all) > 1
+        return f"seed {run.settings.train.seed}" + (f" in {run.out}" if alike else "")
 
     def worlds(self, k: int) -> slice:
         """Worlds of a run in the model."""
@@ -102,7 +92,7 @@ class Runs:
         """Let the robots of these runs move; the others stay at rest, with the scene's material, which cannot fail."""
         rests = [k not in moving for k in range(len(self.all))]
         self._resting.copy_(torch.tensor(rests))
-        for stack in self._stacks:
+        for stack in self.stacks:
             stack.attach()
 
     def owner(self, error: UnstableError) -> int:
@@ -114,7 +104,7 @@ class Runs:
         first = self.owner(error)
         others = {world // self.share for world in self.loop.failed} - {first}
         found: dict[int, Exception] = {first: error}
-        return found | {k: AlsoFailedError(self.all[k]) for k in sorted(others)}
+        return found | {k: AlsoFailedError(self.name(k)) for k in sorted(others)}
 
     def failed(self, failures: Failures) -> dict[int, UnstableError]:
         """The first of some failures in the worlds of each run that has one, by its number."""
@@ -133,8 +123,8 @@ class Runs:
                         f"This was in process {self.group.rank}, whose world {error.world} is world {world} of the run."
                     )
                 elif len(self.all) > 1:
-                    seed = self.all[self.owner(error)].settings.train.seed
-                    error.add_note(f"World {error.world} is world {error.world % self.share} of seed {seed}.")
+                    name = self.name(self.owner(error))
+                    error.add_note(f"World {error.world} is world {error.world % self.share} of {name}.")
                 raise
 
     def goals(self, drawing: Sequence[int]) -> Tensor | None:
@@ -151,120 +141,42 @@ class Runs:
         rounds = zip(*(run.evaluation_goals() for run in self.all), strict=True)
         return [torch.cat(goals) for goals in rounds]
 
+    def observations(self, k: int, pictures: Tensor) -> Tensor:
+        """Those of a run, shape (frame, world, ...), out of the observations of all worlds."""
+        own = pictures[:, self.worlds(k)]
+        return own if self._together is None else self._together[0].shown(k, own)
+
     def split(self, gradients: Sequence[Tensor]) -> list[list[Tensor]]:
         """Gradients with respect to policy and design of each run, from what :attr:`loop` gives."""
-        if len(self.all) == 1:
+        if self._together is None:
             return [list(gradients)]
         count = len(self.loop.weights)
-        parts, rest = self._stacks[1].split(gradients[:count]), iter(gradients[count:])
+        parts, rest = self._together[1].split(gradients[:count]), iter(gradients[count:])
         return [
             part + [next(rest) for _ in run.design.parameters()]
             for part, run in zip(parts, self.all, strict=True)
         ]
 
 
+def shared(settings: Settings) -> dict[str, object]:
+    """Settings that runs of one simulation have in common, by their names: those that are part of the simulation, or of the loop."""
+    train = {f"train.{name}": value for name, value in vars(settings.train).items() if name != "seed"}
+    return train | {
+        "optimizer.fade": settings.optimizer.fade,
+        "learning.frame_every": settings.learning.frame_every,
+        "design's inputs": declared_inputs(settings.design),
+    }
+
+
 def need_equal(one: Settings, other: Settings) -> None:
     """Raise ValueError unless two settings differ only in what runs of one simulation may have of their own."""
-
-    def shared(settings: Settings) -> dict[str, dict]:
-        found = dataclasses.asdict(settings)
-        found["optimizer"] = {"fade": settings.optimizer.fade}
-        found["train"] = found["train"] | {"seed": None}
-        return found
-
-    for group, values in shared(one).items():
-        for name, value in values.items():
-            if shared(other)[group][name] != value:
-                own = ", ".join(f.name for f in dataclasses.fields(OptimizerConf) if f.name != "fade")
-                raise ValueError(
-                    f"runs side by side share {group}.{name}; here it is {value} and {shared(other)[group][name]}. Only "
-                    f"train.seed and these of the optimizer may differ: {own}."
-                )
-
-
-class _Encoder(nn.Module):
-    """The second step of an observer, as a module."""
-
-    def __init__(self, observer: Observer):
-        super().__init__()
-        self.observer = observer
-
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.observer.encode(observation)
-
-
-class _Observers(Observer):
-    """Observers of all runs. What they see before they encode it is the same for equal observers, up to rounding, and computed once."""
-
-    def __init__(self, runs: Sequence[Run], encoders: Stacked):
-        super().__init__()
-        self.runs, self.encoders = len(runs), encoders
-        self.size = runs[0].observer.size
-        self._each = [run.observer for run in runs]
-        state = _probe(runs[0].model)
-        with torch.no_grad():
-            first, *others = (one.observe(runs[0].model, state) for one in self._each)
-        near = ROUNDING[first.dtype] * first.abs().max()
-        if all(bool((other - first).abs().max() <= near) for other in others):
-            self._each = self._each[:1]
-
-    def observe(self, model: Model, state: State) -> Tensor:
-        if len(self._each) == 1:
-            return self._each[0].observe(model, state)
-        seen = [one.observe(model, state).unflatten(0, (self.runs, -1)) for one in self._each]
-        return torch.cat([one[k] for k, one in enumerate(seen)])
-
-    def encode(self, observation: Tensor) -> Tensor:
-        return self.encoders(observation.unflatten(0, (self.runs, -1))).flatten(end_dim=1)
-
-
-class _Policies:
-    """Policies of all runs for all worlds; those of runs at rest give no activation."""
-
-    def __init__(self, stack: Stacked, resting: Tensor):
-        self.stack, self.resting, self.runs = stack, resting, len(stack.modules)
-
-    def __call__(self, z: Tensor, time: Tensor, goal: Tensor | None = None) -> Tensor:
-        goals = None if goal is None else goal.unflatten(0, (self.runs, -1))
-        features = z.unflatten(-2, (self.runs, -1)).movedim(-3, 0)
-        resting = self.resting.view(-1, *(1,) * (features.dim() - 1))
-        # The weights of a run that failed may be nan, and nothing of them may reach its simulation or the gradient of it:
-        found = self.stack(features.masked_fill(resting, 0.0), time, goals)
-        return found.masked_fill(resting, 0.0).movedim(0, -3).flatten(-3, -2)
-
-
-class _Designs:
-    """Designs of all runs for all worlds; runs at rest have the scene's material."""
-
-    def __init__(self, runs: Sequence[Run], resting: Tensor, share: int):
-        self.each: list[Design] = [run.design for run in runs]
-        self.resting, self.share = resting, share
-
-    def __call__(self) -> tuple[Params, Inputs]:
-        """Shape (world, particle) or (world, muscle) where it is designed."""
-        found = [design() for design in self.each]
-        params, inputs = found[0]
-        own = {name: self._for_worlds(name, [getattr(p, name) for p, _ in found]) for name in params._fields}
-        given = {
-            name: self._for_worlds(name, [getattr(i, name) for _, i in found])
-            for name, value in inputs._asdict().items()
-            if value is not None
-        }
-        return params._replace(**own), inputs._replace(**given)
-
-    def _for_worlds(self, name: str, values: list[Tensor]) -> Tensor:
-        start = self.each[0].start.get(name)
-        if start is None:
-            return values[0]
-        chosen = torch.where(self.resting[:, None], start, torch.stack(values))
-        return chosen[:, None].expand(-1, self.share, -1).flatten(end_dim=1)
-
-
-def _probe(model: Model) -> State:
-    """A state in which robots of different worlds move differently."""
-    state = model.rest()
-    wave = torch.linspace(0.0, 9.0, state.v.numel(), dtype=state.v.dtype, device=state.v.device).sin()
-    return state._replace(v=wave.view_as(state.v))
+    for name, value in shared(one).items():
+        if shared(other)[name] != value:
+            raise ValueError(
+                f"runs side by side share {name}; here it is {value} and {shared(other)[name]}. What may differ is train.seed and the "
+                "settings of observer, policy, design, learning and optimizer, except for design.strength, design.viscosity, "
+                "learning.frame_every and optimizer.fade."
+            )
 
 
 def _joined(goals: Sequence[Tensor | None]) -> Tensor | None:

@@ -235,8 +235,8 @@ def add_observations(runs: Runs, k: int, pictures: Tensor) -> None:
     """Add those of a run, of the observations of all worlds."""
     run = runs.all[k]
     if run.learner is not None:
-        own = pictures if len(runs.all) == 1 else pictures[:, runs.worlds(k)]
-        run.learner.add_observations(run.iteration * run.settings.train.worlds, own)
+        first = run.iteration * run.settings.train.worlds
+        run.learner.add_observations(first, runs.observations(k, pictures))
 
 
 def at_once(work: Callable[[int], object], numbers: Collection[int]) -> None:

@@ -112,11 +112,58 @@ def test_three_seeds_side_by_side_are_three_runs(task, conf, tmp_path, case):
         assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
 
 
+MIXED = (
+    dict(),
+    dict(observer=dict(name="centroids"), policy=dict(clock=False)),
+    dict(observer=dict(name="untrained"), design=dict(enabled=False)),
+    dict(learning=dict(epochs=2, every=3), policy=dict(hidden=[4])),
+    dict(observer=dict(name="kmeans", clusters=2), policy=dict(name="linear")),
+    dict(observer=dict(name="nothing")),
+    dict(train=dict(seed=5), optimizer=dict(policy_rate=1e-2)),
+)
+"""Runs that differ in all that runs side by side may differ in."""
+
+
+def mixed(conf: Settings, out: Path) -> list[Plan]:
+    conf = changed(conf, train=dict(seeds=1, record_every=2, worlds=2, goal_spread=[0.2, 0.1]))
+    return [Plan(settings=changed(conf, **change), out=out / str(k)) for k, change in enumerate(MIXED)]
+
+
+def test_runs_of_many_kinds_side_by_side_are_single_runs(task, conf, tmp_path):
+    """Observers, policies, designs and learning phases that differ: metrics, weights and recordings agree with those of each alone."""
+    plans = mixed(conf, tmp_path / "together")
+    train_side_by_side(task, built(task, plans[0].settings, len(plans)), plans)
+    for k, plan in enumerate(mixed(conf, tmp_path / "alone")):
+        train(task, built(task, plan.settings), plan.settings, plan.out)
+        assert_same(tmp_path / "together" / str(k), plan.out)
+        with (
+            softmpm.Recording(plan.out / "run.h5") as want,
+            softmpm.Recording(tmp_path / "together" / str(k) / "run.h5") as found,
+        ):
+            frames, others = found.frames(4), want.frames(4)
+            assert frames.keys() == others.keys()
+            assert all(
+                np.allclose(frames[name], others[name], rtol=1e-5, atol=1e-6, equal_nan=True)
+                for name in frames
+            )
+
+
+def test_what_one_kind_has_in_common_is_computed_at_once(task, conf, tmp_path, monkeypatch):
+    """Encoders of three latents, policies of two of them and of the untrained one, and the picture of all four."""
+    plans, real, seen = mixed(conf, tmp_path), VelocityImage.__call__, []
+    model = built(task, plans[0].settings, len(plans))
+    runs = Runs([Run(task, model, plan.settings, plan.out, runs=len(plans)) for plan in plans])
+    assert sorted(len(stack.modules) for stack in runs.stacks) == sorted([3, 1, 1, 1, 1] + [3, 1, 1, 1, 1])
+    monkeypatch.setattr(VelocityImage, "__call__", lambda *given: seen.append(1) or real(*given))
+    runs.observer(model, model.rest())
+    assert len(seen) == 1
+
+
 def test_weights_are_evaluated_at_once(task, conf, tmp_path):
     """Policies and encoders are batched, and a change of one run in place is what the batched evaluation sees."""
     model = built(task, conf, SEEDS)
     runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
-    assert [stack.batched for stack in runs._stacks] == [True, True]
+    assert [stack.batched for stack in runs.stacks] == [True, True]
     before = runs.loop(None)[0].loss
     with torch.no_grad():
         for p in runs.all[1].policy.parameters():
@@ -389,7 +436,7 @@ def test_policies_that_cannot_be_batched_are_evaluated_in_turn(task, conf, tmp_p
     conf = changed(conf, policy=dict(name="odd"))
     model = built(task, conf, SEEDS)
     runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
-    assert [stack.batched for stack in runs._stacks] == [True, False]
+    assert [stack.batched for stack in runs.stacks] == [True, False]
     together(task, conf, tmp_path / "together")
     alone(task, conf, tmp_path / "alone")
     for k in range(SEEDS):
