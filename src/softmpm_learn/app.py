@@ -4,29 +4,22 @@ import dataclasses
 import logging
 import math
 import os
-import sys
 import time
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from softmpm_learn import files, plugins, seeds, sweep
-from softmpm_learn.checkpoint import LockedError
+from softmpm_learn import plugins, seeds, sweep
 from softmpm_learn.config import RunConf, conf_dir, register, to_run
 from softmpm_learn.distributed import Group, OtherProcessError, joined
-from softmpm_learn.experiment import run_experiment
-from softmpm_learn.log_file import log_file
-from softmpm_learn.optimisation import TrainingError
+from softmpm_learn.jobs import Job, JobError, RefusedError, experiments, fail, run_jobs, side_by_side
 from softmpm_learn.saved import load as saved_configuration
-from softmpm_learn.sentences import EXPECTED, sentence
+from softmpm_learn.sentences import end, give_up, sentence
 from softmpm_learn.stop import Signals
-from softmpm_learn.train import Result
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -36,9 +29,11 @@ CHANGEABLE = (
     "train.frame_every",
     "train.examine",
     "train.log",
+    "train.side_by_side",
     "device",
 )
-"""Settings that may differ when a run is resumed: its length, the recorded episodes, the loggers and the device."""
+"""Settings that may differ when a run is resumed: its length, the recorded episodes, the loggers, the jobs beside it and
+the device."""
 
 
 def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
@@ -57,20 +52,22 @@ def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
                 logging.disable(logging.WARNING)  # the first process says it
             _load(own)
             register(group.broadcast(time.time()))
-            failed: dict[int, Path] = {}
+            waiting, failed = list[Job](), dict[int, Path]()
             run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
-            run(lambda config: job(config, group, signals, failed))()
+            run(lambda config: job(config, group, signals, waiting, failed))()
+            for jobs in side_by_side(waiting):
+                run_jobs(jobs, group, signals, failed)
             if failed:
                 numbers, table = ", ".join(map(str, failed)), next(iter(failed.values()))
-                _end(1, f"these jobs of {table} failed: {numbers}; the same command tries them again.")
+                end(1, f"these jobs of {table} failed: {numbers}; the same command tries them again.")
     except Exception as error:
         if full:
             raise
         if not group.first:
             raise SystemExit(1) from None  # the first process says the same
-        _give_up(error)
+        give_up(error)
     except KeyboardInterrupt:
-        _end(130, "" if signals.quiet else f"interrupted. {signals.advice}")
+        end(130, "" if signals.quiet else f"interrupted. {signals.advice}")
 
 
 def load(own: Sequence[str]) -> None:
@@ -80,7 +77,7 @@ def load(own: Sequence[str]) -> None:
     except Exception as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise
-        _give_up(error)
+        give_up(error)
 
 
 def _load(own: Sequence[str]) -> None:
@@ -90,78 +87,62 @@ def _load(own: Sequence[str]) -> None:
         plugins.load(path)
 
 
-class JobError(Exception):
-    """A run that failed: the sentence for people, empty where another process has it, and the iterations done before."""
-
-    def __init__(self, text: str = "", iterations: int = 0):
-        super().__init__(text)
-        self.iterations = iterations
-
-
-class RefusedError(JobError):
-    """A run that is another's: its folder is left as it is."""
-
-
-def job(config: DictConfig, group: Group, signals: Signals, failed: dict[int, Path]) -> float:
+def job(
+    config: DictConfig, group: Group, signals: Signals, waiting: list[Job], failed: dict[int, Path]
+) -> float:
     """One run, or a job of a sweep; gives the objective, its lowest loss. An error ends a run with a sentence on stderr, and is the
-    outcome of a job, whose number is added to ``failed``.
+    outcome of a job, whose number is added to ``failed``. A job that goes side by side with others is added to ``waiting``.
     """
     hydra_config = HydraConfig.get()
     out = Path(group.broadcast(hydra_config.runtime.output_dir))
     if hydra_config.mode == RunMode.MULTIRUN:
-        return _swept(config, out, group, signals, failed)
+        return _swept(config, out, group, signals, waiting, failed)
     try:
         conf = _configured(config, out, group)
-        results = _experiment(conf, out, group, signals)
+        (results,) = experiments([(conf, out)], group, signals)
         if conf.train.seeds > 1:
             words = [text for text in hydra_config.overrides.task if not text.startswith("resume=")]
             about = {"job": 0, "settings": " ".join(words), "folder": str(out)}
             found = seeds.record(conf, out, results, group, about)
             if found and found.status == "failed":
-                _end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
+                end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
         return seeds.median_loss(results)
     except JobError as failure:
-        _end(1, str(failure))
+        end(1, str(failure))
 
 
-def _swept(config: DictConfig, out: Path, group: Group, signals: Signals, failed: dict[int, Path]) -> float:
-    """A job of a sweep: skipped if it has finished, gone on with if it has begun. Only its own failure lets the next one run."""
-    hydra_config, loss = HydraConfig.get(), math.inf
+def _swept(
+    config: DictConfig,
+    out: Path,
+    group: Group,
+    signals: Signals,
+    waiting: list[Job],
+    failed: dict[int, Path],
+) -> float:
+    """A job of a sweep: skipped if it has finished, gone on with if it has begun."""
+    hydra_config = HydraConfig.get()
     number, table = int(hydra_config.job.num), Path(hydra_config.sweep.dir) / sweep.TABLE
-    about = {"job": number, "settings": " ".join(hydra_config.overrides.task), "folder": str(out)}
+    mine = Job(number=number, settings=" ".join(hydra_config.overrides.task), out=out, table=table)
     try:
-        conf = _configured(config, out, group)
+        mine.conf = _configured(config, out, group)
         before = group.broadcast(group.once(sweep.outcome, out))
-        if before and before.status == "finished" and before.iterations >= conf.train.iterations:
+        if before and before.status == "finished" and before.iterations >= mine.conf.train.iterations:
             group.once(sweep.tabulate, table.parent)  # a kill may have come between outcome and table
             logger.info("Job %d had finished with the loss %.5g: %s", number, before.loss, out)
             return before.loss
-        results = _experiment(conf, out, group, signals)
-        if conf.train.seeds > 1:
-            found = seeds.record(conf, out, results, group, about)
-        else:
-            found = seeds.outcome(results[0], about) if results[0].finished else None
-        if found is None:
-            logger.info("The same command goes on with the sweep.")
-            raise SystemExit(0)
-        if found.status == "failed":
-            raise JobError(found.error, found.iterations)
-        loss = found.loss
+        if mine.conf.train.side_by_side > 1:
+            if not hydra_config.sweeper._target_.endswith("BasicSweeper"):
+                raise ValueError(
+                    "train.side_by_side begins once all jobs are known, but this sweeper needs the loss of one to choose the next; set "
+                    f"it to 1. The sweeper is {hydra_config.sweeper._target_}."
+                )
+            waiting.append(mine)
+            return math.nan
     except JobError as failure:
-        if isinstance(failure, RefusedError):
-            _end(1, str(failure))
-        if str(failure):
-            print(f"softmpm_learn: job {number}: {failure}", file=sys.stderr)
-        failed[number] = table
-        found = sweep.Outcome(status="failed", error=str(failure), iterations=failure.iterations, **about)
+        return fail([mine], failure, group, failed)[0]
     except (ValueError, OSError) as error:
-        _give_up(error)
-    if group.first:
-        sweep.record(out, found)
-        sweep.tabulate(table.parent)
-    if failed and group.size > 1:
-        raise SystemExit(1)  # the processes may no longer be in step; the same command goes on
-    return loss
+        give_up(error)
+    return run_jobs([mine], group, signals, failed)[0]
 
 
 def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
@@ -192,19 +173,6 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
         raise JobError(sentence(error)) from error
 
 
-def _experiment(conf: RunConf, out: Path, group: Group, signals: Signals) -> list[Result]:
-    """The run; an error leaves its traceback in the folder, from where it happened."""
-    with log_file() as begin_log:
-        try:
-            return run_experiment(conf, out, group, signals, lambda: begin_log(out / "softmpm_learn.log"))
-        except Exception as error:
-            if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
-                raise JobError from None
-            kind = RefusedError if isinstance(error, LockedError) else JobError
-            done = error.iteration if isinstance(error, TrainingError) else 0
-            raise kind(f"{sentence(error)}{_left(error, out, group)}", done) from error
-
-
 def _fixed(conf: RunConf) -> dict:
     """Settings that a run keeps when it is resumed."""
     flat = dataclasses.asdict(conf)
@@ -212,18 +180,6 @@ def _fixed(conf: RunConf) -> dict:
         group, _, name = key.partition(".")
         del (flat[group] if name else flat)[name or group]
     return flat
-
-
-def _left(error: Exception, out: Path, group: Group) -> str:
-    """Leave the traceback in the folder of the run, unless that is another's; gives a note on where it is, if people need it."""
-    place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
-    if isinstance(error, LockedError):
-        return ""
-    try:
-        files.replace(place, "".join(traceback.format_exception(error)).encode())
-    except OSError as other:
-        return "" if isinstance(error, EXPECTED) else f" The traceback could not be saved: {other}"
-    return "" if isinstance(error, EXPECTED) else f" The traceback is in {place}."
 
 
 def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
@@ -241,13 +197,3 @@ def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
                 f"a run is resumed with its own settings; only {', '.join(CHANGEABLE)} may change, not {key}."
             )
     return saved
-
-
-def _give_up(error: Exception, more: str = "") -> NoReturn:
-    _end(1, f"{sentence(error)}{more}")
-
-
-def _end(code: int, said: str) -> NoReturn:
-    if said:
-        print(f"softmpm_learn: {said}", file=sys.stderr)
-    raise SystemExit(code)

@@ -45,29 +45,51 @@ def run_experiment(
         signals: What asks the run to end, None for nothing.
         begin: Called in the first process once ``out`` is locked and found to be this run's, before the configuration is saved.
     """
+    return run_side_by_side([(conf, out)], group, signals, begin)[0]
+
+
+def run_side_by_side(
+    jobs: Sequence[tuple[RunConf, Path]],
+    group: Group | None = None,
+    signals: Signals | None = None,
+    begin: Callable[[], None] = lambda: None,
+) -> list[list[Result]]:
+    """As :func:`run_experiment`, for several of one robot in one simulation; gives the results of each.
+
+    Args:
+        jobs: Settings and folder of each. They have task and device in common, and what :func:`softmpm_learn.runs.shared` names.
+
+    Raises:
+        ValueError: Several processes have one run each, or share one of several.
+    """
     group, signals = group or Group(), signals or Signals()
+    (conf, out), alone = jobs[0], len(jobs) == 1 and jobs[0][0].train.seeds == 1
+    if len(jobs) > 1 and conf.train.seeds < group.size:
+        raise ValueError(
+            f"jobs side by side need train.seeds ≥ {group.size}, so that each process has some of them; got {conf.train.seeds}."
+        )
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(conf.device.threads)
     need_determinism(conf.device.deterministic)
     with group.fail_together():
-        members, task = seeds.share(conf, out, group), make_task(conf.task)
-        alone = conf.train.seeds == 1
-        model = make_model(task, conf, group, len(members))
+        shares = [seeds.share(own, place, group) for own, place in jobs]
+        members, task = [member for share in shares for member in share], make_task(conf.task)
+        model = make_model(task, conf, group, None if alone else len(members))
     logger.info("%s", model.describe(task.substeps))
     with contextlib.ExitStack() as open_loggers, contextlib.ExitStack() as held:
         loggers = [open_loggers.enter_context(Loggers(one.train.log, place)) for one, place in members]
         progress = held.enter_context(ProgressBar(conf.train.iterations)) if group.first else None
         stop = held.enter_context(signals.awaited(insist=group.size == 1))
-        if not alone:
-            group.once(lambda: held.enter_context(entered(out)))
+        if conf.train.seeds > 1:
+            for _, place in jobs:
+                group.once(lambda place=place: held.enter_context(entered(place)))
 
         def begun(number: int) -> None:
             if group.first and number == 0:
                 begin()
-                save(conf, out)
-                signals.advice = (
-                    f"Finished iterations are saved; to go on, or to draw the pictures: resume={out}"
-                )
+                for own, place in jobs:
+                    save(own, place)
+                signals.advice = advice(jobs)
             if not alone:
                 save(*members[number])
 
@@ -98,10 +120,20 @@ def run_experiment(
             if not result.error and (group.first or not alone):
                 draw(result, task, place)
                 own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
+    rest = iter(results)
+    found = [[next(rest) for _ in share] for share in shares]
     if group.first:
-        logger.info("%s", farewell(results[0], task, out) if alone else farewell_of_seeds(results, out))
-        signals.advice = f"The run had ended; everything is in {out}."
-    return results
+        for own, (_, place) in zip(found, jobs, strict=True):
+            logger.info("%s", farewell(own[0], task, place) if alone else farewell_of_seeds(own, place))
+        signals.advice = f"The run had ended; everything is in {out if len(jobs) == 1 else out.parent}."
+    return found
+
+
+def advice(jobs: Sequence[tuple[RunConf, Path]]) -> str:
+    """What to do where a signal ends the program."""
+    if len(jobs) > 1:
+        return "Finished iterations are saved; the same command goes on."
+    return f"Finished iterations are saved; to go on, or to draw the pictures: resume={jobs[0][1]}"
 
 
 def shown(rows: dict[int, tuple[int, dict[str, float]]]) -> tuple[int, list[float]]:
@@ -122,8 +154,8 @@ def need_determinism(needed: bool) -> None:
     torch.use_deterministic_algorithms(needed)
 
 
-def make_model(task: Task, conf: RunConf, group: Group, seeds: int = 1) -> softmpm.Model:
-    """The task's scene on the device of the settings, with this process's share of the worlds, or all worlds of its seeds."""
+def make_model(task: Task, conf: RunConf, group: Group, runs: int | None = None) -> softmpm.Model:
+    """The task's scene on the device of the settings, with this process's share of the worlds of one run, or all worlds of its runs."""
     device, memory = group.device(conf.device.name), conf.device.memory
     if device and device.startswith("cuda:"):
         torch.cuda.set_device(device)  # else every process takes memory of the first GPU too
@@ -131,7 +163,7 @@ def make_model(task: Task, conf: RunConf, group: Group, seeds: int = 1) -> softm
         task.scene,
         device=device,
         dtype=getattr(torch, conf.device.dtype),
-        worlds=len(group.split(conf.train.worlds)) if conf.train.seeds == 1 else seeds * conf.train.worlds,
+        worlds=len(group.split(conf.train.worlds)) if runs is None else runs * conf.train.worlds,
         memory_budget=None if memory is None else round(1e6 * memory),
         inputs=declared_inputs(conf.design),
         calls=task.control_steps,

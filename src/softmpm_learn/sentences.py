@@ -1,6 +1,8 @@
 """What the command line says when something goes wrong: one sentence for people in place of a traceback."""
 
 import dataclasses
+import sys
+from typing import NoReturn
 
 import torch
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -64,3 +66,13 @@ def _line(text: str) -> str:
     """A message on one line, without Hydra's list of search paths."""
     text = " ".join(text.partition("Config search path:")[0].split())
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def give_up(error: Exception, more: str = "") -> NoReturn:
+    end(1, f"{sentence(error)}{more}")
+
+
+def end(code: int, said: str) -> NoReturn:
+    if said:
+        print(f"softmpm_learn: {said}", file=sys.stderr)
+    raise SystemExit(code)

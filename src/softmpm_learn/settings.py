@@ -203,6 +203,9 @@ class TrainConf:
     seeds: int = 1
     """Number of seeds, from ``seed`` on, that learn side by side in one simulation, each as if it were alone; several processes share
     them out."""
+    side_by_side: int = 1
+    """Sweeps: most jobs that learn side by side in one simulation. They have the task in common and may differ in observer, policy,
+    design, learning, optimiser and seed."""
     worlds: int = 1
     """Simulations side by side in each step, of all processes together; useful with random goals. Of each seed as many."""
     goal_spread: list[float] = field(default_factory=list)
@@ -235,6 +238,7 @@ class TrainConf:
             self,
             "iterations",
             "seeds",
+            "side_by_side",
             "worlds",
             "frame_every",
             "evaluate_every",

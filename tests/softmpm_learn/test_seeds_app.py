@@ -13,7 +13,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn import app, checkpoint, experiment, jobs
 from softmpm_learn.figures import __main__ as figures
 from softmpm_learn.saved import load
 
@@ -171,7 +171,7 @@ def test_a_sweep_has_a_row_for_each_seed(main, monkeypatch):
         own = [float(row["loss"]) for row in table if row["job"] == str(job)]
         assert objective == pytest.approx(statistics.median(own))
     real = []
-    monkeypatch.setattr(app, "run_experiment", lambda *args: real.append(args))
+    monkeypatch.setattr(jobs, "run_experiment", lambda *args: real.append(args))
     assert main(*words) == (0, objectives) and not real
 
 

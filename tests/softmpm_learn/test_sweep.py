@@ -12,7 +12,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, checkpoint, optimisation, sweep, train
+from softmpm_learn import app, checkpoint, jobs, optimisation, sweep, train
 from softmpm_learn.saved import load
 
 TINY = [
@@ -122,7 +122,7 @@ def test_a_setting_that_no_run_accepts_is_a_row_too(run):
 
 def test_the_same_command_skips_what_has_finished(run, monkeypatch):
     """Finished jobs give their objective again without a run; a failed one is tried again, and its row replaced."""
-    real, ran = app.run_experiment, []
+    real, ran = jobs.run_experiment, []
 
     def fails_at_first(conf, out, *args):
         ran.append(conf.train.seed)
@@ -130,7 +130,7 @@ def test_the_same_command_skips_what_has_finished(run, monkeypatch):
             raise RuntimeError("no memory just now.")
         return real(conf, out, *args)
 
-    monkeypatch.setattr(app, "run_experiment", fails_at_first)
+    monkeypatch.setattr(jobs, "run_experiment", fails_at_first)
     (code, first), (again, second) = run("train.seed=0,1,2"), run("train.seed=0,1,2")
     assert (code, again) == (1, 0) and ran == [0, 1, 2, 1]
     assert first[1] == math.inf and second == [first[0], float(table()[1]["loss"]), first[2]]
@@ -180,14 +180,14 @@ def test_the_same_command_goes_on_after_a_kill(run, monkeypatch, where):
 
 def test_a_wish_to_stop_ends_the_sweep(run, monkeypatch):
     """The job in progress is saved and has no row; the next ones do not begin; the same command goes on."""
-    real = app.run_experiment
+    real = jobs.run_experiment
 
     def stopped(conf, out, group, signals, begin):
         signals.awaited = lambda **_: contextlib.nullcontext(lambda: conf.train.seed == 1)
         return real(conf, out, group, signals, begin)
 
     with monkeypatch.context() as patch:
-        patch.setattr(app, "run_experiment", stopped)
+        patch.setattr(jobs, "run_experiment", stopped)
         code, objectives = run("train.seed=0,1,2")
     assert code == 0 and len(objectives) == 1 and [row["job"] for row in table()] == ["0"]
     (folder,) = Path("outputs/sweep").iterdir()
