@@ -19,9 +19,9 @@ WIDTH = 0.01
 STEP = 0.1
 """Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
 VIGOROUS = 3.0
-LASTING = 3
-"""A motion counts as the best by what it is over so many episodes in a row."""
 """Size of the first activations of a robot on legs, with which it steps from the beginning."""
+LASTING = 3
+"""Number of episodes in a row over which a motion is evaluated, to choose the best."""
 SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""
 STRAIN = 0.5
