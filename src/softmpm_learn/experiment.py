@@ -204,7 +204,8 @@ def farewell_of_seeds(results: Sequence[Result], out: Path) -> str:
     lines, place = [], _relative(out)
     if losses:
         middle, ends = statistics.median(losses), f"{min(losses):.5g} to {max(losses):.5g}"
-        lines.append(f"Best losses of {len(losses)} seeds: median {middle:.5g}, from {ends}.")
+        what = "evaluations" if results[0].run.evaluated else "losses"
+        lines.append(f"Best {what} of {len(losses)} seeds: median {middle:.5g}, from {ends}.")
     failed = [str(result.run.settings.train.seed) for result in results if result.error]
     if failed:
         lines.append(f"Failed: seed {', '.join(failed)}.")

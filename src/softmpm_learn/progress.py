@@ -17,7 +17,7 @@ class ProgressBar:
     def __init__(self, total: int, *, lines: int = 20):
         """Count to ``total`` iterations; without a terminal, write about ``lines`` lines."""
         self.total, self.every = total, max(1, round(total / lines))
-        self.best = float("inf")
+        self.lowest = float("inf")
         self._first: int | None = None
         self._began = time.monotonic()
         self._bar = tqdm(total=total, dynamic_ncols=True, smoothing=0.1) if sys.stderr.isatty() else None
@@ -28,10 +28,10 @@ class ProgressBar:
             self._first = iteration
             if self._bar is not None:
                 self._bar.initial = self._bar.n = self._bar.last_print_n = iteration
-        self.best = min(self.best, *losses)
+        self.lowest = min(self.lowest, *losses)
         done, loss = iteration + 1, statistics.median(losses)
         all_of = f" ({min(losses):.5g} to {max(losses):.5g})" if len(losses) > 1 else ""
-        text = f"loss {loss:.5g}{all_of}, best {self.best:.5g}"
+        text = f"loss {loss:.5g}{all_of}, lowest {self.lowest:.5g}"
         if self._bar is not None:
             self._bar.set_postfix_str(text, refresh=False)
             self._bar.update(1)

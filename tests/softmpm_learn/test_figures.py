@@ -119,23 +119,23 @@ def test_figures_do_not_import_matplotlib_until_they_draw():
 
 
 def test_progress_without_a_terminal_writes_a_few_lines(caplog):
-    """The first and the last iteration and every so many in between, with the loss, the best and the time left."""
+    """The first and the last iteration and every so many in between, with the loss, the lowest one and the time left."""
     with caplog.at_level("INFO", logger="softmpm_learn"), ProgressBar(40, lines=4) as progress:
         for k in range(40):
             progress(k, float((k - 30) ** 2))
     lines = [record.getMessage() for record in caplog.records]
     assert len(lines) == 5
     assert lines[0].startswith("after 1 of 40 iterations: loss 900") and " left" in lines[0]
-    assert lines[-1].startswith("after 40 of 40 iterations: loss 81, best 0")
+    assert lines[-1].startswith("after 40 of 40 iterations: loss 81, lowest 0")
 
 
 def test_progress_of_runs_side_by_side_is_their_median_and_range(caplog):
-    """And the best of all of them."""
+    """And the lowest of all of them."""
     with caplog.at_level("INFO", logger="softmpm_learn"), ProgressBar(2) as progress:
         progress(0, 3.0, 1.0, 2.5)
         progress(1, 4.0, 2.0, 3.5)
     last = caplog.records[-1].getMessage()
-    assert last.startswith("after 2 of 2 iterations: loss 3.5 (2 to 4), best 1")
+    assert last.startswith("after 2 of 2 iterations: loss 3.5 (2 to 4), lowest 1")
 
 
 def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):

@@ -121,6 +121,24 @@ def test_each_seed_has_the_folder_of_a_run(main):
         assert sizes[0] == pytest.approx(sizes[1], rel=0.01)  # not the weights of the others as well
 
 
+@pytest.mark.parametrize(("endurance", "what"), [("1", "losses"), ("2", "evaluations")])
+def test_the_last_lines_name_what_chose_the_best(main, caplog, endurance, what):
+    """The best of each seed is that of its losses, or of its evaluations if there are any; the lines before show losses alone."""
+    with caplog.at_level("INFO", logger="softmpm_learn"):
+        main(
+            *TINY,
+            "train.seeds=2",
+            "train.record_every=0",
+            f"train.endurance={endurance}",
+            "hydra.run.dir=all",
+        )
+    values = [float(row["loss"]) for row in rows(Path("all/sweep.csv"))]
+    middle, ends = statistics.median(values), f"{min(values):.5g} to {max(values):.5g}"
+    assert f"Best {what} of 2 seeds: median {middle:.5g}, from {ends}." in caplog.text
+    lowest = min(loss for k in range(2) for loss in losses(Path(f"all/seed_{k}")))
+    assert f", lowest {lowest:.5g}, " in caplog.text
+
+
 def test_they_go_on_with_resume(main):
     """All with the folder of all, or one with its own."""
     main(*TINY, "train.seeds=2", "train.iterations=1", "hydra.run.dir=all")

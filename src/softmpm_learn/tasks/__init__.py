@@ -7,8 +7,9 @@ from softmpm_learn.tasks.biped import BipedConf, biped
 from softmpm_learn.tasks.elephant import ElephantConf, elephant
 from softmpm_learn.tasks.image import ImageConf, image
 from softmpm_learn.tasks.mesh import MeshConf, mesh
-from softmpm_learn.tasks.task import Resolution, Task, TaskConf, WalkerConf
+from softmpm_learn.tasks.task import Resolution, Task, TaskConf
 from softmpm_learn.tasks.voxels import VoxelsConf, voxels
+from softmpm_learn.tasks.walker import WalkerConf
 
 register.task("elephant", ElephantConf)(elephant)
 register.task("arm", ArmConf)(arm)

@@ -4,20 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Body, Muscle, Scene
+from softmpm import Body, Muscle
 from softmpm_learn.tasks.outline import Limb, smooth
-from softmpm_learn.tasks.task import (
-    LASTING,
-    STEP,
-    VIGOROUS,
-    Task,
-    WalkerConf,
-    clock,
-    filled,
-    neo_hookean,
-    track,
-    walking,
-)
+from softmpm_learn.tasks.task import Task, filled, neo_hookean
+from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -59,26 +49,5 @@ def biped(conf: BipedConf) -> Task:
     ]
     regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
     grid, walls, height = track(conf)
-    scene = Scene(
-        grid=grid,
-        bodies=[Body(shape.moved((0.2, height)), neo_hookean(conf))],
-        muscles=muscles,
-        walls=walls,
-        gravity=(0.0, -conf.gravity),
-        damping=conf.damping,
-        dt=conf.control_period,
-    )
-    scene, control_steps, substeps = clock(conf, scene)
-    return Task(
-        name="biped",
-        scene=scene,
-        control_steps=control_steps,
-        substeps=substeps,
-        regions=regions,
-        objective=walking(conf, rest, regions["body"]),
-        body_length=float(np.ptp(rest[:, 0])),
-        build=conf.build,
-        fade=STEP,
-        gain=VIGOROUS,
-        endurance=LASTING,
-    )
+    body = Body(shape.moved((0.2, height)), neo_hookean(conf))
+    return walker_task(conf, grid, walls, [body], muscles, rest=rest, regions=regions, torso=regions["body"])

@@ -8,20 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softmpm import Body, Muscle, Scene
+from softmpm import Body, Muscle
 from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
-from softmpm_learn.tasks.task import (
-    LASTING,
-    STEP,
-    VIGOROUS,
-    Task,
-    WalkerConf,
-    clock,
-    filled,
-    neo_hookean,
-    track,
-    walking,
-)
+from softmpm_learn.tasks.task import Task, filled, neo_hookean
+from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -86,29 +76,8 @@ def elephant(conf: ElephantConf) -> Task:
     rest = shape.positions
     regions, muscles = actuate(rest, limbs, conf.strength)
     grid, walls, height = track(conf)
-    scene = Scene(
-        grid=grid,
-        bodies=[Body(shape.moved((0.22, height)), neo_hookean(conf))],
-        muscles=muscles,
-        walls=walls,
-        gravity=(0.0, -conf.gravity),
-        damping=conf.damping,
-        dt=conf.control_period,
-    )
-    scene, control_steps, substeps = clock(conf, scene)
-    return Task(
-        name="elephant",
-        scene=scene,
-        control_steps=control_steps,
-        substeps=substeps,
-        regions=regions,
-        objective=walking(conf, rest, regions["body"]),
-        body_length=float(np.ptp(rest[:, 0])),
-        build=conf.build,
-        fade=STEP,
-        gain=VIGOROUS,
-        endurance=LASTING,
-    )
+    body = Body(shape.moved((0.22, height)), neo_hookean(conf))
+    return walker_task(conf, grid, walls, [body], muscles, rest=rest, regions=regions, torso=regions["body"])
 
 
 def actuate(

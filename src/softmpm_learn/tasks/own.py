@@ -13,17 +13,8 @@ from typing import Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.tasks.task import (
-    LASTING,
-    STEP,
-    VIGOROUS,
-    Task,
-    WalkerConf,
-    clock,
-    neo_hookean,
-    track,
-    walking,
-)
+from softmpm_learn.tasks.task import Task, neo_hookean
+from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 START = 0.2
 """Rear end of the robot on the track [m]."""
@@ -121,35 +112,22 @@ def walker(
         softmpm.Body(shape.moved(place), dataclasses.replace(material, young=factor * material.young))
         for shape, factor in shapes
     ]
-    scene = softmpm.Scene(
-        grid=grid,
-        bodies=bodies,
-        muscles=[
-            softmpm.Muscle(particles=m.particles, direction=m.direction, strength=conf.strength)
-            for m in muscles
-        ],
-        walls=walls,
-        gravity=(0.0, -conf.gravity, 0.0)[: grid.dim],
-        damping=conf.damping,
-        dt=conf.control_period,
-    )
-    scene, control_steps, substeps = clock(conf, scene)
     regions = {muscle.name: muscle.particles for muscle in muscles}
     passive = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
     if len(passive):
         regions["body"] = passive
-    return Task(
-        name=conf.name,
-        scene=scene,
-        control_steps=control_steps,
-        substeps=substeps,
+    return walker_task(
+        conf,
+        grid,
+        walls,
+        bodies,
+        [
+            softmpm.Muscle(particles=m.particles, direction=m.direction, strength=conf.strength)
+            for m in muscles
+        ],
+        rest=rest,
         regions=regions,
-        objective=walking(conf, rest, np.flatnonzero(rest[:, 1] >= np.median(rest[:, 1]))),
-        body_length=float(np.ptp(rest[:, 0])),
-        build=conf.build,
-        fade=STEP,
-        gain=VIGOROUS,
-        endurance=LASTING,
+        torso=np.flatnonzero(rest[:, 1] >= np.median(rest[:, 1])),
     )
 
 

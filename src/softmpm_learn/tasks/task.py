@@ -10,22 +10,14 @@ from typing import Any, Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.objective import Effort, Objective, Progress, Strain, Tilt
+from softmpm_learn.objective import Objective
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
 WIDTH = 0.01
 """Distance over which surface contact sets in while a robot learns [cells]."""
-STEP = 0.1
-"""Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
-VIGOROUS = 3.0
 LASTING = 3
-"""A motion counts as the best by what it is over so many episodes in a row."""
-"""Size of the first activations of a robot on legs, with which it steps from the beginning."""
-SOLES = 0.15
-"""Part of a walker's height, from below, that belongs to its soles."""
-STRAIN = 0.5
-"""Equivalent strain of a walker that costs nothing: it is half as long again as at rest."""
+"""Number of episodes in a row over which a motion is evaluated, to choose the best."""
 
 
 class Resolution(Enum):
@@ -153,53 +145,6 @@ class TaskConf:
         return softmpm.Alarms(overlap=None) if self.overlap else softmpm.Alarms()
 
 
-@dataclass(kw_only=True)
-class WalkerConf(TaskConf):
-    """Settings that robots on legs have besides, and their own defaults: contact that converges (docs/gait.md)."""
-
-    retardation: float = 1e-3
-    """Retardation time η/μ of the material [s], instead of ``viscosity``; without it soles flutter. Good value in the reference
-    formulation: 4e-3."""
-    strength: float = 6e3
-    """Stress of a muscle at full activation [Pa]."""
-    effort: float = 5e-2
-    """Weight of the mean squared activation in the loss [m]; with less, gaits stretch the robot until it breaks."""
-    upright: float = 1.0
-    """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
-    strain: float = 1e4
-    """Weight of strains beyond a half in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
-    friction: float = 0.8
-    """Coulomb friction of the floor [-]."""
-    seconds: float = 2.0
-    """Length of an episode [s]: four steps or five, so that what walks at its end goes on walking."""
-    lead: float | None = None
-    """Time before the distance counts, to get under way [s]; null is a quarter of the episode."""
-    track: float = 4.0
-    """Length of the track [m], for three episodes."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        self.need_not_negative("friction", "upright", "strain")
-        if self.lead is not None and not 0 <= self.lead < self.seconds:
-            raise ValueError(
-                f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
-            )
-        if not (math.isfinite(self.track) and self.track >= 1.0):
-            raise ValueError(f"task.track must be at least 1 m, got {self.track}.")
-
-    @property
-    def on_surface(self) -> bool:
-        return self.contact != "nodes"
-
-    @property
-    def alarms(self) -> softmpm.Alarms:
-        """On the moving grid without the alarm on the step: single particles in the inner corners of the hips are beyond the limit of a
-        lone one, which falls with up to the fourth power of the stretch, and their neighbours are not (docs/gait.md)."""
-        alarms = super().alarms
-        carried = self.on_surface and self.formulation == "moving"
-        return dataclasses.replace(alarms, step=None) if carried else alarms
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
     """A robot, its world and what it should do."""
@@ -257,41 +202,3 @@ def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:
     """Particles half a cell apart in the union of polygons; with cut cells where the outline or the mass at rest counts."""
     cut = conf.on_surface or conf.formulation == "reference"
     return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=cut)
-
-
-def walking(conf: "WalkerConf", rest: np.ndarray, torso: np.ndarray) -> Objective:
-    """Bring the soles far, without effort or overstretching, while the hind and the front quarter of the torso stay level.
-
-    The soles count because they have to step for it. The whole robot also gains by leaning forward, which a gradient that fades takes
-    for a step.
-    """
-    low, high = np.quantile(rest[torso, 0], (0.25, 0.75))
-    front, back = torso[rest[torso, 0] > high], torso[rest[torso, 0] < low]
-    lead = conf.seconds / 4 if conf.lead is None else conf.lead
-    height = rest[:, 1] - rest[:, 1].min()
-    return Objective(
-        Progress(begin=lead, particles=np.flatnonzero(height <= SOLES * height.max())),
-        Effort(weight=conf.effort),
-        Tilt(weight=conf.upright, front=front, back=back, rest=rest),
-        Strain(weight=conf.strain, most=STRAIN),
-    )
-
-
-def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
-    """Grid and walls of a walker, 0.5 m high, a floor with friction first, smooth ends; and the height of the soles [m].
-
-    The soles lie on spline knots, half a cell above a row of nodes. The floor is at the soles if surface points meet it, and at the
-    nodes otherwise.
-    """
-    length, height, margin, nodes, spacing = conf.track, 0.5, 0.05, conf.cells, conf.spacing
-    floor = math.floor(0.0625 * nodes) * spacing
-    soles = floor + 0.5 * spacing
-    if conf.on_surface:
-        floor = soles
-    grid = softmpm.Grid(shape=(round(length * nodes), round(height * nodes)), spacing=spacing)
-    walls = [
-        softmpm.Wall(normal=(0.0, 1.0), offset=floor, friction=conf.friction),
-        softmpm.Wall(normal=(1.0, 0.0), offset=margin),
-        softmpm.Wall(normal=(-1.0, 0.0), offset=margin - length),
-    ]
-    return grid, walls, soles
