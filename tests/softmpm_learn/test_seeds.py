@@ -501,3 +501,13 @@ def test_seeds_go_through_one_captured_graph(task, conf, tmp_path, observer):
     for k, one in enumerate(split(conf)):
         train(task, built(task, one, device="cuda"), one, tmp_path / "alone" / str(k))
         assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k), tolerance=1e-7)
+
+
+@pytest.mark.gpu
+def test_runs_of_many_kinds_go_through_one_captured_graph(task, conf, tmp_path):
+    """Those that differ in observer, policy, design and learning phases are on a GPU, too, what they would be alone."""
+    plans = mixed(conf, tmp_path / "together")
+    train_side_by_side(task, built(task, plans[0].settings, len(plans), "cuda"), plans)
+    for k, plan in enumerate(mixed(conf, tmp_path / "alone")):
+        train(task, built(task, plan.settings, device="cuda"), plan.settings, plan.out)
+        assert_same(tmp_path / "together" / str(k), plan.out, tolerance=1e-7)
