@@ -32,13 +32,14 @@ logger = logging.getLogger("softmpm_learn")
 
 CHANGEABLE = (
     "train.iterations",
+    "train.save_every",
     "train.record_every",
     "train.frame_every",
     "train.examine",
     "train.log",
     "device",
 )
-"""Settings that may differ when a run is resumed: its length, the recorded episodes, the loggers and the device."""
+"""Settings that may differ when a run is resumed: its length, the checkpoints, the recorded episodes, the loggers and the device."""
 
 
 def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
