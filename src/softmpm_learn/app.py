@@ -36,10 +36,11 @@ CHANGEABLE = (
     "train.record_every",
     "train.frame_every",
     "train.examine",
+    "train.pictures",
     "train.log",
     "device",
 )
-"""Settings that may differ when a run is resumed: its length, the checkpoints, the recorded episodes, the loggers and the device."""
+"""Settings that may differ when a run is resumed: its length, checkpoints, recorded episodes, pictures, loggers and the device."""
 
 
 def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
