@@ -1,6 +1,6 @@
 """Time of several seeds side by side in one simulation, against that of one seed.
 
-    python bench/seeds.py [--seeds 1 2 5 10] [--iterations 21] [--device cuda] [--json bench/results/seeds.json]
+    python bench/seeds.py [--seeds 1 2 5 10] [--iterations 21] [--save-every 1] [--device cuda] [--json bench/results/seeds.json]
 
 The elephant learns with the default settings, on a GPU at standard resolution, on a CPU at draft for 0.4 s; without recording and
 examination. ``whole`` is the time of all iterations but the first, which compiles and captures: episodes, learning, checkpoints.
@@ -56,6 +56,7 @@ def main():
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 5, 10])
     parser.add_argument("--iterations", type=int, default=21)
+    parser.add_argument("--save-every", type=int, default=1, help="iterations between two checkpoints")
     parser.add_argument("--json", type=Path, default=None, help="also write the table to this file")
     args = parser.parse_args()
     device = torch.device(args.device)
@@ -65,7 +66,13 @@ def main():
         task = make_task(ElephantConf(resolution=Resolution.draft, seconds=0.4))
     table, first = Table("Seeds side by side, float32", device, args.json), None
     for count in args.seeds:
-        train = TrainConf(iterations=args.iterations, seeds=count, record_every=0, examine=False)
+        train = TrainConf(
+            iterations=args.iterations,
+            seeds=count,
+            save_every=args.save_every,
+            record_every=0,
+            examine=False,
+        )
         settings = Settings(train=train)
         with tempfile.TemporaryDirectory() as folder:
             found = seconds(task, settings, device, Path(folder))

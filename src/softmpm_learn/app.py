@@ -25,14 +25,16 @@ logger = logging.getLogger("softmpm_learn")
 
 CHANGEABLE = (
     "train.iterations",
+    "train.save_every",
     "train.record_every",
     "train.frame_every",
     "train.examine",
+    "train.pictures",
     "train.log",
     "train.side_by_side",
     "device",
 )
-"""Settings that may differ when a run is resumed: its length, the recorded episodes, the loggers, the jobs beside it and
+"""Settings that may differ when a run is resumed: its length, checkpoints, recorded episodes, pictures, loggers, the jobs beside it and
 the device."""
 
 

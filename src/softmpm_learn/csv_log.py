@@ -51,20 +51,30 @@ class Table:
         elif seal is not None:
             logger.warning("%s is missing; its rows up to here are lost, and a new one begins.", path)
         self._hash, self._bytes = hashlib.sha256(content), len(content)
+        self._lines: list[str] = []
         files.replace(path, content)
 
     @property
     def seal(self) -> Seal:
-        """For the checkpoint: what :class:`Table` goes on from."""
+        """For the checkpoint: what :class:`Table` goes on from, the rows that were flushed."""
         return {"bytes": self._bytes, "sha256": self._hash.hexdigest()}
 
     def append(self, iteration: int, values: dict[str, float]) -> None:
-        """Add the row of an iteration and force it to the disk; a missing value is an empty cell."""
+        """Add the row of an iteration, to be written by :meth:`flush`; a missing value is an empty cell."""
         unknown = set(values) - set(self.columns)
         if unknown:
             raise ValueError(f"{self.path.name} has no column {', '.join(sorted(unknown))}.")
         cells = [values.get(name, math.nan) for name in self.columns]
-        line = ",".join([str(iteration), *("" if math.isnan(c) else repr(c) for c in cells)]) + "\n"
-        files.append(self.path, line.encode())
-        self._hash.update(line.encode())
-        self._bytes += len(line)
+        self._lines.append(
+            ",".join([str(iteration), *("" if math.isnan(c) else repr(c) for c in cells)]) + "\n"
+        )
+
+    def flush(self) -> None:
+        """Force all rows to the disk."""
+        if not self._lines:
+            return
+        added = "".join(self._lines).encode()
+        files.append(self.path, added)
+        self._hash.update(added)
+        self._bytes += len(added)
+        self._lines.clear()

@@ -117,7 +117,7 @@ def run_side_by_side(
         if alone and results[0].error:
             raise results[0].error
         for result, own, (_, place) in zip(results, loggers, members, strict=True):
-            if not result.error and (group.first or not alone):
+            if conf.train.pictures and not result.error and (group.first or not alone):
                 draw(result, task, place)
                 own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
     rest = iter(results)

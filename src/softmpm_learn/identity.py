@@ -14,7 +14,10 @@ from softmpm_learn.settings import Settings
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
 
-MAY_CHANGE = ("iterations", "record_every", "frame_every", "examine", "log", "side_by_side")
+MAY_CHANGE = (
+    *("iterations", "save_every", "record_every", "frame_every"),
+    *("examine", "pictures", "log", "side_by_side"),
+)
 """Settings of TrainConf that a resumed run may have different."""
 
 

@@ -41,7 +41,8 @@ def optimise(
     """One optimisation step of every run that goes on: simulate, differentiate, update policy and design.
 
     After a failure policy and design of the run in which it was go halfway back to the last simulation that succeeded, and all try
-    again. A run that has no retry left goes back to its best; if that fails too, it has failed and rests.
+    again. A run that has no retry left goes back to its best; if that fails too, it has failed and rests. Before it goes back for the
+    first time it is saved as it was: from there it is resumed if it fails.
 
     Args:
         loggers: One for each run, or none.
@@ -52,6 +53,7 @@ def optimise(
     Raises:
         TrainingError: The robot of a run failed that was at rest.
     """
+    streams = {k: runs.all[k].goals.get_state() for k in runs.active}
     goals, retries = runs.goals(runs.active), dict.fromkeys(runs.active, 0)
     while runs.active:
         runs.move(runs.active)
@@ -64,6 +66,9 @@ def optimise(
             found = {k: row | {"retries": retries[k]} for k, row in rows.items() if isinstance(row, dict)}
             update(runs, found)
             return found, episode.observations
+        ends = any(k not in runs.active for k in failed)
+        with runs.group.fail_together():
+            save_before(runs, loggers, {k: s for k, s in streams.items() if ends or k in failed})
         for k, error in failed.items():
             if (
                 isinstance(error, AlsoFailedError)
@@ -73,6 +78,21 @@ def optimise(
             go_back(runs, k, error, retries.get(k, 0))
             retries[k] += 1
     return {}, None
+
+
+def save_before(runs: Runs, loggers: Sequence[RunLogger], streams: dict[int, Tensor]) -> None:
+    """Write checkpoints of some runs as they were before this iteration drew their goals, unless there are such.
+
+    Args:
+        streams: State of the random stream of the goals at that time, by the number of the run.
+    """
+    for k, before in streams.items() if loggers else ():
+        if not loggers[k].is_saved:
+            goals = runs.all[k].goals
+            now = goals.get_state()
+            goals.set_state(before)
+            loggers[k].save()
+            goals.set_state(now)
 
 
 def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:

@@ -70,7 +70,7 @@ class Sketches:
 
     def __call__(self, run: Run, iteration: int, frames: dict[str, np.ndarray]) -> None:
         """Draw, if it is time, for the loggers as well; arguments as of :func:`draw_robot`."""
-        if time.monotonic() - self._drawn > PAUSE:
+        if run.settings.train.pictures and time.monotonic() - self._drawn > PAUSE:
             loss_figure(self.out / "loss.png", curves(self.out / "metrics.csv"))
             draw_robot(run, self.task, self.out, iteration, frames)
             self.loggers.pictures(iteration, [self.out / "loss.png", self.out / "robot.png"])

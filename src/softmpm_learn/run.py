@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -223,7 +224,7 @@ class Run:
     def state_dict(self) -> dict:
         return {
             "iteration": self.iteration,
-            "about": self.about(),
+            "about": self.about,
             "policy": self.policy.state_dict(),
             "design": self.design.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -242,7 +243,7 @@ class Run:
             ValueError, LookupError, TypeError, AttributeError, RuntimeError: It holds something else than a run.
         """
         theirs = identity_of_settings(Settings()) | json.loads(content["about"])
-        ours = json.loads(self.about())
+        ours = json.loads(self.about)
         changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
         if changed:
             both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
@@ -280,8 +281,9 @@ class Run:
             self.load_policy(self.best)  # compares the shapes
             self.load_policy(now)
 
+    @cached_property
     def about(self) -> str:
-        """Identity of the run, which a resumed run must share, as JSON."""
+        """Identity of the run, which a resumed run must share, as JSON; its tensors are read once."""
         return json.dumps(identity(self.task, self.model, self.settings), sort_keys=True)
 
 

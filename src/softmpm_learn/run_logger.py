@@ -72,6 +72,8 @@ class RunLogger:
         self._timing = Table(out / "timing.csv", TIMING, seals.get("timing.csv"))
         self._recorded = seals.get("run.h5")
         self._recorder = self._open_recorder() if run.settings.train.record_every else None
+        self._seal_recording(run.iteration)
+        self._saved = run.iteration if seals else -1
         self.frames: list[tuple[float, Tensor, Tensor | None]] = []
         try:
             settings = {"task": run.task.name} | dataclasses.asdict(run.settings)
@@ -106,11 +108,14 @@ class RunLogger:
                 f"{str(error).rstrip('.')}. Move {path} away to go on without what was recorded, or put the right file there."
             ) from error
 
+    def _seal_recording(self, iteration: int) -> None:
+        """Seal the recording as it is before an iteration; an episode of it may fail and be recorded again."""
+        if self._recorder:
+            self._recorded = {"before": iteration, "sha256": self._recorder.digest}
+
     @property
     def seals(self) -> dict:
         """Seals of the other files of the run, for the checkpoint."""
-        if self._recorder:
-            self._recorded = {"before": self.run.iteration, "sha256": self._recorder.digest}
         return {
             "metrics.csv": self._metrics.seal,
             "timing.csv": self._timing.seal,
@@ -119,9 +124,10 @@ class RunLogger:
         }
 
     def add(self, iteration: int, row: dict[str, float], seconds: dict[str, float]) -> None:
-        """A row of either table, and the figures to the recording and the loggers."""
+        """End an iteration: a row of either table, for :meth:`flush`, and the figures to the recording and the loggers."""
         self._timing.append(iteration, seconds)
         self.add_figures(iteration, row, seconds)
+        self._seal_recording(iteration + 1)
 
     def add_figures(
         self, iteration: int, row: dict[str, float], seconds: dict[str, float] | None = None
@@ -133,13 +139,31 @@ class RunLogger:
             self._recorder.scalars(iteration, known)
         self._loggers.scalars(iteration, row, seconds)
 
+    def flush(self) -> None:
+        """Force the rows of both tables to the disk."""
+        self._timing.flush()
+        self._metrics.flush()
+
+    @property
+    def is_saved(self) -> bool:
+        """True if the checkpoint is that of the iterations done."""
+        return self._saved == self.run.iteration
+
+    @property
+    def is_due(self) -> bool:
+        """True if a checkpoint is due now: every so many iterations and after the last."""
+        conf, done = self.run.settings.train, self.run.iteration
+        return not self.is_saved and (done % conf.save_every == 0 or done >= conf.iterations)
+
     def save(self) -> None:
-        """Write a checkpoint, then drop the simulations that neither it nor the one before names."""
+        """Write the rows and a checkpoint, then drop the simulations that neither it nor the one before names."""
+        self.flush()
         checkpoint.save(self.out, self.run.state_dict() | {"seals": self.seals})
         if self.run.learner is not None:
             ids = self.run.learner.replay.ids
             self.run.learner.replay.prune(self._named + ids)
             self._named = ids
+        self._saved = self.run.iteration
 
     @property
     def records(self) -> bool:

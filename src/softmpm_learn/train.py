@@ -5,7 +5,7 @@ for each iteration:
                which passes through every substep, every activation and every encoder evaluation
     learn      every few iterations: train the autoencoder on the grid velocity of past simulations,
                and let the target network, which the policy uses, follow it
-    save       metrics, recording, checkpoint
+    save       metrics, recording, and every so many iterations a checkpoint
 
 Runs with different seeds may go side by side in one simulation (see :mod:`softmpm_learn.runs`). Or several processes may share the
 worlds of one run (see :mod:`softmpm_learn.distributed`); the first of them alone learns, from the pictures of all, and saves. To learn
@@ -14,7 +14,6 @@ the same everywhere would take a replay buffer in each process, and bits that ag
 
 import contextlib
 from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,6 +32,7 @@ from softmpm_learn.run import Run
 from softmpm_learn.run_logger import TIMING, RunLogger, recorded
 from softmpm_learn.runs import Runs
 from softmpm_learn.settings import Settings
+from softmpm_learn.threads import at_once
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def train(
         model: Built from ``task.scene`` with ``settings.train.worlds`` worlds, or with this process's share of them.
         out, begin, sketch: See :class:`Plan`.
         progress: Called after each iteration with its number and metrics; in the first process only.
-        stop: Asked after each iteration; once it says True in any process the run ends, ready to resume.
+        stop: Asked after each iteration; once it says True in any process the run is saved and ends, ready to resume.
         group: The processes that share the worlds, None for this one alone. Any number of them can resume a run.
         finer: The task on the next finer grid, on which the motion is examined; None leaves that out.
 
@@ -175,12 +175,14 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
         with clock(seconds, "learn"):
             learn(runs, rows, observations)
         ended = {k: (runs.all[k].iteration, row) for k, row in rows.items()}
-        _write(work, ended)
+        _end_iteration(work, ended)
         if progress and group.first and rows:
             progress(ended)
         for k in ended if work.loggers else ():  # a run that failed may have frames, but of no iteration
             if work.loggers[k].frames:
+                work.loggers[k].flush()
                 work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
+    _save(work, [k for k, one in enumerate(work.loggers) if not one.is_saved])
     found = finish(work, finer) if work.loggers else {}
     return [
         Result(
@@ -195,16 +197,21 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
     ]
 
 
-def _write(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) -> None:
-    """End an iteration of some runs: rows of the tables, then a checkpoint."""
+def _end_iteration(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) -> None:
+    """End an iteration of some runs: rows of the tables, then the checkpoints that are due."""
     runs, group = work.runs, work.runs.group
     loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
     with group.fail_together():
         at_once(lambda k: loggers[k].add(*ended[k], work.seconds), loggers)
     for k in ended:
         runs.all[k].iteration += 1
-    with clock(work.seconds, "save"), group.fail_together():
-        at_once(lambda k: loggers[k].save(), loggers)
+    _save(work, [k for k, one in loggers.items() if one.is_due])
+
+
+def _save(work: _Work, numbers: Collection[int]) -> None:
+    """Write the checkpoints of some runs."""
+    with clock(work.seconds, "save"), work.runs.group.fail_together():
+        at_once(lambda k: work.loggers[k].save(), numbers)
 
 
 def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | None) -> None:
@@ -237,19 +244,6 @@ def add_observations(runs: Runs, k: int, pictures: Tensor) -> None:
     if run.learner is not None:
         first = run.iteration * run.settings.train.worlds
         run.learner.add_observations(first, runs.observations(k, pictures))
-
-
-def at_once(work: Callable[[int], object], numbers: Collection[int]) -> None:
-    """Do the same for runs side by side, several in threads: most of the time they wait for the disk.
-
-    Raises the first error once all have ended.
-    """
-    if len(numbers) < 2:
-        for k in numbers:
-            work(k)
-        return
-    with ThreadPoolExecutor(len(numbers)) as pool:
-        list(pool.map(work, numbers))
 
 
 @torch.no_grad()
@@ -288,6 +282,7 @@ def finish(work: _Work, finer) -> dict[int, dict[str, float]]:
         found = {k: answers[k] for k in done}
         for k in done:
             loggers[k].add_figures(runs.all[k].iteration, found[k])
+            loggers[k].flush()
     for run, before in zip(runs.all, now, strict=True):
         run.load_policy(before)
     return found

@@ -365,6 +365,17 @@ def test_a_deterministic_run_repeats_itself_on_a_gpu(monkeypatch, tmp_path, dtyp
     assert one == two
 
 
+def test_pictures_may_be_left_out(tmp_path):
+    """Neither while a run is recorded nor at its end is anything drawn; resumed with pictures, it is."""
+    experiment.run_experiment(to_run(composed(*TINY, "train.pictures=false")), tmp_path)
+    assert (tmp_path / "run.h5").exists() and not list(tmp_path.glob("*.png"))
+    again = to_run(composed("train.pictures=true"))
+    again.resume = str(tmp_path)
+    conf = app.resumed(again, [f"resume={tmp_path}", "train.pictures=true"])
+    experiment.run_experiment(conf, tmp_path)
+    assert {path.name for path in tmp_path.glob("*.png")} == {"loss.png", "latent.png", "robot.png"}
+
+
 def test_resume_changes_nothing_but_what_may_change(tmp_path):
     """Iterations, recording and device may differ; another key is refused by name."""
     old = RunConf(task=ArmConf(young=4e4))
@@ -392,9 +403,11 @@ def test_a_signal_at_start_up_is_answered(tmp_path, number):
     assert done.stderr == "softmpm_learn: interrupted. No iteration had begun, so nothing is lost.\n"
 
 
-def test_ctrl_c_ends_cleanly_and_saves(tmp_path):
+@pytest.mark.parametrize("every", [1, 1000])
+def test_ctrl_c_ends_cleanly_and_saves(tmp_path, every):
     """After SIGINT the iteration is finished and saved; exit code 0, and the last line says how to go on."""
     words = [sys.executable, "-m", "softmpm_learn", *TINY, "train.iterations=1000", "hydra.run.dir=run"]
+    words.append(f"train.save_every={every}")
     process = subprocess.Popen(
         words,
         cwd=tmp_path,

@@ -10,6 +10,7 @@ def test_numbers_read_back_to_the_last_bit(tmp_path):
     """Floats are written so that they come back equal; nan and missing values are empty cells."""
     table = Table(tmp_path / "t.csv", ["a", "b", "c"])
     table.append(0, {"a": 0.1 + 0.2, "b": math.nan})
+    table.flush()
     header, row = (tmp_path / "t.csv").read_text().splitlines()
     assert header == "iteration,a,b,c"
     assert float(row.split(",")[1]) == 0.1 + 0.2 and row.split(",")[2:] == ["", ""]
@@ -22,13 +23,30 @@ def test_resuming_cuts_back_whole_and_broken_rows(tmp_path):
     for k in range(4):
         table.append(k, {"a": k / 3})
         unbroken.append(k, {"a": k / 3})
+        table.flush()
+        unbroken.flush()
         if k == 1:
             seal = table.seal
     path.write_text(path.read_text()[:-5])
     table = Table(path, ["a"], seal)
     for k in (2, 3):
         table.append(k, {"a": k / 3})
+    table.flush()
     assert path.read_bytes() == other.read_bytes() and table.seal == unbroken.seal
+
+
+def test_rows_are_written_when_they_are_flushed(tmp_path):
+    """Until then neither the file nor its seal has them, and a row that is flushed is not written again."""
+    path = tmp_path / "t.csv"
+    table = Table(path, ["a"])
+    empty = table.seal
+    for k in range(2):
+        table.append(k, {"a": k / 3})
+    assert path.read_text() == "iteration,a\n" and table.seal == empty
+    for _ in range(2):
+        table.flush()
+        assert path.read_text().splitlines() == ["iteration,a", "0,0.0", "1,0.3333333333333333"]
+    assert table.seal["bytes"] == path.stat().st_size and Table(path, ["a"], table.seal).seal == table.seal
 
 
 def test_another_file_is_refused(tmp_path):
@@ -36,6 +54,7 @@ def test_another_file_is_refused(tmp_path):
     path = tmp_path / "t.csv"
     table = Table(path, ["a"])
     table.append(0, {"a": 1.25})
+    table.flush()
     for content in (b"iteration,a\n0,1.26\n", b"iteration,a\n", b"", b"iteration,a\n0,\xff.25\n"):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"t\.csv is damaged or of another run.* move it away"):
@@ -50,10 +69,12 @@ def test_a_file_that_was_moved_away_begins_anew(tmp_path, caplog):
     """The remedy of the error above works, and the log says what is lost."""
     table = Table(tmp_path / "t.csv", ["a"])
     table.append(0, {"a": 1.0})
+    table.flush()
     (tmp_path / "t.csv").unlink()
     with caplog.at_level(logging.WARNING):
         again = Table(tmp_path / "t.csv", ["a"], table.seal)
     again.append(1, {"a": 2.0})
+    again.flush()
     assert (tmp_path / "t.csv").read_text() == "iteration,a\n1,2.0\n" and "t.csv is missing" in caplog.text
 
 

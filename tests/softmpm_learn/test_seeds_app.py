@@ -78,7 +78,8 @@ def fails_in(monkeypatch, world: int) -> None:
 
 
 def test_the_comparison_is_a_sweep(main):
-    """One word runs it, without ``-m``; what the command line names replaces its values. Figures are made of what it leaves."""
+    """One word runs it, without ``-m``; what the command line names replaces its values. Figures are made of what it leaves, and a seed
+    that is resumed for it is drawn."""
     words = ("experiment=comparison", *TINY, "observer=nothing,untrained", "policy.clock=false")
     words += ("learning.every=1", "observer.channels=[4]", "train.seeds=2")
     assert main(*words)[0] == 0
@@ -93,9 +94,13 @@ def test_the_comparison_is_a_sweep(main):
         *((True, "nothing"), (True, "untrained"), (False, "nothing"), (False, "untrained"))
     ]
     assert {one.task.name for one in conf} == {"arm"} and not any(one.policy.clock for one in conf)
-    assert not list(folder.rglob("run.h5")) and not (folder / "1" / "seed_300" / "latent.png").exists()
+    assert {one.train.save_every for one in conf} == {10}
+    assert not list(folder.rglob("run.h5")) and not list(folder.rglob("*.png"))
     figures.make([folder], folder / "figures")
     assert "| off | untrained |" in (folder / "figures" / "summary.md").read_text()
+    one = folder / "1" / "seed_300"
+    assert main(f"resume='{one}'", "train.record_every=1", "train.pictures=true")[0] == 0
+    assert {path.name for path in one.glob("*.png")} == {"loss.png", "robot.png"}  # no latent was learned
 
 
 def test_each_seed_has_the_folder_of_a_run(main):
