@@ -95,7 +95,8 @@ def run_episode(
             :mod:`softmpm_learn.fading`.
         keep_every: Control steps between two stored observations, 0 for none.
         on_frame: Called at every control step and at the end.
-        failures: Collects the failures of worlds, while the others go on; None raises the first.
+        failures: Collects the failures of worlds, while the others go on; None raises the first. A world that failed has no
+            activation from then on, or it would fail again and again.
 
     Raises:
         softmpm.UnstableError: With a note that names the control step.
@@ -109,6 +110,9 @@ def run_episode(
             observations.append(observation.detach())
         features = observer.encode(observation)
         activation = policy(features, times[step], goal)
+        if failures:
+            failed = torch.tensor(failures.worlds, device=activation.device)
+            activation = activation.index_fill(0, failed, 0.0)
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
         try:
@@ -181,6 +185,7 @@ class ClosedLoop:
         self.runs, self.keep_every = runs, keep_every
         self._goal: Tensor | None = None
         # Sums in the order of the particles wait for the device, see docs/conventions.md:
+        self._failed: list[int] = []
         self._captures = not (
             model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64)
         )
@@ -198,12 +203,13 @@ class ClosedLoop:
         """
         if goal is not None:
             self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
+        self._failed = []
         return self._graph() if self._captures and not on_frame else self._work(on_frame)
 
     @property
     def failed(self) -> list[int]:
-        """Worlds in which the last call failed, where a captured graph knows of more than the error says."""
-        return self._graph.failed
+        """Worlds in which the last call failed, where more are known than the error says."""
+        return self._failed or self._graph.failed
 
     @torch.no_grad()
     def _simulate(self) -> None:
@@ -216,7 +222,15 @@ class ClosedLoop:
         return run_episode(self.task, self.model, self.observer, self.policy, params, **about)
 
     def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
-        episode = self._episode(keep_every=self.keep_every, on_frame=on_frame)
+        # One failure need not hide those of other runs, unless the device cannot be asked:
+        collects = self.runs > 1 and not (
+            self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+        )
+        failures = softmpm.Failures("reset") if collects else None
+        episode = self._episode(keep_every=self.keep_every, on_frame=on_frame, failures=failures)
+        if failures:
+            self._failed = failures.worlds
+            raise failures.errors[0]
         activations = episode.decisions.activations
         loss = (
             episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()

@@ -13,8 +13,8 @@ class OptimizerConf:
 
     name: str = "adam"
     """adam or sgd (plain gradient descent)."""
-    policy_rate: float = 2e-2
-    """Learning rate of the policy: 2e-2 suits the linear one, 5e-3 the mlp."""
+    policy_rate: float | None = 2e-2
+    """Learning rate of the policy: 2e-2 suits the linear one. null is the task's, for the mlp and adam: 5e-3, of walkers 1e-2."""
     design_rate: float = 3e-2
     """Learning rate of the design, in the unbounded space before the sigmoid."""
     halving: float | None = 40.0
@@ -41,8 +41,8 @@ class OptimizerConf:
 
     def __post_init__(self):
         OPTIMIZERS.need(self.name, self.options)
-        positive("optimizer", self, "policy_rate", "design_rate")
-        for name in ("halving", "max_norm"):
+        positive("optimizer", self, "design_rate")
+        for name in ("policy_rate", "halving", "max_norm"):
             if getattr(self, name) is not None:
                 positive("optimizer", self, name)
         if self.fade is not None and not self.fade > 0:

@@ -67,7 +67,7 @@ class Run:
             raise ValueError(
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
-        settings = settings.suited(task.fade, task.gain, task.endurance)
+        settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
         self.fallback = Fallback()

@@ -7,12 +7,15 @@ elsewhere name their source. A wrong value fails where the settings are made, in
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
 from softmpm_learn.setting_checks import one_of, positive, share
+
+if TYPE_CHECKING:
+    from softmpm_learn.tasks.task import Task
 
 DESIGNS = ("particle", "region", "uniform")
 
@@ -270,13 +273,16 @@ class Settings:
     learning: LearningConf = field(default_factory=LearningConf)
     train: TrainConf = field(default_factory=TrainConf)
 
-    def suited(self, fade: float, gain: float, endurance: int) -> "Settings":
-        """With a task's ``optimizer.fade`` [s], ``policy.gain`` and ``train.endurance`` where these leave them to it."""
+    def suited(self, task: "Task") -> "Settings":
+        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``policy.gain`` and ``train.endurance`` where these leave
+        them to it."""
         optimizer, policy, train = self.optimizer, self.policy, self.train
+        if optimizer.policy_rate is None:
+            optimizer = dataclasses.replace(optimizer, policy_rate=task.rate)
         if optimizer.fade is None:
-            optimizer = dataclasses.replace(optimizer, fade=fade)
+            optimizer = dataclasses.replace(optimizer, fade=task.fade)
         if policy.gain is None:
-            policy = dataclasses.replace(policy, gain=gain)
+            policy = dataclasses.replace(policy, gain=task.gain)
         if train.endurance is None:
-            train = dataclasses.replace(train, endurance=endurance)
+            train = dataclasses.replace(train, endurance=task.endurance)
         return dataclasses.replace(self, optimizer=optimizer, policy=policy, train=train)

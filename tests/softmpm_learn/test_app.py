@@ -126,6 +126,20 @@ def test_every_task_has_its_file():
     assert {path.stem for path in (Path(conf_dir()) / "task").glob("*.yaml")} == set(TASKS)
 
 
+def test_the_learning_rate_is_the_tasks_unless_it_is_chosen():
+    """Walkers learn faster than the arm; plain gradient descent has a rate of its own."""
+    rates = {
+        words: (conf := to_run(composed(*words))).settings.suited(make_task(conf.task)).optimizer.policy_rate
+        for words in [
+            ("task=elephant",),
+            ("task=arm",),
+            ("task=elephant", "optimizer.policy_rate=0.02"),
+            ("task=arm", "optimizer=sgd"),
+        ]
+    }
+    assert list(rates.values()) == [1e-2, 5e-3, 2e-2, 0.1]
+
+
 def test_plain_settings_reach_the_run():
     """A value on the command line is that value in the settings, of its own type."""
     conf = to_run(composed("task=arm", "task.resolution=fine", "train.seed=7", "task.goal=[0.5,0.3]"))

@@ -17,7 +17,7 @@ from torch import nn
 
 import softmpm
 from softmpm_learn import checkpoint, optimisation, register
-from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.episode import ClosedLoop, run_episode
 from softmpm_learn.observe import VelocityImage
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.run import Run
@@ -275,6 +275,42 @@ def test_seeds_that_fail_in_one_replay_go_back_at_once(task, conf, tmp_path, mon
     retries = [[row["retries"] for row in metrics(tmp_path / str(k))] for k in range(SEEDS)]
     assert retries == [[0, 0, 1, 0, 0], [0] * 5, [0, 0, 1, 0, 0]]
     assert len(calls) == 5 + 1
+
+
+def fails_in(worlds: tuple[int, ...], monkeypatch) -> None:
+    """Simulations in which these worlds fail at once, where failures are collected."""
+    real = softmpm.simulate
+
+    def simulate(*args, failures=None, **kwargs):
+        for world in worlds if failures is not None and not failures else ():
+            what = dict(kind="inverted", particle=3, substep=1, value=-1.0, limit="det F > 0")
+            failures.errors.append(softmpm.UnstableError(f"world {world} is inverted.", world=world, **what))
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(softmpm, "simulate", simulate)
+
+
+def test_seeds_that_fail_outside_of_a_graph_are_all_known(task, conf, tmp_path, monkeypatch):
+    """One simulation serves all of them here too: with many runs side by side each would otherwise take one of its own."""
+    model = built(task, conf, SEEDS)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    fails_in((2, 0), monkeypatch)
+    with pytest.raises(softmpm.UnstableError, match="world 2 is inverted") as error:
+        runs.loop(None)
+    assert sorted(runs.blamed(error.value)) == [0, 2]
+
+
+def test_a_world_that_failed_has_no_activation(task, conf, tmp_path, monkeypatch):
+    """The others have theirs."""
+    model, frames = built(task, conf, SEEDS), []
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    fails_in((1,), monkeypatch)
+    about = dict(failures=softmpm.Failures("reset"), on_frame=frames.append)
+    with torch.no_grad():
+        episode = run_episode(task, model, runs.observer, runs.policy, runs.design()[0], **about)
+    own = [frame.activation.abs().amax(dim=1) for frame in frames if frame.activation is not None]
+    assert all(one > 0 for one in own[0]) and all(one[1] == 0 and one[0] > 0 for one in own[1:])
+    assert torch.equal(episode.activation[1:, 1], torch.zeros_like(episode.activation[1:, 1]))
 
 
 def test_a_seed_that_fails_ends_alone(task, conf, tmp_path, monkeypatch):

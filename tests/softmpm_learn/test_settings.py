@@ -18,7 +18,7 @@ from softmpm_learn import settings
         ("DesignConf", {"poisson_range": [0.3, 0.5]}, "poisson_range must be .* with -1 < low < high < 0.5"),
         ("DesignConf", {"strength_factor": [0.5, 0.9]}, "strength_factor must be .* with 0 < low < 1 < high"),
         ("DesignConf", {"viscosity_factor": [0.0, 2.0]}, "viscosity_factor"),
-        ("OptimizerConf", {"policy_rate": 0.0}, "policy_rate"),
+        ("OptimizerConf", {"policy_rate": 0.0}, "policy_rate must be > 0"),
         ("OptimizerConf", {"max_norm": -1.0}, "max_norm"),
         ("OptimizerConf", {"retries": -1}, "retries"),
         ("OptimizerConf", {"fallback_share": 1.0}, "fallback_share"),
