@@ -4,6 +4,7 @@ A job that fails is a row of the sweep's table, and the next ones run. The same 
 """
 
 import dataclasses
+import gc
 import logging
 import math
 import sys
@@ -86,7 +87,7 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
     except JobError as failure:
         if len(jobs) == 1 or isinstance(failure, RefusedError) or group.size > 1:
             return fail(jobs, failure, group, failed)
-        logger.warning("Jobs %s failed side by side and go on one after another: %s", _numbers(jobs), failure)
+        problem = str(failure)
     except (ValueError, OSError) as error:
         give_up(error)
     else:
@@ -95,6 +96,8 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
             logger.info("The same command goes on with the sweep.")
             raise SystemExit(0)
         return [loss for loss in losses if loss is not None]
+    logger.warning("Jobs %s failed side by side and go on one after another: %s", _numbers(jobs), problem)
+    gc.collect()  # the error and what it came through, the model among it, refer to each other
     return [run_jobs([one], group, signals, failed)[0] for one in jobs]
 
 

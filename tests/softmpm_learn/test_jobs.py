@@ -2,10 +2,12 @@
 
 import csv
 import dataclasses
+import gc
 import logging
 import math
 import sys
 import types
+import weakref
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.plugins.sweeper import Sweeper
 
-from softmpm_learn import app, jobs, train
+from softmpm_learn import app, experiment, jobs, train
 from softmpm_learn.config import RunConf
 from softmpm_learn.jobs import Job, side_by_side
 from softmpm_learn.settings import ObserverConf, OptimizerConf, TrainConf
@@ -96,6 +98,29 @@ def test_a_job_that_cannot_begin_leaves_the_others(run, begun, capsys):
     assert (failed["status"], finished["status"]) == ("failed", "finished")
     assert "observer.clusters must not be above" in failed["error"] and math.isfinite(float(finished["loss"]))
     assert "softmpm_learn: job 0: observer.clusters" in capsys.readouterr().err
+
+
+def test_what_failed_side_by_side_is_freed_before_the_jobs_go_on(run, monkeypatch):
+    """Or a GPU on which all of them had no room would have none for one of them either."""
+    real, build, models, alive = jobs.experiments, experiment.make_model, [], []
+
+    def built(*args):
+        model = build(*args)
+        models.append(weakref.ref(model))
+        return model
+
+    def noted(*args):
+        alive.append(sum(model() is not None for model in models))
+        return real(*args)
+
+    monkeypatch.setattr(experiment, "make_model", built)
+    monkeypatch.setattr(jobs, "experiments", noted)
+    gc.disable()
+    try:
+        run("sweep", "observer=kmeans", "observer.clusters=100000,3", "train.side_by_side=2")
+    finally:
+        gc.enable()
+    assert alive[:2] == [0, 0] and len(models) == 3
 
 
 class Killed(BaseException):
