@@ -60,7 +60,7 @@ def run_side_by_side(
         jobs: Settings and folder of each. They have task and device in common, and what :func:`softmpm_learn.runs.shared` names.
 
     Raises:
-        ValueError: Several processes have one run each, or share one of several.
+        ValueError: Settings that do not go together, or fewer seeds than processes.
     """
     group, signals = group or Group(), signals or Signals()
     (conf, out), alone = jobs[0], len(jobs) == 1 and jobs[0][0].train.seeds == 1
