@@ -27,6 +27,8 @@ from hydra.core.global_hydra import GlobalHydra
 import softmpm
 from softmpm_learn import app, checkpoint, experiment
 from softmpm_learn.config import RunConf, conf_dir, to_run
+from softmpm_learn.log_file import log_file
+from softmpm_learn.sentences import sentence
 from softmpm_learn.stop import SIGNALS, Signals
 
 TINY = [
@@ -139,10 +141,10 @@ def _training(conf: Callable[[], RunConf], folder: Path) -> Callable[[], None]:
         experiment.draw, experiment.convert = lambda *_: None, lambda *_: "nothing"
         logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout, force=True)
         try:
-            with app.log_file() as begin:
+            with log_file() as begin:
                 experiment.run_experiment(conf(), folder, begin=lambda: begin(folder / "softmpm_learn.log"))
         except Exception as error:
-            print(f"softmpm_learn: {app.sentence(error)}", file=sys.stderr)
+            print(f"softmpm_learn: {sentence(error)}", file=sys.stderr)
             raise SystemExit(1) from None
 
     return work
@@ -196,6 +198,8 @@ def killed_run(folder: Path, rows: int = 3) -> None:
     def kill(pid: int) -> None:
         metrics = folder / "metrics.csv"
         while not (metrics.exists() and metrics.read_text().count("\n") > rows):
+            if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                return  # it ended by itself, and says why
             time.sleep(0.002)
         os.kill(pid, signal.SIGKILL)
 
