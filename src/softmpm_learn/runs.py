@@ -143,8 +143,9 @@ class Runs:
 
     def observations(self, k: int, pictures: Tensor) -> Tensor:
         """Those of a run, shape (frame, world, ...), out of the observations of all worlds."""
-        own = pictures[:, self.worlds(k)]
-        return own if self._together is None else self._together[0].shown(k, own)
+        if self._together is None:
+            return pictures  # of several processes those of all
+        return self._together[0].shown(k, pictures[:, self.worlds(k)])
 
     def split(self, gradients: Sequence[Tensor]) -> list[list[Tensor]]:
         """Gradients with respect to policy and design of each run, from what :attr:`loop` gives."""
