@@ -16,8 +16,9 @@ class Graph(Generic[Result]):
     """A function, which may call :func:`softmpm.simulate`, captured once as a CUDA graph and replayed without any launch from the host.
 
     On the CPU the function is called each time. After a replay that reports a failure ``again`` is called, which raises
-    the error; the captured graph stays. If a particle only left the allocated part of the grid, that part is enlarged, the function is
-    called, and the next call captures again.
+    the error; the captured graph stays. Calls that collect failures (:class:`softmpm.Failures`) go on without the worlds that
+    failed. If a particle only left the allocated part of the grid, that part is enlarged, the function is called, and the next call
+    captures again.
 
     Args:
         work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
@@ -71,13 +72,14 @@ class Graph(Generic[Result]):
             changed()
         if self._any_failed is not None and self._any_failed.item():
             self.failed = self._resources.failed()
-            if not self._resources.widen():
+            if self._resources.widen():
+                self._graph = self._resources = None
+                self._warm = False
+                return self()
+            if not self._resources.collect():
                 if self.again is not None:
                     self._run(self._stream, self.again)
                 return self._run(self._stream, self.work)  # where sums in another order did not fail
-            self._graph = self._resources = None
-            self._warm = False
-            return self()
         return self._result
 
     def _run(self, stream: torch.cuda.Stream, work: Callable[[], Called]) -> Called:
@@ -99,6 +101,6 @@ class Graph(Generic[Result]):
             torch.cuda.synchronize(self.device)
             with torch.cuda.graph(graph, stream=stream):
                 self._result = self.work()
-                words = [words for words, _ in resources.words]
+                words = [status.words for status in resources.statuses]
                 self._any_failed = (torch.cat(words) != NEVER).any() if words else None
         return graph, resources

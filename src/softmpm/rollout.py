@@ -21,7 +21,7 @@ from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.failure_report import Report, raise_gradient_failure
 from softmpm.schemes.inputs import InputsAdj, Values
 from softmpm.schemes.scheme import Run
-from softmpm.state import Nodal, State
+from softmpm.state import Nodal, State, chosen
 
 
 @dataclass
@@ -120,18 +120,19 @@ def _returned(model: Model, end: Any, start: Any, runner: Runner) -> Any:
         return end
     reset = runner.failures.policy == "reset"
     # Worlds that never ran are returned as they were given: the fast scheme cannot represent particles off the grid.
-    worlds = sorted(world for world, substep in runner.frozen.items() if reset or substep == 0)
-    there, end = runner.scheme.rest() if reset else start.detach(), end.clone()
-    for tensor, wanted in zip(end.differentiable(), there.differentiable(), strict=True):
-        tensor[worlds] = wanted[worlds]
-    low, there_low = getattr(end, "low", None), getattr(there, "low", None)
-    for name in () if low is None else ("x", "F"):
-        getattr(low, name)[worlds] = 0.0 if there_low is None else getattr(there_low, name)[worlds]
-    return end
+    frozen = [runner.frozen.get(world) for world in range(model.worlds)]
+    worlds = [first is not None and (reset or first == 0) for first in frozen]
+    there = runner.scheme.rest() if reset else start.detach()
+    return chosen(torch.tensor(worlds, device=model.device), there, end)
 
 
 def _captured(runner: Runner, trail: Trail, inside: bool) -> Any:
     """:func:`rollout` while PyTorch captures a graph, without reading anything back."""
+    if inside and runner.failures is not None:
+        raise RuntimeError(
+            "softmpm: inside a softmpm.Graph failures are collected without a gradient only: call simulate under torch.no_grad, or "
+            "without failures, which raises the first one."
+        )
     keep_alive(runner.model)
     state: Any = trail.start
     checkpointed = trail.checkpointed
@@ -142,7 +143,7 @@ def _captured(runner: Runner, trail: Trail, inside: bool) -> Any:
         state = run.end
         if inside:
             trail.keep(run)
-    return runner.scheme.to_user(state)
+    return runner.captured(runner.scheme.to_user(state))
 
 
 @on_its_gpu

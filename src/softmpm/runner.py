@@ -1,10 +1,14 @@
 """Runs the chunks of one call by the model's scheme, accepts or repeats them, and locates failures."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from softmpm.alarms import Failures
-from softmpm.errors import UnstableError
+from softmpm.errors import FROZEN, UnstableError
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
@@ -13,6 +17,7 @@ from softmpm.schemes.failure_report import Report, failed_worlds, failure
 from softmpm.schemes.inputs import Values, in_rows, stiffest
 from softmpm.schemes.registry import SCHEMES
 from softmpm.schemes.scheme import Run, Scheme
+from softmpm.state import chosen
 
 
 class Runner:
@@ -29,6 +34,8 @@ class Runner:
     def __init__(self, model: Model, values: Values, failures: Failures | None = None):
         self.model, self.values, self.failures = model, values, failures
         self.frozen: dict[int, int] = {}
+        self._deferred: list[Tensor] = []
+        self._end: Any = None
         self.scheme: Scheme = SCHEMES[model.scheme].of(model)
 
     def run(self, chunk: Chunk, start: Any, keep: bool) -> Run:
@@ -43,7 +50,7 @@ class Runner:
             return None
         words = self.scheme.check_start(start, self.values)
         if is_capturing(self.model):
-            defer_status_check(words.clone())
+            self._defer(words.clone(), None, 0, before=True)
             return None
         return Report(words)
 
@@ -128,8 +135,37 @@ class Runner:
             run = self.run(chunk, start, keep)
             if is_capturing(self.model):
                 words = run.words[: self.model.worlds].clone()  # the backward pass overwrites them
-                defer_status_check(words, run.outgrow)
+                self._defer(words, run.outgrow, chunk.first, values=in_rows(self.values, chunk.rows))
                 return run
             if self.settled(run, Report(run.words)):
                 return run
             del run  # release its buffers before those with a larger window are allocated
+
+    def _defer(self, words: Tensor, outgrow: Callable[[], None] | None, first: int, **about: Any) -> None:
+        """Check these words after each replay of the graph that is being captured; collect failures if the call does."""
+        if self.failures is None:
+            defer_status_check(words, outgrow)
+            return
+        about |= {"first": first, "values": stiffest(self.model, about.get("values", self.values))}
+        self._deferred.append(words)
+        defer_status_check(words, outgrow, functools.partial(self._collect, about))
+
+    def _collect(self, about: dict[str, Any], words: list[int]) -> None:
+        """Collect the first failure of each world in the last replay, in which a world that failed stays as it is and fails on."""
+        assert self.failures is not None
+        for world in failed_worlds(words):
+            if world not in self.failures.worlds:
+                self.failures.errors.append(
+                    failure(self.model, words, world, self.scheme.particles(self._end), **about)
+                )
+
+    def captured(self, end: Any) -> Any:
+        """The final state of a captured call that collects failures, as :class:`Failures` has it."""
+        if self.failures is None:
+            return end
+        self._end = end
+        if self.failures.policy == "freeze":
+            return end
+        self.scheme.jumped()
+        failed = (torch.stack(self._deferred) < FROZEN).any(dim=0)
+        return chosen(failed, self.scheme.rest(), end)

@@ -1,8 +1,9 @@
 """State, material and grid fields as named tuples of tensors that PyTorch owns."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import torch
 from torch import Tensor
 
 from softmpm.summary import table
@@ -177,6 +178,32 @@ class State(NamedTuple):
         x, v, C, F = (change(tensor) for tensor in self[:4])
         others = (None if part is None else change(part) for part in self[4:])
         return State(x, v, C, F, *others)
+
+
+Kind = TypeVar("Kind", Nodal, State)
+
+
+def chosen(worlds: Tensor, there: Kind, elsewhere: Kind) -> Kind:
+    """One state in some worlds and another one of the same kind in the rest.
+
+    Args:
+        worlds: True where ``there`` is chosen, shape (world,).
+        there: May have no low-order parts and no shift, which then are zero.
+    """
+
+    def mixed(one: Any, other: Any) -> Any:
+        if other is None:
+            return None
+        return torch.where(worlds.view(-1, *(1,) * (other.dim() - 1)), 0.0 if one is None else one, other)
+
+    pairs = zip(there.differentiable(), elsewhere.differentiable(), strict=True)
+    found: Any = type(elsewhere).of([mixed(*pair) for pair in pairs])
+    if isinstance(elsewhere, Nodal):
+        return found._replace(shift=mixed(getattr(there, "shift", None), elsewhere.shift))
+    if elsewhere.low is None:
+        return found
+    low = getattr(there, "low", None) or (None, None)
+    return found._replace(low=Low(*(mixed(*pair) for pair in zip(low, elsewhere.low, strict=True))))
 
 
 class Params(NamedTuple):

@@ -4,7 +4,7 @@ import math
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -154,6 +154,52 @@ def _times(task: "Task", model: Model) -> Tensor:
     return task.control_period * torch.arange(task.control_steps, dtype=model.dtype, device=model.device)
 
 
+def _captures(model: Model) -> bool:
+    """False if sums are in the order of the particles, which wait for the device, see docs/conventions.md."""
+    return not (model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64))
+
+
+class Evaluator:
+    """Simulates a task under a policy without a gradient, again and again; on a GPU as one captured graph, as :class:`ClosedLoop`.
+
+    Args:
+        policy, design: As of :class:`ClosedLoop`.
+
+    Attributes:
+        failures: Those of the last simulation. A robot that fails goes on from rest: frozen, it would fail again in every control
+            step, and outside of a graph the simulation of all robots would be repeated each time.
+    """
+
+    def __init__(
+        self,
+        task: "Task",
+        model: Model,
+        observer: Observer,
+        policy: Policy,
+        design: Callable[[], tuple[Params, Inputs]],
+    ):
+        self.failures = failures = softmpm.Failures("reset")
+        goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
+
+        @torch.no_grad()
+        def work() -> Tensor:
+            params, inputs = design()
+            about: dict[str, Any] = dict(inputs=inputs, goal=goals[0] if goals else None)
+            return run_episode(task, model, observer, policy, params, **about, failures=failures).loss
+
+        self._goals, self._work = goals, work
+        self._graph = softmpm.Graph(work, model.device) if _captures(model) else None
+
+    def __call__(self, goal: Tensor | None) -> Tensor:
+        """Loss of each world, shape (world,); of a world that failed it means nothing."""
+        self.failures.errors.clear()
+        if goal is not None and not self._goals:
+            self._goals.append(goal.clone())
+        elif goal is not None:
+            self._goals[0].copy_(goal)
+        return self._graph().clone() if self._graph else self._work()
+
+
 class ClosedLoop:
     """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one captured graph, where
     the model allows it.
@@ -184,11 +230,8 @@ class ClosedLoop:
         self.design, self.weights, self.free = design, weights, free
         self.runs, self.keep_every = runs, keep_every
         self._goal: Tensor | None = None
-        # Sums in the order of the particles wait for the device, see docs/conventions.md:
         self._failed: list[int] = []
-        self._captures = not (
-            model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64)
-        )
+        self._captures = _captures(model)
         loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
         self._graph = softmpm.Graph(lambda: loop._work(), model.device, again=lambda: loop._simulate())
 

@@ -4,14 +4,12 @@ Where each simulation draws a goal of its own it is taken at fixed goals, withou
 gaits that stumble or break soon after the episode are often those of the lowest loss.
 """
 
-import dataclasses
 import logging
 import math
 
 import torch
 
 import softmpm
-from softmpm_learn.episode import run_episode
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 
@@ -27,25 +25,12 @@ def due(run: Run) -> bool:
 @torch.no_grad()
 def evaluate(runs: Runs) -> list[float]:
     """Mean loss of policy and design of each run as they are over the evaluation goals, ``train.endurance`` times as long as an
-    episode; nan if one of its simulations failed. A robot that fails goes on from rest: frozen, it would fail again in every control
-    step, and each time the simulation of all robots would be repeated."""
-    params, inputs = runs.design()
-    losses, failures = [], softmpm.Failures("reset")
-    steps = runs.task.control_steps * (runs.all[0].settings.train.endurance or 1)
-    task = dataclasses.replace(runs.task, control_steps=steps)
+    episode; nan if one of its simulations failed."""
+    losses, failed = [], dict[int, softmpm.UnstableError]()
     for goal in runs.evaluation_goals() or [None]:
-        episode = run_episode(
-            task,
-            runs.model,
-            runs.observer,
-            runs.policy,
-            params,
-            inputs=inputs,
-            goal=goal,
-            failures=failures,
-        )
-        losses.append(episode.loss.unflatten(0, (len(runs.all), -1)).mean(dim=1))
-    for k, error in runs.failed(failures).items():
+        losses.append(runs.evaluator(goal).unflatten(0, (len(runs.all), -1)).mean(dim=1))
+        failed = runs.failed(runs.evaluator.failures) | failed
+    for k, error in failed.items():
         logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
         losses[0][k] = math.nan
     means = runs.group.average(losses)  # nan in every process if it is in one

@@ -110,7 +110,7 @@ class VelocityImage:
 
     def __init__(self, model: Model, nodes: int | None = None, follow: bool = True):
         grid = model.scene.grid
-        self.follow = follow
+        self.follow, self.channels = follow, model.dim
         window = (_window(model),) * model.dim if follow else grid.shape
         usual = (32 if model.dim == 2 else 16) * (1 if follow else 2)
         self.block = math.ceil(max(window) / (nodes or usual))

@@ -61,6 +61,7 @@ class Feedback(nn.Module):
         gain: float,
         clock: Clock | None = None,
         goal: Goal | None = None,
+        feature_gain: float = 1.0,
     ):
         super().__init__()
         self.clock, self.goal = clock, goal
@@ -73,6 +74,9 @@ class Feedback(nn.Module):
         nn.init.normal_(last.weight, std=gain / math.sqrt(width))
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
+        if clock is not None:  # beside the features of a body that shakes, its rhythm would hardly be heard
+            with torch.no_grad():
+                next(self.layers.parameters())[:, :size].mul_(feature_gain)
 
     def forward(self, z: Tensor, time: Tensor, goal: Tensor | None = None) -> Tensor:
         """Activation (..., world, muscle) in (-1, 1) from features (..., world, size), time [s] and goals (world, dim) [m].
@@ -162,7 +166,8 @@ def knots(conf: PolicyConf, space: Space) -> nn.Module:
 
 def _feedback(conf: PolicyConf, space: Space, hidden: list[int]) -> nn.Module:
     seen = clock(conf) if conf.clock else None
-    return Feedback(space.features, space.muscles, hidden, _gain(conf), seen, space.goal)
+    gain = 1.0 if conf.feature_gain is None else conf.feature_gain
+    return Feedback(space.features, space.muscles, hidden, _gain(conf), seen, space.goal, gain)
 
 
 def _gain(conf: PolicyConf) -> float:

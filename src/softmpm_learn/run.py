@@ -98,7 +98,11 @@ class Run:
         since_last = learning.every * self.settings.train.worlds
         replay = Replay(
             out / "replay",
-            (-(-task.control_steps // learning.frame_every), self.model.dim, *observer.picture.shape),
+            (
+                -(-task.control_steps // learning.frame_every),
+                observer.picture.channels,
+                *observer.picture.shape,
+            ),
             simulations=learning.simulations if learning.replay else since_last,
             megabytes=learning.megabytes,
             validation=learning.validation,

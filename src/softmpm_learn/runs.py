@@ -6,6 +6,7 @@ saved belongs to the runs, as if each were alone; a single run is the case of on
 """
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from softmpm import Failures, UnstableError
 from softmpm_learn.design import declared_inputs
-from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.episode import ClosedLoop, Evaluator
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
 from softmpm_learn.side_by_side import Designs, Observers, Policies
@@ -37,6 +38,7 @@ class Runs:
         all: The runs.
         errors: Why those that failed ended, by their number.
         loop: Simulates and differentiates all of them as they are.
+        evaluator: Simulates them for an evaluation, ``train.endurance`` times as long as an episode.
         observer, policy, design: Those of all runs, for all worlds.
     """
 
@@ -54,6 +56,14 @@ class Runs:
             self._together = Observers(runs, self.share), Policies(runs, self.share, self._resting)
             self.observer, self.policy = self._together
             self.design = Designs(runs, self.share, self._resting)
+        longer = self.task.control_steps * (first.settings.train.endurance or 1)
+        self.evaluator = Evaluator(
+            dataclasses.replace(self.task, control_steps=longer),
+            self.model,
+            self.observer,
+            self.policy,
+            self.design,
+        )
         self.loop = ClosedLoop(
             self.task,
             self.model,

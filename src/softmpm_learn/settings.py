@@ -71,6 +71,9 @@ class PolicyConf:
     """knots: values of each muscle along the episode, joined by straight lines."""
     gain: float | None = None
     """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest. null is the task's: walkers 3, the arm 0.3."""
+    feature_gain: float | None = None
+    """Size of the first random weights of linear and mlp that take the features, in units of those that take the clock; without a clock
+    it is 1. null is the task's: walkers 0.3, the arm 1."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of a policy of one's own."""
 
@@ -81,8 +84,9 @@ class PolicyConf:
             raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
         if self.knots < 2:
             raise ValueError(f"policy.knots must be at least 2, got {self.knots}.")
-        if self.gain is not None and not (math.isfinite(self.gain) and self.gain >= 0):
-            raise ValueError(f"policy.gain must be ≥ 0, got {self.gain}.")
+        for name, value in {"gain": self.gain, "feature_gain": self.feature_gain}.items():
+            if value is not None and not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"policy.{name} must be ≥ 0, got {value}.")
 
 
 @dataclass(kw_only=True)
@@ -274,8 +278,8 @@ class Settings:
     train: TrainConf = field(default_factory=TrainConf)
 
     def suited(self, task: "Task") -> "Settings":
-        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``policy.gain`` and ``train.endurance`` where these leave
-        them to it."""
+        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``policy.gain``, ``policy.feature_gain`` and
+        ``train.endurance`` where these leave them to it."""
         optimizer, policy, train = self.optimizer, self.policy, self.train
         if optimizer.policy_rate is None:
             optimizer = dataclasses.replace(optimizer, policy_rate=task.rate)
@@ -283,6 +287,8 @@ class Settings:
             optimizer = dataclasses.replace(optimizer, fade=task.fade)
         if policy.gain is None:
             policy = dataclasses.replace(policy, gain=task.gain)
+        if policy.feature_gain is None:
+            policy = dataclasses.replace(policy, feature_gain=task.feature_gain)
         if train.endurance is None:
             train = dataclasses.replace(train, endurance=task.endurance)
         return dataclasses.replace(self, optimizer=optimizer, policy=policy, train=train)

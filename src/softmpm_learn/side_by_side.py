@@ -121,7 +121,10 @@ class Policies:
 
     def __init__(self, runs: Sequence[Run], share: int, resting: Tensor):
         model, self._resting = runs[0].model, resting
-        kinds = [(dataclasses.replace(run.settings.policy, gain=None), run.observer.size) for run in runs]
+        kinds = [
+            (dataclasses.replace(run.settings.policy, gain=None, feature_gain=None), run.observer.size)
+            for run in runs
+        ]
         self._kinds = Kinds(kinds, share, model.device)
         self._numbers = [torch.tensor(members, device=model.device) for members in self._kinds.members]
         self._sizes = [runs[members[0]].observer.size for members in self._kinds.members]

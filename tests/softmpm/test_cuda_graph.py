@@ -14,6 +14,7 @@ from softmpm.errors import NEVER
 from softmpm.schemes import capture
 from softmpm.schemes.fast import chunk_buffers
 from softmpm.schemes.fast import scheme as fast_scheme
+from softmpm.schemes.lagrangian import nodal
 
 
 def test_one_captures_at_a_time():
@@ -48,7 +49,7 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
         end = run(softmpm.simulate, built, inputs, 5)
         torch.autograd.grad((end.x[0, 1] * torch.inf).sum(), inputs["v"], retain_graph=True)
         torch.autograd.grad(end.x.sum(), inputs["v"])
-    *forward, first, second = (words.tolist() == [NEVER] for words, _ in resources.words)
+    *forward, first, second = (status.words.tolist() == [NEVER] for status in resources.statuses)
     assert all(forward) and second and not first
 
 
@@ -96,3 +97,85 @@ def test_a_function_without_a_simulation_is_captured_too():
     for value in (1.0, 5.0, 7.0):
         x.fill_(value)
         assert graph().tolist() == [2 * value] * 3
+
+
+FORMULATIONS = {"moving": {}, "reference": dict(formulation="reference")}
+
+
+def falling_pair(device: str = "cpu", **settings):
+    """A model and a start from which world 1 collapses in the first of a few calls, while world 0 goes on."""
+    made = busy_scene(2, ("fixed_corotated",), walls=[], muscles=[], per_law=30)
+    model = softmpm.build(made, device=device, worlds=2, **settings)
+    start = model.rest()
+    start.C[1] = -400.0 * torch.eye(2)
+    start.x[:, :, 0] += 3.5 * made.grid.spacing
+    return model, start
+
+
+def three_calls(model, start, failures):
+    """The end of three calls one after another."""
+    with torch.no_grad():
+        for _ in range(3):
+            start = softmpm.simulate(model, start, None, model.params(), substeps=20, failures=failures)
+    return start
+
+
+def assert_goes_on(model, end, failures, alone):
+    """World 0 is as if it were alone, world 1 started again from rest, and the failure has its name."""
+    assert_relative(end.x[0] - model.rest().x[0], alone.x[0] - model.rest().x[0], 2e-5)
+    away = (end.x[1] - model.rest().x[1]).norm(dim=-1).max()
+    assert away < 0.1 * (end.x[0] - model.rest().x[0]).norm(dim=-1).min()
+    (error,) = failures.errors
+    assert (error.world, error.kind) == (1, "collapsed") and f"particle {error.particle} " in str(error)
+
+
+@pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
+def test_a_recording_goes_on_without_a_world_that_failed(settings, monkeypatch):
+    """Failures of a recorded loop are collected after a replay, by the same rules as those of a call."""
+    model, start = falling_pair(**settings)
+    alone = three_calls(model, start._replace(C=torch.zeros_like(start.C)), None)
+    called, recorded = softmpm.Failures("reset"), softmpm.Failures("reset")
+    assert_goes_on(model, three_calls(model, start, called), called, alone)
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    with capture.collected_resources() as resources:
+        end = three_calls(model, start, recorded)
+    assert not recorded.errors and resources.failed() == [1]
+    assert not resources.widen() and resources.collect()
+    assert_goes_on(model, end, recorded, alone)
+    assert recorded.errors[0].particle == called.errors[0].particle
+    with capture.collected_resources() as resources:
+        three_calls(model, start, None)
+    assert resources.failed() == [1] and not resources.collect()
+
+
+def test_a_recording_with_gradient_does_not_collect_failures(monkeypatch):
+    """The gradient of a world that failed is not finite, and only the host could leave it out."""
+    model, start = falling_pair()
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner):
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    start.x.requires_grad_()
+    failures = softmpm.Failures("freeze")
+    with capture.collected_resources(), pytest.raises(RuntimeError, match=r"under torch\.no_grad"):
+        softmpm.simulate(model, start, None, model.params(), substeps=20, failures=failures)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
+def test_a_graph_goes_on_without_a_world_that_failed(settings):
+    """In each replay anew; one in which no world fails has no failures."""
+    model, start = falling_pair("cuda", **settings)
+    still, C = torch.zeros_like(start.C), start.C.clone()
+    alone = three_calls(model, start._replace(C=still), None)
+    failures = softmpm.Failures("reset")
+    graph = softmpm.Graph(lambda: three_calls(model, start, failures), model.device)
+    for _ in range(4):
+        failures.errors.clear()
+        assert_goes_on(model, graph(), failures, alone)
+    assert graph._graph is not None  # kept: a robot that is back at its start is in the window
+    start.C.copy_(still)
+    failures.errors.clear()
+    assert_relative(graph().x, alone.x, 2e-5)
+    assert not failures.errors
+    start.C.copy_(C)
+    assert_goes_on(model, graph(), failures, alone)

@@ -94,6 +94,18 @@ def test_first_weights_are_scaled_by_the_number_of_inputs():
         assert math.isclose(spread, 0.1, rel_tol=0.2)
 
 
+@pytest.mark.parametrize("name", ["linear", "mlp"])
+def test_features_may_count_less_than_the_clock_at_first(name):
+    """Features times the gain give the same; a policy without a clock has only them and takes them as they are."""
+    z, time = torch.linspace(-1.0, 1.0, 4)[None], at(0.07)
+    whole, less = make(name), make(name, feature_gain=0.3)
+    assert torch.allclose(less(z, time), whole(0.3 * z, time)) and not torch.equal(
+        less(z, time), whole(z, time)
+    )
+    blind = [make(name, clock=False, feature_gain=gain) for gain in (0.3, 1.0)]
+    assert torch.equal(*(policy(z, time) for policy in blind))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_many_control_steps_at_once_are_each_alone(name):
     """Features and times of many control steps give the activations of each."""

@@ -4,7 +4,7 @@ import contextlib
 import gc
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
@@ -44,12 +44,21 @@ def exclusive_capture(wait: bool) -> Iterator[bool]:
         _capture_lock.release()
 
 
+class Status(NamedTuple):
+    """Status words of a captured call, one for each world, to be read after each replay."""
+
+    words: torch.Tensor
+    outgrow: Callable[[], None] | None = None
+    """To be called if a particle left the window; None without a window."""
+    collect: Callable[[list[int]], None] | None = None
+    """Takes words that report a failure, of a call that collects failures; None if it raises them."""
+
+
 class GraphResources:
     """Objects that a captured CUDA graph refers to; they must outlive it.
 
     Attributes:
-        words: Status words of the captured calls, to be read after each replay, each with the function to call if they report
-            that a particle left the window; None in its place without a window.
+        statuses: Those of the captured calls, in the order of time.
         uses: Buffers that the graph reads and writes and that existed before the capture. Tensors that are created during the
             capture lie in the graph's own memory pool.
         made: Objects that parts of the capture share, by a key.
@@ -57,22 +66,40 @@ class GraphResources:
     """
 
     def __init__(self):
-        self.words: list[tuple[torch.Tensor, Callable[[], None] | None]] = []
+        self.statuses: list[Status] = []
         self.uses: list[object] = []
         self.made: dict[object, Any] = {}
         self.changed: list[Callable[[], None]] = []
 
     def failed(self) -> list[int]:
         """Worlds that the last replay reports as failed."""
-        reports = [words.tolist() for words, _ in self.words]
-        return sorted({world for words in reports for world in failed_worlds(words)})
+        return sorted({world for _, words in self._reports() for world in failed_worlds(words)})
+
+    def collect(self) -> bool:
+        """After a replay that failed: give each failure to the call that collects it. False if there is one that is to be raised."""
+        found = [(status.collect, words) for status, words in self._reports() if failed_worlds(words)]
+        for collect, words in found:
+            if collect:
+                collect(words)
+        return all(collect for collect, _ in found)
 
     def widen(self) -> bool:
         """After a replay that failed: larger windows where a particle left one. True if there was such a one; capture anew then."""
-        left = [outgrow for words, outgrow in self.words if outgrow and outgrown(words.tolist())]
+        left = [one.outgrow for one, words in self._reports() if one.outgrow and outgrown(words)]
         for outgrow in left:
             outgrow()
         return bool(left)
+
+    def _reports(self) -> Iterator[tuple[Status, list[int]]]:
+        """All statuses with what the device has written there."""
+        if self.statuses:
+            yield from zip(self.statuses, _on_host([one.words for one in self.statuses]), strict=True)
+
+
+def _on_host(words: list[torch.Tensor]) -> list[list[int]]:
+    """Copied at once: a long simulation has hundreds."""
+    rest = iter(torch.cat(words).tolist())
+    return [[next(rest) for _ in range(len(one))] for one in words]
 
 
 _open: list[GraphResources] = []
@@ -89,9 +116,13 @@ def collected_resources() -> Iterator[GraphResources]:
         _open.pop()
 
 
-def defer_status_check(words: torch.Tensor, outgrow: Callable[[], None] | None = None) -> None:
-    """Check these status words, one for each world, after each replay of the graph that is being captured."""
-    _resources().words.append((words, outgrow))
+def defer_status_check(
+    words: torch.Tensor,
+    outgrow: Callable[[], None] | None = None,
+    collect: Callable[[list[int]], None] | None = None,
+) -> None:
+    """Check these status words after each replay of the graph that is being captured; arguments are those of :class:`Status`."""
+    _resources().statuses.append(Status(words, outgrow, collect))
 
 
 def keep_alive(used: object) -> None:

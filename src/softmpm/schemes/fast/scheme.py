@@ -183,6 +183,9 @@ class Fast:
     def checkpoint(self, state: State | SortedState) -> State | SortedState:
         return state if isinstance(state, State) else state.copy()
 
+    def jumped(self) -> None:
+        self._since_sort = LONGEST  # the window is centred when the particles are sorted
+
     def to_user(self, state: State | SortedState | SortedAdj) -> State:
         return state if isinstance(state, State) else state.state()
 

@@ -174,6 +174,9 @@ class Lagrangian:
     def checkpoint(self, state: Nodal) -> Nodal:
         return state
 
+    def jumped(self) -> None:
+        pass
+
     def rest(self) -> Nodal:
         model = self.model
         return nodes_of(model, model.rest(), model.mass.expand(model.worlds, -1))
