@@ -273,7 +273,11 @@ class ClosedLoop:
         episode = self._episode(keep_every=self.keep_every, on_frame=on_frame, failures=failures)
         if failures:
             self._failed = failures.worlds
-            raise failures.errors[0]
+            try:
+                raise failures.errors[0]
+            finally:
+                # The error would refer to itself through this frame, and keep all states of the simulation alive.
+                del failures, episode
         activations = episode.decisions.activations
         loss = (
             episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()

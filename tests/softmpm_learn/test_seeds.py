@@ -1,7 +1,9 @@
 """Seeds side by side: each is the run that it would be alone."""
 
+import contextlib
 import csv
 import dataclasses
+import gc
 import itertools
 import math
 import re
@@ -16,6 +18,7 @@ import torch
 from torch import nn
 
 import softmpm
+from softmpm import rollout
 from softmpm_learn import checkpoint, optimisation, register
 from softmpm_learn.episode import ClosedLoop, run_episode
 from softmpm_learn.observe import VelocityImage
@@ -298,6 +301,21 @@ def test_seeds_that_fail_outside_of_a_graph_are_all_known(task, conf, tmp_path, 
     with pytest.raises(softmpm.UnstableError, match="world 2 is inverted") as error:
         runs.loop(None)
     assert sorted(runs.blamed(error.value)) == [0, 2]
+
+
+def test_an_error_that_was_dealt_with_keeps_no_states(task, conf, tmp_path, monkeypatch):
+    """Many runs side by side fill a GPU, so two simulations at a time do not fit: the failed one is freed with its error."""
+    model = built(task, conf, SEEDS)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    fails_in((2,), monkeypatch)
+    gc.collect()
+    gc.disable()
+    try:
+        with contextlib.suppress(softmpm.UnstableError):
+            runs.loop(None)
+        assert not [one for one in gc.get_objects() if type(one) is rollout.Trail]
+    finally:
+        gc.enable()
 
 
 def test_a_world_that_failed_has_no_activation(task, conf, tmp_path, monkeypatch):
