@@ -73,7 +73,7 @@ class PolicyConf:
     """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest. null is the task's: walkers 3, the arm 0.3."""
     feature_gain: float | None = None
     """Size of the first random weights of linear and mlp that take the features, in units of those that take the clock; without a clock
-    it is 1. null is the task's: walkers 0.3, the arm 1."""
+    it is 1. null is the task's for features of an encoder (latent, untrained), walkers 0.3 and the arm 1, and 1 for others."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of a policy of one's own."""
 
@@ -288,7 +288,8 @@ class Settings:
         if policy.gain is None:
             policy = dataclasses.replace(policy, gain=task.gain)
         if policy.feature_gain is None:
-            policy = dataclasses.replace(policy, feature_gain=task.feature_gain)
+            encoded = self.observer.name in ("latent", "untrained")
+            policy = dataclasses.replace(policy, feature_gain=task.feature_gain if encoded else 1.0)
         if train.endurance is None:
             train = dataclasses.replace(train, endurance=task.endurance)
         return dataclasses.replace(self, optimizer=optimizer, policy=policy, train=train)

@@ -167,7 +167,7 @@ class Task:
     gain: float = 1.0
     """Size of the first activations; see ``policy.gain``, which goes before."""
     feature_gain: float = 1.0
-    """Influence of the features on them, in units of the clock's; see ``policy.feature_gain``, which goes before."""
+    """Influence of an encoder's features on them, in units of the clock's; see ``policy.feature_gain``, which goes before."""
     rate: float = 5e-3
     """Learning rate of the policy, for the mlp and adam; see ``optimizer.policy_rate``, which goes before."""
     endurance: int = 1

@@ -15,6 +15,9 @@ STEP = 0.1
 """Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
 VIGOROUS = 3.0
 """Size of the first activations of a robot on legs, with which it steps from the beginning."""
+FAINT = 0.3
+"""Influence of an encoder's features on these, in units of the clock's: standardised, the features of a body that shakes would drown
+its rhythm. Of twenty elephants fourteen got under way, with 1 eight (docs/results.md)."""
 BRISK = 1e-2
 """Learning rate of a walker's policy. With half of it most of ten elephants still stood after 72 iterations (docs/learning.md)."""
 SOLES = 0.15
@@ -148,6 +151,7 @@ def walker_task(
         build=conf.build,
         fade=STEP,
         gain=VIGOROUS,
+        feature_gain=FAINT,
         rate=BRISK,
         endurance=LASTING,
     )
