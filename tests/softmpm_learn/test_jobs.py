@@ -184,9 +184,10 @@ def test_a_sweeper_that_needs_each_loss_is_told(run, monkeypatch, capsys):
     """Before anything begins."""
     place = types.ModuleType(Choosy.__module__)
     place.Choosy = Choosy
+    plugins = Plugins.instance()  # it looks for plugins when it is made, in the real package
     monkeypatch.setitem(sys.modules, "hydra_plugins", types.ModuleType("hydra_plugins"))
     monkeypatch.setitem(sys.modules, Choosy.__module__, place)
-    Plugins.instance().register(Choosy)
+    plugins.register(Choosy)
     about = {"_target_": f"{Choosy.__module__}.Choosy"}
     ConfigStore.instance().store(group="hydra/sweeper", name="choosy", node=about, provider="test")
     code, rows = run("sweep", "hydra/sweeper=choosy", "train.side_by_side=2")
