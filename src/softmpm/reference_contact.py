@@ -10,6 +10,7 @@ docs/math/contact.md.
     a° ← R a° + (o° + o) (n° − (n·n°) n) / (1 + n·n°) + Δt w_t                               (K6)
     d = −(y + Δt (v_n − w_n)),   P = H(d) / (Δt D_s),   y = n·x_s − o                        (K3)
     T = −c e, |T| ≤ μ P,   e = x_t + Δt v_t − a,   c = k Δt / (1 + D_s k Δt²)                (K4)
+    further than a cell from the wall, y − Δt w_n > dx:  J = 0,  a = x_t                     (K4)
     v'_i = v*_i + (1/m_i) Σ_s w_si A_s Σ_k J_k,   J_k = P n + T                              (K5)
 """
 
@@ -132,9 +133,12 @@ def meet_walls(
         n, mu, slide = wall.unit[:, None], friction[:, k, None, None], wall.slide[:, None]
         y, v_n = (x * n).sum(-1, keepdim=True) - level(wall), (v * n).sum(-1, keepdim=True)
         x_t, v_t = _tangential(x, n), v - v_n * n
-        P = hinge(-(y + scene.dt * (v_n - (slide * n).sum(-1, keepdim=True))), smoothing) / (scene.dt * D)
+        height = y - scene.dt * (slide * n).sum(-1, keepdim=True)
+        near = height <= scene.grid.spacing
+        P = torch.where(near, hinge(-(height + scene.dt * v_n), smoothing) / (scene.dt * D), 0.0)
         carried = carry(before, wall, anchor[:, number]) + scene.dt * _tangential(slide, n)
         T, moved = _friction(stiffness, scene.dt, D, P, mu, x_t, v_t, carried)
+        moved = torch.where(near, moved, x_t)
         impulses.append(P * n + T)
         anchors.append(moved)
         v = v + D * impulses[-1]

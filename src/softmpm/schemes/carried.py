@@ -9,6 +9,7 @@ from torch import Tensor
 
 from softmpm.kernels.carried.point import outline_type
 from softmpm.kernels.carried.surface import start_depth, surface
+from softmpm.kernels.physics.lanes import lanes_for
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
@@ -20,8 +21,8 @@ from softmpm.schemes.penetration import deepest
 from softmpm.state import State, SurfaceState
 from softmpm.surface_points import CarriedPoints
 
-POINT_BLOCK = 32
-"""Threads per block: few points are spread over as many multiprocessors as possible."""
+POINT_BLOCK = 64
+"""Threads per block: two warps, so that few points are spread over many multiprocessors and many fill one."""
 
 
 class Nodes(NamedTuple):
@@ -45,6 +46,7 @@ def outline_struct(model: Model):
 def _outline_struct(model: Model):
     t, points = types(model.spec.dim, model.spec.dtype), points_of(model)
     struct = outline_type(model.spec.dim, model.spec.dtype)()
+    struct.lanes = lanes_for(model.dim, model.worlds * points.count, model.device)
     struct.arms = view(points.arms.to(model.dtype), t.vec)
     struct.areas = view(points.areas.to(model.dtype), t.real)
     struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)
@@ -72,6 +74,8 @@ class SurfaceContact:
         owner: Number of the particle of each point or, packed, its place in memory; shape (world, point), int32.
         anchor: Anchors of each stored state, shape (state, world, wall, point, dim); one, or one more than substeps.
         force: Mean forces in the control step so far [N], shape (world, wall, point, dim).
+        impulse: Impulses of the walls on the points in each substep or, where an adjoint does not need them, in the last one,
+            shape (substep, world, point, dim).
         rate: 1/T, T being the duration of a control step [1/s], shape (1,): calls whose chunks have one shape may differ in it.
     """
 
@@ -81,10 +85,14 @@ class SurfaceContact:
         self.kernels, self.outline = surface(model.spec, packed), outline_struct(model)
         self.width = model.contact_width * model.scene.grid.spacing
         self.points = (model.worlds, model.anchor_shape[2])
+        self.threads = (*self.points, self.outline.lanes)
 
         def tensor(*size: int) -> Tensor:
             return torch.empty(size, dtype=model.dtype, device=model.device)
 
+        pushes = chunk.length if keep and packed else 1
+        self.impulse = tensor(pushes, *self.points, model.dim)
+        self.impulses = [view(one, t.vec) for one in self.impulse]
         self.owner = points_of(model).nearest.int().expand(self.points).contiguous()
         self.anchor, self.force = tensor(stored, *model.anchor_shape), tensor(*model.anchor_shape)
         self.rate = tensor(1)
@@ -95,7 +103,7 @@ class SurfaceContact:
     @property
     def bytes(self) -> int:
         """Bytes of the stored states."""
-        return self.anchor.nbytes
+        return self.anchor.nbytes + self.impulse.nbytes
 
     def reorder(self, order: Tensor) -> None:
         """Find the places of the points' particles in an order, shape (world, particle), int32."""
@@ -125,7 +133,7 @@ class SurfaceContact:
     def add_loads(self, now: Any, load: wp.array, launch: Callable[..., None]) -> None:
         """Add up the areas on the nodes, of points on the particles ``now``."""
         arguments = (self.model.constants, self.window, self.outline, self.owner_array, now, load)
-        launch(self.kernels.add_loads, self.points, *arguments, block_dim=POINT_BLOCK)
+        launch(self.kernels.add_loads, self.threads, *arguments, block_dim=POINT_BLOCK)
 
     def press(
         self,
@@ -141,8 +149,9 @@ class SurfaceContact:
         parameters = (self.model.constants, inputs, self.window, self.outline, self.width, s)
         about = (self.rate_array, self.chunk.anew(s), self.owner_array, now, self.anchors[self.stored(s)])
         force, anchor = (self.force_array, self.anchors[self.stored(s + 1)]) if out is None else out
-        arguments = (*about, nodes.node, nodes.free, nodes.load, words, force, anchor, nodes.velocity)
-        launch(self.kernels.press, self.points, *parameters, *arguments, block_dim=POINT_BLOCK)
+        states = (words, force, anchor, self.impulses[s % len(self.impulses)], nodes.velocity)
+        arguments = (*about, nodes.node, nodes.free, nodes.load, *states)
+        launch(self.kernels.press, self.threads, *parameters, *arguments, block_dim=POINT_BLOCK)
 
     def check_end(self, inputs: Any, now: Any, words: wp.array, launch: Callable[..., None]) -> None:
         """Check the depth of the points in the final state ``now``, with the inputs of the last substep."""

@@ -32,7 +32,7 @@ class SurfaceContactAdj:
 
         self.anchor, self.force = tensor(*model.anchor_shape), tensor(*model.anchor_shape)
         self._anchor, self._force = view(self.anchor, t.vec), view(self.force, t.vec)
-        scratch = tensor(2, *model.anchor_shape)
+        scratch = tensor(2, *model.anchor_shape)  # the fast scheme has stored the impulses instead
         self._scratch = view(scratch[0], t.vec), view(scratch[1], t.vec)
 
     def load(self, adj_end: SurfaceState) -> None:
@@ -73,7 +73,7 @@ class SurfaceContactAdj:
         about = (one.chunk.anew(s), one.owner_array, now, one.anchors[one.stored(s)])
         arrays = (nodes.node, nodes.free, nodes.load, adj_velocity, self._force, self._anchor)
         arguments = (*parameters, *about, *arrays, adj_load, gained, adj_now, adj_inputs)
-        launch(self.kernels.press_adj, one.points, *arguments, block_dim=POINT_BLOCK)
+        launch(self.kernels.press_adj, one.threads, *arguments, block_dim=POINT_BLOCK)
 
     def add_loads_adj(
         self, forward: SurfaceContact, now: Any, adj_load: wp.array, adj_now: Any, launch: Callable[..., None]
@@ -81,7 +81,7 @@ class SurfaceContactAdj:
         """Adjoint of the loads; adds into that of the particles."""
         one = forward
         arguments = (one.model.constants, one.window, one.outline, one.owner_array, now, adj_load, adj_now)
-        launch(self.kernels.add_loads_adj, one.points, *arguments, block_dim=POINT_BLOCK)
+        launch(self.kernels.add_loads_adj, one.threads, *arguments, block_dim=POINT_BLOCK)
 
     def start(self, chunk: Chunk) -> SurfaceState:
         """Adjoint of the initial state of a chunk, in new tensors: the forces before a control step have none."""

@@ -4,8 +4,8 @@
     press     points: impulses into one of the V (kernels/carried/surface.py)
     backward
     grid_adj  nodes: M̄ ← (G1.adj) of V̄ and of what the points gave;  both V ← (G1), (G2) of the M before;
-              points: the part of L̄ in their adjoints (K9.adj), L of the substep before
-    press, g2p2g_adj, press_adj
+              points: the part of L̄ in their adjoints (K9.adj), L of the substep before, its stored impulses into one of the V (K10)
+    g2p2g_adj, press_adj
 
 Sums of two successive substeps have two buffers: one is added to while the other is cleared. The kernels have modules of their own,
 since a GPU compiles a module for each number of threads in a block.
@@ -32,7 +32,8 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), stencil(spec.dim, spec.dtype)
     real, node_vec, Constants, Window = t.real, t.aligned, t.Constants, t.Window
     Outline, GridInputs = outline_type(dim, spec.dtype), input_types(spec).GridInputs
-    Particles, add_load = surface_point(dim, spec.dtype, True).Particles, surface(spec, True).add_load
+    point, add_load = surface_point(dim, spec.dtype, True), surface(spec, True).add_load
+    Particles, point_of = point.Particles, point.point_of
     place_of, node_velocity = fused(spec).place_of, grid(spec).node_velocity
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
@@ -76,9 +77,12 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
                 store_node(cleared, i, node_vec())
             cleared_load[world, i - world * window.count] = real(0.0)
         elif i >= first:
-            world = (i - first) / owner.shape[1]
-            p = i - first - world * owner.shape[1]
-            add_load(constants, window, outline, now, world, p, owner[world, p], load)
+            k = (i - first) / outline.lanes
+            world = k / owner.shape[1]
+            p = k - world * owner.shape[1]
+            lane = i - first - k * outline.lanes
+            at = point_of(constants, window, outline, now, world, p, owner[world, p])
+            add_load(window, outline, at, world, p, lane, load)
 
     return SimpleNamespace(clear=clear, grid_and_loads=grid_and_loads)
 
@@ -87,10 +91,11 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
 def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     """``grid_adj`` of the table above."""
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), stencil(spec.dim, spec.dtype)
-    real, node_vec, Constants, Window = t.real, t.aligned, t.Constants, t.Window
+    real, vec, node_vec, Constants, Window = t.real, t.vec, t.aligned, t.Constants, t.Window
     Outline, point = outline_type(dim, spec.dtype), surface_point(dim, spec.dtype, True)
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    Particles, ParticlesAdj, add_load = point.Particles, point.ParticlesAdj, surface(spec, True).add_load
+    Particles, ParticlesAdj, point_of = point.Particles, point.ParticlesAdj, point.point_of
+    add_load, push = surface(spec, True).add_load, surface(spec, True).push
     place_of, node_velocity = fused(spec).place_of, grid(spec).node_velocity
     node_velocity_adj, add_load_adj = (
         grid_adj(spec, wanted).node_velocity_adj,
@@ -113,6 +118,8 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
         # In:
         node: wp.array(dtype=node_vec),  # of this substep; empty after the last
         node_before: wp.array(dtype=node_vec),  # of the substep before; empty in the first
+        masses_before: wp.array2d(dtype=t.node),  # the same by worlds
+        impulse: wp.array2d(dtype=vec),  # of the substep before
         now: Particles,  # of this substep
         before: Particles,  # of the substep before
         adj_load: wp.array2d(dtype=real),
@@ -121,11 +128,13 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
         gained: wp.array(dtype=node_vec),  # added to it, then cleared
         # Out:
         free: wp.array(dtype=node_vec),  # of the substep before
-        velocity: wp.array(dtype=node_vec),
         cleared: wp.array(dtype=node_vec),
+        cleared_velocity: wp.array(dtype=node_vec),
         cleared_load: wp.array2d(dtype=real),
         cleared_adj_load: wp.array2d(dtype=real),
         # Out, added into:
+        velocity: wp.array(dtype=node_vec),  # of the substep before
+        pushed: wp.array2d(dtype=vec),  # the same by worlds
         load: wp.array2d(dtype=real),
         adj: ParticlesAdj,  # of the particles of this substep
         adj_inputs: GridInputsAdj,
@@ -151,16 +160,23 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
                         node_velocity(constants, inputs, world, place, head(there), there[dim]), real(0.0)
                     )
                     store_node(free, i, v)
-                    store_node(velocity, i, v)
+                    wp.atomic_add(velocity, i, v)
                 store_node(cleared, i, node_vec())
+                store_node(cleared_velocity, i, node_vec())
                 cleared_load[world, i - world * window.count] = real(0.0)
                 cleared_adj_load[world, i - world * window.count] = real(0.0)
         elif i >= first:
-            world = (i - first) / owner.shape[1]
-            p = i - first - world * owner.shape[1]
+            k = (i - first) / outline.lanes
+            world = k / owner.shape[1]
+            p = k - world * owner.shape[1]
+            lane = i - first - k * outline.lanes
             if node.shape[0] > 0:
-                add_load_adj(constants, window, outline, now, world, p, owner[world, p], adj_load, adj)
+                add_load_adj(constants, window, outline, now, world, p, lane, owner[world, p], adj_load, adj)
             if node_before.shape[0] > 0:
-                add_load(constants, window, outline, before, world, p, owner[world, p], load)
+                at = point_of(constants, window, outline, before, world, p, owner[world, p])
+                add_load(window, outline, at, world, p, lane, load)
+                J = impulse[world, p]
+                if wp.dot(J, J) > real(0.0):
+                    push(window, at, J, world, lane, outline.lanes, masses_before, pushed)
 
     return grid_and_loads_adj

@@ -17,6 +17,7 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import WARP, native, native_module
+from softmpm.kernels.physics.lanes import lane_sum
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
 
@@ -29,6 +30,7 @@ def outline_type(dim: int, dtype: str):
     class Outline:
         """See :class:`softmpm.surface_points.SurfacePoints`."""
 
+        lanes: int  # threads of a point
         arms: wp.array(dtype=t.vec)  # X_s − X_p [m]
         areas: wp.array(dtype=t.real)
         newtons: wp.array(dtype=t.real)  # areas in the units of force
@@ -54,10 +56,9 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
     """
     t, s = types(dim, dtype), spline(dim, dtype)
     real, vec, mat, ivec, Constants, Window = t.real, t.vec, t.mat, t.ivec, t.Constants, t.Window
-    offset, position, weight, weight_slope = s.offset, s.position, s.weight, s.weight_slope
-    exact_vec, Outline, size = types(dim, "float64").vec, outline_type(dim, dtype), s.count
-    table = wp.types.matrix((3, dim), real)
-    Table = wp.types.vector(size, real)  # one number for each node
+    offset, position, weight_at, slope_at = s.offset, s.position, s.weight_at, s.slope_at
+    exact_vec, Outline = types(dim, "float64").vec, outline_type(dim, dtype)
+    both, both_summed = wp.types.vector(2 * dim, real), lane_sum(2 * dim, real)
     Particles = t.Packed if packed else t.Motion
     ParticlesAdj = wp.array(dtype=real) if packed else t.MotionAdj
 
@@ -67,6 +68,11 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
         fx: vec
         arm: vec  # b
         x: exact_vec
+
+    @wp.struct
+    class PlaceAdj:
+        fx: vec
+        arm: vec
 
     @wp.func
     def put(
@@ -145,43 +151,58 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
             wp.atomic_add(adj.H, world, owner, H)
 
     @wp.func
-    def share(at: Point, w: table, n: int) -> real:
+    def share(at: Point, n: int) -> real:
         """W of node ``n`` (K8)"""
         o = offset(n)
-        return weight(w, o) * (real(1.0) + real(4.0) * wp.dot(position(o) - at.fx, at.arm))
+        return weight_at(at.fx, o) * (real(1.0) + real(4.0) * wp.dot(position(o) - at.fx, at.arm))
 
     @wp.func
-    def shares_adj(
+    def with_share_adj(so_far: PlaceAdj, at: Point, n: int, adj_share: real) -> PlaceAdj:
+        """The sums of (K8.adj) with the term of node ``n``."""
+        o = offset(n)
+        r = position(o) - at.fx
+        lean = real(4.0) * adj_share * weight_at(at.fx, o)
+        new = so_far
+        new.fx += adj_share * (real(1.0) + real(4.0) * wp.dot(r, at.arm)) * slope_at(at.fx, o)
+        new.fx -= lean * at.arm
+        new.arm += lean * r
+        return new
+
+    @wp.func
+    def add_place_adj(
         constants: Constants,
         outline: Outline,
-        at: Point,
-        w: table,
-        slope: table,
-        adj_shares: Table,
+        found: PlaceAdj,  # by this lane
         adj_x: vec,
         world: int,
         p: int,
         owner: int,
+        lane: int,
         adj: ParticlesAdj,
     ):
         """(K8.adj)"""
-        adj_fx = constants.spacing * adj_x
-        adj_arm = vec()
-        for n in range(size):
-            o = offset(n)
-            r = position(o) - at.fx
-            lean = real(4.0) * adj_shares[n] * weight(w, o)
-            adj_fx += adj_shares[n] * (real(1.0) + real(4.0) * wp.dot(r, at.arm)) * weight_slope(w, slope, o)
-            adj_fx -= lean * at.arm
-            adj_arm += lean * r
-        add_adj(adj, world, owner, adj_fx, wp.outer(adj_x + adj_arm / constants.spacing, outline.arms[p]))
+        parts = both()
+        for axis in range(dim):
+            parts[axis] = found.fx[axis]
+            parts[dim + axis] = found.arm[axis]
+        sums = both_summed(parts, outline.lanes)
+        fx = constants.spacing * adj_x
+        arm = adj_x
+        idle = bool(True)  # as most points, which no wall is near
+        for axis in range(dim):
+            fx[axis] = fx[axis] + sums[axis]
+            arm[axis] = arm[axis] + sums[dim + axis] / constants.spacing
+            idle = idle and fx[axis] == real(0.0) and arm[axis] == real(0.0)
+        if lane == 0 and not idle:
+            add_adj(adj, world, owner, fx, wp.outer(arm, outline.arms[p]))
 
     return SimpleNamespace(
         Point=Point,
-        Table=Table,
+        PlaceAdj=PlaceAdj,
         Particles=Particles,
         ParticlesAdj=ParticlesAdj,
         point_of=point_of,
         share=share,
-        shares_adj=shares_adj,
+        with_share_adj=with_share_adj,
+        add_place_adj=add_place_adj,
     )

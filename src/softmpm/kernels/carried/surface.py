@@ -5,9 +5,10 @@
     f_s += A_s J / T, the mean force of a wall on a point in a control step of T                     (K7)
     v'_i = v*_i + (1/m_i) Σ W_si A_s J                                                               (K10)
 
-``add_loads`` is L, ``press`` the rest. Nodes are those of a window, the whole grid in the plain scheme. Their arrays may have strides:
-the fast scheme has several quantities in one. v* and v' are two arrays, since points read the one while others add to the other. The
-adjoint is in surface_adj.py.
+``add_loads`` is L, ``press`` the rest. A point further than a cell from all walls needs no node. Otherwise its lanes (physics/lanes.py)
+share its nodes, and the first lane writes what is the point's own. Nodes are those of a window, the whole grid in the plain scheme;
+their arrays may have strides, since the fast scheme has several quantities in one. v* and v' are two arrays: points read the one while
+others add to the other. The adjoint is in surface_adj.py.
 """
 
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from softmpm.errors import Kind
 from softmpm.kernels.carried.point import module_of, outline_type, surface_point
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
+from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face
@@ -35,54 +37,95 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         outline_type(dim, spec.dtype),
         wall_face(spec),
     )
-    Particles, Table, point_of, share = point.Particles, point.Table, point.point_of, point.share
-    weights, offset, node_index, size = s.weights, s.offset, s.node_index, s.count
+    Particles, point_of, share = point.Particles, point.point_of, point.share
+    Point, offset, node_index, size = point.Point, s.offset, s.node_index, s.count
+    vD, summed = wp.types.vector(dim + 1, real), lane_sum(dim + 1, real)
     face, depth, friction_of = one.face, one.depth, one.friction_of
     block = surface_contact(dim, spec.dtype)
     touch, Touch = block.touch, block.Touch
     running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
     walls = spec.surface_walls
     count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
+    vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
     in_wall, module = int(Kind.IN_WALL), module_of(spec.module + ".surface", packed)
+
+    @wp.struct
+    class Faces:
+        near: int  # 1 if a wall is not further away than a cell
+        n: vecs
+        y: reals
+        depth: reals
+        anchor: vecs
+        friction: reals
 
     @wp.func
     def add_load(
-        constants: Constants,
         window: Window,
         outline: Outline,
-        now: Particles,
+        at: Point,
         world: int,
         p: int,
-        owner: int,
+        lane: int,
         load: wp.array2d(dtype=real),
     ):
-        """The point's part of L (K9)"""
-        at = point_of(constants, window, outline, now, world, p, owner)
-        w = weights(at.fx)
+        """The lane's part of L (K9)"""
         area = outline.areas[p]
-        for n in range(size):
+        for n in range(lane, size, outline.lanes):
             i = node_index(at.base, offset(n), window.shape)
-            wp.atomic_add(load, world, i, area * wp.abs(share(at, w, n)))
+            wp.atomic_add(load, world, i, area * wp.abs(share(at, n)))
+
+    @wp.func
+    def faces_of(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, anchor: vecs) -> Faces:
+        """The walls as the point at ``x`` meets them. All are read before the nodes are awaited."""
+        out = Faces()
+        for q in range(count):
+            k = number[q]
+            wall = face(constants, inputs, world, k, x, anchor[q])
+            out.n[q] = wall.n
+            out.y[q] = wall.y
+            out.depth[q] = wall.depth
+            out.anchor[q] = wall.anchor
+            out.friction[q] = friction_of(inputs, world, k)
+            if wall.y <= constants.spacing:
+                out.near = 1
+        return out
 
     @wp.func
     def meet(
-        constants: Constants,
-        inputs: GridInputs,
-        outline: Outline,
-        smoothing: real,
-        world: int,
-        k: int,
-        p: int,
-        n: vec,
-        y: real,
-        x: exact_vec,
-        v: vec,
-        anchor: vec,
-        D: real,
+        constants: Constants, wall: Faces, q: int, stiffness: real, smoothing: real, x: vec, v: vec, D: real
     ) -> Touch:
-        """J and the new anchor of (K3), (K4) at wall ``k``."""
-        friction = friction_of(inputs, world, k)
-        return touch(n, y, vec(x), v, anchor, D, friction, outline.stiffness[p], constants.dt, smoothing)
+        """J and the new anchor of (K3), (K4) at wall ``q``."""
+        return touch(
+            wall.n[q],
+            wall.y[q],
+            x,
+            v,
+            wall.anchor[q],
+            D,
+            wall.friction[q],
+            stiffness,
+            constants.dt,
+            smoothing,
+            constants.spacing,
+        )
+
+    @wp.func
+    def push(
+        window: Window,
+        at: Point,
+        impulse: vec,
+        world: int,
+        lane: int,
+        lanes: int,
+        node: wp.array2d(dtype=node_vec),
+        velocity: wp.array2d(dtype=vec),
+    ):
+        """The lane's part of (K10)"""
+        for n in range(lane, size, lanes):
+            i = node_index(at.base, offset(n), window.shape)
+            m = node[world, i][dim]
+            if m > real(0.0):
+                wp.atomic_add(velocity, world, i, (share(at, n) / m) * impulse)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_loads(
@@ -96,8 +139,9 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         # Out, added into:
         load: wp.array2d(dtype=real),
     ):
-        world, p = wp.tid()
-        add_load(constants, window, outline, now, world, p, owner[world, p], load)
+        world, p, lane = wp.tid()
+        at = point_of(constants, window, outline, now, world, p, owner[world, p])
+        add_load(window, outline, at, world, p, lane, load)
 
     @wp.kernel(module=module, enable_backward=False)
     def press(
@@ -122,49 +166,67 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         force: wp.array3d(dtype=vec),
         # Out:
         new_anchor: wp.array3d(dtype=vec),
+        impulse: wp.array2d(dtype=vec),  # A J of all walls
         # Out, added into:
         velocity: wp.array2d(dtype=vec),  # v'
     ):
-        world, p = wp.tid()
+        world, p, lane = wp.tid()
         alive = running(words, world)
-        at = point_of(constants, window, outline, now, world, p, owner[world, p])
-        w = weights(at.fx)
-        heaviness = Table()  # masses
-        v = vec()
-        D = real(0.0)
-        for n in range(size):
-            i = node_index(at.base, offset(n), window.shape)
-            heaviness[n] = node[world, i][dim]
-            b = share(at, w, n)
-            v += b * free[world, i]
-            if heaviness[n] > real(0.0):
-                D += wp.abs(b) * load[world, i] / heaviness[n]
-        total = vec()
+        before = vecs()
+        pushed = vecs()
         for q in range(count):
-            k = number[q]
-            before = anchor[world, q, p]
-            pushed = force[world, q, p]
-            wall = face(constants, inputs, world, k, at.x, before)
-            found = meet(
-                constants, inputs, outline, smoothing, world, k, p, wall.n, wall.y, at.x, v, wall.anchor, D
-            )
-            total += found.J
-            v += D * found.J
-            if anew == 1:
-                pushed = vec()
-            if alive:
-                if wall.depth > outline.deepest[p]:
-                    report(words, world, wp.max(substep - 1, 0), in_wall, q * owner.shape[1] + p)
-                new_anchor[world, q, p] = found.anchor
-                force[world, q, p] = pushed + (rate[0] * outline.newtons[p]) * found.J
-            else:
-                new_anchor[world, q, p] = before
-        if alive and wp.dot(total, total) > real(0.0):
-            impulse = outline.areas[p] * total
-            for n in range(size):
-                if heaviness[n] > real(0.0):
-                    i = node_index(at.base, offset(n), window.shape)
-                    wp.atomic_add(velocity, world, i, (share(at, w, n) / heaviness[n]) * impulse)
+            before[q] = anchor[world, q, p]
+            if anew == 0:
+                pushed[q] = force[world, q, p]
+        at = point_of(constants, window, outline, now, world, p, owner[world, p])
+        wall = faces_of(constants, inputs, world, at.x, before)
+        stiffness = outline.stiffness[p]
+        area = outline.areas[p]
+        deepest = outline.deepest[p]
+        per_force = rate[0] * outline.newtons[p]
+        found = vD()
+        if wall.near == 1:
+            for n in range(lane, size, outline.lanes):
+                i = node_index(at.base, offset(n), window.shape)
+                m = node[world, i][dim]
+                v_i = free[world, i]
+                L_i = load[world, i]
+                b = share(at, n)
+                for axis in range(dim):
+                    found[axis] = found[axis] + b * v_i[axis]
+                if m > real(0.0):
+                    found[dim] = found[dim] + wp.abs(b) * L_i / m
+            found = summed(found, outline.lanes)
+        meet_lanes(outline.lanes)
+        v = vec()
+        for axis in range(dim):
+            v[axis] = found[axis]
+        after = vecs()
+        total = vec()
+        deep = int(-1)
+        for q in range(count):
+            met = meet(constants, wall, q, stiffness, smoothing, vec(at.x), v, found[dim])
+            total += met.J
+            v += found[dim] * met.J
+            after[q] = met.anchor
+            pushed[q] = pushed[q] + per_force * met.J
+            if wall.depth[q] > deepest:
+                deep = q
+        pushing = vec()
+        if alive:
+            pushing = area * total
+            if wp.dot(total, total) > real(0.0):
+                push(window, at, pushing, world, lane, outline.lanes, node, velocity)
+        if lane == 0:
+            impulse[world, p] = pushing
+            for q in range(count):
+                if alive:
+                    new_anchor[world, q, p] = after[q]
+                    force[world, q, p] = pushed[q]
+                else:
+                    new_anchor[world, q, p] = before[q]
+            if alive and deep >= 0:
+                report(words, world, wp.max(substep - 1, 0), in_wall, deep * owner.shape[1] + p)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_end(
@@ -193,8 +255,11 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         press=press,
         check_end=check_end,
         add_load=add_load,
+        faces_of=faces_of,
         meet=meet,
+        push=push,
         number=number,
+        vecs=vecs,
     )
 
 

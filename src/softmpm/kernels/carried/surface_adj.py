@@ -17,9 +17,10 @@ import warp as wp
 from softmpm.kernels.carried.point import module_of, outline_type, surface_point
 from softmpm.kernels.carried.surface import surface
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.physics.wall_face import wall_face, wall_face_adj
+from softmpm.kernels.physics.wall_face import wall_face_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
@@ -33,9 +34,9 @@ def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
         outline_type(dim, dtype),
     )
     real, vec, Constants, Window = t.real, t.vec, t.Constants, t.Window
-    Particles, ParticlesAdj, Table = point.Particles, point.ParticlesAdj, point.Table
-    point_of, share, shares_adj = point.point_of, point.share, point.shares_adj
-    weights, slopes, offset, node_index, size = s.weights, s.slopes, s.offset, s.node_index, s.count
+    Particles, ParticlesAdj, PlaceAdj = point.Particles, point.ParticlesAdj, point.PlaceAdj
+    point_of, share, with_share_adj = point.point_of, point.share, point.with_share_adj
+    add_place_adj, offset, node_index, size = point.add_place_adj, s.offset, s.node_index, s.count
 
     @wp.func
     def add_load_adj(
@@ -45,19 +46,18 @@ def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
         now: Particles,
         world: int,
         p: int,
+        lane: int,
         owner: int,
         adj_load: wp.array2d(dtype=real),
         adj: ParticlesAdj,
     ):
         at = point_of(constants, window, outline, now, world, p, owner)
-        w = weights(at.fx)
         area = outline.areas[p]
-        adj_shares = Table()
-        for n in range(size):
+        found = PlaceAdj()
+        for n in range(lane, size, outline.lanes):
             i = node_index(at.base, offset(n), window.shape)
-            adj_shares[n] = wp.sign(share(at, w, n)) * area * adj_load[world, i]
-        slope = slopes(at.fx)
-        shares_adj(constants, outline, at, w, slope, adj_shares, vec(), world, p, owner, adj)
+            found = with_share_adj(found, at, n, wp.sign(share(at, n)) * area * adj_load[world, i])
+        add_place_adj(constants, outline, found, vec(), world, p, owner, lane, adj)
 
     return add_load_adj
 
@@ -73,19 +73,15 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     )
     real, vec, node_vec, Constants, Window, pack = t.real, t.vec, t.node, t.Constants, t.Window, s.pack
     point, Outline = surface_point(dim, spec.dtype, packed), outline_type(dim, spec.dtype)
-    Particles, ParticlesAdj, Table = point.Particles, point.ParticlesAdj, point.Table
-    point_of, share, shares_adj = point.point_of, point.share, point.shares_adj
+    Particles, ParticlesAdj, PlaceAdj = point.Particles, point.ParticlesAdj, point.PlaceAdj
+    point_of, share, with_share_adj = point.point_of, point.share, point.with_share_adj
+    add_place_adj = point.add_place_adj
+    vDp, summed = wp.types.vector(2 * dim + 1, real), lane_sum(2 * dim + 1, real)
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     touch_adj, meet, number = surface_contact(dim, spec.dtype).touch_adj, one.meet, one.number
-    face, friction_of, face_adj = (
-        wall_face(spec).face,
-        wall_face(spec).friction_of,
-        wall_face_adj(spec, wanted),
-    )
-    weights, slopes, offset, node_index, size = s.weights, s.slopes, s.offset, s.node_index, s.count
-    add_load_adj = loads_adj(dim, spec.dtype, packed)
-    count = len(spec.surface_walls)
-    before_wall = wp.types.matrix((count, dim), real)
+    faces_of, face_adj = one.faces_of, wall_face_adj(spec, wanted)
+    offset, node_index, size, vecs = s.offset, s.node_index, s.count, one.vecs
+    add_load_adj, count = loads_adj(dim, spec.dtype, packed), len(spec.surface_walls)
     module = module_of(adj_module(spec, wanted) + ".surface", packed)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -115,98 +111,115 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         adj: ParticlesAdj,
         adj_inputs: GridInputsAdj,
     ):
-        world, p = wp.tid()
+        world, p, lane = wp.tid()
+        before = vecs()
+        adj_after = vecs()
+        adj_pushed = vecs()
+        for q in range(count):
+            before[q] = anchor[world, q, p]
+            adj_after[q] = adj_anchor[world, q, p]
+            adj_pushed[q] = adj_force[world, q, p]
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
-        w = weights(at.fx)
-        lightness = Table()  # 1/m, or zero
-        v = vec()
-        D = real(0.0)
-        pull = vec()
-        for n in range(size):
-            i = node_index(at.base, offset(n), window.shape)
-            m = node[world, i][dim]
-            b = share(at, w, n)
-            v += b * free[world, i]
-            if m > real(0.0):
-                lightness[n] = real(1.0) / m
-                D += wp.abs(b) * load[world, i] / m
-                pull += (b / m) * adj_velocity[world, i]
-        if not D > real(0.0):  # a point of a world that failed
+        wall = faces_of(constants, inputs, world, at.x, before)
+        stiffness = outline.stiffness[p]
+        area = outline.areas[p]
+        per_force = rate[0] * outline.newtons[p]
+        found = vDp()
+        if wall.near == 1:
+            for n in range(lane, size, outline.lanes):
+                i = node_index(at.base, offset(n), window.shape)
+                m = node[world, i][dim]
+                v_i = free[world, i]
+                L_i = load[world, i]
+                adj_v = adj_velocity[world, i]
+                b = share(at, n)
+                for axis in range(dim):
+                    found[axis] = found[axis] + b * v_i[axis]
+                if m > real(0.0):
+                    found[dim] = found[dim] + wp.abs(b) * L_i / m
+                    for axis in range(dim):
+                        found[dim + 1 + axis] = found[dim + 1 + axis] + (b / m) * adj_v[axis]
+            found = summed(found, outline.lanes)
+        meet_lanes(outline.lanes)
+        D = found[dim]
+        if wall.near == 1 and not D > real(0.0):  # a point of a world that failed
             return
-        reached = before_wall()
+        v = vec()
+        pull = vec()
+        for axis in range(dim):
+            v[axis] = found[axis]
+            pull[axis] = area * found[dim + 1 + axis]
+        reached = vecs()
+        given = vecs()
         total = vec()
         for q in range(count):
-            for axis in range(dim):
-                reached[q, axis] = v[axis]
-            k = number[q]
-            wall = face(constants, inputs, world, k, at.x, anchor[world, q, p])
-            found = meet(
-                constants, inputs, outline, smoothing, world, k, p, wall.n, wall.y, at.x, v, wall.anchor, D
-            )
-            v += D * found.J
-            total += found.J
+            reached[q] = v
+            met = meet(constants, wall, q, stiffness, smoothing, vec(at.x), v, D)
+            given[q] = met.J
+            v += D * met.J
+            total += met.J
         back_x = vec()
         back_v = vec()
         back_D = real(0.0)
-        after = v
         slot = world * window.count + p
         for back in range(count):
             q = count - 1 - back
-            k = number[q]
-            here = vec()
-            for axis in range(dim):
-                here[axis] = reached[q, axis]
-            wall = face(constants, inputs, world, k, at.x, anchor[world, q, p])
-            adj_J = (
-                outline.areas[p] * pull + D * back_v + (rate[0] * outline.newtons[p]) * adj_force[world, q, p]
-            )
+            here = reached[q]
             more = touch_adj(
-                wall.n,
-                wall.y,
+                wall.n[q],
+                wall.y[q],
                 vec(at.x),
                 here,
-                wall.anchor,
+                wall.anchor[q],
                 D,
-                friction_of(inputs, world, k),
-                outline.stiffness[p],
+                wall.friction[q],
+                stiffness,
                 constants.dt,
                 smoothing,
-                adj_J,
-                adj_anchor[world, q, p],
+                constants.spacing,
+                pull + D * back_v + per_force * adj_pushed[q],
+                adj_after[q],
             )
-            back_D += wp.dot(after - here, back_v) / D + more.D
+            back_D += wp.dot(given[q], back_v) + more.D
             back_v += more.v
             back_x += more.x
-            adj_anchor[world, q, p] = face_adj(
-                constants,
-                inputs,
-                world,
-                k,
-                anchor[world, q, p],
-                more.n,
-                more.y,
-                more.anchor,
-                slot,
-                adj_inputs,
-            )
-            if anew == 1:  # the mean before is dropped
-                adj_force[world, q, p] = vec()
-            if wp.static("friction" in wanted):
-                adj_inputs.friction[k, slot] = adj_inputs.friction[k, slot] + more.friction
-            after = here
-        impulse = outline.areas[p] * total
-        adj_shares = Table()
-        for n in range(size):
-            i = node_index(at.base, offset(n), window.shape)
-            b = share(at, w, n)
-            along = lightness[n] * wp.dot(impulse, adj_velocity[world, i])
-            loaded = lightness[n] * back_D * load[world, i]
-            adj_shares[n] = wp.dot(free[world, i], back_v) + along + wp.sign(b) * loaded
-            wp.atomic_add(adj_load, world, i, wp.abs(b) * lightness[n] * back_D)
-            adj_m = -lightness[n] * (wp.abs(b) * loaded + b * along)
-            wp.atomic_add(gained, world, i, pack(b * back_v, adj_m))
-        slope = slopes(at.fx)
-        shares_adj(constants, outline, at, w, slope, adj_shares, back_x, world, p, owner[world, p], adj)
+            if lane == 0:
+                adj_anchor[world, q, p] = face_adj(
+                    constants,
+                    inputs,
+                    world,
+                    number[q],
+                    before[q],
+                    more.n,
+                    more.y,
+                    more.anchor,
+                    slot,
+                    adj_inputs,
+                )
+                if anew == 1:  # the mean before is dropped
+                    adj_force[world, q, p] = vec()
+                if wp.static("friction" in wanted):
+                    adj_inputs.friction[number[q], slot] = (
+                        adj_inputs.friction[number[q], slot] + more.friction
+                    )
+        impulse = area * total
+        back_place = PlaceAdj()
+        if wall.near == 1:
+            for n in range(lane, size, outline.lanes):
+                i = node_index(at.base, offset(n), window.shape)
+                m = node[world, i][dim]
+                b = share(at, n)
+                lightness = real(0.0)
+                if m > real(0.0):
+                    lightness = real(1.0) / m
+                along = lightness * wp.dot(impulse, adj_velocity[world, i])
+                loaded = lightness * back_D * load[world, i]
+                adj_share = wp.dot(free[world, i], back_v) + along + wp.sign(b) * loaded
+                back_place = with_share_adj(back_place, at, n, adj_share)
+                wp.atomic_add(adj_load, world, i, wp.abs(b) * lightness * back_D)
+                adj_m = -lightness * (wp.abs(b) * loaded + b * along)
+                wp.atomic_add(gained, world, i, pack(b * back_v, adj_m))
+        add_place_adj(constants, outline, back_place, back_x, world, p, owner[world, p], lane, adj)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_loads_adj(
@@ -221,7 +234,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         # Out, added into:
         adj: ParticlesAdj,
     ):
-        world, p = wp.tid()
-        add_load_adj(constants, window, outline, now, world, p, owner[world, p], adj_load, adj)
+        world, p, lane = wp.tid()
+        add_load_adj(constants, window, outline, now, world, p, lane, owner[world, p], adj_load, adj)
 
     return SimpleNamespace(press_adj=press_adj, add_loads_adj=add_loads_adj)

@@ -211,6 +211,7 @@ def surface(spec: Spec) -> SimpleNamespace:
                     stiffness,
                     constants.dt,
                     body.width,
+                    constants.spacing,
                 )
                 after[q] = found.anchor - across(wall.n[q], d)
                 total += found.J

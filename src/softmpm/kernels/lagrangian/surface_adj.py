@@ -118,6 +118,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 stiffness,
                 constants.dt,
                 body.width,
+                constants.spacing,
             )
             v += dv * found.J
         back_x = vec()
@@ -140,6 +141,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 stiffness,
                 constants.dt,
                 body.width,
+                constants.spacing,
                 adj_J + dv * back_v + per_force * pushed[q],
                 adj_after[q],
             )

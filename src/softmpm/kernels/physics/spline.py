@@ -39,6 +39,19 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
         return w
 
     @wp.func
+    def line_weight(f: real, o: int) -> real:
+        """That of :func:`weights` for the node at offset ``o`` along one axis, without a table."""
+        g = f - real(1.0)
+        square = (g * g + real(0.5)) - real(0.5)
+        outer = real(0.125) + real(0.5) * square
+        return wp.where(o == 1, real(0.75) - square, outer + real(0.5) * real(o - 1) * g)
+
+    @wp.func
+    def line_slope(f: real, o: int) -> real:
+        """That of :func:`slopes` for the node at offset ``o``."""
+        return wp.where(o == 1, real(2.0) - real(2.0) * f, f - wp.where(o == 0, real(1.5), real(0.5)))
+
+    @wp.func
     def slopes(fx: vec) -> table:
         s = table()
         for axis in range(dim):
@@ -65,6 +78,16 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
         @wp.func
         def weight_slope(w: table, s: table, o: ivec) -> vec:
             return vec(s[o[0], 0] * w[o[1], 1], w[o[0], 0] * s[o[1], 1])
+
+        @wp.func
+        def weight_at(fx: vec, o: ivec) -> real:
+            return line_weight(fx[0], o[0]) * line_weight(fx[1], o[1])
+
+        @wp.func
+        def slope_at(fx: vec, o: ivec) -> vec:
+            a = line_weight(fx[0], o[0])
+            b = line_weight(fx[1], o[1])
+            return vec(line_slope(fx[0], o[0]) * b, a * line_slope(fx[1], o[1]))
 
         @wp.func
         def node_index(base: ivec, o: ivec, shape: ivec) -> int:
@@ -95,6 +118,21 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
             return vec(s[o[0], 0] * b * c, a * s[o[1], 1] * c, a * b * s[o[2], 2])
 
         @wp.func
+        def weight_at(fx: vec, o: ivec) -> real:
+            return line_weight(fx[0], o[0]) * line_weight(fx[1], o[1]) * line_weight(fx[2], o[2])
+
+        @wp.func
+        def slope_at(fx: vec, o: ivec) -> vec:
+            a = line_weight(fx[0], o[0])
+            b = line_weight(fx[1], o[1])
+            c = line_weight(fx[2], o[2])
+            return vec(
+                line_slope(fx[0], o[0]) * b * c,
+                a * line_slope(fx[1], o[1]) * c,
+                a * b * line_slope(fx[2], o[2]),
+            )
+
+        @wp.func
         def node_index(base: ivec, o: ivec, shape: ivec) -> int:
             return ((base[0] + o[0]) * shape[1] + base[1] + o[1]) * shape[2] + base[2] + o[2]
 
@@ -122,11 +160,13 @@ def spline(dim: int, dtype: str) -> SimpleNamespace:
         pack=pack,
         count=3**dim,
         weights=weights,
-        slopes=slopes,
         offset=offset,
         position=position,
         weight=weight,
         weight_slope=weight_slope,
+        weight_at=weight_at,
+        slopes=slopes,
+        slope_at=slope_at,
         node_index=node_index,
         node_coordinates=node_coordinates,
     )

@@ -6,11 +6,12 @@ With y the height over the wall, v_n and v_t the velocity along and across its n
     e = x_t + Δt v_t − a,  T = −c e,  c = k Δt / (1 + D k Δt²)                                        (K4)
     |T| > μ P:  T ← μ P T/|T|,  a' = x_t + Δt (v_t + D T) + T/(k Δt);   else a' = a
     P = 0:  T = 0,  a' = x_t + Δt v_t;   J = P n + T
+    y > dx: P = 0,  a' = x_t, whatever D and v are
 
     slip:   T̄ += (Δt D + 1/(k Δt)) ā',  x̄_t += ā',  v̄_t += Δt ā',  D̄ += Δt T·ā'                      (K4.adj)
             μ̄ += P τ·T̄,  P̄ += μ τ·T̄,  ē = −c (μ P/|T₀|) (T̄ − τ (τ·T̄)),  τ = T₀/|T₀|
     stick:  ā += ā',  ē = −c T̄,  D̄ += c² Δt e·T̄
-    both:   x̄_t += ē,  v̄_t += Δt ē,  ā −= ē
+    both:   x̄_t += ē,  v̄_t += Δt ē,  ā −= ē;   y > dx: x̄_t += ā' only
     d̄ = P̄ H'(d) / (Δt D),  D̄ −= P̄ P / D,  ȳ −= d̄,  v̄_n −= Δt d̄                                     (K3.adj)
     n̄ = ȳ x + (v̄_n − n·v̄_t) v − v_n v̄_t − (n·x) x̄_t − (n·x̄_t) x + P J̄
 
@@ -67,11 +68,24 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def touch(
-        n: vec, y: real, x: vec, v: vec, anchor: vec, D: real, friction: real, k: real, dt: real, s: real
+        n: vec,
+        y: real,
+        x: vec,
+        v: vec,
+        anchor: vec,
+        D: real,
+        friction: real,
+        k: real,
+        dt: real,
+        s: real,
+        reach: real,
     ) -> Touch:
         x_t = across(n, x)
-        v_t = across(n, v)
         out = Touch()
+        if y > reach:
+            out.anchor = x_t
+            return out
+        v_t = across(n, v)
         out.anchor = x_t + dt * v_t
         pressed = hinge(-(y + dt * wp.dot(n, v)), s)
         if pressed > real(0.0):  # no division for the many points that are not
@@ -97,6 +111,7 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
         k: real,
         dt: real,
         s: real,
+        reach: real,
         adj_J: vec,
         adj_next: vec,
     ) -> TouchAdj:
@@ -107,6 +122,9 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
         adj_v = dt * adj_next
         d = -(y + dt * wp.dot(n, v))
         pressed = hinge(d, s)
+        if y > reach:
+            pressed = real(0.0)
+            adj_v = vec()
         P = real(0.0)
         adj_y = real(0.0)
         if pressed > real(0.0):

@@ -25,7 +25,7 @@ class SharedAdjoint:
     Attributes:
         adj: Packed adjoint of the state.
         nodes: Adjoints of mass and momentum of the nodes, of two successive substeps.
-        velocity: Recomputed nodal velocities; with contact at surface points those before contact as well.
+        velocity: Recomputed nodal velocities; with contact at surface points of two successive substeps, then those before contact.
         contact: Adjoint of contact at surface points, or None.
         gained: What contact adds to the adjoints of velocities and masses.
         adj_loads: Adjoint of the loads, of two successive substeps.
@@ -41,11 +41,10 @@ class SharedAdjoint:
         self.model, self.wanted = model, wanted
         self.adj = tensor(buffers.rows.shape[1])
         self.nodes = tensor(2, buffers.held, 4)
-        self.velocity = torch.empty_like(buffers.velocity)
+        self.velocity = tensor(1 if model.surface is None else 3, buffers.held, 4)
         self.adj_array = view(self.adj, t.real)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_arrays = [view(velocity, t.aligned) for velocity in self.velocity]
-        self.velocity_array = self.velocity_arrays[0]
         self._accumulators: dict[int, Accumulators] = {}
         self.contact = None
         if model.surface is not None:
@@ -59,6 +58,10 @@ class SharedAdjoint:
         self.exact = None
         if model.spec.deterministic:
             self.exact = FixedPointAccumulator(model, self.adj_array, self.node_arrays)
+
+    def velocity_at(self, s: int) -> wp.array:
+        """Nodal velocities of substep ``s``."""
+        return self.velocity_arrays[0 if self.contact is None else s % 2]
 
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""

@@ -140,10 +140,13 @@ class ChunkBuffers:
         """Packed state before substep ``s``."""
         return self.packed[s if self.keep else 0]
 
-    def contact_nodes(self, s: int, velocities: Sequence[wp.array]) -> Nodes:
+    def masses(self, s: int) -> wp.array:
+        """Momentum and mass of the nodes of substep ``s``, (world, node)."""
+        return self._contact_nodes[s % len(self.nodes)]
+
+    def contact_nodes(self, s: int, velocity: wp.array, free: wp.array) -> Nodes:
         """Nodes of substep ``s`` as contact at surface points takes them, with velocities after and before contact."""
-        velocity, free = velocities
-        return Nodes(self._contact_nodes[s % len(self.nodes)], free, velocity, self.load_arrays[s % 2])
+        return Nodes(self.masses(s), free, velocity, self.load_arrays[s % 2])
 
     def reset_status(self) -> None:
         """Reset all status words."""

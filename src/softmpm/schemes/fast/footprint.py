@@ -43,7 +43,8 @@ class FastFootprint:
     def sizes(self, model) -> Sizes:
         real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count
         points = surface_bytes(model)
-        inside = particles * (4 + real * packed_rows(d).rows) + points
+        pushes = 0 if model.surface is None else model.worlds * model.surface.count * d * real
+        inside = particles * (4 + real * packed_rows(d).rows) + points + pushes
         between = inside + 4 * particles + points  # the order, and at most as much for the forces
         nodes = model.worlds * model.held_nodes * 4 * real
         return sizes_of(model, inside=inside, nodes=nodes, between=between)
@@ -58,9 +59,8 @@ class FastFootprint:
         forward = small * _at_once(horizon, sizes.longest)
         passed = 2 * sizes.inside  # adjoints in the order of the previous chunk, and their copy
         if model.surface is not None:
-            passed += (
-                second + sizes.nodes
-            )  # the same again, and what contact adds to the adjoints of the nodes
+            # The same again, velocities of a second substep, and what contact adds to the adjoints of the nodes.
+            passed += second + 2 * sizes.nodes
         if chosen.keep_all:
             kept = model.calls * graph * len(horizon.chunks(chosen.longest))
             return Buffers(forward, kept, passed)

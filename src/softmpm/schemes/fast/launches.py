@@ -72,15 +72,15 @@ def _contact(buffers: ChunkBuffers, contact: SurfaceContact, s: int, launch: Ker
     out = (free, velocity, then, loads[(s + 1) % 2], loads[s % 2])
     kernel = contact_stage(model.spec).grid_and_loads
     launch(kernel, threads, *parameters, packed, now, *out, block_dim=BLOCK)
-    nodes = buffers.contact_nodes(s, buffers.velocity_vectors)
+    nodes = buffers.contact_nodes(s, *buffers.velocity_vectors)
     contact.press(s, inputs, packed, nodes, buffers.words_array, launch)
 
 
 def point_threads(buffers: ChunkBuffers) -> tuple[int, int]:
-    """Number of the first thread of a point, in a block of its own after those of the nodes, and of all threads."""
+    """Number of the first lane of a point, in a block of its own after those of the nodes, and of all threads."""
     assert buffers.contact is not None
     first = -(-buffers.held // BLOCK) * BLOCK
-    return first, first + math.prod(buffers.contact.points)
+    return first, first + math.prod(buffers.contact.threads)
 
 
 def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:

@@ -49,13 +49,13 @@ def _grid(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
             forward.inputs.grid_struct(k),
             adjoint.found.grid_struct(forward.chunk.row(k)),
         )
-        grids = (now, then, here, shared.velocity_array, before)
+        grids = (now, then, here, shared.velocity_at(s - 1), before)
         arguments = (model.constants, inputs, forward.window, *grids, adj_inputs)
         launch(kernel, forward.held, *arguments, block_dim=BLOCK)
 
 
 def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
-    """The same with contact at surface points: the adjoint of its loads, and contact in substep ``s - 1`` once more."""
+    """The same with contact at surface points: the adjoint of its loads, and what it gave to the nodes in substep ``s - 1``."""
     forward, shared, (here, before) = adjoint.forward, adjoint.shared, _adj_nodes(adjoint, s)
     model, nodes, nothing, contact = forward.model, forward.node_arrays, forward.nothing, forward.contact
     assert contact is not None and shared.contact is not None
@@ -65,21 +65,22 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
     ]
     if model.spec.moving and not (last or first):  # the walls have another pose in each
         stages = [(s, nodes[s], nothing), (s - 1, nothing, nodes[s - 1])]
-    velocity, free = shared.velocity_arrays
+    free, velocity, cleared = (shared.velocity_arrays[k] for k in (2, (s - 1) % 2, s % 2))
+    pushed, earlier = shared.velocity_vectors[(s - 1) % 2], max(s - 1, 0)
+    about = forward.masses(earlier), contact.impulses[earlier]
     loads, adj_loads = forward.load_arrays, shared.adj_load_arrays
     point, threads = point_threads(forward)
     for k, now, then in stages:
         inputs = forward.inputs.grid_struct(k)
         parameters = (model.constants, inputs, forward.window, contact.outline, point, contact.owner_array)
-        states = (now, then, forward.packed[s], forward.packed[max(s - 1, 0)], adj_loads[s % 2])
-        out = (here, shared.gained_array, free, velocity, before, loads[s % 2], adj_loads[(s + 1) % 2])
-        sums = (loads[(s + 1) % 2], shared.adj_array, adjoint.found.grid_struct(forward.chunk.row(k)))
-        kernel = contact_stage_adj(model.spec, adjoint.wanted)
-        launch(kernel, threads, *parameters, *states, *out, *sums, block_dim=BLOCK)
-    if not first:
-        inputs, states = forward.inputs.grid_struct(s - 1), forward.packed[s - 1]
-        nodes = forward.contact_nodes(s - 1, shared.velocity_vectors)
-        shared.contact.press_again(contact, s - 1, inputs, states, nodes, forward.words_array, launch)
+        states = (now, then, *about, forward.packed[s], forward.packed[earlier], adj_loads[s % 2])
+        out = (here, shared.gained_array, free, before, cleared, loads[s % 2], adj_loads[(s + 1) % 2])
+        sums = (velocity, pushed, loads[(s + 1) % 2], shared.adj_array)
+        adj_inputs, kernel = (
+            adjoint.found.grid_struct(forward.chunk.row(k)),
+            contact_stage_adj(model.spec, adjoint.wanted),
+        )
+        launch(kernel, threads, *parameters, *states, *out, *sums, adj_inputs, block_dim=BLOCK)
 
 
 def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
@@ -87,7 +88,8 @@ def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     assert forward.contact is not None and shared.contact is not None
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
-    states = (inputs, adj_inputs, forward.packed[s], forward.contact_nodes(s, shared.velocity_vectors))
+    velocity, free = shared.velocity_vectors[s % 2], shared.velocity_vectors[2]
+    states = (inputs, adj_inputs, forward.packed[s], forward.contact_nodes(s, velocity, free))
     adj_nodes = (shared.node_vectors[s % 2], shared.adj_load_arrays[s % 2], shared.gained_view)
     shared.contact.press_adj(forward.contact, s, *states, *adj_nodes, shared.adj_array, launch)
 
@@ -109,7 +111,7 @@ def _particles(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     parameters = (model.constants, inputs, forward.window, chunk.length - 1 - s, first, last)
     sizes = (size.per_warp_adj, model.particle_count, size.particles, forward.order_flat)
     states = (forward.packed[max(s - 1, 0)], forward.packed[s])
-    grids = (shared.velocity_array, here, shared.adj_array)
+    grids = (shared.velocity_at(s - 1), here, shared.adj_array)
     out = (forward.words_array, adjoint.found.particle_struct(*rows), sink)
     kernel = fused_adj(model.spec, adjoint.wanted).g2p2g_adj[size.few]
     launch(kernel, size.threads_adj, *parameters, *sizes, *states, *grids, *out, block_dim=size.block)
