@@ -115,6 +115,31 @@ CUDA_CALLABLE inline wp::vec_t<DIM, T> given(int number, int lane)
     return value;
 }
 
+// Store a row of `COUNT` numbers of each thread; those with a negative number have none. All threads of a block come here together. The
+// threads of a warp store row after row: rows lie in the user's order, and single numbers would take a memory transaction each.
+template <int COUNT, int THREADS, typename T> CUDA_CALLABLE inline void store_rows(T* out, int row, int lane, const T* value)
+{
+#if defined(__CUDA_ARCH__)
+    __shared__ T box[GROUPS * THREADS * COUNT];
+    const int own = lane % 32, first = lane - own, lanes = THREADS - first < 32 ? THREADS - first : 32;
+    const unsigned together = 0xffffffffu >> (32 - lanes);
+    T* all = box + (group() * THREADS + first) * COUNT;
+    for (int k = 0; k < COUNT; ++k)
+        all[own * COUNT + k] = value[k];
+    __syncwarp(together);
+    for (int n = own; n < lanes * COUNT; n += lanes) {
+        const int owner = n / COUNT, target = __shfl_sync(together, row, owner);
+        if (target >= 0)
+            out[size_t(target) * COUNT + n - owner * COUNT] = all[n];
+    }
+    __syncwarp(together);
+#else
+    if (row >= 0)
+        for (int k = 0; k < COUNT; ++k)
+            out[size_t(row) * COUNT + k] = value[k];
+#endif
+}
+
 // Set the partial sums of a brick to zero, on the CPU.
 template <int NODES, typename T, unsigned DIM>
 CUDA_CALLABLE inline void clear_sums(const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick)
@@ -161,6 +186,19 @@ CUDA_CALLABLE inline void write_sums(
 // Lattices: the particles of every cell have the same K places along each axis. A thread has those of a cell with one place along the
 // last axis; w and e are the weights w and w (o - f) of node o, [axis][place][o] in rows of three.
 
+// The three weights of a layer, of K rows from `FIRST` on. A row chosen by its number would put the table into local memory.
+template <int FIRST, int K, typename T, unsigned ROWS>
+CUDA_CALLABLE inline void layer_weights(const wp::mat_t<ROWS, 3, T>& table, int layer, T* out)
+{
+#pragma unroll
+    for (int o = 0; o < 3; ++o) {
+        out[o] = table.data[FIRST][o];
+#pragma unroll
+        for (int k = 1; k < K; ++k)
+            out[o] = layer == k ? table.data[FIRST + k][o] : out[o];
+    }
+}
+
 // Sums a (x) g / rate over the nodes of a cell, for the K^(DIM - 1) particles of a layer, DIM rows for each.
 template <int FIELD, int NODES, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
 CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradients(
@@ -173,10 +211,8 @@ CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradi
     constexpr int LAST = (DIM - 1) * K, Q = DIM == 2 ? 1 : K;  // places along the middle axis
     wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> out(T(0));
     T wl[3], el[3];
-    for (int o = 0; o < 3; ++o) {
-        wl[o] = w.data[LAST + layer][o];
-        el[o] = e.data[LAST + layer][o];
-    }
+    layer_weights<LAST, K>(w, layer, wl);
+    layer_weights<LAST, K>(e, layer, el);
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
         T a[Q][DIM][DIM] = {};  // with the slope along the first axis to come, along the middle one and the last
@@ -258,6 +294,9 @@ CUDA_CALLABLE inline void add_layer(
                 }
                 x[i][q][c] = sums[0], y[i][q][c] = sums[1], z[i][q][c] = sums[2];
             }
+    T of_layer[3], sloped_layer[3];
+    layer_weights<LAST, K>(w, layer, of_layer);
+    layer_weights<LAST, K>(e, layer, sloped_layer);
 #pragma unroll
     for (int j = 0; j < MIDDLE; ++j) {
         T plain[3][DIM], sloped[3][DIM];
@@ -280,7 +319,7 @@ CUDA_CALLABLE inline void add_layer(
             }
 #pragma unroll
         for (int k = 0; k < 3; ++k) {
-            T wl = w.data[LAST + layer][k], el = e.data[LAST + layer][k];
+            T wl = of_layer[k], el = sloped_layer[k];
             if (corner >= 0)
 #pragma unroll
                 for (int i = 0; i < 3; ++i) {

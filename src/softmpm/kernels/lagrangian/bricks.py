@@ -96,10 +96,9 @@ class Bricks(NamedTuple):
         """Of kernels that have bricks."""
         return dict(enable_backward=False, grid_stride=False, launch_bounds=(self.threads, self.blocks))
 
-    @property
-    def layer_settings(self) -> dict:
-        """Of kernels that have bricks of a lattice."""
-        bounds = (self.layer_threads, self.blocks)
+    def layer_settings(self, warps: int = 0) -> dict:
+        """Of kernels that have bricks of a lattice, with so many warps in a multiprocessor at least."""
+        bounds = (self.layer_threads, max(self.blocks, 32 * warps // self.layer_threads))
         return dict(enable_backward=False, grid_stride=False, launch_bounds=bounds)
 
 

@@ -12,6 +12,15 @@ from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
+WARPS, WARPS_ADJ = 20, 16
+"""Warps of a multiprocessor, forward and adjoint, at which the threads of small layers hardly spill registers."""
+
+
+def resident(spec: Spec, bricks: Bricks, warps: int) -> int:
+    """``warps`` where a thread has few numbers, else 0, no demand."""
+    small = bricks.parts <= 2 and not spec.viscosity and spec.dtype == "float32"
+    return warps if small and not bricks.serial else 0
+
 
 @kernel_factory
 def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
@@ -156,7 +165,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                             check(constants, at.words, world, inside.order[p], s - 1, Hn)
             add(A, at.partial, world, brick, corner, layer, lane, lattice)
 
-    @wp.kernel(module=module, **bricks.layer_settings)
+    @wp.kernel(module=module, **bricks.layer_settings(resident(spec, bricks, WARPS)))
     def forces(
         constants: Constants,
         inputs: ParticleInputs,
@@ -249,7 +258,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
             if wp.static(viscous):
                 add(B, bar.partial_v, world, brick, corner, layer, lane, lattice)
 
-    @wp.kernel(module=module, **bricks.layer_settings)
+    @wp.kernel(module=module, **bricks.layer_settings(resident(spec, bricks, WARPS_ADJ)))
     def forces_adj(
         constants: Constants,
         inputs: ParticleInputs,

@@ -91,6 +91,13 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     cells, turns, threads, place_of = bricks.cell_count, bricks.turns, bricks.threads, total_of.place_of
     line, clear, add, write = total_of.line, total_of.clear, total_of.add, total_of.write
     module = brick_module(f"softmpm.d{dim}.{dtype}.projection.{bricks.name}")
+    store = f"softmpm::store_rows<{{}}, {threads}>(&out.data->{{}}, row, lane, &value.{{}});"
+
+    @wp.func_native(store.format(dim, "c[0]", "c[0]"))
+    def store_vec(out: wp.array2d(dtype=vec), row: int, lane: int, value: vec): ...
+
+    @wp.func_native(store.format(dim * dim, "data[0][0]", "data[0][0]"))
+    def store_mat(out: wp.array2d(dtype=mat), row: int, lane: int, value: mat): ...
 
     @wp.kernel(module=module, **settings)
     def show(
@@ -117,16 +124,25 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
             for slot in range(lane, turns, threads):
                 place = place_of(inside, row, slot)
                 corner = inside.corners[brick, slot % cells]
+                row_of_p = int(-1)
+                place_x = vec()
+                speed = vec()
+                affine = mat()
+                here = mat()
                 if place >= 0:
                     p = inside.order[place]
                     fx = inside.fraction[place]
                     here = identity() + gradient_u(u, inside, world, brick, corner, fx, constants.rate)
                     rate = gradient_v(nodal_v, inside, world, brick, corner, fx, constants.rate)
                     way = value_u(u, inside, world, brick, corner, fx)
-                    x[world, p] = vec(exact(rest_x[p]) + shift[world] + exact(way))
-                    v[world, p] = value_v(nodal_v, inside, world, brick, corner, fx)
-                    C[world, p] = rate * wp.inverse(here)
-                    F[world, p] = here
+                    place_x = vec(exact(rest_x[p]) + shift[world] + exact(way))
+                    speed = value_v(nodal_v, inside, world, brick, corner, fx)
+                    affine = rate * wp.inverse(here)
+                    row_of_p = world * x.shape[1] + p
+                store_vec(x, row_of_p, lane, place_x)
+                store_vec(v, row_of_p, lane, speed)
+                store_mat(C, row_of_p, lane, affine)
+                store_mat(F, row_of_p, lane, here)
 
     @wp.kernel(module=module, **settings)
     def show_adj(
@@ -247,20 +263,30 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
             for slot in range(lane, turns, threads):
                 place = place_of(inside, row, slot)
                 corner = inside.corners[brick, slot % cells]
+                row_of_p = int(-1)
+                x_here = vec()
+                v_here = vec()
+                C_here = mat()
+                F_here = mat()
                 if place >= 0:
                     p = inside.order[place]
                     fx = inside.fraction[place]
                     m = mass[world, place]
-                    u_here = value_u(each_u, inside, world, brick, corner, fx)
-                    v_here = value_v(each_v, inside, world, brick, corner, fx)
+                    of_u = value_u(each_u, inside, world, brick, corner, fx)
+                    of_v = value_v(each_v, inside, world, brick, corner, fx)
                     U = gradient_u(each_u, inside, world, brick, corner, fx, constants.spacing)
                     V = gradient_v(each_v, inside, world, brick, corner, fx, constants.spacing)
-                    adj_x[world, p] = m * u_here
-                    adj_v[world, p] = m * v_here
-                    adj_C[world, p] = m * (V * wp.transpose(F[world, p]))
-                    adj_F[world, p] = m * (U + wp.transpose(C[world, p]) * V)
+                    x_here = m * of_u
+                    v_here = m * of_v
+                    C_here = m * (V * wp.transpose(F[world, p]))
+                    F_here = m * (U + wp.transpose(C[world, p]) * V)
                     affine = wp.ddot(F[world, p] - identity(), U) + wp.ddot(C[world, p] * F[world, p], V)
-                    linear = wp.dot(moved[world, p], u_here) + wp.dot(v[world, p], v_here)
+                    linear = wp.dot(moved[world, p], of_u) + wp.dot(v[world, p], of_v)
                     adj_mass[world, place] = adj_mass[world, place] + affine + linear
+                    row_of_p = world * adj_x.shape[1] + p
+                store_vec(adj_x, row_of_p, lane, x_here)
+                store_vec(adj_v, row_of_p, lane, v_here)
+                store_mat(adj_C, row_of_p, lane, C_here)
+                store_mat(adj_F, row_of_p, lane, F_here)
 
     return SimpleNamespace(show=show, show_adj=show_adj, project=project, project_adj=project_adj)
