@@ -19,6 +19,7 @@ from extremes.judges import DENSITIES, Exact, Matter, exact, stretches
 from extremes.laws import LAWS
 
 import softmpm
+from softmpm.reference_lagrangian import quadrature
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 SUBSTEPS = 10_000
@@ -86,7 +87,9 @@ def turned(model: softmpm.Model, state: softmpm.State) -> tuple[float, float]:
     grid, matter, nodes = model.rest_grid, Matter(model.scene), state.nodes
     assert nodes is not None
     u, v = (field[0].double().cpu().numpy() for field in nodes[:2])
-    stencil, weights, slopes = (t.cpu().numpy() for t in (grid.stencil, grid.weights, grid.slopes))
+    points, number = quadrature(model.scene), np.full(math.prod(model.scene.grid.shape), -1)
+    number[grid.index.cpu().numpy()] = np.arange(grid.count)
+    stencil, weights, slopes = number[points.node.numpy()], points.N.numpy(), points.slope.numpy()
     mass = np.zeros(grid.count)
     np.add.at(mass, stencil, matter.mass[:, None] * weights)
     half = u - 0.5 * model.scene.dt * v  # at the time of the velocities
