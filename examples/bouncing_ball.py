@@ -14,7 +14,7 @@ import torch
 import softmpm
 
 period, frames = 0.005, 60  # time between two observations [s], and their number
-iterations = 5 if "--quick" in sys.argv else 9
+iterations = 7 if "--quick" in sys.argv else 9
 
 
 def heights(cell, young, viscosity):
