@@ -7,6 +7,8 @@ Each answer compares the first term of the objective with what it was in the epi
     friction  the worse of 0.75 and 1.25 times the friction of every wall, in closed loop
     finer     the same activations on the next finer grid
     tilt      largest tilt until 3T [degrees]
+    miss      what should reach a goal: largest distance from it from T − 0.3 s to T + 0.5 s [m]
+    speed     what should come to rest: largest speed in that time [m/s]
 
 A simulation that fails has no answer, and the log says why. The robot goes on from rest, so that it does not fail again in every
 control step.
@@ -24,7 +26,7 @@ import softmpm
 from softmpm import Failures, Model, State
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.episode import Frame, run_episode
-from softmpm_learn.objective import Tilt
+from softmpm_learn.objective import Reach, Still, Tilt
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.tasks.task import Task
@@ -35,7 +37,9 @@ LONGER = 3
 KICK = 0.1
 """Speed of the start along the first axis [m/s]."""
 FRICTION = 0.75, 1.25
-NAMES = ["later", "kicked", "friction", "finer", "tilt"]
+BEFORE, AFTER = 0.3, 0.5
+"""Time at the end of an episode and after it in which what holds a goal should be at rest there [s]."""
+NAMES = ["later", "kicked", "friction", "finer", "tilt", "miss", "speed"]
 """Columns of metrics.csv."""
 
 logger = logging.getLogger("softmpm_learn")
@@ -85,8 +89,21 @@ def _answers(
         found[name] = term.worst([against(path) for path in motions[name]])
     if finer is not None:
         found["finer"] = against(motions["finer"][0], finer.objective.terms[0])
-    tilts = [one for one in task.objective.terms if isinstance(one, Tilt)]
-    found["tilt"] = tilts[0].degrees(long) if tilts and long is not None else math.nan
+    if long is not None:
+        found |= _extremes(task, long)
+    return found
+
+
+def _extremes(task: Task, long: Path) -> dict[str, float]:
+    """Largest tilt, and largest distance and speed around the end of the episode, as far as the objective has such terms."""
+    window, found = dict(begin=task.seconds - BEFORE, end=task.seconds + AFTER), {}
+    for term in reversed(task.objective.terms):  # of several of a kind the first counts
+        if isinstance(term, Tilt):
+            found["tilt"] = term.degrees(long)
+        elif isinstance(term, Reach):
+            found["miss"] = dataclasses.replace(term, **window).farthest(long)
+        elif isinstance(term, Still):
+            found["speed"] = dataclasses.replace(term, **window).fastest(long)
     return found
 
 

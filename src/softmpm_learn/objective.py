@@ -66,13 +66,21 @@ class Reach(Term):
     """Target position [m], shape (dim,); the goal of an episode, if it has one, takes its place."""
 
     def value(self, path: Path) -> Tensor:
-        x = path.x[self.window(path)]
-        place = self.on("target", x) if path.goal is None else path.goal
-        return (x[..., self.on("particles", x), :].mean(dim=-2) - place).square().sum(dim=-1).mean(dim=0)
+        return self._away(path).square().sum(dim=-1).mean(dim=0)
 
     def verdict(self, own: float, other: float) -> float:
         """The distance from the place, root mean square [m]."""
         return math.sqrt(other)
+
+    def farthest(self, path: Path) -> float:
+        """The largest distance from the place of any world in the window [m]."""
+        return self._away(path).norm(dim=-1).max().item()
+
+    def _away(self, path: Path) -> Tensor:
+        """Way from the place, shape (state, world, dim)."""
+        x = path.x[self.window(path)]
+        place = self.on("target", x) if path.goal is None else path.goal
+        return x[..., self.on("particles", x), :].mean(dim=-2) - place
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         away = float(np.linalg.norm(x[-1, self.particles].mean(axis=0) - self.target))
@@ -87,8 +95,16 @@ class Still(Term):
     """Indices of the particles."""
 
     def value(self, path: Path) -> Tensor:
+        return self._velocity(path).square().sum(dim=-1).mean(dim=0)
+
+    def fastest(self, path: Path) -> float:
+        """The largest speed of any world in the window [m/s]."""
+        return self._velocity(path).norm(dim=-1).max().item()
+
+    def _velocity(self, path: Path) -> Tensor:
+        """Mean velocity of the particles, shape (state, world, dim)."""
         v = path.v[self.window(path)]
-        return v[..., self.on("particles", v), :].mean(dim=-2).square().sum(dim=-1).mean(dim=0)
+        return v[..., self.on("particles", v), :].mean(dim=-2)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,11 +38,13 @@ class Outcome:
     iterations: int = 0
     """Iterations done."""
     later: float = math.nan
-    """This and the next four: see examination.py; nan where a job has no answer."""
+    """This and the next six: see examination.py; nan where a job has no answer."""
     kicked: float = math.nan
     friction: float = math.nan
     finer: float = math.nan
     tilt: float = math.nan
+    miss: float = math.nan
+    speed: float = math.nan
     settings: str
     """Settings of the job, as on the command line."""
     folder: str

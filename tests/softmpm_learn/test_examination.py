@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +12,7 @@ import softmpm
 from softmpm_learn import examination
 from softmpm_learn.episode import run_episode
 from softmpm_learn.examination import examine, motion, rubbed
-from softmpm_learn.objective import Objective, Progress, Tilt
+from softmpm_learn.objective import Objective, Progress, Reach, Still, Tilt
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.train import train
@@ -60,6 +61,28 @@ def test_answers_are_those_of_simulations_by_hand(run, task):
 def test_the_finer_grid_replays_the_activations(run, task, make_block):
     """On the same grid the motion is the same: the answer is 1."""
     assert examine(Runs([run]), finer=task)[0]["finer"] == pytest.approx(1.0, rel=1e-4)
+
+
+def test_miss_and_speed_are_the_largest_around_the_end(run, task, monkeypatch):
+    """Of what should reach a place and rest there: from a while before the end of the episode to a while after it."""
+    period, n = task.control_period, task.control_steps
+    monkeypatch.setattr(examination, "BEFORE", 2 * period)
+    monkeypatch.setattr(examination, "AFTER", 1 * period)
+    part, place = task.regions["right"], np.array([0.3, 0.2])
+    run.task = dataclasses.replace(
+        task, objective=Objective(Reach(particles=part, target=place), Still(particles=part, end=period))
+    )
+    states, longer = [], dataclasses.replace(task, control_steps=n + 1)
+    with torch.no_grad():
+        design = run.design()[0]
+        run_episode(
+            longer, run.model, run.observer, run.policy, design, on_frame=lambda f: states.append(f.state)
+        )
+    around = states[n - 2 : n + 2]
+    x, v = (torch.stack([getattr(one, name)[0, part].mean(dim=0).cpu() for one in around]) for name in "xv")
+    found = examine(Runs([run]))[0]
+    assert found["miss"] == pytest.approx((x - torch.tensor(place).to(x)).norm(dim=-1).max().item(), rel=1e-4)
+    assert found["speed"] == pytest.approx(v.norm(dim=-1).max().item(), rel=1e-3)
 
 
 def test_the_tilt_is_the_largest_until_the_end(run, task):

@@ -260,14 +260,18 @@ def test_the_summary_has_a_row_for_each_setting(tmp_path):
         ({"tilt": math.nan}, False),
         ({"best": 0.01}, False),  # it went backwards
         ({"term": "reach"}, False),
-        ({"term": "reach", "later": 0.005, "best": 0.01, "tilt": math.nan}, True),
-        ({"term": "reach", "later": math.nan}, False),
+        ({"term": "reach", "best": 0.01, "tilt": math.nan, "miss": 0.005, "speed": 0.05}, True),
+        ({"term": "reach", "miss": 0.005, "speed": math.nan}, True),  # it need not come to rest
+        ({"term": "reach", "miss": 0.005, "speed": 0.051}, False),
+        ({"term": "reach", "miss": 0.0051, "speed": 0.0}, False),
+        ({"term": "reach", "miss": math.nan, "speed": 0.0}, False),
         ({"term": "own"}, False),
     ],
 )
 def test_what_passes_the_examination(changes, passed):
     """Walkers go on forward and level, what reaches stays at its goal; without an answer nothing passes."""
     row = {"status": "finished", "term": "progress", "later": 0.7, "tilt": 29.0, "best": -0.5}
+    row |= {"miss": math.nan, "speed": math.nan}
     assert passes(row | changes) == passed
 
 

@@ -25,7 +25,10 @@ TITLES = {
     "friction": "friction ± 25 %",
     "finer": "next finer grid",
     "tilt": "tilt while it continues",
+    "miss": "distance from the goal around the end",
+    "speed": "speed around the end",
 }
+EXTREMES = {"tilt": "largest tilt [degrees]", "miss": "largest distance [m]", "speed": "largest speed [m/s]"}
 ANSWERS = {"progress": "speed over that in the episode [1]", "reach": "distance from the goal [m]"}
 """Meaning of the examination, by the first term of the objective."""
 QUOTIENTS = -2.0, 3.0
@@ -66,8 +69,8 @@ def label(name: str, jobs: Sequence[Row]) -> str:
     """Axis label of a column of jobs.csv, with its unit."""
     if name == "final":
         return f"{jobs[0]['quantity']} at iteration {jobs[0]['at']:.0f}"
-    if name == "tilt":
-        return "largest tilt [degrees]"
+    if name in EXTREMES:
+        return EXTREMES[name]
     terms = {row["term"] for row in jobs if row["term"]}
     return ANSWERS.get(terms.pop(), "answer") if len(terms) == 1 else "answer"
 
