@@ -369,6 +369,22 @@ def test_a_block_on_an_incline(degrees, settled):
         assert gained == pytest.approx(exact, rel=5e-3)
 
 
+@pytest.mark.parametrize("scheme", ["plain", "fast"])
+def test_a_point_out_of_reach_has_its_place_as_anchor(scheme):
+    """Further than a cell from the floor a sliding point leaves x_t, nearer x_t + Δt v_t; it gets no impulse in either case."""
+    scene = slab(gravity=(0.0, 0.0))
+    above = dataclasses.replace(scene.walls[0], offset=scene.walls[0].offset - 0.3 * scene.grid.spacing)
+    model = build(dataclasses.replace(scene, walls=[above]), scheme=scheme)
+    start = model.rest()
+    start.v[..., 0] = 2.0
+    rest, end = points_of(model).points, softmpm.simulate(model, start, None, model.params(), substeps=1)
+    far = rest[:, 1] - above.offset > scene.grid.spacing
+    assert far.any() and not far.all() and end.surface is not None
+    moved = end.surface.anchor[0, 0, :, 0] - rest[:, 0]
+    torch.testing.assert_close(moved, (~far).double() * 2.0 * scene.dt, rtol=1e-9, atol=1e-15)
+    assert (end.surface.force == 0).all()
+
+
 def test_places_are_exact_for_affine_motion():
     """x = c + B X and F = B give c + B X_s, in float32 with the low-order parts too."""
     for dtype in (torch.float64, torch.float32):

@@ -32,8 +32,9 @@ class SurfaceContactAdj:
 
         self.anchor, self.force = tensor(*model.anchor_shape), tensor(*model.anchor_shape)
         self._anchor, self._force = view(self.anchor, t.vec), view(self.force, t.vec)
-        scratch = tensor(2, *model.anchor_shape)  # the fast scheme has stored the impulses instead
-        self._scratch = view(scratch[0], t.vec), view(scratch[1], t.vec)
+        self._scratch = None
+        if not packed:  # the fast scheme has stored the impulses
+            self._scratch = view(tensor(*model.anchor_shape), t.vec), view(tensor(*model.anchor_shape), t.vec)
 
     def load(self, adj_end: SurfaceState) -> None:
         """Copy the adjoint of the final state of a chunk into the buffers."""

@@ -43,8 +43,8 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     face, depth, friction_of = one.face, one.depth, one.friction_of
     block = surface_contact(dim, spec.dtype)
     touch, Touch = block.touch, block.Touch
-    running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
-    walls = spec.surface_walls
+    reports, walls = status.report(dim, spec.dtype), spec.surface_walls
+    was_running, report = reports.was_running, reports.report
     count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
     vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
     in_wall, module = int(Kind.IN_WALL), module_of(spec.module + ".surface", packed)
@@ -86,7 +86,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
             out.depth[q] = wall.depth
             out.anchor[q] = wall.anchor
             out.friction[q] = friction_of(inputs, world, k)
-            if wall.y <= constants.spacing:
+            if not wall.y > constants.spacing:  # nor for a place that is not a number
                 out.near = 1
         return out
 
@@ -171,7 +171,8 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         velocity: wp.array2d(dtype=vec),  # v'
     ):
         world, p, lane = wp.tid()
-        alive = running(words, world)
+        last = wp.max(substep - 1, 0)
+        alive = was_running(words, world, last, in_wall)
         before = vecs()
         pushed = vecs()
         for q in range(count):
@@ -210,7 +211,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
             v += found[dim] * met.J
             after[q] = met.anchor
             pushed[q] = pushed[q] + per_force * met.J
-            if wall.depth[q] > deepest:
+            if deep < 0 and wall.depth[q] > deepest:
                 deep = q
         pushing = vec()
         if alive:
@@ -226,7 +227,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
                 else:
                     new_anchor[world, q, p] = before[q]
             if alive and deep >= 0:
-                report(words, world, wp.max(substep - 1, 0), in_wall, deep * owner.shape[1] + p)
+                report(words, world, last, in_wall, deep * owner.shape[1] + p)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_end(

@@ -117,7 +117,7 @@ CUDA_CALLABLE inline wp::vec_t<DIM, T> given(int number, int lane)
 
 // Store a row of `COUNT` numbers of each thread; those with a negative number have none. All threads of a block come here together. The
 // threads of a warp store row after row: rows lie in the user's order, and single numbers would take a memory transaction each.
-template <int COUNT, int THREADS, typename T> CUDA_CALLABLE inline void store_rows(T* out, int row, int lane, const T* value)
+template <int COUNT, int THREADS, typename T> CUDA_CALLABLE inline void scatter_rows(T* out, int row, int lane, const T* value)
 {
 #if defined(__CUDA_ARCH__)
     __shared__ T box[GROUPS * THREADS * COUNT];

@@ -98,7 +98,7 @@ class Bricks(NamedTuple):
 
     def layer_settings(self, warps: int = 0) -> dict:
         """Of kernels that have bricks of a lattice, with so many warps in a multiprocessor at least."""
-        bounds = (self.layer_threads, max(self.blocks, 32 * warps // self.layer_threads))
+        bounds = (self.layer_threads, max(self.blocks, warps // -(-self.layer_threads // 32)))
         return dict(enable_backward=False, grid_stride=False, launch_bounds=bounds)
 
 

@@ -91,7 +91,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     cells, turns, threads, place_of = bricks.cell_count, bricks.turns, bricks.threads, total_of.place_of
     line, clear, add, write = total_of.line, total_of.clear, total_of.add, total_of.write
     module = brick_module(f"softmpm.d{dim}.{dtype}.projection.{bricks.name}")
-    store = f"softmpm::store_rows<{{}}, {threads}>(&out.data->{{}}, row, lane, &value.{{}});"
+    store = f"softmpm::scatter_rows<{{}}, {threads}>(&out.data->{{}}, row, lane, &value.{{}});"
 
     @wp.func_native(store.format(dim, "c[0]", "c[0]"))
     def store_vec(out: wp.array2d(dtype=vec), row: int, lane: int, value: vec): ...

@@ -45,7 +45,7 @@ class FastFootprint:
         points = surface_bytes(model)
         pushes = 0 if model.surface is None else model.worlds * model.surface.count * d * real
         inside = particles * (4 + real * packed_rows(d).rows) + points + pushes
-        between = inside + 4 * particles + points  # the order, and at most as much for the forces
+        between = inside - pushes + 4 * particles + points  # the order, and at most as much for the forces
         nodes = model.worlds * model.held_nodes * 4 * real
         return sizes_of(model, inside=inside, nodes=nodes, between=between)
 
