@@ -165,7 +165,7 @@ def knots(conf: PolicyConf, space: Space) -> nn.Module:
 
 
 def _feedback(conf: PolicyConf, space: Space, hidden: list[int]) -> nn.Module:
-    seen = clock(conf) if conf.clock else None
+    seen = None if conf.clock is False else clock(conf)
     gain = 1.0 if conf.feature_gain is None else conf.feature_gain
     return Feedback(space.features, space.muscles, hidden, _gain(conf), seen, space.goal, gain)
 

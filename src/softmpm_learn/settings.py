@@ -61,8 +61,9 @@ class PolicyConf:
     """linear, tanh(Wz + b); mlp; sinusoids or knots, which are open loop and see nothing but the time."""
     hidden: list[int] = field(default_factory=lambda: [64, 64])
     """mlp: width of each hidden layer; two of 64 as in Spielberg et al. 2021 (Robotica)."""
-    clock: bool = True
-    """Show linear and mlp the time as sines and cosines. Our choice: a rhythm to start from; False is the paper's feedback."""
+    clock: bool | None = None
+    """Show linear and mlp the time as sines and cosines. Our choice: a rhythm to start from; False is the paper's feedback. null is the
+    task's: walkers have a clock, the arm, which is to rest, has none."""
     period: float = 0.4
     """Longest period of the clock and of sinusoids [s]."""
     harmonics: int = 2
@@ -278,8 +279,8 @@ class Settings:
     train: TrainConf = field(default_factory=TrainConf)
 
     def suited(self, task: "Task") -> "Settings":
-        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``policy.gain``, ``policy.feature_gain`` and
-        ``train.endurance`` where these leave them to it."""
+        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``policy.gain``, ``policy.feature_gain``,
+        ``policy.clock`` and ``train.endurance`` where these leave them to it."""
         optimizer, policy, train = self.optimizer, self.policy, self.train
         if optimizer.policy_rate is None:
             optimizer = dataclasses.replace(optimizer, policy_rate=task.rate)
@@ -287,6 +288,8 @@ class Settings:
             optimizer = dataclasses.replace(optimizer, fade=task.fade)
         if policy.gain is None:
             policy = dataclasses.replace(policy, gain=task.gain)
+        if policy.clock is None:
+            policy = dataclasses.replace(policy, clock=task.clock)
         if policy.feature_gain is None:
             encoded = self.observer.name in ("latent", "untrained")
             policy = dataclasses.replace(policy, feature_gain=task.feature_gain if encoded else 1.0)

@@ -42,7 +42,7 @@ class ArmConf(TaskConf):
     """Goal of the tip: x and y [m]; at rest it is at (0.45, 0.41)."""
     hold: float = 1.2
     """Time at the end of the episode during which the tip should stay at the goal [s], at most all of it."""
-    still: float = 1e-2
+    still: float = 5e-2
     """Weight of the tip's mean squared speed during that time in the loss [s²]."""
 
     def __post_init__(self):
@@ -107,6 +107,7 @@ def arm(conf: ArmConf) -> Task:
         goal=goal,
         fade=FADE,
         gain=QUIET,
+        clock=False,  # its rhythm would have to be unlearned: what sees it never quite rests
         endurance=LASTING,
         build=conf.build,
     )

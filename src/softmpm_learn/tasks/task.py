@@ -168,6 +168,8 @@ class Task:
     """Size of the first activations; see ``policy.gain``, which goes before."""
     feature_gain: float = 1.0
     """Influence of an encoder's features on them, in units of the clock's; see ``policy.feature_gain``, which goes before."""
+    clock: bool = True
+    """Whether policies see the time; see ``policy.clock``, which goes before."""
     rate: float = 5e-3
     """Learning rate of the policy, for the mlp and adam; see ``optimizer.policy_rate``, which goes before."""
     endurance: int = 1
