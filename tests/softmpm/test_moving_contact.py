@@ -12,6 +12,7 @@ from surface_scenes import G, block, slab, velocity
 import softmpm
 from softmpm import Inputs, reference_moving_contact
 from softmpm.inputs import QUANTITIES
+from softmpm.kernels.physics import lanes
 from softmpm.kernels.structs import types
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
@@ -129,6 +130,14 @@ def test_contact_is_that_of_the_reference(dim, dtype, width, scheme, limit, devi
     for name, got, want in zip([*"xvCF", "anchor", "force", *leaves], *found, strict=True):
         assert want.abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(got.detach().cpu().double(), want.detach(), limit, name)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dim", [2, 3])
+def test_contact_with_few_lanes_is_that_of_the_reference(dim, monkeypatch):
+    """Many points have fewer lanes than nodes, so that a lane takes several nodes and a warp has points near and far."""
+    monkeypatch.setattr(lanes, "THREADS", 1)
+    test_contact_is_that_of_the_reference(dim, torch.float64, 0.05, "fast", 1e-10, "cuda")
 
 
 def test_a_state_without_points_has_gradients_too():

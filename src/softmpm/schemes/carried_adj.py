@@ -52,6 +52,7 @@ class SurfaceContactAdj:
         launch: Callable[..., None],
     ) -> None:
         """Recompute the nodal velocities of substep ``s`` from those without contact."""
+        assert self._scratch is not None, "else forces and anchors of the forward pass would be overwritten"
         forward.press(s, inputs, now, nodes, words, launch, self._scratch)
 
     def press_adj(

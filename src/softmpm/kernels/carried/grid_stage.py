@@ -3,8 +3,8 @@
     grid      nodes: V ← (G1), (G2) of M, twice,  next M ← 0;   points: L of (K9)
     press     points: impulses into one of the V (kernels/carried/surface.py)
     backward
-    grid_adj  nodes: M̄ ← (G1.adj) of V̄ and of what the points gave;  both V ← (G1), (G2) of the M before;
-              points: the part of L̄ in their adjoints (K9.adj), L of the substep before, its stored impulses into one of the V (K10)
+    grid_adj  nodes: M̄ ← (G1.adj) of V̄ and of what the points gave;  one V ← (G1), (G2) of the M before, the other +=;
+              points: the part of L̄ in their adjoints (K9.adj), L of the substep before, its stored impulses into that other V (K10)
     g2p2g_adj, press_adj
 
 Sums of two successive substeps have two buffers: one is added to while the other is cleared. The kernels have modules of their own,

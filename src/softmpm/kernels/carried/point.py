@@ -41,10 +41,8 @@ def outline_type(dim: int, dtype: str):
 
 
 def module_of(name: str, packed: bool) -> str:
-    """Set the options of the Warp module of this name, with loops over the nodes of a stencil written out; returns the name."""
-    name = native_module(name + ".packed") if packed else name
-    wp.set_module_options({"max_unroll": 27}, module=wp.get_module(name))
-    return name
+    """Name of a Warp module, whose options are set as native functions need them if it is for packed particles."""
+    return native_module(name + ".packed") if packed else name
 
 
 @kernel_factory

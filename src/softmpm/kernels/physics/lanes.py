@@ -12,7 +12,7 @@ from softmpm.kernels.compile import kernel_factory
 MOST = {2: 16, 3: 32}
 """Lanes of a point on a GPU: the power of two from the number of its nodes on."""
 THREADS = 2**17
-"""Lanes of all points, at most, while a point has more than ``LEAST``: about as many threads as a large GPU runs at a time."""
+"""Lanes of all points, at most, while a point has more than ``LEAST``: half as many threads as an H200 runs at a time."""
 LEAST = 4
 GROUP = "unsigned(((1ull << lanes) - 1) << (threadIdx.x & 31 & ~(lanes - 1)))"
 SUM = f"""

@@ -65,7 +65,7 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
     ]
     if model.spec.moving and not (last or first):  # the walls have another pose in each
         stages = [(s, nodes[s], nothing), (s - 1, nothing, nodes[s - 1])]
-    free, velocity, cleared = (shared.velocity_arrays[k] for k in (2, (s - 1) % 2, s % 2))
+    free, velocity, cleared = shared.velocity_arrays[-1], shared.velocity_at(s - 1), shared.velocity_at(s)
     pushed, earlier = shared.velocity_vectors[(s - 1) % 2], max(s - 1, 0)
     about = forward.masses(earlier), contact.impulses[earlier]
     loads, adj_loads = forward.load_arrays, shared.adj_load_arrays
@@ -88,7 +88,7 @@ def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     assert forward.contact is not None and shared.contact is not None
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
-    velocity, free = shared.velocity_vectors[s % 2], shared.velocity_vectors[2]
+    velocity, free = shared.velocity_vectors[s % 2], shared.velocity_vectors[-1]
     states = (inputs, adj_inputs, forward.packed[s], forward.contact_nodes(s, velocity, free))
     adj_nodes = (shared.node_vectors[s % 2], shared.adj_load_arrays[s % 2], shared.gained_view)
     shared.contact.press_adj(forward.contact, s, *states, *adj_nodes, shared.adj_array, launch)
