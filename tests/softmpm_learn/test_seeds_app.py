@@ -23,6 +23,9 @@ TINY = [
     *("policy=linear", "train.iterations=2", "train.examine=false", "device.dtype=float64"),
 ]
 
+MOVING = (*TINY, "policy.clock=true")
+"""The arm moves from the first step on."""
+
 
 @pytest.fixture(autouse=True)
 def fresh_hydra(monkeypatch, tmp_path):
@@ -160,7 +163,7 @@ def test_a_seed_that_fails_is_a_row_that_says_so(main, monkeypatch, capsys):
     """The exit code tells it, the others finish; the same folder tries it again."""
     with monkeypatch.context() as patch:
         fails_in(patch, world=1)
-        code, _ = main(*TINY, "train.seeds=3", "hydra.run.dir=all")
+        code, _ = main(*MOVING, "train.seeds=3", "hydra.run.dir=all")
     said = capsys.readouterr().err
     assert code == 1 and "of 3 seeds these failed: 1. Seed 1: iteration 0: particle 3 is inverted." in said
     table = rows(Path("all/sweep.csv"))
@@ -173,7 +176,7 @@ def test_a_seed_that_fails_is_a_row_that_says_so(main, monkeypatch, capsys):
 
 def test_a_sweep_has_a_row_for_each_seed(main, monkeypatch):
     """A job whose seeds have finished is skipped; one in which a seed failed is tried again, and has no objective."""
-    words = ("-m", *TINY, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
+    words = ("-m", *MOVING, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
     with monkeypatch.context() as patch:
         fails_in(patch, world=1)
         code, objectives = main(*words)
