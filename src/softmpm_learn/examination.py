@@ -38,7 +38,7 @@ KICK = 0.1
 """Speed of the start along the first axis [m/s]."""
 FRICTION = 0.75, 1.25
 BEFORE, AFTER = 0.3, 0.5
-"""Time at the end of an episode and after it in which what holds a goal should be at rest there [s]."""
+"""Durations before and after the end of an episode during which a held goal must be kept at rest [s]."""
 NAMES = ["later", "kicked", "friction", "finer", "tilt", "miss", "speed"]
 """Columns of metrics.csv."""
 
