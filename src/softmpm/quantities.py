@@ -210,7 +210,8 @@ def _green_strain(state: State) -> Tensor:
     if not isinstance(state, State):
         raise TypeError(f"state must be a softmpm.State, got {type(state).__name__}.")
     H = _displacement_gradient(state)
-    return (H + H.mT + H.mT @ H) / 2
+    square = (H.unsqueeze(-1) * H.unsqueeze(-2)).sum(-3)  # HᵀH; a GPU takes long for products of many small matrices
+    return (H + H.mT + square) / 2
 
 
 def _laws(model: Model) -> Iterator[tuple[type, slice]]:
