@@ -210,7 +210,9 @@ def _green_strain(state: State) -> Tensor:
     if not isinstance(state, State):
         raise TypeError(f"state must be a softmpm.State, got {type(state).__name__}.")
     H = _displacement_gradient(state)
-    square = (H.unsqueeze(-1) * H.unsqueeze(-2)).sum(-3)  # HᵀH; a GPU takes long for products of many small matrices
+    square = (H.unsqueeze(-1) * H.unsqueeze(-2)).sum(
+        -3
+    )  # HᵀH; a GPU takes long for products of many small matrices
     return (H + H.mT + square) / 2
 
 

@@ -49,14 +49,15 @@ class RestGrid:
         size, first = np.array(bricks.cells), base.min(axis=0)
         box, inside = np.divmod(base - first, size)
         boxes, brick = np.unique(box, axis=0, return_inverse=True)
-        cell = np.ravel_multi_index(tuple(inside.T), bricks.cells)
+        numbers = bricks.cell_numbers
+        cell = numbers[tuple(inside.T)]
 
         # Cells, brick by brick, and particles, cell by cell
         cells, of = np.unique(brick.reshape(-1) * size.prod() + cell, return_inverse=True)
         of = of.reshape(-1)
         brick_of_cell = cells // size.prod()
         turn = cells % size.prod()
-        corner = np.stack(np.unravel_index(turn, bricks.cells), axis=-1)
+        corner = np.stack(np.unravel_index(np.argsort(numbers, axis=None)[turn], bricks.cells), axis=-1)
         corners = np.full((len(boxes), size.prod()), -1)
         corners[brick_of_cell, turn] = flat(corner, bricks.window)
         order = np.argsort(of, kind="stable")

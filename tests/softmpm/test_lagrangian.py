@@ -9,6 +9,7 @@ from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, d
 from surface_scenes import by_reference, compare
 
 import softmpm
+from softmpm.kernels.lagrangian import bricks
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
@@ -84,6 +85,18 @@ def test_lattices_have_the_values_and_gradients_of_the_reference(dim, places, de
     assert model.rest_grid.lattice is not None and model.rest_grid.lattice.shape == (dim, places)
     compare(model, names, 1e-10)
     compare(build(made, device=device, worlds=2, inputs=names), names, 5e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("viscosity", [0.0, 0.02])
+def test_bricks_of_large_scenes(viscosity, monkeypatch):
+    """The same for a small scene with the bricks that large ones have on a GPU."""
+    monkeypatch.setattr(bricks, "FEW", {2: 0, 3: 0})
+    made = on_lattice(full_scene(3, driven=(), viscosity=viscosity), 2)
+    names = ("gravity", "damping", "friction", "direction", "strength")
+    model = build(made, device="cuda", worlds=2, inputs=names)
+    assert model.rest_grid.bricks.cells == (4, 4, 4)
+    compare(model, names, 5e-4)
 
 
 @pytest.mark.parametrize("budget", [None, 40_000])

@@ -31,6 +31,25 @@ template <int, int, typename T, unsigned DIM> CUDA_CALLABLE inline Node<T, DIM>*
 template <int, typename T> CUDA_CALLABLE inline T* shared_terms() { return nullptr; }
 #endif
 
+// Number of this block of threads, and of this thread in it: found from the number of the thread, they would take divisions of 64 bits.
+CUDA_CALLABLE inline int block_number()
+{
+#if defined(__CUDA_ARCH__)
+    return blockIdx.x + gridDim.x * (blockIdx.y + gridDim.y * blockIdx.z);
+#else
+    return 0;
+#endif
+}
+
+CUDA_CALLABLE inline int thread_number()
+{
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x;
+#else
+    return 0;
+#endif
+}
+
 CUDA_CALLABLE inline void meet()
 {
 #if defined(__CUDA_ARCH__)
@@ -77,9 +96,12 @@ CUDA_CALLABLE inline void stage(
         value[n] = first[at[n] > 0 ? at[n] : 0];
 #pragma unroll
     for (int n = 0; n < EACH; ++n)
-        if (lane + n * THREADS < NODES)
+        if (lane + n * THREADS < NODES) {
+            Node<T, DIM> node = {};  // stored as a whole, as it is read
             for (unsigned axis = 0; axis < DIM; ++axis)
-                nodes[lane + n * THREADS].at[axis] = at[n] >= 0 ? value[n].c[axis] : T(0);
+                node.at[axis] = at[n] >= 0 ? value[n].c[axis] : T(0);
+            nodes[lane + n * THREADS] = node;
+        }
 }
 
 // Node k of the window

@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -76,6 +77,18 @@ class Bricks(NamedTuple):
     @property
     def nodes(self) -> int:
         return math.prod(self.window)
+
+    @property
+    def cell_numbers(self) -> np.ndarray:
+        """Number of each cell, shape ``cells``.
+
+        Eight threads in a row read their nodes at once if these lie in different banks of shared memory. Four nodes along the last axis
+        fill half of the banks; in bricks of 4 × 4 × 4 cells those of the next slice fill the other half, those of the next row do not.
+        """
+        numbers = np.arange(self.cell_count)
+        if self.cells == (4, 4, 4) and not self.serial:
+            numbers = numbers.reshape(2, 4, 2, 4).swapaxes(1, 2)
+        return numbers.reshape(self.cells)
 
     def shared_bytes(self, number: int) -> int:
         """Bytes of shared memory of the adjoint kernel with viscosity, the largest, for numbers of this size (bricks.h)."""
@@ -143,6 +156,14 @@ def brick_module(name: str, groups: int = 1) -> str:
     }
     wp.set_module_options(options, module=wp.get_module(name))
     return name
+
+
+@wp.func_native("return softmpm::block_number();")
+def block_number() -> int: ...
+
+
+@wp.func_native("return softmpm::thread_number();")
+def thread_number() -> int: ...
 
 
 @wp.func_native("softmpm::meet();")

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
+from softmpm.kernels.lagrangian.bricks import Bricks, block_number, brick_module, meet, thread_number
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
@@ -175,6 +175,10 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         s: int,
     ):
         world, brick, lane = wp.tid()
+        if wp.static(not serial):
+            world = block_number() / inside.corners.shape[0]
+            brick = block_number() - world * inside.corners.shape[0]
+            lane = thread_number()
         forces_at(world, brick, lane, constants, inputs, inside, lattice, at, s)
 
     return SimpleNamespace(forces=forces, forces_at=forces_at)
@@ -270,6 +274,10 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
         s: int,
     ):
         world, brick, lane = wp.tid()
+        if wp.static(not serial):
+            world = block_number() / inside.corners.shape[0]
+            brick = block_number() - world * inside.corners.shape[0]
+            lane = thread_number()
         forces_adj_at(world, brick, lane, constants, inputs, inside, lattice, at, bar, adj_inputs, s)
 
     return SimpleNamespace(forces_adj=forces_adj, forces_adj_at=forces_adj_at)
