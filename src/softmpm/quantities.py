@@ -210,9 +210,8 @@ def _green_strain(state: State) -> Tensor:
     if not isinstance(state, State):
         raise TypeError(f"state must be a softmpm.State, got {type(state).__name__}.")
     H = _displacement_gradient(state)
-    square = (H.unsqueeze(-1) * H.unsqueeze(-2)).sum(
-        -3
-    )  # HᵀH; a GPU takes long for products of many small matrices
+    # HᵀH, for which a GPU takes long as a product of many small matrices
+    square = (H.unsqueeze(-1) * H.unsqueeze(-2)).sum(-3)
     return (H + H.mT + square) / 2
 
 
