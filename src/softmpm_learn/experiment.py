@@ -172,6 +172,10 @@ def make_model(task: Task, conf: RunConf, group: Group, runs: int | None = None)
     )
 
 
+def times(count: int) -> str:
+    return f"{count} time{'s' if count > 1 else ''}"
+
+
 def farewell(result: Result, task: Task, out: Path) -> str:
     """Summary of the result; its last line is the command to view the recording or to resume the run."""
     lines = []
@@ -181,9 +185,9 @@ def farewell(result: Result, task: Task, out: Path) -> str:
             f"Best {what} {result.best_loss:.5g}, in iteration {result.best_iteration}{outcome(task, out)}."
         )
     if count := result.run.fallback.count:
-        lines.append(
-            f"It fell far below its best and went back to it: {count} time{'s' if count > 1 else ''}."
-        )
+        lines.append(f"It failed or fell far below its best and went back to it: {times(count)}.")
+    if count := result.run.restart.count:
+        lines.append(f"It got nowhere and began anew: {times(count)}.")
     if result.examination:
         lines.append(f"Examined: {examined(result.examination)}.")
     shown = _relative(out)

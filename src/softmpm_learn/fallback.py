@@ -18,7 +18,7 @@ class Fallback:
     below: int = 0
     """Iterations in a row, up to the present one."""
     count: int = 0
-    """Fallbacks so far."""
+    """Times that the run went back so far."""
     iterations: int = 0
     """Iterations so far."""
 
@@ -40,5 +40,5 @@ class Fallback:
         self.below = self.below + 1 if low else 0
         if conf.fallback_share == 0 or self.below < conf.fallback_after:
             return False
-        self.below, self.count = 0, self.count + 1
+        self.below = 0
         return True

@@ -41,7 +41,7 @@ def optimise(
     """One optimisation step of every run that goes on: simulate, differentiate, update policy and design.
 
     After a failure policy and design of the run in which it was go halfway back to the last simulation that succeeded, and all try
-    again. A run that has no retry left goes back to its best; if that fails too, it has failed and rests. Before it goes back for the
+    again. A run that has no retry left goes back to its best, or begins anew; if that fails too, it has failed and rests. Before it goes back for the
     first time it is saved as it was: from there it is resumed if it fails.
 
     Args:
@@ -96,8 +96,8 @@ def save_before(runs: Runs, loggers: Sequence[RunLogger], streams: dict[int, Ten
 
 
 def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
-    """Halve the last step of a run whose simulation or gradient failed; after the last retry go back to its best. A run without a way
-    back, or whose best fails too, has failed.
+    """Halve the last step of a run whose simulation or gradient failed; after the last retry go back to its best, or begin anew. A run
+    without a way back, or that fails there too, has failed.
 
     Raises:
         TrainingError: It was at rest.
@@ -108,9 +108,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
             logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
             run.backtrack()
         else:
-            best = run.best["iteration"]
-            logger.warning("Iteration %d: %s Going back to iteration %d.", run.iteration, error, best)
-            run.fall_back()
+            logger.warning("Iteration %d: %s The run is %s.", run.iteration, error, run.fall_back())
         return
     ended = TrainingError(run.iteration, in_full(error))
     ended.__cause__ = error
@@ -122,7 +120,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
 
 
 def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
-    """Take the step of each run along its gradient, or go back to its best; keeps the best, and completes the rows."""
+    """Take the step of each run along its gradient, go back to its best, or begin anew; keeps the best, and completes the rows."""
     asked = [k for k in rows if due(runs.all[k])]
     evaluations = evaluate(runs) if asked else []
     for k, row in rows.items():
@@ -131,21 +129,28 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
             value = row["evaluation"] = evaluations[k] if k in asked else math.nan
         if value < run.best["loss"]:
             run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
-        row |= {"best": run.best["loss"], "fallbacks": int(step_or_fall_back(run, value))}
+        row |= {"best": run.best["loss"]} | step(run, row["loss"], value)
 
 
-def step_or_fall_back(run: Run, loss: float) -> bool:
-    """Take the step along the gradient, or go back to the best; True for the latter."""
-    conf = run.settings.optimizer
-    if not run.fallback.is_due(loss, run.best["loss"], conf):
+def step(run: Run, loss: float, value: float) -> dict[str, int]:
+    """Take the step along the gradient, go back to the best, or begin anew; how often it did the latter two, 0 or 1.
+
+    Args:
+        loss: That of the episode.
+        value: By which the best is chosen; nan where it is not known.
+    """
+    conf, restarts, low = run.settings.optimizer, run.restart.count, ""
+    if run.restart.is_due(loss, conf):
+        low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
+    elif run.fallback.is_due(value, run.best["loss"], conf):
+        share = f"for {conf.fallback_after} iterations the progress was below {conf.fallback_share:g} of the best"
+        low = f"{share}; {run.fall_back()}"
+    if low:
+        logger.warning("Iteration %d: %s.", run.iteration, low)
+    else:
         run.step()
-        return False
-    run.fall_back()
-    logger.warning(
-        "Iteration %d: for %d iterations the progress was below %g of the best; going back to iteration %d, with rates times %g.",
-        *(run.iteration, conf.fallback_after, conf.fallback_share, run.best["iteration"], conf.fallback_rate),
-    )
-    return True
+    anew = run.restart.count - restarts
+    return {"fallbacks": int(bool(low)) - anew, "restarts": anew}
 
 
 def attempt(

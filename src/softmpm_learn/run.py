@@ -22,6 +22,7 @@ from softmpm_learn.observe import Latent, Observer, make_observer
 from softmpm_learn.optimizers import make_optimizer
 from softmpm_learn.policy import Goal, make_policy
 from softmpm_learn.replay import Replay
+from softmpm_learn.restart import Restart, is_worth
 from softmpm_learn.seeding import seeded, stream, stream_seed
 from softmpm_learn.settings import Settings
 
@@ -47,6 +48,7 @@ class Run:
         safe: Values of policy and design in the last simulation that did not fail.
         best: The lowest loss so far, that of the evaluations if there are any, and what gave it.
         fallback: Decides when the run goes back to its best.
+        restart: Decides when it begins anew.
     """
 
     def __init__(
@@ -70,21 +72,27 @@ class Run:
         settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
-        self.fallback = Fallback()
+        self.fallback, self.restart = Fallback(), Restart()
         self.goals = stream(settings.train.seed, "goals")
         self.learner: Learner | None = None
         self.observer = self._make_observer(out)
         self._goal = self._make_goal()
-        seconds = task.control_steps * task.substeps * model.scene.dt
-        seed = stream_seed(settings.train.seed, "policy")
-        policy = make_policy(
-            settings.policy, self.observer.size, model.muscle_count, seconds, seed, self._goal
-        )
-        self.policy: nn.Module = policy.to(model.device, model.dtype)
-        self.design = Design(settings.design, model, task.regions)
+        self.policy, self.design = self._make_policy("policy"), self._make_design()
         rates = list(self.policy.parameters()), list(self.design.parameters())
         self.optimizer = make_optimizer(settings.optimizer, *rates)
+        self._first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.safe: list[Tensor] = []
+
+    def _make_policy(self, name: str) -> nn.Module:
+        """With first weights from the random stream of this name."""
+        conf, seed = self.settings.policy, stream_seed(self.settings.train.seed, name)
+        policy = make_policy(
+            conf, self.observer.size, self.model.muscle_count, self.task.seconds, seed, self._goal
+        )
+        return policy.to(self.model.device, self.model.dtype)
+
+    def _make_design(self) -> Design:
+        return Design(self.settings.design, self.model, self.task.regions)
 
     def _make_observer(self, out: Path) -> Observer:
         seed, task = self.settings.train.seed, self.task
@@ -155,12 +163,29 @@ class Run:
         for group in self.optimizer.param_groups:
             group["lr"] *= factor
 
-    def fall_back(self) -> None:
-        """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments."""
+    def fall_back(self) -> str:
+        """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments; or begin anew
+        if the best is not worth it. Says which."""
+        if not is_worth(self.best["loss"], self.settings.optimizer):
+            return self.begin_anew()
+        self.fallback.count += 1
         self.load_policy(self.best)
         self.optimizer.state.clear()
         self._scale_rates(self.settings.optimizer.fallback_rate)
         self.snapshot()
+        return f"going back to iteration {self.best['iteration']}"
+
+    def begin_anew(self) -> str:
+        """Take other first weights of the policy and the first design, with the first rates; the encoder keeps what it has learned.
+        Says so."""
+        self.restart, self.fallback = self.restart.next(), Fallback(count=self.fallback.count)
+        self.policy.load_state_dict(self._make_policy(f"policy {self.restart.count}").state_dict())
+        self.design.load_state_dict(self._make_design().state_dict())
+        self.optimizer.state.clear()
+        for group, rate in zip(self.optimizer.param_groups, self._first_rates, strict=True):
+            group["lr"] = rate
+        self.snapshot()
+        return "beginning anew with other first weights"
 
     def draw_goals(self) -> Tensor | None:
         """A goal for each world [m], shape (world, dim), or None for the task's own.
@@ -237,6 +262,7 @@ class Run:
             "safe": self.safe,
             "best": self.best,
             "fallback": dataclasses.asdict(self.fallback),
+            "restart": dataclasses.asdict(self.restart),
         }
 
     def load_state_dict(self, content: dict) -> None:
@@ -261,6 +287,7 @@ class Run:
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, self.best = content["iteration"], content["best"]
         self.fallback = Fallback(**content["fallback"])
+        self.restart = Restart(**content.get("restart", {}))
         self._check_shapes()
 
     def _check_shapes(self) -> None:

@@ -279,13 +279,15 @@ class Settings:
     train: TrainConf = field(default_factory=TrainConf)
 
     def suited(self, task: "Task") -> "Settings":
-        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``policy.gain``, ``policy.feature_gain``,
-        ``policy.clock`` and ``train.endurance`` where these leave them to it."""
+        """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``optimizer.restart_above``, ``policy.gain``,
+        ``policy.feature_gain``, ``policy.clock`` and ``train.endurance`` where these leave them to it."""
         optimizer, policy, train = self.optimizer, self.policy, self.train
         if optimizer.policy_rate is None:
             optimizer = dataclasses.replace(optimizer, policy_rate=task.rate)
         if optimizer.fade is None:
             optimizer = dataclasses.replace(optimizer, fade=task.fade)
+        if optimizer.restart_above is None:
+            optimizer = dataclasses.replace(optimizer, restart_above=task.worth)
         if policy.gain is None:
             policy = dataclasses.replace(policy, gain=task.gain)
         if policy.clock is None:

@@ -24,7 +24,6 @@ def due(losses: list[float], **conf) -> list[int]:
         best = min(best, loss) if not math.isnan(loss) else best
         if fallback.is_due(loss, best, OptimizerConf(**dict(fallback_from=0) | conf)):
             found.append(k)
-    assert fallback.count == len(found)
     return found
 
 

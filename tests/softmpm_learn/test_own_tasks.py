@@ -226,7 +226,7 @@ def painted(**boxes: tuple) -> None:
         (lambda: Image.new("RGB", (30, 30), "white").save("wrong.png"), ImageConf(file="wrong.png"), "is empty"),
         (lambda: painted(cffffff=(0, 78, 239, 84)), ImageConf(file="wrong.png"), "in 3 pieces.*fall apart"),
         (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf(file="wrong.png"), "no muscle"),
-        (lambda: None, ImageConf(file="robot.png", size=2.0), "is 2 m long and 1 m high; the track of 4 m has room for"),
+        (lambda: None, ImageConf(file="robot.png", size=2.0), "is 2 m long and 1 m high; the track of 7 m has room for"),
         (lambda: None, ImageConf(file="robot.png", size=0.02), "too small for cells of 0.0125 m"),
         (lambda: painted(c0000ff=(30, 30, 33, 33)), ImageConf(file="wrong.png", cells=20), "muscle blue .* is smaller than a particle"),
         (lambda: np.save("wrong.npy", WALKER + 3), VoxelsConf(file="wrong.npy"), "7 voxels other than 0 empty.*the first is 6"),

@@ -8,8 +8,9 @@ import torch
 
 import softmpm
 from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
-from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
+from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
 from softmpm_learn.tasks.task import Resolution, TaskConf
+from softmpm_learn.tasks.walker import EDGE
 
 ROBOTS = ("elephant", "arm", "biped")
 """The tasks that need no file."""
@@ -110,7 +111,8 @@ def test_soles_meet_the_floor_on_spline_knots(name, resolution):
         soles = outline.points[:, 1] < lowest + 1e-9
         legs = 4 if name == "elephant" else 2
         width = {"elephant": 0.106 * 0.44, "biped": 0.078}[name]
-        assert outline.areas[soles].sum() == pytest.approx(legs * width, rel=0.05)  # of oblique legs
+        flat = width - 2 * EDGE
+        assert outline.areas[soles].sum() == pytest.approx(legs * flat, rel=0.05)  # of oblique legs
         if resolution is Resolution.draft:
             model = softmpm.build(scene, device="cpu", **task.build)
             assert (model.surface is not None) == (contact != "nodes")
@@ -269,6 +271,29 @@ def test_smooth_curves_pass_through_their_points():
     assert len(smooth(SQUARE, 4)) == 16
     line = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 2.0), (2.0, 1.0, 1.0)])
     assert smooth_line(line, 5)[::5] == pytest.approx(line)
+
+
+def test_a_foot_ends_at_the_floor_with_bevelled_edges():
+    """An oblique leg that goes through the floor, drawn either way round: its sole is flat, and no corner below turns by 35°."""
+    leg = np.array([(0.0, 1.0), (0.1, -0.2), (0.5, -0.2), (0.4, 1.0)])
+    for outline in (leg, leg[::-1], np.roll(leg, 2, axis=0)):
+        found = foot(outline, 0.06)
+        sole = found[np.isclose(found[:, 1], 0.0, atol=1e-12), 0]
+        ends = 0.1 / 1.2 + 0.06, 0.5 - 0.1 / 6 - 0.06
+        assert sorted(sole) == pytest.approx(sorted(ends)) and found[:, 1].min() > -1e-12
+        side = np.diff(np.concatenate([found[-1:], found, found[:1]]), axis=0)
+        angle = np.arctan2(side[:, 1], side[:, 0])
+        turn = np.abs((np.diff(angle) + np.pi) % (2 * np.pi) - np.pi)
+        assert turn[found[:, 1] < 0.5].max() < np.radians(35) and turn.sum() == pytest.approx(2 * np.pi)
+        assert found[:, 1].max() == 1.0
+
+
+def test_a_track_has_room_for_three_episodes():
+    """At 1 m/s; what comes to its end leaves the grid, and no wall is there to stop it without a word."""
+    assert ElephantConf().length == 7.0 and ElephantConf(seconds=0.5).length == 4.0
+    task = make_task(ElephantConf(seconds=4.0))
+    assert task.scene.grid.shape[0] == 13 * 80 and ElephantConf(track=2.5).length == 2.5
+    assert [wall.normal for wall in task.scene.walls] == [(0.0, 1.0), (1.0, 0.0)]
 
 
 def test_a_limb_knows_along_and_across():

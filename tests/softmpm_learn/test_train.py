@@ -313,7 +313,7 @@ def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
     train.train(task, model, conf, tmp_path)
     result = train.train(task, model, copy_of(conf, train=dict(iterations=6)), tmp_path)
     found = rows(tmp_path)
-    assert result.finished and list(found[0])[12:17] == [
+    assert result.finished and list(found[0])[13:18] == [
         f"{n}_change" for n in ("young", "poisson", "density", "strength")
     ] + ["epochs"]
     assert float(found[0]["strength_change"]) == 0 < float(found[-1]["strength_change"])
@@ -413,7 +413,7 @@ def test_a_run_without_a_retry_left_goes_back_to_its_best(
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, first.safe, strict=True):
         assert torch.equal(now, want)
-    assert "Going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
+    assert "The run is going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
     now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
     assert now == pytest.approx(before * conf.optimizer.fallback_rate)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle
-from softmpm_learn.tasks.outline import Limb, smooth
+from softmpm_learn.tasks.outline import Limb, foot, smooth
 from softmpm_learn.tasks.task import Task, filled, neo_hookean
-from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
+from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
 TORSO = (
     *((0.000, 0.165), (0.018, 0.125), (0.075, 0.110), (0.150, 0.107), (0.225, 0.110), (0.282, 0.125)),
@@ -34,8 +34,7 @@ def biped(conf: BipedConf) -> Task:
         name: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
         for name, (hip, sole) in LEGS.items()
     }
-    soles = [np.maximum(limb.outline(), (-np.inf, 0.0)) for limb in limbs.values()]
-    shape = filled(conf, [smooth(TORSO), *soles])
+    shape = filled(conf, [smooth(TORSO), *(foot(limb.outline(), EDGE) for limb in limbs.values())])
     rest = shape.positions
     regions = {name: limb.part(rest, *LEG_MUSCLE) for name, limb in limbs.items()}
     muscles = [

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle
-from softmpm_learn.tasks.outline import Limb, smooth, smooth_line
+from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
 from softmpm_learn.tasks.task import Task, filled, neo_hookean
-from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
+from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
@@ -111,9 +111,7 @@ def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:
     outlines = [smooth(TORSO), Limb(tail[:, :2], tail[:, 2], round_tip=True).outline()]
     for name, limb in limbs.items():
         outline = limb.outline()
-        if name != "trunk":
-            outline[:, 1] = np.maximum(outline[:, 1], 0.0)  # flat soles
-        outlines.append(outline)
+        outlines.append(outline if name == "trunk" else foot(outline, EDGE / LENGTH))
     return {
         name: Limb(LENGTH * limb.line, LENGTH * limb.width, limb.round_tip) for name, limb in limbs.items()
     }, outlines

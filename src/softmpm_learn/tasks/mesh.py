@@ -27,8 +27,6 @@ class MeshConf(OwnConf):
     """Axis of the file that points up: z or y."""
     cells: int | None = 40  # pyright: ignore[reportIncompatibleVariableOverride, reportAssignmentType]
     """Cells of the grid per metre; work grows with its fourth power."""
-    track: float = 2.0
-    """Length of the track [m]."""
     seconds: float = 1.0
     """Length of an episode [s]."""
     slabs: int = 4

@@ -1,4 +1,4 @@
-"""Drawing robots by code: smooth outlines and tapered limbs, which ``softmpm.polygons`` fills; limbs are split for muscles.
+"""Drawing robots by code: smooth outlines, tapered limbs and feet, which ``softmpm.polygons`` fills; limbs are split for muscles.
 
 All lengths are in metres unless a robot says otherwise; points are (x, y), y up.
 """
@@ -30,6 +30,41 @@ def smooth_line(points: Sequence, steps: int = 12) -> np.ndarray:
 
 def _catmull_rom(a, b, c, d, t):
     return 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
+
+
+BEVEL = 0.27
+"""Place of the edge between two facets on the way from the middle of the bevel to the corner: the three turns are then the same."""
+
+
+def foot(outline: np.ndarray, edge: float) -> np.ndarray:
+    """What a closed outline (point, 2) encloses above the floor y = 0, which cuts it once, with a flat sole and bevelled edges.
+
+    A sharp edge that pushes the robot off carries the friction of its foot, and tears.
+
+    Args:
+        edge: Distance from a corner at which its bevel, of two facets, leaves the sole and the side [m].
+    """
+    ahead, above = np.roll(outline, -1, axis=0), []
+    for a, b in zip(outline, ahead, strict=True):
+        if a[1] > 0:
+            above.append(a)
+        if (a[1] > 0) != (b[1] > 0):
+            above.append(a + (b - a) * a[1] / (a[1] - b[1]))
+    ring = np.array(above)
+    on_floor = np.isclose(ring[:, 1], 0.0, atol=1e-12)
+    last = int(np.flatnonzero(on_floor & np.roll(on_floor, 1))[0])
+    ring = np.roll(ring, -last, axis=0)  # up one side of the foot and down the other
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
+
+    def bevel(corner: np.ndarray, sole: np.ndarray, leave: float) -> np.ndarray:
+        """From the sole, towards its other end, to the place on the side that is ``leave`` along the ring."""
+        start = corner + edge * (sole - corner) / np.linalg.norm(sole - corner)
+        end = np.array([np.interp(leave, way, axis) for axis in ring.T])
+        middle = (start + end) / 2 + BEVEL * (corner - (start + end) / 2)
+        return np.array([start, middle, end])
+
+    up, down = bevel(ring[0], ring[-1], edge), bevel(ring[-1], ring[0], way[-1] - edge)
+    return np.concatenate([up, ring[(way > edge) & (way < way[-1] - edge)], down[::-1]])
 
 
 @dataclass(frozen=True, eq=False)

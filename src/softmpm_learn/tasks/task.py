@@ -172,6 +172,9 @@ class Task:
     """Whether policies see the time; see ``policy.clock``, which goes before."""
     rate: float = 5e-3
     """Learning rate of the policy, for the mlp and adam; see ``optimizer.policy_rate``, which goes before."""
+    worth: float = math.inf
+    """Loss of a motion that is worth going on with: a run that stays above begins anew; see ``optimizer.restart_above``, which goes
+    before."""
     endurance: int = 1
     """Length of the evaluations that choose the best policy, in episodes; see ``train.endurance``, which goes before."""
     build: dict[str, Any] = field(default_factory=dict)

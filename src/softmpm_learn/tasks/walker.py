@@ -20,8 +20,14 @@ FAINT = 0.3
 its rhythm. Of twenty elephants fourteen got under way, with 1 eight (docs/results.md)."""
 BRISK = 1e-2
 """Learning rate of a walker's policy. With half of it most of ten elephants still stood after 72 iterations (docs/learning.md)."""
+WORTH = -0.1
+"""Loss of a walker that is worth going on with, in units of its length: it has come forward by more than it costs."""
+ROOM = 1.0
+"""Length of the track at its start and for the robot [m]."""
 SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""
+EDGE = 0.012
+"""Distance from the corner at which the bevelled edge of a sole begins [m]: one cell as a draft."""
 STRAIN = 0.5
 """Equivalent strain of a walker that costs nothing: it is half as long again as at rest."""
 
@@ -47,8 +53,8 @@ class WalkerConf(TaskConf):
     """Length of an episode [s]: four steps or five, so that what walks at its end goes on walking."""
     lead: float | None = None
     """Time before the distance counts, to get under way [s]; null is a quarter of the episode."""
-    track: float = 4.0
-    """Length of the track [m], for three episodes."""
+    track: float | None = None
+    """Length of the track [m], at whose end the simulation stops by name; null: 4 m, or room for three episodes at 1 m/s."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -57,8 +63,13 @@ class WalkerConf(TaskConf):
             raise ValueError(
                 f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
             )
-        if not (math.isfinite(self.track) and self.track >= 1.0):
-            raise ValueError(f"task.track must be at least 1 m, got {self.track}.")
+        if not (math.isfinite(self.length) and self.length >= ROOM):
+            raise ValueError(f"task.track must be at least {ROOM:g} m, got {self.track}.")
+
+    @property
+    def length(self) -> float:
+        """Length of the track [m]."""
+        return max(4.0, ROOM + LASTING * self.seconds) if self.track is None else self.track
 
     @property
     def on_surface(self) -> bool:
@@ -92,12 +103,13 @@ def walking(conf: WalkerConf, rest: np.ndarray, torso: np.ndarray) -> Objective:
 
 
 def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
-    """Grid and walls of a walker, 0.5 m high, a floor with friction first, smooth ends; and the height of the soles [m].
+    """Grid of a walker, 0.5 m high, and its walls: a floor with friction and a smooth one behind it; and the height of the soles [m].
 
     The soles lie on spline knots, half a cell above a row of nodes. The floor is at the soles if surface points meet it, and at the
-    nodes otherwise.
+    nodes otherwise. There is no wall at the far end, which a fast walker would run into without a word: it leaves the grid instead, by
+    name.
     """
-    length, height, margin, nodes, spacing = conf.track, 0.5, 0.05, conf.cells, conf.spacing
+    length, height, margin, nodes, spacing = conf.length, 0.5, 0.05, conf.cells, conf.spacing
     floor = math.floor(0.0625 * nodes) * spacing
     soles = floor + 0.5 * spacing
     if conf.on_surface:
@@ -106,7 +118,6 @@ def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
     walls = [
         softmpm.Wall(normal=(0.0, 1.0), offset=floor, friction=conf.friction),
         softmpm.Wall(normal=(1.0, 0.0), offset=margin),
-        softmpm.Wall(normal=(-1.0, 0.0), offset=margin - length),
     ]
     return grid, walls, soles
 
@@ -140,6 +151,7 @@ def walker_task(
         dt=conf.control_period,
     )
     scene, control_steps, substeps = clock(conf, scene)
+    length = float(np.ptp(rest[:, 0]))
     return Task(
         name=conf.name,
         scene=scene,
@@ -147,11 +159,12 @@ def walker_task(
         substeps=substeps,
         regions=regions,
         objective=walking(conf, rest, torso),
-        body_length=float(np.ptp(rest[:, 0])),
+        body_length=length,
         build=conf.build,
         fade=STEP,
         gain=VIGOROUS,
         feature_gain=FAINT,
         rate=BRISK,
+        worth=WORTH * length,
         endurance=LASTING,
     )
