@@ -41,8 +41,8 @@ def optimise(
     """One optimisation step of every run that goes on: simulate, differentiate, update policy and design.
 
     After a failure policy and design of the run in which it was go halfway back to the last simulation that succeeded, and all try
-    again. A run that has no retry left goes back to its best, or begins anew; if that fails too, it has failed and rests. Before it goes back for the
-    first time it is saved as it was: from there it is resumed if it fails.
+    again. A run that has no retry left goes back to its best, or begins anew; if that fails too, it has failed and rests. Before it
+    goes back for the first time it is saved as it was: from there it is resumed if it fails.
 
     Args:
         loggers: One for each run, or none.

@@ -1,6 +1,7 @@
 """Restart: a run that gets nowhere begins anew, with other first weights of the policy.
 
-Which gait a policy finds, or none, is decided by its first weights; one that has not found any in its first iterations rarely does later.
+Which gait a policy finds, or none, is decided by its first weights; one that has not found any in its first iterations rarely does
+later.
 """
 
 import math
