@@ -143,7 +143,9 @@ def step(run: Run, loss: float, value: float) -> dict[str, int]:
     if run.restart.is_due(loss, conf):
         low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
     elif run.fallback.is_due(value, run.best["loss"], conf):
-        share = f"for {conf.fallback_after} iterations the progress was below {conf.fallback_share:g} of the best"
+        share = (
+            f"for {conf.fallback_after} iterations the progress was below {conf.fallback_share:g} of the best"
+        )
         low = f"{share}; {run.fall_back()}"
     if low:
         logger.warning("Iteration %d: %s.", run.iteration, low)

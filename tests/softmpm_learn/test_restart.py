@@ -47,7 +47,9 @@ def with_optimizer(settings, **conf):
     )
 
 
-def test_policy_design_and_rates_are_those_of_a_new_run(task, model, restarting, tmp_path, monkeypatch, caplog):
+def test_policy_design_and_rates_are_those_of_a_new_run(
+    task, model, restarting, tmp_path, monkeypatch, caplog
+):
     """Weights are others than the first and than those of the attempt after, and follow from the seed; the encoder is kept."""
     seen, real = {}, optimisation.attempt
 
@@ -61,16 +63,22 @@ def test_policy_design_and_rates_are_those_of_a_new_run(task, model, restarting,
     monkeypatch.setattr(optimisation, "attempt", attempt)
     conf = dataclasses.replace(restarting, train=dataclasses.replace(restarting.train, iterations=7))
     result = train(task, model, conf, tmp_path)
-    (first, rates, _), (before, low, _), (anew, again, moments), (third, _, _) = (seen[k] for k in (0, 2, 3, 6))
+    (first, rates, _), (before, low, _), (anew, again, moments), (third, _, _) = (
+        seen[k] for k in (0, 2, 3, 6)
+    )
     assert low < rates == again and moments == 0
     for name in ("policy", "design", "observer"):
         same = all(torch.equal(a, b) for a, b in zip(anew[name], first[name], strict=True))
         kept = all(torch.equal(a, b) for a, b in zip(anew[name], before[name], strict=True))
-        assert (same, kept) == {"policy": (False, False), "design": (True, False), "observer": (False, True)}[name]
+        assert (same, kept) == {"policy": (False, False), "design": (True, False), "observer": (False, True)}[
+            name
+        ]
     assert not torch.equal(anew["policy"][0], third["policy"][0])
     other = Run(task, model, conf, tmp_path)
     other.begin_anew()
-    assert all(torch.equal(a, b) for a, b in zip(other.policy.state_dict().values(), anew["policy"], strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(other.policy.state_dict().values(), anew["policy"], strict=True)
+    )
     with open(tmp_path / "metrics.csv", newline="") as file:
         assert [row["restarts"] for row in csv.DictReader(file)] == ["0", "0", "1", "0", "0", "1", "0"]
     assert result.run.restart.count == 2
@@ -81,7 +89,9 @@ def test_a_stopped_run_begins_anew_as_well(task, model, restarting, tmp_path):
     """Stopped within the count and after the restart, it equals the run that was not."""
     train(task, model, restarting, tmp_path / "whole")
     for stop_after in (2, 3, 5):
-        conf = dataclasses.replace(restarting, train=dataclasses.replace(restarting.train, iterations=stop_after))
+        conf = dataclasses.replace(
+            restarting, train=dataclasses.replace(restarting.train, iterations=stop_after)
+        )
         train(task, model, conf, tmp_path / "parts")
     one, other = ((tmp_path / name / "metrics.csv").read_bytes() for name in ("whole", "parts"))
     assert one == other

@@ -413,7 +413,9 @@ def test_a_run_without_a_retry_left_goes_back_to_its_best(
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, first.safe, strict=True):
         assert torch.equal(now, want)
-    assert "The run is going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
+    assert (
+        "The run is going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
+    )
     now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
     assert now == pytest.approx(before * conf.optimizer.fallback_rate)
 
