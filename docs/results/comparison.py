@@ -1,0 +1,42 @@
+"""Print the table of docs/results.md that compares observers of the elephant, from comparison.elephant.h200.csv beside this script:
+`python docs/results/comparison.py`."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from softmpm_learn.figures.intervals import interval, pairs
+
+WALKS = -0.5
+"""Best evaluation of a run that has got under way."""
+FIRST = ("particle", "true", "latent")
+
+
+def main():
+    with open(Path(__file__).with_name("comparison.elephant.h200.csv"), newline="") as file:
+        rows = list(csv.DictReader(file))
+    jobs: dict[tuple[str, str, str], list[dict[str, str]]] = {}
+    for row in rows:
+        jobs.setdefault((row["design"], row["clock"], row["observer"]), []).append(row)
+    values = {
+        " ".join(job): {int(row["seed"]): float(row["best"]) for row in runs} for job, runs in jobs.items()
+    }
+    differences = {(pair["first"], pair["second"]): pair for pair in pairs(values, "best")}
+    for job, runs in jobs.items():
+        best = [float(row["best"]) for row in runs]
+        low, high = interval(best, np.median)
+        walk = [row for row in runs if float(row["best"]) < WALKS]
+        last = [row for row in walk if float(row["later"]) >= 0.7 and float(row["tilt"]) < 30]
+        anew = [row for row in runs if row["restarts"] != "0"]
+        pair = differences.get((" ".join(FIRST), " ".join(job)))
+        shown = "" if pair is None else f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
+        design, clock, observer = job
+        print(
+            f"| {'yes' if design == 'particle' else 'no'} | {'yes' if clock == 'true' else 'no'} | {observer} | "
+            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(anew)} | {shown} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
