@@ -89,7 +89,7 @@ def test_the_comparison_is_a_sweep(main):
     (folder,) = Path("outputs/sweep").iterdir()
     found = rows(folder / "sweep.csv")
     assert [(row["job"], row["seed"]) for row in found] == [
-        (str(k), f"30{n}") for k in range(4) for n in (0, 1)
+        (str(k), f"90{n}") for k in range(4) for n in (0, 1)
     ]
     assert {row["status"] for row in found} == {"finished"}
     conf = [load(folder / str(k)) for k in range(4)]
@@ -101,7 +101,7 @@ def test_the_comparison_is_a_sweep(main):
     assert not list(folder.rglob("run.h5")) and not list(folder.rglob("*.png"))
     figures.make([folder], folder / "figures")
     assert "| off | untrained |" in (folder / "figures" / "summary.md").read_text()
-    one = folder / "1" / "seed_300"
+    one = folder / "1" / "seed_900"
     assert main(f"resume='{one}'", "train.record_every=1", "train.pictures=true")[0] == 0
     assert {path.name for path in one.glob("*.png")} == {"loss.png", "robot.png"}  # no latent was learned
 
