@@ -1,4 +1,4 @@
-"""One kernel for all substeps of a control step gives the bits of one launch after the other."""
+"""One kernel for all substeps of a control step gives what one launch after the other gives."""
 
 import pytest
 import torch
@@ -14,11 +14,13 @@ NAMES = {"lattice": ("friction",), "particles": ("friction", "force")}
 
 
 @pytest.mark.parametrize("kind", NAMES)
-def test_the_same_bits_as_single_launches(kind, device, monkeypatch):
-    """Three control steps, of which the second begins inside a chunk; contact, a muscle, two worlds."""
+def test_the_same_as_single_launches(kind, device, monkeypatch):
+    """Three control steps, of which the second begins inside a chunk; contact, a muscle, two worlds. Bits are the same on a CPU, where
+    both forms call the same compiled functions. On a GPU compilers fuse products and sums of each kernel in their own way, so the forms
+    agree to rounding, and the single kernel with itself bit by bit: a race between its stages would show."""
     made, found = block(2), []
     body = softmpm.Body(softmpm.box((0.3, 0.3), (0.5, 0.5), spacing=0.05), made.bodies[0].material)
-    for persistent in (False, True):
+    for persistent in (False, True, True):
         model = build(
             block(2, bodies=[body]), device=device, dtype=torch.float64, worlds=2, inputs=NAMES[kind]
         )
@@ -38,5 +40,10 @@ def test_the_same_bits_as_single_launches(kind, device, monkeypatch):
         assert end.nodes is not None and end.nodes.force.abs().max() > 0
         gradients = torch.autograd.grad(dot(cotangent(end), end), list(leaves.values()))
         found.append([*end[:4], *end.nodes, *gradients])
-    for one, other in zip(*found, strict=True):
-        assert torch.equal(one, other)
+    for one, other, again in zip(*found, strict=True):
+        assert torch.equal(other, again)
+        if torch.device(device).type == "cpu":
+            assert torch.equal(one, other)
+        else:
+            size = one.double().nan_to_num(0.0, 0.0, 0.0).norm()
+            torch.testing.assert_close(other, one, rtol=0.0, atol=1e-12 * size.item())
