@@ -38,6 +38,12 @@ def outgrown(words: list[int]) -> bool:
     return any(decode(words[world])[1] is Kind.LEFT_WINDOW for world in failed_worlds(words))
 
 
+def began_outside(words: list[int]) -> bool:
+    """True if a particle was outside of the allocated part of the grid as soon as the chunk began."""
+    found = (decode(words[world]) for world in failed_worlds(words))
+    return any(kind is Kind.LEFT_WINDOW and substep == 0 for substep, kind, _ in found)
+
+
 def failed_worlds(words: list[int]) -> list[int]:
     """Worlds whose status word reports a failure."""
     return [world for world, word in enumerate(words) if word not in (NEVER, FROZEN)]

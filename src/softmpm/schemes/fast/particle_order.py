@@ -3,9 +3,10 @@
 Both may be out of date without affecting results. A stale order costs speed only; particles are re-sorted when neighbours in
 memory share their cell too rarely. The window is the allocated part of the grid, at a separate place in each world, and it is
 re-centred when a particle comes near its edge. If a particle or a surface point leaves it, the chunk is repeated: with the window
-centred on its initial state or, if it was already centred or this is not the first time, with a larger window. A captured graph cannot
-do this: after a replay in which one left, the window is enlarged and the graph captured again. The cost of a substep is proportional
-to the window, not to the grid.
+centred on its initial state or, if it was already centred or this is not the first time, with a larger window. If it was outside
+as the chunk began, because the call began elsewhere, the window is centred only. A captured graph cannot do this: after a replay
+in which one left, the window is enlarged and the graph captured again. The cost of a substep is proportional to the window, not to
+the grid.
 """
 
 import math
@@ -44,7 +45,7 @@ class ParticleLayout:
         shape: Nodes of the window along each axis.
         version: Number of updates.
         stale: Whether the particles should be re-sorted.
-        left: Whether a particle has left the window before.
+        left: Whether a particle has left the window before, on the way.
         outgrown: Whether the window must be enlarged, because a particle left it inside a captured graph.
     """
 

@@ -15,7 +15,7 @@ from softmpm.schemes.alarm_check import StartCheck
 from softmpm.schemes.capture import after_replay, is_capturing, keep_alive
 from softmpm.schemes.carried import check_start
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.failure_report import outgrown
+from softmpm.schemes.failure_report import began_outside, outgrown
 from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
 from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
 from softmpm.schemes.fast.footprint import FastFootprint
@@ -175,7 +175,7 @@ class Fast:
         """Update the staleness of the layout; False if a particle or a surface point left the window."""
         *words, cells, near_edge = words
         if outgrown(words):
-            self._widen(run)
+            self._widen(run, began_outside(words))
             return False
         run.pool.layout.update_staleness(cells, bool(near_edge))
         return True
@@ -195,12 +195,15 @@ class Fast:
         state = self.model.rest()
         return state if self.model.surface is None else with_surface(self.model, state, {})
 
-    def _widen(self, run: FastRun) -> None:
-        """After a particle left the window: centre it on the initial state the first time, enlarge it from then on."""
+    def _widen(self, run: FastRun, began_outside: bool) -> None:
+        """After a particle left the window: centre it on the initial state the first time, enlarge it from then on.
+
+        A call that began elsewhere, as each episode does after a walk, says nothing about the room that a chunk needs.
+        """
         layout = run.pool.layout
-        if run.updated or layout.left:
+        if run.updated or (layout.left and not began_outside):
             self._use(layout.grown(run.start.x))
         else:
             layout.resort(run.start.x)
-            layout.left = True
+            layout.left = layout.left or not began_outside
         self._widened = True

@@ -288,6 +288,16 @@ def test_a_robot_that_wanders_takes_its_window_along(sign, watched, device):
     assert_same(got, want, 1e-12)  # 350 substeps
 
 
+def test_episodes_that_begin_anew_leave_the_window_as_large_as_it_is(watched, device):
+    """Each begins 25 cells from where the one before ended: the window goes back, and memory does not grow with the episodes."""
+    v = torch.tensor([4.5, 1.0], dtype=torch.float64)
+    _, fly = flight(robot(2, [(15, 28)], grid=(80, 64), device=device), v, 25, calls=14)
+    first, *later = [fly() for _ in range(5)]
+    assert len(watched.made) == 1 and not watched.grown_from
+    for got in later:
+        assert_same(got, first, 1e-12)
+
+
 def test_programs_that_are_used_again_see_where_the_window_went(watched, device):
     """Without gradients every call takes the same program: it follows the robot without growing, as the plain scheme does."""
     ends = []
