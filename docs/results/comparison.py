@@ -36,6 +36,12 @@ def main():
             f"| {'yes' if design == 'particle' else 'no'} | {'yes' if clock == 'true' else 'no'} | {observer} | "
             f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(anew)} | {shown} |"
         )
+    print("The latent minus another observer, with the same design and clock:")
+    for design, clock, observer in jobs:
+        pair = differences.get((f"{design} {clock} latent", f"{design} {clock} {observer}"))
+        if pair is not None:
+            shown = f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
+            print(f"design={design} clock={clock} {observer}: {shown}")
 
 
 if __name__ == "__main__":
