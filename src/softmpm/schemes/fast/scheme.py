@@ -205,5 +205,6 @@ class Fast:
             self._use(layout.grown(run.start.x))
         else:
             layout.resort(run.start.x)
-            layout.left = layout.left or not began_outside
+            if not began_outside:
+                layout.left = True
         self._widened = True
