@@ -2,7 +2,7 @@
 
 A cluster of blocks has a world. Where the launches of launches.py follow each other, its multiprocessors wait for each other at a
 barrier of the hardware. The stages are the functions of the kernels that are launched one by one, and the results are theirs up to
-rounding: on a GPU the compiler fuses other products and sums. On the CPU, for tests, one thread does everything.
+rounding, see docs/decisions/0010-reference-formulation.md. On the CPU, for tests, one thread does everything.
 """
 
 from types import SimpleNamespace
