@@ -13,6 +13,11 @@ WALKS = -0.5
 FIRST = ("particle", "true", "latent")
 
 
+def shown(pair: dict | None) -> str:
+    """Mean difference with its interval; nothing of a job with itself."""
+    return "" if pair is None else f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
+
+
 def main():
     with open(Path(__file__).with_name("comparison.elephant.h200.csv"), newline="") as file:
         rows = list(csv.DictReader(file))
@@ -29,19 +34,25 @@ def main():
         walk = [row for row in runs if float(row["best"]) < WALKS]
         last = [row for row in walk if float(row["later"]) >= 0.7 and float(row["tilt"]) < 30]
         anew = [row for row in runs if row["restarts"] != "0"]
-        pair = differences.get((" ".join(FIRST), " ".join(job)))
-        shown = "" if pair is None else f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
+        difference = shown(differences.get((" ".join(FIRST), " ".join(job))))
         design, clock, observer = job
         print(
             f"| {'yes' if design == 'particle' else 'no'} | {'yes' if clock == 'true' else 'no'} | {observer} | "
-            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(anew)} | {shown} |"
+            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(anew)} | {difference} |"
         )
     print("The latent minus another observer, with the same design and clock:")
     for design, clock, observer in jobs:
         pair = differences.get((f"{design} {clock} latent", f"{design} {clock} {observer}"))
         if pair is not None:
-            shown = f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
-            print(f"design={design} clock={clock} {observer}: {shown}")
+            print(f"design={design} clock={clock} {observer}: {shown(pair)}")
+    walking = [row for row in rows if float(row["best"]) < WALKS]
+    torn = sum(row["last"] == "" for row in walking)
+    fell = sum(row["last"] != "" and float(row["last"]) > 0.8 * float(row["best"]) for row in walking)
+    anew = [row for row in rows if row["restarts"] != "0"]
+    print(
+        f"{len(walking)} walk; the last evaluation of {torn} failed, that of {fell} is below 0.8 of their best"
+    )
+    print(f"{len(anew)} began anew, {sum(row in walking for row in anew)} of which walk")
 
 
 if __name__ == "__main__":
