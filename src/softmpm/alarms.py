@@ -63,12 +63,13 @@ class Failures:
     in the rest of the call. It returns in that state (``freeze``) or in the rest state (``reset``), and contributes no gradient. The
     other worlds are the same as without it, to the last bit where sums have a fixed order.
 
-    Inside a :class:`softmpm.Graph` calls without gradient collect failures too: after each replay ``errors`` has the first one of each
-    world that is not in it yet, so clear it before the next. A world stops where it failed, and one that is frozen stays there.
+    It works inside a :class:`softmpm.Graph` too: after each replay ``errors`` has the first failure of each world that is not in it
+    yet, so clear it before the next. There a world stops where it failed, and one that is frozen stays there.
 
     Attributes:
         policy: ``freeze`` or ``reset``.
         errors: What would have been raised, in the order in which it was found; ``world`` and ``substep`` say where and when.
+        note: Added to the errors of the calls that are made while it is set, such as the place of a call among others.
     """
 
     def __init__(self, policy: Policy):
@@ -78,6 +79,7 @@ class Failures:
         )
         self.policy: Policy = policy
         self.errors: list[UnstableError] = []
+        self.note = ""
 
     def __len__(self) -> int:
         return len(self.errors)

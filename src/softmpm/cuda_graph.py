@@ -9,22 +9,20 @@ from softmpm.errors import NEVER
 from softmpm.schemes.capture import GraphResources, collected_resources, exclusive_capture
 
 Result = TypeVar("Result")
-Called = TypeVar("Called")
 
 
 class Graph(Generic[Result]):
     """A function, which may call :func:`softmpm.simulate`, captured once as a CUDA graph and replayed without any launch from the host.
 
-    On the CPU the function is called each time. After a replay that reports a failure ``again`` is called, which raises
-    the error; the captured graph stays. Calls that collect failures (:class:`softmpm.Failures`) go on without the worlds that
-    failed. If a particle only left the allocated part of the grid, that part is enlarged, the function is called, and the next call
+    On the CPU the function is called each time. After a replay in which a call collected failures (:class:`softmpm.Failures`) they are
+    known; after one in which another call failed, the function is called without the graph, which raises the error. The captured graph
+    stays. If a particle only left the allocated part of the grid, that part is enlarged, the function is called, and the next call
     captures again.
 
     Args:
         work: Takes nothing and gives tensors. It must do the same on the same tensors each time, without asking the device
             for a number: what changes between calls is written into tensors that it reads. Gradients are taken inside it.
         device: Where it runs.
-        again: Does the same simulations, without gradients at best, and gives nothing; None: ``work`` itself.
 
     Example:
         >>> def work():
@@ -32,21 +30,15 @@ class Graph(Generic[Result]):
         ...     return loss.detach(), grad(loss, list(policy.parameters()))
         >>> graph = softmpm.Graph(work, model.device)
         >>> loss, gradients = graph()  # overwritten by the next call
-
-    Attributes:
-        failed: Worlds in which the last replay failed; the error that was raised is of one of them.
     """
 
-    def __init__(
-        self, work: Callable[[], Result], device: torch.device, again: Callable[[], object] | None = None
-    ):
-        self.work, self.device, self.again = work, device, again
+    def __init__(self, work: Callable[[], Result], device: torch.device):
+        self.work, self.device = work, device
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._resources: GraphResources | None = None
         self._warm = False
         self._any_failed: torch.Tensor | None = None
-        self.failed: list[int] = []
 
     def __call__(self) -> Result:
         """The result of the function; once captured, in the same tensors each time.
@@ -54,11 +46,10 @@ class Graph(Generic[Result]):
         Raises:
             UnstableError: As ``simulate`` does.
         """
-        self.failed = []
         if self._stream is None:
             return self.work()
         if not self._warm:
-            result = self._run(self._stream, self.work)
+            result = self._run(self._stream)
             # It created what a capture must not: kernels, buffers, an order of the particles.
             self._warm = True
             return result
@@ -71,22 +62,19 @@ class Graph(Generic[Result]):
         for changed in self._resources.changed:
             changed()
         if self._any_failed is not None and self._any_failed.item():
-            self.failed = self._resources.failed()
             if self._resources.widen():
                 self._graph = self._resources = None
                 self._warm = False
                 return self()
             if not self._resources.collect():
-                if self.again is not None:
-                    self._run(self._stream, self.again)
-                return self._run(self._stream, self.work)  # where sums in another order did not fail
+                return self._run(self._stream)  # where sums in another order did not fail
         return self._result
 
-    def _run(self, stream: torch.cuda.Stream, work: Callable[[], Called]) -> Called:
-        """Call a function on the stream of the capture, for which the buffers exist."""
+    def _run(self, stream: torch.cuda.Stream) -> Result:
+        """Call the function on the stream of the capture, for which the buffers exist."""
         stream.wait_stream(torch.cuda.current_stream(self.device))
         with torch.cuda.stream(stream):
-            result = work()
+            result = self.work()
         torch.cuda.current_stream(self.device).wait_stream(stream)
         return result
 

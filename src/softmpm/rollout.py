@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from softmpm.alarms import Failures
 from softmpm.errors import NEVER
@@ -40,6 +41,14 @@ class Trail:
     """Acquired by the backward pass that is running."""
     frozen: dict[int, int] = field(default_factory=dict)
     """Worlds that failed, and the substep from which they were inactive."""
+    failed: Tensor | None = None
+    """Of a captured call that collects failures: worlds that failed, shape (world,)."""
+
+    def without(self, model: Model) -> Tensor | None:
+        """Worlds that contribute no gradient, shape (world,), None if all do."""
+        if self.failed is not None or not self.frozen:
+            return self.failed
+        return torch.tensor([world in self.frozen for world in range(model.worlds)], device=model.device)
 
     def keep(self, run: Run) -> None:
         """Retain a run without its final state: the last one is the result of the call, which refers to this trail."""
@@ -128,11 +137,6 @@ def _returned(model: Model, end: Any, start: Any, runner: Runner) -> Any:
 
 def _captured(runner: Runner, trail: Trail, inside: bool) -> Any:
     """:func:`rollout` while PyTorch captures a graph, without reading anything back."""
-    if inside and runner.failures is not None:
-        raise RuntimeError(
-            "softmpm: inside a softmpm.Graph failures are collected without a gradient only: call simulate under torch.no_grad, or "
-            "without failures, which raises the first one."
-        )
     keep_alive(runner.model)
     state: Any = trail.start
     checkpointed = trail.checkpointed
@@ -143,7 +147,9 @@ def _captured(runner: Runner, trail: Trail, inside: bool) -> Any:
         state = run.end
         if inside:
             trail.keep(run)
-    return runner.captured(runner.scheme.to_user(state))
+    end = runner.captured(runner.scheme.to_user(state))
+    trail.failed = runner.failed
+    return end
 
 
 @on_its_gpu
@@ -159,38 +165,35 @@ def rollout_adj(
         UnstableError: An adjoint is not finite.
     """
     adj_inputs = InputsAdj(model, wanted, horizon.control_steps)
-    adj: Any = _without(trail.frozen, adj_end)
+    failed = trail.without(model)
+    adj: Any = _contiguous(adj_end, failed)
     reports, runner = [], Runner(model, values)
-    runner.frozen = trail.frozen
+    runner.frozen, runner.failed = trail.frozen, trail.failed
     with trail.lock:
         for run in _inside_out(trail, runner):
             adj = run.vjp(adj, adj_inputs, wanted)
+            words = run.words[: model.worlds]  # another backward pass overwrites them
+            words = words.clone() if failed is None else words.masked_fill(failed, NEVER)
             if is_capturing(model):
-                defer_status_check(
-                    run.words[: model.worlds].clone()
-                )  # a second backward pass overwrites them
+                defer_status_check(words)
             else:
-                reports.append((Report(run.words), run.chunk.first + run.chunk.length - 1))
+                reports.append((Report(words), run.chunk.first + run.chunk.length - 1))
             del run  # release its buffers before the previous chunk is recomputed
     for report, last in reports:
-        words = report.read()[: model.worlds]
-        for world in trail.frozen:
-            words[world] = NEVER
-        raise_gradient_failure(model, words, adj_end, last, horizon.total)
+        raise_gradient_failure(model, report.read(), adj_end, last, horizon.total)
     adj = runner.scheme.to_user(adj)
-    for world in trail.frozen:  # a state off the grid has no adjoint
-        for tensor in adj.differentiable():
-            tensor[world] = 0
-        adj_inputs.clear_world(world)
+    if failed is not None:  # a state off the grid has no adjoint
+        adj = _contiguous(adj, failed)
+        adj_inputs.clear(failed)
     return adj, adj_inputs
 
 
-def _without(frozen: dict[int, int], adj_end: Any) -> Any:
-    """The adjoint of the final state, contiguous, and zero for worlds that failed."""
-    tensors = [a.clone() if frozen else a.contiguous() for a in adj_end.differentiable()]
-    for tensor in tensors if frozen else ():
-        tensor[sorted(frozen)] = 0
-    return type(adj_end).of(tensors)
+def _contiguous(adj: Any, failed: Tensor | None) -> Any:
+    """The adjoint of a state, contiguous, and zero for worlds that failed."""
+    tensors = [a.contiguous() for a in adj.differentiable()]
+    if failed is not None:
+        tensors = [a.masked_fill(failed.view(-1, *(1,) * (a.dim() - 1)), 0.0) for a in tensors]
+    return type(adj).of(tensors)
 
 
 def _taken(trail: Trail, runner: Runner) -> dict[int, Any]:

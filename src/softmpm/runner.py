@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from softmpm.alarms import Failures
-from softmpm.errors import FROZEN, UnstableError
+from softmpm.errors import FROZEN, NEVER, UnstableError
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
@@ -29,11 +29,13 @@ class Runner:
 
     Attributes:
         frozen: First inactive substep of each world that failed.
+        failed: Worlds that failed in a captured call that collects failures, on the device, shape (world,); None before its end.
     """
 
     def __init__(self, model: Model, values: Values, failures: Failures | None = None):
         self.model, self.values, self.failures = model, values, failures
         self.frozen: dict[int, int] = {}
+        self.failed: Tensor | None = None
         self._deferred: list[Tensor] = []
         self._end: Any = None
         self.scheme: Scheme = SCHEMES[model.scheme].of(model)
@@ -98,8 +100,15 @@ class Runner:
             finally:
                 # The error would refer to itself through this frame, and keep the objects of the frame alive.
                 del error
-        self.failures.errors.append(error)
+        self._note(error, self.failures.note)
         self.frozen[error.world] = first
+
+    def _note(self, error: UnstableError, note: str) -> None:
+        """Collect a failure."""
+        assert self.failures is not None
+        if note:
+            error.add_note(note)
+        self.failures.errors.append(error)
 
     def _located(self, run: Run, words: list[int]) -> UnstableError:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
@@ -143,29 +152,30 @@ class Runner:
 
     def _defer(self, words: Tensor, outgrow: Callable[[], None] | None, first: int, **about: Any) -> None:
         """Check these words after each replay of the graph that is being captured; collect failures if the call does."""
+        if self.failed is not None:  # in the backward pass of a call that collected them
+            words = words.masked_fill(self.failed, NEVER)
         if self.failures is None:
             defer_status_check(words, outgrow)
             return
         about |= {"first": first, "values": stiffest(self.model, about.get("values", self.values))}
         self._deferred.append(words)
-        defer_status_check(words, outgrow, functools.partial(self._collect, about))
+        defer_status_check(words, outgrow, functools.partial(self._collect, about, self.failures.note))
 
-    def _collect(self, about: dict[str, Any], words: list[int]) -> None:
+    def _collect(self, about: dict[str, Any], note: str, words: list[int]) -> None:
         """Collect the first failure of each world in the last replay, in which a world that failed stays as it is and fails on."""
         assert self.failures is not None
         for world in failed_worlds(words):
             if world not in self.failures.worlds:
-                self.failures.errors.append(
-                    failure(self.model, words, world, self.scheme.particles(self._end), **about)
-                )
+                end = self.scheme.particles(self._end)
+                self._note(failure(self.model, words, world, end, **about), note)
 
     def captured(self, end: Any) -> Any:
         """The final state of a captured call that collects failures, as :class:`Failures` has it."""
         if self.failures is None:
             return end
         self._end = end
+        self.failed = (torch.stack(self._deferred) < FROZEN).any(dim=0)
         if self.failures.policy == "freeze":
             return end
         self.scheme.jumped()
-        failed = (torch.stack(self._deferred) < FROZEN).any(dim=0)
-        return chosen(failed, self.scheme.rest(), end)
+        return chosen(self.failed, self.scheme.rest(), end)

@@ -99,12 +99,13 @@ def run_episode(
             activation from then on, or it would fail again and again.
 
     Raises:
-        softmpm.UnstableError: With a note that names the control step.
+        softmpm.UnstableError: With a note that names the control step, as those have that are collected.
     """
     state = model.rest() if start is None else start
     period, times = task.control_period, _times(task, model)
     made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
     for step in range(task.control_steps):
+        place = f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s."
         observation = observer.observe(model, state)
         if keep_every and step % keep_every == 0:
             observations.append(observation.detach())
@@ -113,6 +114,8 @@ def run_episode(
         if failures:
             failed = torch.tensor(failures.worlds, device=activation.device)
             activation = activation.index_fill(0, failed, 0.0)
+        if failures is not None:
+            failures.note = place
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
         try:
@@ -126,10 +129,7 @@ def run_episode(
                 failures=failures,
             )
         except softmpm.UnstableError as error:
-            when = f"which began at {step * period:.4g} s"
-            if error.kind == "overlap":
-                error.add_note("To train a robot that passes through itself, set task.overlap=true.")
-            error.add_note(f"In control step {step} of {task.control_steps}, {when}.")
+            error.add_note(place)
             raise
         made.features.append(features)
         made.activations.append(activation)
@@ -230,10 +230,10 @@ class ClosedLoop:
         self.design, self.weights, self.free = design, weights, free
         self.runs, self.keep_every = runs, keep_every
         self._goal: Tensor | None = None
-        self._failed: list[int] = []
+        self._failures = softmpm.Failures("reset")
         self._captures = _captures(model)
         loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
-        self._graph = softmpm.Graph(lambda: loop._work(), model.device, again=lambda: loop._simulate())
+        self._graph = softmpm.Graph(lambda: loop._work(), model.device)
 
     def __call__(
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
@@ -242,42 +242,42 @@ class ClosedLoop:
         by the next call. With ``on_frame`` the CUDA graph is bypassed.
 
         Raises:
-            softmpm.UnstableError: As :func:`run_episode`.
+            softmpm.UnstableError: One of :attr:`errors`.
         """
         if goal is not None:
             self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
-        self._failed = []
-        return self._graph() if self._captures and not on_frame else self._work(on_frame)
+        self._failures.errors.clear()
+        try:
+            found = self._graph() if self._captures and not on_frame else self._work(on_frame)
+        except softmpm.UnstableError as error:
+            if not self._failures:  # that of a gradient, or the first of a single run
+                self._failures.errors.append(error)
+            raise
+        if self._failures:
+            raise self._failures.errors[0]
+        return found
 
     @property
-    def failed(self) -> list[int]:
-        """Worlds in which the last call failed, where more are known than the error says."""
-        return self._failed or self._graph.failed
-
-    @torch.no_grad()
-    def _simulate(self) -> None:
-        """The episode alone."""
-        self._episode()
-
-    def _episode(self, **about) -> Episode:
-        params, inputs = self.design()
-        about |= dict(inputs=inputs, goal=self._goal, fade=self.fade)
-        return run_episode(self.task, self.model, self.observer, self.policy, params, **about)
+    def errors(self) -> list[softmpm.UnstableError]:
+        """Failures of the last call, those of all runs."""
+        return self._failures.errors
 
     def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
-        # One failure need not hide those of other runs, unless the device cannot be asked:
-        collects = self.runs > 1 and not (
-            self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+        params, inputs = self.design()
+        capturing = self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+        # A failure must not hide those of other runs, and while a graph is captured none is known yet; a single run may stop at once.
+        failures = self._failures if capturing or self.runs > 1 else None
+        about: dict[str, Any] = dict(
+            inputs=inputs, goal=self._goal, fade=self.fade, keep_every=self.keep_every
         )
-        failures = softmpm.Failures("reset") if collects else None
-        episode = self._episode(keep_every=self.keep_every, on_frame=on_frame, failures=failures)
+        about |= dict(on_frame=on_frame, failures=failures)
+        episode = run_episode(self.task, self.model, self.observer, self.policy, params, **about)
         if failures:
-            self._failed = failures.worlds
             try:
                 raise failures.errors[0]
             finally:
                 # The error would refer to itself through this frame, and keep all states of the simulation alive.
-                del failures, episode
+                del failures, episode, about
         activations = episode.decisions.activations
         loss = (
             episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()

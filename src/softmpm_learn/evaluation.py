@@ -29,7 +29,7 @@ def evaluate(runs: Runs) -> list[float]:
     losses, failed = [], dict[int, softmpm.UnstableError]()
     for goal in runs.evaluation_goals() or [None]:
         losses.append(runs.evaluator(goal).unflatten(0, (len(runs.all), -1)).mean(dim=1))
-        failed = runs.failed(runs.evaluator.failures) | failed
+        failed = runs.failed(runs.evaluator.failures.errors) | failed
     for k, error in failed.items():
         logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
         losses[0][k] = math.nan

@@ -142,7 +142,7 @@ def replayed(runs: Runs, task: Task, own: list[Path | None]) -> list[Path | None
 
 def _each(runs: Runs, name: str, failures: Failures, path: Path) -> list[Path | None]:
     """The part of a motion that each run has, None where one of its worlds failed, which the log tells."""
-    failed = runs.failed(failures)
+    failed = runs.failed(failures.errors)
     for error in failed.values():
         logger.warning("Examination, %s: %s", name, error)
     return [None if k in failed else _of(path, runs.worlds(k)) for k in range(len(runs.all))]

@@ -15,7 +15,7 @@ from softmpm_learn.episode import Episode
 from softmpm_learn.evaluation import due, evaluate
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
-from softmpm_learn.runs import AlsoFailedError, Runs
+from softmpm_learn.runs import Runs
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -23,12 +23,15 @@ logger = logging.getLogger("softmpm_learn")
 class TrainingError(RuntimeError):
     """A simulation failed or a gradient is not finite; the checkpoint of the iterations before is on the disk."""
 
-    def __init__(self, iteration: int, problem: str):
+    def __init__(self, iteration: int, problem: Exception):
+        helps = "a smaller time step (task.safety), smaller learning rates, tighter bounds of the design, or optimizer.max_norm"
+        if isinstance(problem, softmpm.UnstableError) and problem.kind == "overlap":
+            helps = "task.overlap=true, with which a robot may pass through itself"
         super().__init__(
-            f"iteration {iteration}: {problem} The run up to there is saved; what helps is a smaller time step "
-            "(task.safety), smaller learning rates, tighter bounds of the design, or optimizer.max_norm."
+            f"iteration {iteration}: {in_full(problem)} The run up to there is saved; what helps is {helps}."
         )
         self.iteration = iteration
+        self.__cause__ = problem
 
 
 class NotFiniteError(RuntimeError):
@@ -60,8 +63,10 @@ def optimise(
         try:
             episode, rows = attempt(runs, goals, loggers, seconds)
             failed = {k: error for k, error in rows.items() if isinstance(error, NotFiniteError)}
-        except (softmpm.UnstableError, OtherProcessError) as error:
-            failed = runs.blamed(error) if isinstance(error, softmpm.UnstableError) else {0: error}
+        except softmpm.UnstableError as error:
+            failed = runs.failed([error, *runs.loop.errors])
+        except OtherProcessError as error:
+            failed = {0: error}
         if not failed:
             found = {k: row | {"retries": retries[k]} for k, row in rows.items() if isinstance(row, dict)}
             update(runs, found)
@@ -70,11 +75,6 @@ def optimise(
         with runs.group.fail_together():
             save_before(runs, loggers, {k: s for k, s in streams.items() if ends or k in failed})
         for k, error in failed.items():
-            if (
-                isinstance(error, AlsoFailedError)
-                and retries.get(k, 0) >= runs.all[k].settings.optimizer.retries
-            ):
-                continue  # more than half a step back takes an error of its own
             go_back(runs, k, error, retries.get(k, 0))
             retries[k] += 1
     return {}, None
@@ -110,8 +110,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
         else:
             logger.warning("Iteration %d: %s The run is %s.", run.iteration, error, run.fall_back())
         return
-    ended = TrainingError(run.iteration, in_full(error))
-    ended.__cause__ = error
+    ended = TrainingError(run.iteration, error)
     if k not in runs.active:
         raise ended
     runs.errors[k] = ended

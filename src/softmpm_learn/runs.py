@@ -13,20 +13,13 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from softmpm import Failures, UnstableError
+from softmpm import UnstableError
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.episode import ClosedLoop, Evaluator
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
 from softmpm_learn.side_by_side import Designs, Observers, Policies
 from softmpm_learn.stacking import Stacked
-
-
-class AlsoFailedError(RuntimeError):
-    """The robot of a run failed in the same replay as that of another run, whose error says how."""
-
-    def __init__(self, name: str):
-        super().__init__(f"the robot of {name} failed in the same simulation.")
 
 
 class Runs:
@@ -109,16 +102,9 @@ class Runs:
         """Number of the run in whose world a simulation failed."""
         return error.world // self.share
 
-    def blamed(self, error: UnstableError) -> dict[int, Exception]:
-        """Runs that a failure is of, by their number: the one that it names, and those whose robots failed in the same replay."""
-        first = self.owner(error)
-        others = {world // self.share for world in self.loop.failed} - {first}
-        found: dict[int, Exception] = {first: error}
-        return found | {k: AlsoFailedError(self.name(k)) for k in sorted(others)}
-
-    def failed(self, failures: Failures) -> dict[int, UnstableError]:
+    def failed(self, errors: Sequence[UnstableError]) -> dict[int, UnstableError]:
         """The first of some failures in the worlds of each run that has one, by its number."""
-        return {self.owner(error): error for error in reversed(failures.errors)}
+        return {self.owner(error): error for error in reversed(errors)}
 
     @contextlib.contextmanager
     def failing_together(self) -> Iterator[None]:
@@ -132,9 +118,9 @@ class Runs:
                     error.add_note(
                         f"This was in process {self.group.rank}, whose world {error.world} is world {world} of the run."
                     )
-                elif len(self.all) > 1:
-                    name = self.name(self.owner(error))
-                    error.add_note(f"World {error.world} is world {error.world % self.share} of {name}.")
+                for one in self.loop.errors if len(self.all) > 1 else ():
+                    name = self.name(self.owner(one))
+                    one.add_note(f"World {one.world} is world {one.world % self.share} of {name}.")
                 raise
 
     def goals(self, drawing: Sequence[int]) -> Tensor | None:

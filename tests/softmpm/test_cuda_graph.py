@@ -11,6 +11,8 @@ from helpers import KINDS, assert_relative, busy_inputs, busy_scene, run
 import softmpm
 from softmpm import autograd, rollout, runner
 from softmpm.errors import NEVER
+from softmpm.planning.chunks import Horizon
+from softmpm.planning.memory import plan
 from softmpm.schemes import capture
 from softmpm.schemes.fast import chunk_buffers
 from softmpm.schemes.fast import scheme as fast_scheme
@@ -62,7 +64,7 @@ def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
         did.append("record")
         raise RuntimeError("not now")
 
-    monkeypatch.setattr(softmpm.Graph, "_run", lambda self, stream, work: did.append("run"))
+    monkeypatch.setattr(softmpm.Graph, "_run", lambda self, stream: did.append("run"))
     monkeypatch.setattr(softmpm.Graph, "_capture", record)
     for _ in range(2):
         graph()
@@ -102,14 +104,24 @@ def test_a_function_without_a_simulation_is_captured_too():
 FORMULATIONS = {"moving": {}, "reference": dict(formulation="reference")}
 
 
-def falling_pair(device: str = "cpu", **settings):
-    """A model and a start from which world 1 collapses in the first of a few calls, while world 0 goes on."""
+def falling_pair(device: str = "cpu", rate: float = -400.0, **settings):
+    """A model and a start from which world 1 fails in the first of a few calls, while world 0 goes on.
+
+    Args:
+        rate: At which world 1 expands at the start [1/s]; at this one it collapses.
+    """
     made = busy_scene(2, ("fixed_corotated",), walls=[], muscles=[], per_law=30)
     model = softmpm.build(made, device=device, worlds=2, **settings)
     start = model.rest()
-    start.C[1] = -400.0 * torch.eye(2)
+    start.C[0, :, 0, 1] = 20.0  # without strains its gradient would be rounding
+    start.C[1] = rate * torch.eye(2)
     start.x[:, :, 0] += 3.5 * made.grid.spacing
     return model, start
+
+
+def healthy(C):
+    """The same velocity gradients, none in world 1."""
+    return torch.stack([C[0], torch.zeros_like(C[1])])
 
 
 def three_calls(model, start, failures):
@@ -133,31 +145,103 @@ def assert_goes_on(model, end, failures, alone):
 def test_a_recording_goes_on_without_a_world_that_failed(settings, monkeypatch):
     """Failures of a recorded loop are collected after a replay, by the same rules as those of a call."""
     model, start = falling_pair(**settings)
-    alone = three_calls(model, start._replace(C=torch.zeros_like(start.C)), None)
+    alone = three_calls(model, start._replace(C=healthy(start.C)), None)
     called, recorded = softmpm.Failures("reset"), softmpm.Failures("reset")
     assert_goes_on(model, three_calls(model, start, called), called, alone)
     for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         end = three_calls(model, start, recorded)
-    assert not recorded.errors and resources.failed() == [1]
+    assert not recorded.errors
     assert not resources.widen() and resources.collect()
     assert_goes_on(model, end, recorded, alone)
     assert recorded.errors[0].particle == called.errors[0].particle
     with capture.collected_resources() as resources:
         three_calls(model, start, None)
-    assert resources.failed() == [1] and not resources.collect()
+    assert not resources.collect()
 
 
-def test_a_recording_with_gradient_does_not_collect_failures(monkeypatch):
-    """The gradient of a world that failed is not finite, and only the host could leave it out."""
-    model, start = falling_pair()
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner):
+def gradient(model, start, failures):
+    """Of the end of two calls with respect to the start and the material of each world; the first call has a note."""
+    v, params = start.v.clone().requires_grad_(), model.params()
+    young = params.young.expand(2, -1).clone().requires_grad_()
+    state = start._replace(v=v)
+    for note in ("Call 0.", ""):
+        if failures is not None:
+            failures.note = note
+        params = params._replace(young=young)
+        state = softmpm.simulate(model, state, None, params, substeps=20, failures=failures)
+    weights = torch.linspace(1.0, 2.0, state.x.numel(), device=state.x.device).view_as(state.x)
+    loss = (state.x * weights).sum()
+    return torch.autograd.grad(loss, (v, young))
+
+
+def assert_gradient(got, want):
+    """That of world 0 is as if it were alone; world 1 has none of its first call, and that of a robot at rest of the second."""
+    for one, wanted in zip(got, want, strict=True):
+        assert_relative(one[0], wanted[0], 2e-5)
+        assert wanted[0].abs().max() > 0 and torch.isfinite(one[1]).all()
+    assert (got[0][1] == 0).all() and (want[0][1] != 0).any()
+
+
+def assert_one_failure(failures, kind):
+    """World 1 failed in the first call."""
+    (error,) = failures.errors
+    assert (error.world, error.kind, error.__notes__) == (1, kind, ["Call 0."])
+
+
+BUDGETS = {"all states are kept": None, "states are computed again": 30_000}
+
+
+FAILS = {"collapsed": -400.0, "not_finite": 1e10}
+"""Rates at which world 1 expands at the start [1/s], by how it fails."""
+
+
+@pytest.mark.parametrize("kind", FAILS)
+@pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
+@pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
+def test_a_recording_differentiates_the_worlds_that_did_not_fail(settings, budget, kind, monkeypatch):
+    """The one that failed has no gradient, and no failure of its backward pass is reported."""
+    model, start = falling_pair(rate=FAILS[kind], memory_budget=budget, **settings)
+    assert plan(Horizon(1, 20), model.sizes(), model.budget).keep_all == (budget is None)
+    still = start._replace(C=healthy(start.C))
+    want, called, recorded = (
+        gradient(model, still, None),
+        softmpm.Failures("reset"),
+        softmpm.Failures("reset"),
+    )
+    assert_gradient(gradient(model, start, called), want)
+    assert_one_failure(called, kind)
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
-    start.x.requires_grad_()
-    failures = softmpm.Failures("freeze")
-    with capture.collected_resources(), pytest.raises(RuntimeError, match=r"under torch\.no_grad"):
-        softmpm.simulate(model, start, None, model.params(), substeps=20, failures=failures)
+    with capture.collected_resources() as resources:
+        got = gradient(model, start, recorded)
+    assert resources.collect()
+    assert_gradient(got, want)
+    assert_one_failure(recorded, kind)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", FAILS)
+@pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
+def test_a_graph_differentiates_the_worlds_that_did_not_fail(settings, kind):
+    """In each replay anew."""
+    model, start = falling_pair("cuda", FAILS[kind], **settings)
+    C = start.C.clone()
+    want = gradient(model, start._replace(C=healthy(C)), None)
+    failures = softmpm.Failures("reset")
+    graph = softmpm.Graph(lambda: gradient(model, start, failures), model.device)
+    for fails in (True, True, True, False, True):
+        start.C.copy_(C if fails else healthy(C))
+        failures.errors.clear()
+        got = graph()
+        if fails:
+            assert_gradient(got, want)
+            assert_one_failure(failures, kind)
+        else:
+            for one, wanted in zip(got, want, strict=True):
+                assert_relative(one, wanted, 2e-5)
+            assert not failures.errors
 
 
 @pytest.mark.gpu
@@ -165,7 +249,7 @@ def test_a_recording_with_gradient_does_not_collect_failures(monkeypatch):
 def test_a_graph_goes_on_without_a_world_that_failed(settings):
     """In each replay anew; one in which no world fails has no failures."""
     model, start = falling_pair("cuda", **settings)
-    still, C = torch.zeros_like(start.C), start.C.clone()
+    still, C = healthy(start.C), start.C.clone()
     alone = three_calls(model, start._replace(C=still), None)
     failures = softmpm.Failures("reset")
     graph = softmpm.Graph(lambda: three_calls(model, start, failures), model.device)

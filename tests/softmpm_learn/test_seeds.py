@@ -259,19 +259,17 @@ def test_a_retry_of_one_seed_leaves_the_others_as_they_are(task, conf, tmp_path,
     )
 
 
-def test_seeds_that_fail_in_one_replay_go_back_at_once(task, conf, tmp_path, monkeypatch):
-    """The error names one world; the graph knows all. One more simulation serves every seed that failed."""
+def test_seeds_that_fail_in_one_simulation_go_back_at_once(task, conf, tmp_path, monkeypatch):
+    """One more simulation serves every seed that failed."""
     conf, calls = changed(conf, observer=dict(name="centroids")), []
     real = ClosedLoop.__call__
 
     def counted(self, goal, on_frame=None):
         calls.append(1)
-        self._graph.failed = []
-        if len(calls) == 3:
-            self._graph.failed = [0, 2]
-            what = dict(kind="inverted", particle=3, substep=1, value=-1.0, limit="det F > 0")
-            raise softmpm.UnstableError("particle 3 is inverted.", world=0, **what)
-        return real(self, goal, on_frame)
+        with pytest.MonkeyPatch.context() as patch:
+            if len(calls) == 3:
+                fails_in((0, 2), patch)
+            return real(self, goal, on_frame)
 
     monkeypatch.setattr(ClosedLoop, "__call__", counted)
     together(task, conf, tmp_path)
@@ -293,14 +291,16 @@ def fails_in(worlds: tuple[int, ...], monkeypatch) -> None:
     monkeypatch.setattr(softmpm, "simulate", simulate)
 
 
-def test_seeds_that_fail_outside_of_a_graph_are_all_known(task, conf, tmp_path, monkeypatch):
-    """One simulation serves all of them here too: with many runs side by side each would otherwise take one of its own."""
+def test_seeds_that_fail_are_all_known(task, conf, tmp_path, monkeypatch):
+    """Each has an error of its own."""
     model = built(task, conf, SEEDS)
     runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
     fails_in((2, 0), monkeypatch)
-    with pytest.raises(softmpm.UnstableError, match="world 2 is inverted") as error:
+    with pytest.raises(softmpm.UnstableError, match="world 2 is inverted"):
         runs.loop(None)
-    assert sorted(runs.blamed(error.value)) == [0, 2]
+    assert {k: str(error) for k, error in runs.failed(runs.loop.errors).items()} == {
+        k: f"world {k} is inverted." for k in (0, 2)
+    }
 
 
 def test_an_error_that_was_dealt_with_keeps_no_states(task, conf, tmp_path, monkeypatch):

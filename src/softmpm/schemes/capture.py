@@ -71,10 +71,6 @@ class GraphResources:
         self.made: dict[object, Any] = {}
         self.changed: list[Callable[[], None]] = []
 
-    def failed(self) -> list[int]:
-        """Worlds that the last replay reports as failed."""
-        return sorted({world for _, words in self._reports() for world in failed_worlds(words)})
-
     def collect(self) -> bool:
         """After a replay that failed: give each failure to the call that collects it. False if there is one that is to be raised."""
         found = [(status.collect, words) for status, words in self._reports() if failed_worlds(words)]

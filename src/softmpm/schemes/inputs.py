@@ -124,11 +124,11 @@ class InputsAdj:
             if one.per == "particle" and one.rows:
                 self.tensors[one.name][rows] += found.tensors[one.name]
 
-    def clear_world(self, world: int) -> None:
-        """Set the adjoints of a world to zero."""
+    def clear(self, worlds: Tensor) -> None:
+        """Set the adjoints of some worlds to zero; ``worlds`` is True for these, shape (world,)."""
         for one in self.inputs:
             tensor = self.tensors[one.name]
-            (tensor[:, world] if one.rows else tensor[world]).zero_()
+            tensor.masked_fill_(worlds.view(-1, *(1,) * (tensor.dim() - 1 - one.rows)), 0.0)
 
 
 def is_particle_scalar(one: Input) -> bool:
