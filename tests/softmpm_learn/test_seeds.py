@@ -303,6 +303,24 @@ def test_seeds_that_fail_are_all_known(task, conf, tmp_path, monkeypatch):
     }
 
 
+def test_a_best_motion_that_fails_when_it_is_recorded_ends_no_run(task, conf, tmp_path, monkeypatch, caplog):
+    """On a GPU it may, since sums have another order each time. The warning says whose it was, and the recording is whole."""
+    real = run_episode
+
+    def failing(*args, **kwargs):
+        with pytest.MonkeyPatch.context() as patch:
+            fails_in((1,), patch)
+            return real(*args, **kwargs)
+
+    monkeypatch.setattr("softmpm_learn.train.run_episode", failing)
+    conf = changed(conf, observer=dict(name="centroids"), train=dict(record_every=1))
+    assert all(result.finished for result in together(task, conf, tmp_path))
+    assert "The best of seed 5 failed when it was recorded: world 1 is inverted." in caplog.text
+    for k in range(SEEDS):
+        with softmpm.Recording(tmp_path / str(k) / "run.h5") as recording:
+            assert recording.attributes(recording.episodes[-1])["kind"] == "best"
+
+
 def test_an_error_that_was_dealt_with_keeps_no_states(task, conf, tmp_path, monkeypatch):
     """Many runs side by side fill a GPU, so two simulations at a time do not fit: the failed one is freed with its error."""
     model = built(task, conf, SEEDS)
