@@ -1,7 +1,8 @@
-"""Print the table of docs/results.md that compares observers of the elephant, from comparison.elephant.h200.csv beside this script:
-`python docs/results/comparison.py`."""
+"""Print a table of docs/results.md that compares observers, from comparison.ROBOT.h200.csv beside this script:
+`python docs/results/comparison.py elephant`."""
 
 import csv
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,13 @@ def shown(pair: dict | None) -> str:
     return "" if pair is None else f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
 
 
-def main():
-    with open(Path(__file__).with_name("comparison.elephant.h200.csv"), newline="") as file:
+def lasts(row: dict[str, str]) -> bool:
+    """True if the gait goes on after the episode, upright; False also where the robot tore."""
+    return row["later"] != "" and float(row["later"]) >= 0.7 and float(row["tilt"]) < 30
+
+
+def main(robot: str):
+    with open(Path(__file__).with_name(f"comparison.{robot}.h200.csv"), newline="") as file:
         rows = list(csv.DictReader(file))
     jobs: dict[tuple[str, str, str], list[dict[str, str]]] = {}
     for row in rows:
@@ -32,13 +38,14 @@ def main():
         best = [float(row["best"]) for row in runs]
         low, high = interval(best, np.median)
         walk = [row for row in runs if float(row["best"]) < WALKS]
-        last = [row for row in walk if float(row["later"]) >= 0.7 and float(row["tilt"]) < 30]
+        last = [row for row in walk if lasts(row)]
+        torn = [row for row in walk if row["later"] == ""]
         anew = [row for row in runs if row["restarts"] != "0"]
         difference = shown(differences.get((" ".join(FIRST), " ".join(job))))
         design, clock, observer = job
         print(
             f"| {'yes' if design == 'particle' else 'no'} | {'yes' if clock == 'true' else 'no'} | {observer} | "
-            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(anew)} | {difference} |"
+            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(torn)} | {len(anew)} | {difference} |"
         )
     print("The latent minus another observer, with the same design and clock:")
     for design, clock, observer in jobs:
@@ -56,4 +63,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])
