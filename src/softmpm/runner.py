@@ -177,5 +177,4 @@ class Runner:
         self.failed = (torch.stack(self._deferred) < FROZEN).any(dim=0)
         if self.failures.policy == "freeze":
             return end
-        self.scheme.jumped()
         return chosen(self.failed, self.scheme.rest(), end)

@@ -77,10 +77,6 @@ class Scheme(Protocol):
         """The state at rest, as calls take it."""
         ...
 
-    def jumped(self) -> None:
-        """Prepare for bodies that are elsewhere at the start of the next call, during a capture, in which they cannot be looked for."""
-        ...
-
     def to_user(self, state: Any) -> Any:
         """An initial state, a final state or an adjoint as calls take and return it: a :class:`State` in the user's order, or a
         :class:`softmpm.state.Nodal` in the reference formulation.

@@ -4,9 +4,9 @@ Both may be out of date without affecting results. A stale order costs speed onl
 memory share their cell too rarely. The window is the allocated part of the grid, at a separate place in each world, and it is
 re-centred when a particle comes near its edge. If a particle or a surface point leaves it, the chunk is repeated: with the window
 centred on its initial state or, if it was already centred or this is not the first time, with a larger window. If it was outside
-as the chunk began, because the call began elsewhere, the window is centred only. A captured graph cannot do this: after a replay
-in which one left, the window is enlarged and the graph captured again. The cost of a substep is proportional to the window, not to
-the grid.
+as the chunk began, because the call began elsewhere, the window is centred only. A captured graph cannot do this: it centres the
+window for each call, and after a replay in which one left, the window is enlarged and the graph captured again. The cost of a substep
+is proportional to the window, not to the grid.
 """
 
 import math
@@ -130,18 +130,22 @@ class ParticleLayout:
         self._ends[1].fill_(0)
         self._find(stream_of(model.device), x.contiguous(), follow.contiguous())
 
-    def resort(self, x: Tensor) -> None:
-        """Sort by cell and centre the window on the particles, without waiting for the device."""
-        model = self.model
+    def centre(self, x: Tensor) -> None:
+        """Centre the window on the particles, without waiting for the device."""
         self._locate(x)
+        self._centre(stream_of(self.model.device))
+        self.version += 1
+
+    def resort(self, x: Tensor) -> None:
+        """Centre the window on the particles and sort them by cell, without waiting for the device."""
+        model = self.model
+        self.centre(x)
         key, order = torch.sort(self._key, dim=1, stable=True)
         self.order.copy_(order)
-        self._centre(stream_of(model.device))
         if not is_capturing(model):
             cell = key // 2
             self._fresh = Report(model.worlds + (cell[:, 1:] != cell[:, :-1]).sum()[None])
         self.stale = False
-        self.version += 1
 
     def place_neighbours(self) -> None:
         """Permute the lists of rest neighbours into the present order."""

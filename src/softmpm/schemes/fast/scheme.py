@@ -153,20 +153,24 @@ class Fast:
         return True
 
     def _layout_in_capture(self, start: State | SortedState, chunk: Chunk) -> bool:
-        """Sort at fixed intervals during a capture, since staleness cannot be read back."""
+        """Sort at fixed intervals during a capture, since staleness cannot be read back, and centre the window for each call."""
         if self._pool is None:
             raise RuntimeError(
                 "a CUDA graph is being captured, and this model has not run before on this stream: run the same work once "
                 "first, or let softmpm.Graph do it."
             )
         keep_alive(self._pool.layout)
-        resorted = self._since_sort >= LONGEST or self.model.deterministic
-        if resorted:
-            self._pool.layout.resort(start.x)
-            after_replay(self._pool.layout.changed)
+        layout, resorts = self._pool.layout, self._since_sort >= LONGEST or self.model.deterministic
+        updates = resorts or isinstance(start, State)
+        if resorts:
+            layout.resort(start.x)
             self._since_sort = 0
+        elif updates:
+            layout.centre(start.x)
+        if updates:
+            after_replay(layout.changed)
         self._since_sort += chunk.length
-        return resorted
+        return updates
 
     def _use(self, layout: ParticleLayout) -> None:
         self._pool = LayoutGraphs(self.model, layout, self._unpacker)
@@ -182,9 +186,6 @@ class Fast:
 
     def checkpoint(self, state: State | SortedState) -> State | SortedState:
         return state if isinstance(state, State) else state.copy()
-
-    def jumped(self) -> None:
-        self._since_sort = LONGEST  # the window is centred when the particles are sorted
 
     def to_user(self, state: State | SortedState | SortedAdj) -> State:
         return state if isinstance(state, State) else state.state()

@@ -174,9 +174,6 @@ class Lagrangian:
     def checkpoint(self, state: Nodal) -> Nodal:
         return state
 
-    def jumped(self) -> None:
-        pass
-
     def rest(self) -> Nodal:
         model = self.model
         return nodes_of(model, model.rest(), model.mass.expand(model.worlds, -1))

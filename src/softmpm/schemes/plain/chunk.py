@@ -149,9 +149,6 @@ class Plain:
 
     particles = to_user
 
-    def jumped(self) -> None:
-        pass
-
     def rest(self) -> State:
         state = self.model.rest()
         return state if self.model.surface is None else with_surface(self.model, state, {})
