@@ -25,13 +25,13 @@ def due(run: Run) -> bool:
 @torch.no_grad()
 def evaluate(runs: Runs) -> list[float]:
     """Mean loss of policy and design of each run as they are over the evaluation goals, ``train.endurance`` times as long as an
-    episode; nan if one of its simulations failed."""
+    episode; infinite if one of its simulations failed."""
     losses, failed = [], dict[int, softmpm.UnstableError]()
     for goal in runs.evaluation_goals() or [None]:
         losses.append(runs.evaluator(goal).unflatten(0, (len(runs.all), -1)).mean(dim=1))
         failed = runs.failed(runs.evaluator.failures.errors) | failed
     for k, error in failed.items():
         logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
-        losses[0][k] = math.nan
-    means = runs.group.average(losses)  # nan in every process if it is in one
+        losses[0][k] = math.inf
+    means = runs.group.average(losses)  # infinite in every process if it is in one
     return torch.stack(means).mean(dim=0).tolist()

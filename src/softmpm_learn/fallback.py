@@ -26,7 +26,8 @@ class Fallback:
         """True if the run should fall back after an iteration; then a new count begins.
 
         Args:
-            loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing.
+            loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing, infinite where its
+                simulation failed.
             best: The lowest so far.
         """
         self.iterations += 1
@@ -34,6 +35,8 @@ class Fallback:
             self.below += self.below > 0
             return False
         if math.isnan(self.first):
+            if math.isinf(loss):
+                return False
             self.first = loss
         early = self.iterations <= conf.fallback_from
         low = not early and self.first - loss < conf.fallback_share * (self.first - best)

@@ -125,7 +125,8 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
     for k, row in rows.items():
         run, value = runs.all[k], row["loss"]
         if run.evaluated:
-            value = row["evaluation"] = evaluations[k] if k in asked else math.nan
+            value = evaluations[k] if k in asked else math.nan
+            row["evaluation"] = value if math.isfinite(value) else math.nan
         if value < run.best["loss"]:
             run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
         row |= {"best": run.best["loss"]} | step(run, row["loss"], value)
