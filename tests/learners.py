@@ -1,5 +1,6 @@
 """Learners with pictures of one's choice, for tests of the learning phase."""
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -54,3 +55,10 @@ def spoil(learner: Learner, epoch: int, value: float) -> None:
         return real(*args)
 
     learner.replay.draw = draw
+
+
+def viscous(task):
+    """The task with a material that can have its viscosity designed."""
+    (body,) = task.scene.bodies
+    body = dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=0.1))
+    return dataclasses.replace(task, scene=dataclasses.replace(task.scene, bodies=[body]))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from softmpm import UnstableError
 from softmpm_learn.design import declared_inputs
-from softmpm_learn.episode import ClosedLoop, Evaluator
+from softmpm_learn.loops import ClosedLoop, Evaluator
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
 from softmpm_learn.side_by_side import Designs, Observers, Policies

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import softmpm
-from softmpm_learn import episode, evaluation, optimisation
+from softmpm_learn import evaluation, loops, optimisation
 from softmpm_learn.objective import Objective, Reach
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -92,7 +92,7 @@ def test_a_failed_evaluation_is_no_best(reaching, model, drawn, tmp_path, monkey
     """The run goes on; its cell is empty, and the log says why."""
     run = Run(reaching, model, drawn, tmp_path)
 
-    real = episode.run_episode
+    real = loops.run_episode
 
     def fails(*args, failures, **kwargs):
         kind = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
@@ -100,7 +100,7 @@ def test_a_failed_evaluation_is_no_best(reaching, model, drawn, tmp_path, monkey
             failures.errors.append(softmpm.UnstableError("particle 3 is inverted.", **kind))
         return real(*args, **kwargs)
 
-    monkeypatch.setattr(episode, "run_episode", fails)
+    monkeypatch.setattr(loops, "run_episode", fails)
     row = optimisation.optimise(Runs([run]), [], {})[0][0]
     assert math.isnan(row["evaluation"]) and run.best["iteration"] == -1
     assert "the evaluation failed: particle 3 is inverted" in caplog.text

@@ -13,7 +13,7 @@ import torch
 import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
-from softmpm_learn.episode import ClosedLoop
+from softmpm_learn.loops import ClosedLoop
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.seeds import split
 from softmpm_learn.settings import Settings, TrainConf

@@ -20,7 +20,8 @@ from torch import nn
 import softmpm
 from softmpm import rollout
 from softmpm_learn import checkpoint, optimisation, register
-from softmpm_learn.episode import ClosedLoop, run_episode
+from softmpm_learn.episode import run_episode
+from softmpm_learn.loops import ClosedLoop
 from softmpm_learn.observe import VelocityImage
 from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.run import Run

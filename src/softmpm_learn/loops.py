@@ -1,0 +1,156 @@
+"""Closed loops that are run again and again: on a GPU each is one captured graph, where the model allows it."""
+
+import math
+import weakref
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+import softmpm
+from softmpm import Inputs, Model, Params
+from softmpm_learn.episode import Decisions, Episode, Frame, Policy, run_episode, times_of
+from softmpm_learn.observe import Observer
+
+if TYPE_CHECKING:
+    from softmpm_learn.tasks.task import Task
+
+
+def _captures(model: Model) -> bool:
+    """False if sums are in the order of the particles, which wait for the device, see docs/conventions.md."""
+    return not (model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64))
+
+
+class Evaluator:
+    """Simulates a task under a policy without a gradient, again and again; on a GPU as one captured graph, as :class:`ClosedLoop`.
+
+    Args:
+        policy, design: As of :class:`ClosedLoop`.
+
+    Attributes:
+        failures: Those of the last simulation. A robot that fails goes on from rest: frozen, it would fail again in every control
+            step, and outside of a graph the simulation of all robots would be repeated each time.
+    """
+
+    def __init__(
+        self,
+        task: "Task",
+        model: Model,
+        observer: Observer,
+        policy: Policy,
+        design: Callable[[], tuple[Params, Inputs]],
+    ):
+        self.failures = failures = softmpm.Failures("reset")
+        goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
+
+        @torch.no_grad()
+        def work() -> Tensor:
+            params, inputs = design()
+            about: dict[str, Any] = dict(inputs=inputs, goal=goals[0] if goals else None)
+            return run_episode(task, model, observer, policy, params, **about, failures=failures).loss
+
+        self._goals, self._work = goals, work
+        self._graph = softmpm.Graph(work, model.device) if _captures(model) else None
+
+    def __call__(self, goal: Tensor | None) -> Tensor:
+        """Loss of each world, shape (world,); of a world that failed it means nothing."""
+        self.failures.errors.clear()
+        if goal is not None and not self._goals:
+            self._goals.append(goal.clone())
+        elif goal is not None:
+            self._goals[0].copy_(goal)
+        return self._graph().clone() if self._graph else self._work()
+
+
+class ClosedLoop:
+    """Simulates a task under a policy and differentiates the loss, again and again; on a GPU as one captured graph, where
+    the model allows it.
+
+    Args:
+        policy: The policy, which may be that of several runs side by side.
+        design: Gives the material and the inputs, see :class:`softmpm_learn.design.Design`.
+        weights, free: Parameters of the policy and of the design.
+        runs: Number of runs, each with as many worlds.
+        keep_every, fade: As in :func:`run_episode`.
+    """
+
+    def __init__(
+        self,
+        task: "Task",
+        model: Model,
+        observer: Observer,
+        policy: Policy,
+        design: Callable[[], tuple[Params, Inputs]],
+        weights: list[Tensor],
+        free: list[Tensor],
+        runs: int = 1,
+        keep_every: int = 0,
+        fade: float | Tensor = math.inf,
+    ):
+        self.fade = fade
+        self.task, self.model, self.observer, self.policy = task, model, observer, policy
+        self.design, self.weights, self.free = design, weights, free
+        self.runs, self.keep_every = runs, keep_every
+        self._goal: Tensor | None = None
+        self._failures = softmpm.Failures("reset")
+        self._captures = _captures(model)
+        loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
+        self._graph = softmpm.Graph(lambda: loop._work(), model.device)
+
+    def __call__(
+        self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
+    ) -> tuple[Episode, tuple[Tensor, ...]]:
+        """The episode, detached, and the gradient of each run's mean loss with respect to ``weights``, then to ``free``; overwritten
+        by the next call. With ``on_frame`` the CUDA graph is bypassed.
+
+        Raises:
+            softmpm.UnstableError: One of :attr:`errors`.
+        """
+        if goal is not None:
+            self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
+        self._failures.errors.clear()
+        try:
+            found = self._graph() if self._captures and not on_frame else self._work(on_frame)
+        except softmpm.UnstableError as error:
+            if not self._failures:  # that of a gradient, or the first of a single run
+                self._failures.errors.append(error)
+            raise
+        if self._failures:
+            raise self._failures.errors[0]
+        return found
+
+    @property
+    def errors(self) -> list[softmpm.UnstableError]:
+        """Failures of the last call, those of all runs."""
+        return self._failures.errors
+
+    def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
+        params, inputs = self.design()
+        capturing = self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+        # A failure must not hide those of other runs, and while a graph is captured none is known yet; a single run may stop at once.
+        failures = self._failures if capturing or self.runs > 1 else None
+        about: dict[str, Any] = dict(
+            inputs=inputs, goal=self._goal, fade=self.fade, keep_every=self.keep_every
+        )
+        about |= dict(on_frame=on_frame, failures=failures)
+        episode = run_episode(self.task, self.model, self.observer, self.policy, params, **about)
+        if failures:
+            try:
+                raise failures.errors[0]
+            finally:
+                # The error would refer to itself through this frame, and keep all states of the simulation alive.
+                del failures, episode, about
+        activations = episode.decisions.activations
+        loss = (
+            episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()
+        )  # a run's parameters see its own worlds
+        adj = torch.autograd.grad(loss, [*activations, *self.free])
+        adj_activations, adj_free = adj[: len(activations)], adj[len(activations) :]
+        return episode.detach(), (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
+
+    def _policy_gradient(self, decisions: Decisions, adj_activations: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Of all decisions at once: layer by layer and step by step it would be many small sums."""
+        features, times = torch.stack(decisions.features).detach(), times_of(self.task, self.model)[:, None]
+        again = self.policy(features, times, self._goal)
+        return torch.autograd.grad(again, self.weights, torch.stack(list(adj_activations)))
