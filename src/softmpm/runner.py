@@ -1,6 +1,7 @@
 """Runs the chunks of one call by the model's scheme, accepts or repeats them, and locates failures."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -29,20 +30,23 @@ class Runner:
 
     Attributes:
         frozen: First inactive substep of each world that failed.
-        failed: Worlds that failed in a captured call that collects failures, on the device, shape (world,); None before its end.
+        failed: Worlds that failed so far in a captured call that collects failures, on the device, shape (world,); in its backward pass
+            all that did.
     """
 
     def __init__(self, model: Model, values: Values, failures: Failures | None = None):
         self.model, self.values, self.failures = model, values, failures
         self.frozen: dict[int, int] = {}
         self.failed: Tensor | None = None
-        self._deferred: list[Tensor] = []
         self._end: Any = None
         self.scheme: Scheme = SCHEMES[model.scheme].of(model)
 
     def run(self, chunk: Chunk, start: Any, keep: bool) -> Run:
         """Launch a chunk from a :class:`State` or from the final state of a run."""
-        frozen = [world for world, substep in self.frozen.items() if chunk.first >= substep]
+        frozen = self.failed
+        if self.frozen:
+            rest = (chunk.first >= self.frozen.get(world, math.inf) for world in range(self.model.worlds))
+            frozen = torch.tensor(list(rest), device=self.model.device)
         return self.scheme.run(chunk, start, in_rows(self.values, chunk.rows), keep, frozen)
 
     def check(self, start: Any) -> Report | None:
@@ -152,29 +156,32 @@ class Runner:
 
     def _defer(self, words: Tensor, outgrow: Callable[[], None] | None, first: int, **about: Any) -> None:
         """Check these words after each replay of the graph that is being captured; collect failures if the call does."""
-        if self.failed is not None:  # in the backward pass of a call that collected them
+        returned = self.failures is not None and self.failures.policy == "freeze"
+        if self.failed is not None and not returned:  # such a world needs no window
             words = words.masked_fill(self.failed, NEVER)
         if self.failures is None:
             defer_status_check(words, outgrow)
             return
+        failed = words < FROZEN
+        self.failed = failed if self.failed is None else self.failed | failed
         about |= {"first": first, "values": stiffest(self.model, about.get("values", self.values))}
-        self._deferred.append(words)
         defer_status_check(words, outgrow, functools.partial(self._collect, about, self.failures.note))
 
     def _collect(self, about: dict[str, Any], note: str, words: list[int]) -> None:
-        """Collect the first failure of each world in the last replay, in which a world that failed stays as it is and fails on."""
+        """Collect the first failure of each world in the last replay."""
         assert self.failures is not None
-        for world in failed_worlds(words):
-            if world not in self.failures.worlds:
-                end = self.scheme.particles(self._end)
-                self._note(failure(self.model, words, world, end, **about), note)
+        new = [world for world in failed_worlds(words) if world not in self.failures.worlds]
+        if not new:
+            return
+        end = self.scheme.particles(self._end)
+        for world in new:
+            self._note(failure(self.model, words, world, end, **about), note)
 
     def captured(self, end: Any) -> Any:
         """The final state of a captured call that collects failures, as :class:`Failures` has it."""
         if self.failures is None:
             return end
-        self._end = end
-        self.failed = (torch.stack(self._deferred) < FROZEN).any(dim=0)
-        if self.failures.policy == "freeze":
+        self._end = end.detach()
+        if self.failures.policy == "freeze" or self.failed is None:
             return end
         return chosen(self.failed, self.scheme.rest(), end)

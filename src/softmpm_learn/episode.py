@@ -1,7 +1,8 @@
 """Closed-loop simulation: observe → act → simulate in each control step, differentiable end to end."""
 
+import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -104,7 +105,6 @@ def run_episode(
     period, times = task.control_period, times_of(task, model)
     made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
     for step in range(task.control_steps):
-        place = f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s."
         observation = observer.observe(model, state)
         if keep_every and step % keep_every == 0:
             observations.append(observation.detach())
@@ -113,11 +113,11 @@ def run_episode(
         if failures:
             failed = torch.tensor(failures.worlds, device=activation.device)
             activation = activation.index_fill(0, failed, 0.0)
-        if failures is not None:
-            failures.note = place
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
-        try:
+        with _placed(
+            f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s.", failures
+        ):
             state = softmpm.simulate(
                 model,
                 state,
@@ -127,9 +127,6 @@ def run_episode(
                 inputs=inputs,
                 failures=failures,
             )
-        except softmpm.UnstableError as error:
-            error.add_note(place)
-            raise
         made.features.append(features)
         made.activations.append(activation)
         state, seen = fading(state)
@@ -146,6 +143,22 @@ def run_episode(
         activation=activations.detach(),
         decisions=made,
     )
+
+
+@contextlib.contextmanager
+def _placed(place: str, failures: softmpm.Failures | None) -> Iterator[None]:
+    """Errors in the block, raised or collected, have a note of its place."""
+    before = "" if failures is None else failures.note
+    try:
+        if failures is not None:
+            failures.note = f"{place} {before}".rstrip()
+        yield
+    except softmpm.UnstableError as error:
+        error.add_note(place)
+        raise
+    finally:
+        if failures is not None:
+            failures.note = before
 
 
 def times_of(task: "Task", model: Model) -> Tensor:

@@ -117,6 +117,7 @@ class ClosedLoop:
                 self._failures.errors.append(error)
             raise
         if self._failures:
+            del found
             raise self._failures.errors[0]
         return found
 

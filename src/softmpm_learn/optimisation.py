@@ -65,6 +65,7 @@ def optimise(
             failed = {k: error for k, error in rows.items() if isinstance(error, NotFiniteError)}
         except softmpm.UnstableError as error:
             failed = runs.failed([error, *runs.loop.errors])
+            runs.loop.errors.clear()  # they refer to the loop through their tracebacks
         except OtherProcessError as error:
             failed = {0: error}
         if not failed:

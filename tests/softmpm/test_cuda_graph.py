@@ -6,7 +6,7 @@ import threading
 
 import pytest
 import torch
-from helpers import KINDS, assert_relative, busy_inputs, busy_scene, run
+from helpers import KINDS, assert_relative, bar, busy_inputs, busy_scene, run
 
 import softmpm
 from softmpm import autograd, rollout, runner
@@ -219,6 +219,51 @@ def test_a_recording_differentiates_the_worlds_that_did_not_fail(settings, budge
     assert resources.collect()
     assert_gradient(got, want)
     assert_one_failure(recorded, kind)
+
+
+def torn_in_flight():
+    """A bar in free space whose halves part at 0.04 cells per substep each: it is torn after the first chunk of a call, and leaves the
+    window if it goes on."""
+    made = bar(grid=softmpm.Grid(shape=(400, 400), spacing=1 / 32))
+    model = softmpm.build(made, device="cpu", worlds=2, alarms=softmpm.Alarms(step=None, collapse=None))
+    start = model.rest()
+    start.x[:] += 5.0
+    right = start.x[1, :, 0] > start.x[1, :, 0].median()
+    speed = 5 / 32 / (128 * made.dt)
+    start.v[1, right, 0], start.v[1, ~right, 0] = speed, -speed
+    soft = model.params()._replace(young=0.01 * model.params().young)
+    return model, start, soft
+
+
+@pytest.mark.parametrize("policy", ["reset", "freeze"])
+def test_a_world_that_failed_in_a_recording_stops(policy, monkeypatch):
+    """In the chunks after it is where it failed, so it leaves no window."""
+    model, start, soft = torn_in_flight()
+    softmpm.simulate(model, start._replace(v=torch.zeros_like(start.v)), None, soft, substeps=256)
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    failures = softmpm.Failures(policy)
+    with capture.collected_resources() as resources, torch.no_grad():
+        softmpm.simulate(model, start, None, soft, substeps=256, failures=failures)
+    assert len(resources.statuses) >= 2  # two chunks
+    assert not resources.widen() and resources.collect()
+    (error,) = failures.errors
+    assert (error.world, error.kind) == (1, "torn") and error.substep < 128
+
+
+def test_a_failure_is_counted_once_where_another_is_raised(monkeypatch):
+    """The work is then done again outside of the recording, which counts it."""
+    model, start = falling_pair()
+    gradient(model, start._replace(C=healthy(start.C)), None)
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner):
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    failures, v = softmpm.Failures("reset"), start.v.clone().requires_grad_()
+    with capture.collected_resources() as resources:
+        end = softmpm.simulate(
+            model, start._replace(v=v), None, model.params(), substeps=20, failures=failures
+        )
+        torch.autograd.grad((end.x[0] * torch.inf).sum(), v)
+    assert not resources.collect() and not failures.errors
 
 
 @pytest.mark.gpu

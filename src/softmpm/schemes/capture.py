@@ -74,10 +74,12 @@ class GraphResources:
     def collect(self) -> bool:
         """After a replay that failed: give each failure to the call that collects it. False if there is one that is to be raised."""
         found = [(status.collect, words) for status, words in self._reports() if failed_worlds(words)]
+        if any(collect is None for collect, _ in found):
+            return False  # the work is done again, and collects
         for collect, words in found:
-            if collect:
-                collect(words)
-        return all(collect for collect, _ in found)
+            assert collect is not None
+            collect(words)
+        return True
 
     def widen(self) -> bool:
         """After a replay that failed: larger windows where a particle left one. True if there was such a one; capture anew then."""

@@ -1,6 +1,6 @@
 """Interface of a scheme, through which ``runner`` and ``rollout`` run substeps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, Self
 
 from torch import Tensor
@@ -53,7 +53,7 @@ class Scheme(Protocol):
         start: Any,
         values: Values,
         keep: bool,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ) -> Run:
         """Launch a chunk.
 
@@ -61,7 +61,7 @@ class Scheme(Protocol):
             start: A :class:`State`, or the final state of a run of this scheme.
             values: Inputs that the call sets; those with rows have one row for each control step of the chunk.
             keep: Whether to store the intermediate states for :meth:`Run.vjp`.
-            frozen: Worlds whose state does not change.
+            frozen: True for worlds whose state does not change, shape (world,); None if all run.
         """
         ...
 

@@ -4,10 +4,9 @@ A captured graph refers to addresses, so whatever changes between calls is copie
 the inputs (sorted_inputs.py) and the initial state.
 """
 
-from collections.abc import Sequence
-
 import torch
 import warp as wp
+from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
 from softmpm.kernels.fast.native import padded
@@ -158,14 +157,14 @@ class ChunkBuffers:
         chunk: Chunk,
         start: State | SortedState,
         values: Values,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ) -> None:
         """Copy everything that a chunk depends on into the buffers, in the present order of the particles.
 
         Args:
             chunk: Of these buffers' shape.
             values: Inputs that the call sets; those with rows have one for each control step of the chunk.
-            frozen: Worlds whose particles do not move.
+            frozen: True for worlds whose particles do not move, shape (world,).
         """
         moved = is_capturing(self.model) or self._version != self.layout.version
         if moved:
@@ -176,8 +175,8 @@ class ChunkBuffers:
                 self.contact.reorder(self.order)
             self.layout.place_neighbours()
         self.reset_status()
-        if frozen:
-            self.words[list(frozen)] = FROZEN
+        if frozen is not None:
+            self.words[: self.model.worlds].masked_fill_(frozen, FROZEN)
         self.inputs.take(stream, chunk, values, moved)
         self._version = self.layout.version
         self.load_state(stream, start)

@@ -1,7 +1,7 @@
 """The fast scheme: chunks of substeps run as captured graphs, on particles sorted by cell and the grid nodes near them."""
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import ClassVar
 
 import torch
@@ -62,7 +62,7 @@ class FastRun:
         start: State | SortedState,
         values: Values,
         keep: bool,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ):
         self.pool, self.updated, self.chunk, self.start = pool, updated, chunk, start
         self._lease = Lease(pool, chunk, keep)
@@ -116,7 +116,7 @@ class Fast:
         start: State | SortedState,
         values: Values,
         keep: bool,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ) -> FastRun:
         updated = self._provide_layout(start, chunk)
         assert self._pool is not None

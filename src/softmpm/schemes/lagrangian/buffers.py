@@ -1,6 +1,5 @@
 """Buffers of a chunk of the reference formulation, forward and adjoint."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -96,14 +95,14 @@ class ChunkBuffers:
         return s if self.keep else s % 2
 
     def load(
-        self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Sequence[int]
+        self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Tensor | None
     ) -> None:
         """Copy the initial state and the inputs of a chunk into the buffers."""
         first = is_capturing(self.model) or not self._loaded
         self._loaded = False
         self.words.fill_(NEVER)
-        if frozen:
-            self.words[list(frozen)] = FROZEN
+        if frozen is not None:
+            self.words.masked_fill_(frozen, FROZEN)
         self.inputs.take(stream, chunk, values, first)
         given_states = (*start[:3], shift_of(self.model, start))
         for own, given in zip((self.u, self.v, self.anchor, self.shift), given_states, strict=True):

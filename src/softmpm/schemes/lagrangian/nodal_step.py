@@ -85,9 +85,7 @@ class NodalStep:
             )
         if self._graph is None:
             self._graph = ChunkGraph(self.model, ONE, keep=True)
-        self._graph.load(self.stream, ONE, now, values, ())
-        if failed is not None:
-            self._graph.buffers.words.masked_fill_(failed, FROZEN)
+        self._graph.load(self.stream, ONE, now, values, failed)
         self._graph.run(self.stream)
         return self._graph
 

@@ -1,7 +1,7 @@
 """The scheme of the reference formulation: chunks of substeps on the nodes at rest, any precision, any device."""
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -38,7 +38,7 @@ class ChunkGraph:
         self._replay = LaunchReplay(model)
 
     def load(
-        self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Sequence[int]
+        self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Tensor | None
     ) -> None:
         """Copy the initial state and the inputs of a chunk into the buffers."""
         self.buffers.load(stream, chunk, start, values, frozen)
@@ -109,7 +109,7 @@ class LagrangianRun:
         start: Nodal,
         values: Values,
         keep: bool,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ):
         self.pool, self.chunk, self.start = pool, chunk, start
         self._lease = Lease(pool, chunk, keep)
@@ -147,7 +147,7 @@ class Lagrangian:
         define(model.spec)
 
     def run(
-        self, chunk: Chunk, start: Nodal, values: Values, keep: bool, frozen: Sequence[int] = ()
+        self, chunk: Chunk, start: Nodal, values: Values, keep: bool, frozen: Tensor | None = None
     ) -> LagrangianRun:
         return LagrangianRun(self._pool, chunk, start, values, keep, frozen)
 

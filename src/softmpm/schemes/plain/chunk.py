@@ -1,6 +1,6 @@
 """The plain scheme: three kernels for each substep, launched one by one, any precision, any device."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import ClassVar
 
 from torch import Tensor
@@ -37,7 +37,7 @@ class PlainRun:
         start: State,
         values: Values,
         keep: bool,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ):
         self.model, self.chunk, self.start = model, chunk, start
         self._values = model.fixed | values  # the structs only see their tensors
@@ -50,8 +50,8 @@ class PlainRun:
         if start.surface is not None:
             self.contact = contact_on_grid(model, chunk, keep)
             self.contact.load(chunk, start.surface)
-        if frozen:
-            self.step.words[list(frozen)] = FROZEN
+        if frozen is not None:
+            self.step.words.masked_fill_(frozen, FROZEN)
         self.step.enter(start, self.structs[0])
         for s in range(chunk.length):
             now, then = (s, s + 1) if keep else (s % 2, (s + 1) % 2)
@@ -128,7 +128,7 @@ class Plain:
         start: State,
         values: Values,
         keep: bool,
-        frozen: Sequence[int] = (),
+        frozen: Tensor | None = None,
     ) -> PlainRun:
         return PlainRun(self.model, chunk, start, values, keep, frozen)
 
