@@ -38,11 +38,17 @@ class Encoder(nn.Module):
     spread: Tensor
 
     def __init__(
-        self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float
+        self,
+        dim: int,
+        shape: tuple[int, ...],
+        latent_size: int,
+        channels: Sequence[int],
+        scale: float,
+        seen: int,
     ):
         super().__init__()
         conv = nn.Conv2d if dim == 2 else nn.Conv3d
-        widths = [dim, *channels]
+        widths = [seen, *channels]
         self.convs = nn.ModuleList(
             conv(a, b, kernel_size=3, stride=2, padding=1) for a, b in itertools.pairwise(widths)
         )
@@ -71,12 +77,14 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """Latent → picture in units of the scale: the encoder mirrored."""
 
-    def __init__(self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int]):
+    def __init__(
+        self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], seen: int
+    ):
         super().__init__()
         conv = nn.Conv2d if dim == 2 else nn.Conv3d
         *self.sizes, self.corner = _halvings(shape, len(channels))
         self.tail = nn.Linear(latent_size, channels[-1] * torch.Size(self.corner).numel())
-        widths = [*reversed(channels), dim]
+        widths = [*reversed(channels), seen]
         self.convs = nn.ModuleList(
             conv(a, b, kernel_size=3, padding=1) for a, b in itertools.pairwise(widths)
         )
@@ -96,17 +104,24 @@ class Autoencoder(nn.Module):
         shape: Nodes of a picture.
         latent_size, channels: See :class:`softmpm_learn.settings.ObserverConf`.
         scale: Typical velocity [m/s], until :meth:`rescale` has seen some.
+        seen: Channels of a picture, None for those of a velocity.
     """
 
     def __init__(
-        self, dim: int, shape: tuple[int, ...], latent_size: int, channels: Sequence[int], scale: float = 1.0
+        self,
+        dim: int,
+        shape: tuple[int, ...],
+        latent_size: int,
+        channels: Sequence[int],
+        scale: float = 1.0,
+        seen: int | None = None,
     ):
         super().__init__()
-        self.encoder = Encoder(dim, shape, latent_size, channels, scale)
-        self.decoder = Decoder(dim, shape, latent_size, channels)
+        self.encoder = Encoder(dim, shape, latent_size, channels, scale, seen or dim)
+        self.decoder = Decoder(dim, shape, latent_size, channels, seen or dim)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Velocity [m/s], shape (picture, dim, *nodes), that a standardised latent (picture, latent_size) stands for."""
+        """Picture [m/s], shape (picture, channels, *nodes), that a standardised latent (picture, latent_size) stands for."""
         encoder = self.encoder
         return self.decoder(encoder.centre + encoder.spread * z) * encoder.scale
 

@@ -29,6 +29,9 @@ THIN = 0.01
 miss the jump, whenever a node gains or loses its last particle. Our choice."""
 STRETCH = 1.25
 """Stretch of the robot that the window of a learned observer has room for, in any direction. Our choice."""
+PACE = 0.1
+"""Displacements in a picture are divided by this time [s], of the order of that of a gait, so that they are as large as velocities. Our
+choice."""
 POSTURE = 0.1
 """Regions typically move by this much of a body length against each other; makes features of order one."""
 
@@ -99,23 +102,29 @@ def clusters(positions: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 class VelocityImage:
-    """Grid velocity as a learned observer sees it: averaged over blocks of nodes, components first.
+    """Grid velocity as a learned observer sees it: averaged over blocks of nodes, components first. With posture, the displacement from
+    rest as well, that of the centroid left out: the velocity at which the robot would come from rest in :data:`PACE`.
 
     Args:
         model: Whose grid and robot.
         nodes: Most nodes of the picture along the longest axis, None for 32 in 2D and 16 in 3D if it follows, else for twice as many.
         follow: See a window around the robot, with its centroid on a node: the picture depends neither on the place nor on the size of
             the grid, so that what learned on one track can be used on another. False shows the whole grid as it is.
+        posture: See the displacement too.
+
+    Attributes:
+        channels: Components of all that is seen.
+        shape: Nodes of the picture.
     """
 
-    def __init__(self, model: Model, nodes: int | None = None, follow: bool = True):
+    def __init__(self, model: Model, nodes: int | None = None, follow: bool = True, posture: bool = False):
         grid = model.scene.grid
-        self.follow, self.channels = follow, model.dim
+        self.follow, self.posture, self.channels = follow, posture, model.dim * (1 + posture)
+        self._rest = model.positions - model.positions.mean(dim=0)
         window = (_window(model),) * model.dim if follow else grid.shape
         usual = (32 if model.dim == 2 else 16) * (1 if follow else 2)
         self.block = math.ceil(max(window) / (nodes or usual))
         self.shape = tuple(math.ceil(n / self.block) for n in window)
-        """Nodes of the picture."""
         mass = (model.params().density * model.volume).sum() / model.volume.sum() * grid.spacing**model.dim
         self._thin = THIN * mass.item()
         place = {"dtype": model.dtype, "device": model.device}
@@ -128,10 +137,17 @@ class VelocityImage:
         self._pad = [pad for pair in reversed(ends) for pad in pair]
 
     def __call__(self, model: Model, state: State) -> Tensor:
-        """Velocity [m/s], shape (world, dim, *shape)."""
+        """Velocity [m/s], then the displacement over :data:`PACE`, shape (world, channels, *shape)."""
+        centred = state.x - state.x.mean(dim=1, keepdim=True)
         if self.follow:
-            x = state.x + (self._middle - state.x.mean(dim=1, keepdim=True))
-            state = state._replace(x=x.clamp(self._low, self._high))
+            state = state._replace(x=(centred + self._middle).clamp(self._low, self._high))
+        if not self.posture:
+            return self._seen(model, state)
+        away = state._replace(v=(centred - self._rest) / PACE, C=torch.zeros_like(state.C))
+        return torch.cat([self._seen(model, state), self._seen(model, away)], dim=1)
+
+    def _seen(self, model: Model, state: State) -> Tensor:
+        """Picture of the velocities of a state."""
         field = softmpm.rasterize(model, state)
         velocity = field.velocity * (field.mass / (field.mass + self._thin))[..., None]
         seen = functional.pad(velocity.movedim(-1, 1), self._pad)  # negative where the window is smaller
@@ -161,7 +177,7 @@ class Latent(Observer):
         self.picture, self.encoder, self.size, self.trained = picture, encoder, size, True
 
     def observe(self, model: Model, state: State) -> Tensor:
-        """The picture, shape (world, dim, *nodes) [m/s]."""
+        """The picture, shape (world, channels, *nodes) [m/s]."""
         return self.picture(model, state)
 
     def encode(self, observation: Tensor) -> Tensor:
@@ -184,8 +200,15 @@ class Nothing(Observer):
 @register.observer("latent")
 def latent(conf: ObserverConf, model: Model, task: "Task") -> Latent:
     """Learned; its encoder is an autoencoder yet to be trained, whose own encoder the learner puts in its place."""
-    picture, channels = VelocityImage(model, conf.nodes, conf.follow), list(conf.channels)
-    autoencoder = Autoencoder(model.dim, picture.shape, conf.latent_size, channels, scale=task.body_length)
+    picture = VelocityImage(model, conf.nodes, conf.follow, conf.posture)
+    autoencoder = Autoencoder(
+        model.dim,
+        picture.shape,
+        conf.latent_size,
+        conf.channels,
+        scale=task.body_length,
+        seen=picture.channels,
+    )
     return Latent(picture, autoencoder, conf.latent_size)
 
 

@@ -100,7 +100,7 @@ def decoded(run: Run) -> np.ndarray:
     features = torch.zeros(size, len(VALUES), size, dtype=run.model.dtype, device=run.model.device)
     for k in range(size):
         features[k, :, k] = torch.tensor(VALUES)
-    fields = run.learner.autoencoder.decode(features.flatten(end_dim=1))
+    fields = run.learner.autoencoder.decode(features.flatten(end_dim=1))[:, : run.model.dim]
     return fields.unflatten(0, (size, len(VALUES))).movedim(2, -1).cpu().numpy()
 
 

@@ -39,6 +39,8 @@ class ObserverConf:
     many with follow=False."""
     follow: bool = True
     """latent: the velocity image is a window around the robot, the same on any track; False shows the whole grid unchanged."""
+    posture: bool = False
+    """latent: the picture shows the displacement from rest beside the velocity, so that the policy knows the robot's posture."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of an observer of one's own."""
 

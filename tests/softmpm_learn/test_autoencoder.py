@@ -11,12 +11,13 @@ def make(dim=2, shape=(11, 6), variational_size=2, **kwargs) -> Autoencoder:
         return Autoencoder(dim, shape, variational_size, [4, 8], **kwargs)
 
 
+@pytest.mark.parametrize("fields", [1, 2])
 @pytest.mark.parametrize("dim, shape", [(2, (11, 6)), (2, (16, 16)), (3, (5, 8, 7))])
-def test_shapes_come_back(dim, shape):
-    """Any picture, odd sizes too, is encoded to the latent size and decoded to its own shape."""
-    autoencoder = make(dim, shape)
-    z = autoencoder.encoder(torch.randn(3, dim, *shape))
-    assert z.shape == (3, 2) and autoencoder.decode(z).shape == (3, dim, *shape)
+def test_shapes_come_back(dim, shape, fields):
+    """Any picture, odd sizes and several vectors at a node too, is encoded to the latent size and decoded to its own shape."""
+    autoencoder, seen = make(dim, shape, seen=fields * dim), fields * dim
+    z = autoencoder.encoder(torch.randn(3, seen, *shape))
+    assert z.shape == (3, 2) and autoencoder.decode(z).shape == (3, seen, *shape)
 
 
 def test_scale_makes_units_vanish():

@@ -120,6 +120,21 @@ def test_the_window_holds_the_robot_in_any_direction(make_block, nodes):
     assert share(0.0, 1.2) == pytest.approx(1.0, rel=1e-9) and share(0.0, 3.0) < 0.8
 
 
+def test_picture_shows_the_posture(exact):
+    """None at rest, wherever the robot is; sheared, the velocity that would shear it in the given time; beside it the same velocity."""
+    picture, velocity = VelocityImage(exact, posture=True), VelocityImage(exact)
+    away = exact.rest()._replace(x=exact.rest().x + torch.tensor([0.13, 0.07]).double())
+    assert picture.channels == 4 and picture(exact, away).abs().max() < 1e-12
+    shear = torch.tensor([[0.0, 0.3], [0.0, 0.0]]).double()
+    shift = (exact.positions - exact.positions.mean(dim=0)) @ shear.T
+    state = moving(exact)._replace(x=(exact.positions + shift).expand(2, -1, -1))
+    seen = picture(exact, state)
+    torch.testing.assert_close(seen[:, :2], velocity(exact, state))
+    state = exact.rest()._replace(x=state.x, v=(shift / 0.1).expand(2, -1, -1))
+    torch.testing.assert_close(seen[:, 2:], velocity(exact, state))
+    assert seen[:, 2].abs().max() > 0.1 and (seen[:, 3] == 0).all()
+
+
 def test_picture_in_three_dimensions():
     """A 3D grid gives a 3D picture, components first, with the velocity of a uniform motion where the robot is."""
     model = softmpm.build(busy_scene(3), device="cpu", worlds=2)
@@ -131,15 +146,15 @@ def test_picture_in_three_dimensions():
     torch.testing.assert_close(brightest / brightest.norm(), velocity / velocity.norm(), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["centroids", "latent"])
+@pytest.mark.parametrize("kind", ["centroids", "latent", "latent with posture"])
 def test_features_are_differentiable(exact, kind):
     """A central difference of the features along a random direction of x, v and C agrees with autograd."""
     torch.manual_seed(0)
     if kind == "centroids":
         observer = Centroids(exact, [np.arange(12)], body_length=0.4)
     else:
-        picture = VelocityImage(exact)
-        linear = torch.nn.Linear(2 * math.prod(picture.shape), 3)
+        picture = VelocityImage(exact, posture=kind == "latent with posture")
+        linear = torch.nn.Linear(picture.channels * math.prod(picture.shape), 3)
         net = torch.nn.Sequential(torch.nn.Flatten(), linear, torch.nn.Tanh()).double()
         observer = Latent(picture, net, size=3)
     state, direction = moving(exact), [torch.randn_like(t) for t in exact.rest()[:4]]

@@ -97,6 +97,7 @@ CASES = {
     "two worlds": dict(train=dict(seeds=SEEDS, worlds=2, goal_spread=[0.2, 0.1], evaluation_goals=4, evaluate_every=2)),
     "centroids": dict(observer=dict(name="centroids"), design=dict(per="region", strength=True)),
     "control only": dict(design=dict(enabled=False), policy=dict(name="knots"), observer=dict(name="kmeans", clusters=3)),
+    "posture": dict(observer=dict(posture=True)),
     "untrained": dict(observer=dict(name="untrained"), policy=dict(clock=False)),
     "nothing": dict(observer=dict(name="nothing")),
     "constant": dict(observer=dict(name="nothing"), policy=dict(clock=False)),
@@ -123,6 +124,7 @@ MIXED = (
     dict(learning=dict(epochs=2, every=3), policy=dict(hidden=[4])),
     dict(observer=dict(name="kmeans", clusters=2), policy=dict(name="linear")),
     dict(observer=dict(name="nothing")),
+    dict(observer=dict(posture=True)),
     dict(train=dict(seed=5), optimizer=dict(policy_rate=1e-2)),
 )
 """Runs that differ in all that runs side by side may differ in."""
@@ -153,14 +155,14 @@ def test_runs_of_many_kinds_side_by_side_are_single_runs(task, conf, tmp_path):
 
 
 def test_what_one_kind_has_in_common_is_computed_at_once(task, conf, tmp_path, monkeypatch):
-    """Encoders of three latents, policies of two of them and of the untrained one, and the picture of all four."""
+    """Encoders of three latents, policies of four, and the picture of all four but the one that shows the posture."""
     plans, real, seen = mixed(conf, tmp_path), VelocityImage.__call__, []
     model = built(task, plans[0].settings, len(plans))
     runs = Runs([Run(task, model, plan.settings, plan.out, runs=len(plans)) for plan in plans])
-    assert sorted(len(stack.modules) for stack in runs.stacks) == sorted([3, 1, 1, 1, 1] + [3, 1, 1, 1, 1])
+    assert sorted(len(stack.modules) for stack in runs.stacks) == sorted([3, 1, 1, 1, 1, 1] + [4, 1, 1, 1, 1])
     monkeypatch.setattr(VelocityImage, "__call__", lambda *given: seen.append(1) or real(*given))
     runs.observer(model, model.rest())
-    assert len(seen) == 1
+    assert len(seen) == 2
 
 
 def test_weights_are_evaluated_at_once(task, conf, tmp_path):
