@@ -44,7 +44,7 @@ class OptimizerConf:
     """Iterations after which that is decided. Our choice: of a hundred elephants 22 stood still after 40 iterations, and 19 of them
     would have begun anew, with 9 of the others (docs/learning.md)."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Further arguments of the optimiser, such as betas of adam."""
+    """Further arguments of the optimiser, such as betas of adam: +optimizer.options.betas=[0.9,0.99]."""
 
     def __post_init__(self):
         OPTIMIZERS.need(self.name, self.options)

@@ -42,6 +42,8 @@ def sentence(error: BaseException) -> str:
         kind = error.object_type
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             return unknown_key(str(error.full_key), kind)
+        if kind is dict:
+            return f"{error.full_key} is not set yet: write +{error.full_key}=VALUE to add it."
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
     if isinstance(error, MissingConfigException) and error.options:

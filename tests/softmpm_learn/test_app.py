@@ -189,6 +189,7 @@ def test_help_does_not_wait_for_pytorch():
         ("task=elefant", "there is no task called elefant; choose one of arm, biped, elephant, image, mesh, voxels."),
         ("task.sekonds=3", "there is no setting task.sekonds; did you mean task.seconds?"),
         ("tsk=arm", "there is no setting tsk; did you mean task?"),
+        ("optimizer.options.betas=[0.9,0.99]", "write +optimizer.options.betas=VALUE to add it."),
         ("train.iterations=1.5", "train.iterations: Value '1.5' of type 'float' could not be converted"),
         ("design.young=perhaps", "design.young: Value 'perhaps' is not a valid bool"),
         ("task.resolution=huge", "task.resolution: Invalid value 'huge', expected one of [draft, standard, fine]."),
