@@ -1,4 +1,4 @@
-"""Closed loops that are run again and again: on a GPU each is one captured graph, where the model allows it."""
+"""Closed loops that are simulated once for each iteration: on a GPU each is one captured graph, where the model allows it."""
 
 import math
 import weakref

@@ -18,7 +18,7 @@ def policy(k: int) -> nn.Module:
 
 
 def encoder(k: int) -> nn.Module:
-    return TargetNetwork(Encoder(2, (9, 7), 3, [4, 4], scale=1.0 + k))
+    return TargetNetwork(Encoder(2, (9, 7), 3, [4, 4], scale=1.0 + k, seen=2))
 
 
 def knots(k: int) -> nn.Module:
