@@ -52,6 +52,11 @@ def main(robot: str):
         pair = differences.get((f"{design} {clock} latent", f"{design} {clock} {observer}"))
         if pair is not None:
             print(f"design={design} clock={clock} {observer}: {shown(pair)}")
+    print("With co-design minus without, and with the clock minus without, of each observer:")
+    for (first, second), pair in differences.items():
+        (design, clock, observer), (other_design, other_clock, other) = first.split(), second.split()
+        if observer == other and (design == other_design) != (clock == other_clock):
+            print(f"{first} - {second}: {shown(pair)}")
     walking = [row for row in rows if float(row["best"]) < WALKS]
     torn = sum(row["last"] == "" for row in walking)
     fell = sum(row["last"] != "" and float(row["last"]) > 0.8 * float(row["best"]) for row in walking)
