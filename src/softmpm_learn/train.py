@@ -13,29 +13,24 @@ the same everywhere would take a replay buffer in each process, and bits that ag
 """
 
 import contextlib
-import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from softmpm import Failures, Model
-from softmpm_learn.distributed import Group, in_full
-from softmpm_learn.episode import run_episode
-from softmpm_learn.examination import examine
+from softmpm import Model
+from softmpm_learn.distributed import Group
+from softmpm_learn.finishing import finish
 from softmpm_learn.learning_phase import learn_side_by_side
 from softmpm_learn.loggers import Loggers
 from softmpm_learn.optimisation import clock, optimise
 from softmpm_learn.resuming import entered, resume
 from softmpm_learn.run import Run
-from softmpm_learn.run_logger import TIMING, RunLogger, recorded
+from softmpm_learn.run_logger import TIMING, RunLogger
 from softmpm_learn.runs import Runs
 from softmpm_learn.settings import Settings
 from softmpm_learn.threads import at_once
-
-logger = logging.getLogger("softmpm_learn")
 
 
 @dataclass(frozen=True)
@@ -186,7 +181,7 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
                 work.loggers[k].flush()
                 work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     _save(work, [k for k, one in enumerate(work.loggers) if not one.is_saved])
-    found = finish(work, finer) if work.loggers else {}
+    found = finish(runs, work.loggers, finer) if work.loggers else {}
     return [
         Result(
             run,
@@ -247,58 +242,3 @@ def add_observations(runs: Runs, k: int, pictures: Tensor) -> None:
     if run.learner is not None:
         first = run.iteration * run.settings.train.worlds
         run.learner.add_observations(first, runs.observations(k, pictures))
-
-
-def _record_best(work: _Work, done: Sequence[int]) -> None:
-    """Record an episode of these runs, whose policies and designs are their best.
-
-    It may fail where that of the training did not, since a GPU adds in any order; such a robot goes on without activation.
-    """
-    runs, failures = work.runs, Failures("freeze")
-    params, inputs = runs.design()
-    about = [{"of": runs.all[k].best["iteration"], "kind": "best"} for k in done]
-    with recorded(runs, [work.loggers[k] for k in done], about) as on_frame:
-        run_episode(
-            runs.task,
-            runs.model,
-            runs.observer,
-            runs.policy,
-            params,
-            inputs=inputs,
-            goal=runs.middle_goals(),
-            on_frame=on_frame,
-            failures=failures,
-        )
-    for k, error in runs.failed(failures.errors).items():
-        logger.warning("The best of %s failed when it was recorded: %s", runs.name(k), in_full(error))
-
-
-@torch.no_grad()
-def finish(work: _Work, finer) -> dict[int, dict[str, float]]:
-    """Record the best policy and design of each finished run once more, as the episode after the last, and examine them."""
-    runs, loggers = work.runs, work.loggers
-    done = [
-        k
-        for k, run in enumerate(runs.all)
-        if run.iteration >= run.settings.train.iterations
-        and k not in runs.errors
-        and run.best["iteration"] >= 0
-    ]
-    if not done:
-        return {}
-    now = [run.policy_snapshot() for run in runs.all]
-    for k in done:
-        runs.all[k].load_policy(runs.all[k].best)
-    runs.move(done)
-    if any(loggers[k].records for k in done):
-        _record_best(work, done)
-    found = {}
-    if runs.all[0].settings.train.examine:
-        answers = examine(runs, finer)
-        found = {k: answers[k] for k in done}
-        for k in done:
-            loggers[k].add_figures(runs.all[k].iteration, found[k])
-            loggers[k].flush()
-    for run, before in zip(runs.all, now, strict=True):
-        run.load_policy(before)
-    return found

@@ -315,7 +315,7 @@ def test_a_best_motion_that_fails_when_it_is_recorded_ends_no_run(task, conf, tm
             fails_in((1,), patch)
             return real(*args, **kwargs)
 
-    monkeypatch.setattr("softmpm_learn.train.run_episode", failing)
+    monkeypatch.setattr("softmpm_learn.finishing.run_episode", failing)
     conf = changed(conf, observer=dict(name="centroids"), train=dict(record_every=1))
     assert all(result.finished for result in together(task, conf, tmp_path))
     assert "The best of seed 5 failed when it was recorded: world 1 is inverted." in caplog.text
