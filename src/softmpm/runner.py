@@ -35,7 +35,9 @@ class Runner:
     """
 
     def __init__(self, model: Model, values: Values, failures: Failures | None = None):
-        self.model, self.values, self.failures = model, values, failures
+        self.model, self.failures = model, failures
+        # A captured graph keeps what it needs to name a failure; with it would live the history of these tensors.
+        self.values: Values = {name: tensor.detach() for name, tensor in values.items()}
         self.frozen: dict[int, int] = {}
         self.failed: Tensor | None = None
         self._end: Any = None

@@ -266,6 +266,29 @@ def test_a_failure_is_counted_once_where_another_is_raised(monkeypatch):
     assert not resources.collect() and not failures.errors
 
 
+@pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
+def test_a_recording_keeps_no_history_of_its_tensors(settings, monkeypatch):
+    """It belongs to the stream of the graph, where a gradient that is taken outside of the graph would meet it."""
+    model, start = falling_pair(**settings)
+    gradient(model, start._replace(C=healthy(start.C)), None)
+    young = model.params().young.expand(2, -1).clone().requires_grad_()
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+
+    def marks() -> dict:
+        """Of the node that adds up the gradient of ``young``, which lives as long as a history that contains it."""
+        return torch.autograd.graph.get_gradient_edge(young).node.metadata
+
+    with capture.collected_resources() as resources:
+        params = model.params()._replace(young=young * 1.0)
+        end = softmpm.simulate(model, start, None, params, substeps=20, failures=softmpm.Failures("reset"))
+        marks()["seen"] = True
+        torch.autograd.grad(end.x.sum(), young)
+    assert "seen" in marks()
+    del params, end
+    assert resources.statuses and "seen" not in marks()
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", FAILS)
 @pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
