@@ -33,7 +33,8 @@ from softmpm.summary import table
 
 _DAMAGE = (OSError, RuntimeError, LookupError, TypeError, AttributeError, OverflowError, MemoryError)
 """Exceptions of h5py for files that HDF5 cannot read."""
-_ATTEMPTS, _PAUSE = 20, 0.02  # [s]
+_ATTEMPTS, _PATIENCE, _PAUSE = 20, 15, 0.02
+"""Most changes of the file by a writer while a reader tries again, most pauses in a row without one, and their length [s]."""
 _T = TypeVar("_T")
 
 
@@ -81,18 +82,21 @@ class Recording:
         }
 
     def _steadily(self, read: Callable[[], _T]) -> _T:
-        """The result of ``read``, which is repeated after a failure while a writer changes the file."""
-        for attempt in range(_ATTEMPTS):
-            before = self._stamp()
+        """The result of ``read``, which is repeated after a failure while a writer changes the file.
+
+        One that has not changed it for a while may only wait for a processor, so the failure is final after :data:`_PATIENCE` pauses.
+        """
+        changes, pauses, before = 0, 0, self._stamp()
+        while True:
             try:
                 return read()
             except (OSError, ValueError):
-                time.sleep(_PAUSE)
-                if (
-                    attempt and self._stamp() == before
-                ):  # once may be too soon for the clock of the file system
+                if changes == _ATTEMPTS or pauses == _PATIENCE:
                     raise
-        return read()
+                time.sleep(_PAUSE)
+                now = self._stamp()
+                changes, pauses = (changes, pauses + 1) if now == before else (changes + 1, 0)
+                before = now
 
     def _stamp(self) -> tuple[int, ...]:
         found = os.stat(self.path)
