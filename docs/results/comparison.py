@@ -2,7 +2,9 @@
 `python docs/results/comparison.py elephant`."""
 
 import csv
+import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,53 +12,48 @@ import numpy as np
 from softmpm_learn.figures.intervals import interval, pairs
 
 WALKS = -0.5
-"""Best evaluation of a run that has got under way."""
-FIRST = ("particle", "true", "latent")
+"""Best evaluation of a walker that has got under way."""
+MISS, SPEED = 5e-3, 0.05
+"""Largest distance [m] and speed [m/s] of an arm's tip that is at rest at its goal."""
+FIRST = "particle true latent"
+"""The job that the others are compared with."""
+
+Row = dict[str, str]
 
 
-def shown(pair: dict | None) -> str:
-    """Mean difference with its interval; nothing of a job with itself."""
-    return "" if pair is None else f"{pair['difference']:.2f} [{pair['low']:.2f}, {pair['high']:.2f}]"
+def shown(pair: dict | None, is_log: bool) -> str:
+    """Mean difference with its interval, of logarithms the quotient of geometric means; nothing of a job with itself."""
+    if pair is None:
+        return ""
+    mean, low, high = (
+        math.exp(pair[name]) if is_log else pair[name] for name in ("difference", "low", "high")
+    )
+    return f"{mean:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def lasts(row: dict[str, str]) -> bool:
+def lasts(row: Row) -> bool:
     """True if the gait goes on after the episode, upright; False also where the robot tore."""
     return row["later"] != "" and float(row["later"]) >= 0.7 and float(row["tilt"]) < 30
 
 
-def main(robot: str):
-    with open(Path(__file__).with_name(f"comparison.{robot}.h200.csv"), newline="") as file:
-        rows = list(csv.DictReader(file))
-    jobs: dict[tuple[str, str, str], list[dict[str, str]]] = {}
-    for row in rows:
-        jobs.setdefault((row["design"], row["clock"], row["observer"]), []).append(row)
-    values = {
-        " ".join(job): {int(row["seed"]): float(row["best"]) for row in runs} for job, runs in jobs.items()
-    }
-    differences = {(pair["first"], pair["second"]): pair for pair in pairs(values, "best")}
-    for job, runs in jobs.items():
-        best = [float(row["best"]) for row in runs]
-        low, high = interval(best, np.median)
-        walk = [row for row in runs if float(row["best"]) < WALKS]
-        last = [row for row in walk if lasts(row)]
-        torn = [row for row in walk if row["later"] == ""]
-        anew = [row for row in runs if row["restarts"] != "0"]
-        difference = shown(differences.get((" ".join(FIRST), " ".join(job))))
-        design, clock, observer = job
-        print(
-            f"| {'yes' if design == 'particle' else 'no'} | {'yes' if clock == 'true' else 'no'} | {observer} | "
-            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}] | {len(walk)} | {len(last)} | {len(torn)} | {len(anew)} | {difference} |"
-        )
-    print("The latent minus another observer, with the same design and clock:")
-    for design, clock, observer in jobs:
-        pair = differences.get((f"{design} {clock} latent", f"{design} {clock} {observer}"))
-        if pair is not None:
-            print(f"design={design} clock={clock} {observer}: {shown(pair)}")
-    print("With co-design minus without, and with the clock minus without, of each observer:")
-    for (first, second), pair in differences.items():
-        (design, clock, observer), (other_design, other_clock, other) = first.split(), second.split()
-        if observer == other and (design == other_design) != (clock == other_clock):
-            print(f"{first} - {second}: {shown(pair)}")
+def of_walkers(runs: Sequence[Row]) -> list[str]:
+    """How many walk, last, tore within 6 s, and began anew."""
+    walk = [row for row in runs if float(row["best"]) < WALKS]
+    anew = [row for row in runs if row["restarts"] != "0"]
+    return [
+        str(len(some)) for some in (walk, [*filter(lasts, walk)], [r for r in walk if r["later"] == ""], anew)
+    ]
+
+
+def of_arms(runs: Sequence[Row]) -> list[str]:
+    """How many rest at their goal; medians of the largest distance [mm] and speed [m/s] from 0.3 s before the end until 0.5 s after."""
+    miss, speed = (np.array([float(row[name]) for row in runs]) for name in ("miss", "speed"))
+    rest = int(np.sum((miss <= MISS) & (speed <= SPEED)))
+    return [str(rest), f"{1e3 * np.median(miss):.1f}", f"{np.median(speed):.3f}"]
+
+
+def print_ends(rows: Sequence[Row]) -> None:
+    """How the runs of walkers ended."""
     walking = [row for row in rows if float(row["best"]) < WALKS]
     torn = sum(row["last"] == "" for row in walking)
     fell = sum(row["last"] != "" and float(row["last"]) > 0.8 * float(row["best"]) for row in walking)
@@ -65,6 +62,48 @@ def main(robot: str):
         f"{len(walking)} walk; the last evaluation of {torn} failed, that of {fell} is below 0.8 of their best"
     )
     print(f"{len(anew)} began anew, {sum(row in walking for row in anew)} of which walk")
+
+
+def main(robot: str):
+    with open(Path(__file__).with_name(f"comparison.{robot}.h200.csv"), newline="") as file:
+        rows = list(csv.DictReader(file))
+    arm = robot == "arm"  # its losses, mean squares, lie decades apart
+    jobs: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        jobs.setdefault((row["design"], row["clock"], row["observer"]), []).append(row)
+    values = {
+        " ".join(job): {
+            int(row["seed"]): math.log(float(row["best"])) if arm else float(row["best"]) for row in runs
+        }
+        for job, runs in jobs.items()
+    }
+    differences = {(pair["first"], pair["second"]): shown(pair, is_log=arm) for pair in pairs(values, "best")}
+    for job, runs in jobs.items():
+        best = [(1e5 if arm else 1.0) * float(row["best"]) for row in runs]
+        low, high = interval(best, np.median)
+        design, clock, observer = job
+        cells = [
+            "yes" if design == "particle" else "no",
+            "yes" if clock == "true" else "no",
+            observer,
+            f"{np.median(best):.2f} [{low:.2f}, {high:.2f}]",
+            *(of_arms(runs) if arm else of_walkers(runs)),
+            differences.get((FIRST, " ".join(job)), ""),
+        ]
+        print(f"| {' | '.join(cells)} |")
+    sign = "divided by" if arm else "minus"
+    print(f"The latent {sign} another observer, with the same design and clock:")
+    for design, clock, observer in jobs:
+        difference = differences.get((f"{design} {clock} latent", f"{design} {clock} {observer}"))
+        if difference is not None:
+            print(f"design={design} clock={clock} {observer}: {difference}")
+    print(f"With co-design {sign} without, and with the clock {sign} without, of each observer:")
+    for (one, other), difference in differences.items():
+        (design, clock, observer), (other_design, other_clock, other_observer) = one.split(), other.split()
+        if observer == other_observer and (design == other_design) != (clock == other_clock):
+            print(f"{one}, {other}: {difference}")
+    if not arm:
+        print_ends(rows)
 
 
 if __name__ == "__main__":
