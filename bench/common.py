@@ -4,6 +4,8 @@ import argparse
 import json
 import platform
 import statistics
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -102,6 +104,16 @@ def arguments(
         parser.add_argument("--threads", type=int, nargs="+", default=[torch.get_num_threads()], help=help)
     parser.add_argument("--json", type=Path, default=None, help="also write the table to this file")
     return parser.parse_args()
+
+
+def train(words: list[str], processes: int, folder: str) -> None:
+    """``python -m softmpm_learn`` with these words in so many processes, into this folder; ends the program if it fails."""
+    torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    program = ["-m", "softmpm_learn", *words, f"hydra.run.dir={folder}"]
+    done = subprocess.run([sys.executable, *torchrun, *program], capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stdout + done.stderr).splitlines()[-60:]  # torchrun adds some forty of its own
+        sys.exit("\n".join([*last, f"The run in {processes} process(es) failed."]))
 
 
 def machine(device: torch.device) -> str:

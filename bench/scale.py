@@ -15,13 +15,12 @@ amplifies the difference: two runs of a single process differ as much.
 
 import csv
 import statistics
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import torch
-from common import Table, arguments
+from common import Table, arguments, train
 
 from softmpm_learn.tasks.arm import ArmConf, arm
 from softmpm_learn.tasks.task import Resolution
@@ -75,13 +74,8 @@ def main():
 
 def run(words: list[str], processes: int) -> tuple[list[float], float, float]:
     """Train with ``processes`` processes; returns the loss of each iteration, and the seconds of ``episode`` and ``alone``."""
-    torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
     with tempfile.TemporaryDirectory() as folder:
-        program = ["-m", "softmpm_learn", *words, f"hydra.run.dir={folder}"]
-        done = subprocess.run([sys.executable, *torchrun, *program], capture_output=True, text=True)
-        if done.returncode:
-            last = (done.stdout + done.stderr).splitlines()[-60:]  # torchrun adds some forty of its own
-            sys.exit("\n".join([*last, f"The run in {processes} process(es) failed."]))
+        train(words, processes, folder)
         timing, metrics = (read(Path(folder) / name) for name in ("timing.csv", "metrics.csv"))
     episode = statistics.median(row["episode"] for row in timing[WARM:])
     alone = statistics.mean(row["learn"] + row["save"] for row in timing[WARM:])

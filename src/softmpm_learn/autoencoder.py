@@ -25,6 +25,16 @@ def _halvings(shape: tuple[int, ...], times: int) -> list[tuple[int, ...]]:
     return sizes
 
 
+def doubled(h: Tensor, size: Sequence[int]) -> Tensor:
+    """Pictures (picture, channel, *nodes) with each node twice along each axis, cut to ``size``: nearest neighbours.
+
+    The same values as ``functional.interpolate``, whose backward pass took half of a learning phase of 80 learners on an H200.
+    """
+    for axis, nodes in enumerate(size, start=2):
+        h = torch.stack((h, h), dim=axis + 1).flatten(axis, axis + 1).narrow(axis, 0, nodes)
+    return h
+
+
 class Encoder(nn.Module):
     """Picture → latent. Each convolution halves the picture; smooth activations, because a policy's gradient passes here.
 
@@ -92,7 +102,7 @@ class Decoder(nn.Module):
     def forward(self, z: Tensor) -> Tensor:
         h = self.tail(z).unflatten(1, (-1, *self.corner))
         for conv, size in zip(self.convs, reversed(self.sizes), strict=True):
-            h = conv(functional.interpolate(functional.silu(h), size=size))
+            h = conv(doubled(functional.silu(h), size))
         return h
 
 

@@ -35,6 +35,13 @@ class Frame:
     activation: Tensor | None
     """Activation during the step [-], shape (world, muscle)."""
 
+    def detach(self) -> "Frame":
+        """The frame without its history."""
+        activation = None if self.activation is None else self.activation.detach()
+        return replace(
+            self, state=self.state.detach(), features=self.features.detach(), activation=activation
+        )
+
 
 @dataclass(frozen=True)
 class Episode:

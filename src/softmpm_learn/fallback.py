@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 from softmpm_learn.optimizer_settings import OptimizerConf
+from softmpm_learn.settling import SHARE
 
 
 @dataclass
@@ -22,13 +23,14 @@ class Fallback:
     iterations: int = 0
     """Iterations so far."""
 
-    def is_due(self, loss: float, best: float, conf: OptimizerConf) -> bool:
+    def is_due(self, loss: float, best: float, conf: OptimizerConf, settles: bool = False) -> bool:
         """True if the run should fall back after an iteration; then a new count begins.
 
         Args:
             loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing, infinite where its
                 simulation failed.
             best: The lowest so far.
+            settles: The run settles: a single iteration below :data:`softmpm_learn.settling.SHARE` decides.
         """
         self.iterations += 1
         if math.isnan(loss):
@@ -39,9 +41,10 @@ class Fallback:
                 return False
             self.first = loss
         early = self.iterations <= conf.fallback_from
-        low = not early and self.first - loss < conf.fallback_share * (self.first - best)
+        share, after = (SHARE, 1) if settles else (conf.fallback_share, conf.fallback_after)
+        low = not early and self.first - loss < share * (self.first - best)
         self.below = self.below + 1 if low else 0
-        if conf.fallback_share == 0 or self.below < conf.fallback_after:
+        if conf.fallback_share == 0 or self.below < after:
             return False
         self.below = 0
         return True

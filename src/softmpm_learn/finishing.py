@@ -1,6 +1,7 @@
 """The end of a training: the best motion of each run is recorded once more and examined."""
 
 import logging
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import torch
 from softmpm import Failures
 from softmpm_learn.distributed import in_full
 from softmpm_learn.episode import run_episode
+from softmpm_learn.evaluation import evaluate
 from softmpm_learn.examination import examine
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
@@ -45,7 +47,8 @@ def _record_best(runs: Runs, loggers: Sequence[RunLogger], done: Sequence[int]) 
 
 @torch.no_grad()
 def finish(runs: Runs, loggers: Sequence[RunLogger], finer: "Task | None") -> dict[int, dict[str, float]]:
-    """Record the best policy and design of each finished run once more, as the episode after the last, and examine them."""
+    """Record the best policy and design of each finished run once more, as the episode after the last, evaluate them once more, and
+    examine them."""
     done = [
         k
         for k, run in enumerate(runs.all)
@@ -63,10 +66,11 @@ def finish(runs: Runs, loggers: Sequence[RunLogger], finer: "Task | None") -> di
         _record_best(runs, loggers, done)
     found = {}
     if runs.all[0].settings.train.examine:
-        answers = examine(runs, finer)
+        again, answers = evaluate(runs), examine(runs, finer)
         found = {k: answers[k] for k in done}
         for k in done:
-            loggers[k].add_figures(runs.all[k].iteration, found[k])
+            value = again[k] if math.isfinite(again[k]) else math.nan
+            loggers[k].add_figures(runs.all[k].iteration, found[k] | {"evaluation": value})
             loggers[k].flush()
     for run, before in zip(runs.all, now, strict=True):
         run.load_policy(before)

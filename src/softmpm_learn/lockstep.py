@@ -165,8 +165,8 @@ class LockStep:
         batches, batch = self.conf.batches, self.conf.batch
         self._drawn_places[k] = learner.replay.draw(learner.streams["minibatches"], batches * batch)
         if self.conf.variational:
-            for noise in self._drawn_noise[k]:
-                torch.randn(noise.shape, generator=learner.streams["noise"], out=noise)
+            noise = self._drawn_noise[k]
+            torch.randn(noise.shape, generator=learner.streams["noise"], out=noise)
 
     def epoch(self) -> list[tuple[float, float, bool]]:
         """Run an epoch; for each learner the mean loss of its minibatches, the validation loss, and whether all is finite."""

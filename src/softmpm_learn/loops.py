@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
 
 
+_Found = tuple[Episode, tuple[Tensor, ...], list[Frame]]
+"""Episode, gradients, and the frames that nobody has seen yet: those of a captured graph."""
+
+
 def _captures(model: Model) -> bool:
     """False if sums are in the order of the particles, which wait for the device, see docs/conventions.md."""
     return not (model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64))
@@ -73,6 +77,7 @@ class ClosedLoop:
         weights, free: Parameters of the policy and of the design.
         runs: Number of runs, each with as many worlds.
         keep_every, fade: As in :func:`run_episode`.
+        records: Episodes will be recorded: a captured graph keeps the states of all control steps.
     """
 
     def __init__(
@@ -87,12 +92,14 @@ class ClosedLoop:
         runs: int = 1,
         keep_every: int = 0,
         fade: float | Tensor = math.inf,
+        records: bool = False,
     ):
-        self.fade = fade
+        self.fade, self.records = fade, records
         self.task, self.model, self.observer, self.policy = task, model, observer, policy
         self.design, self.weights, self.free = design, weights, free
         self.runs, self.keep_every = runs, keep_every
         self._goal: Tensor | None = None
+        self._on_frame: Callable[[Frame], None] | None = None
         self._failures = softmpm.Failures("reset")
         self._captures = _captures(model)
         loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
@@ -102,33 +109,49 @@ class ClosedLoop:
         self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
     ) -> tuple[Episode, tuple[Tensor, ...]]:
         """The episode, detached, and the gradient of each run's mean loss with respect to ``weights``, then to ``free``; overwritten
-        by the next call. With ``on_frame`` the CUDA graph is bypassed.
+        by the next call. ``on_frame`` is called for each control step, after a replay for all of them.
 
         Raises:
             softmpm.UnstableError: One of :attr:`errors`.
         """
         if goal is not None:
             self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
+        episode, gradients, frames = self._run(on_frame, self._captures and (self.records or not on_frame))
+        if on_frame and frames and self._failures and self.runs == 1:
+            del episode, gradients, frames  # a frame after the failure shows nothing
+            episode, gradients, frames = self._run(on_frame, as_graph=False)
+        if on_frame:
+            for frame in frames:
+                on_frame(frame)
+        if self._failures:
+            del episode, gradients, frames
+            raise self._failures.errors[0]
+        return episode, gradients
+
+    def _run(self, on_frame: Callable[[Frame], None] | None, as_graph: bool) -> _Found:
         self._failures.errors.clear()
+        self._on_frame = on_frame
         try:
-            found = self._graph() if self._captures and not on_frame else self._work(on_frame)
+            return self._graph() if as_graph else self._work()
         except softmpm.UnstableError as error:
             if not self._failures:  # that of a gradient, or the first of a single run
                 self._failures.errors.append(error)
             raise
-        if self._failures:
-            del found
-            raise self._failures.errors[0]
-        return found
+        finally:
+            self._on_frame = None
 
     @property
     def errors(self) -> list[softmpm.UnstableError]:
         """Failures of the last call, those of all runs."""
         return self._failures.errors
 
-    def _work(self, on_frame=None) -> tuple[Episode, tuple[Tensor, ...]]:
+    def _work(self) -> _Found:
         params, inputs = self.design()
         capturing = self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+        frames = list[Frame]()
+        on_frame = self._on_frame
+        if capturing:
+            on_frame = (lambda frame: frames.append(frame.detach())) if self.records else None
         # A failure must not hide those of other runs, and while a graph is captured none is known yet; a single run may stop at once.
         failures = self._failures if capturing or self.runs > 1 else None
         about: dict[str, Any] = dict(
@@ -148,7 +171,8 @@ class ClosedLoop:
         )  # a run's parameters see its own worlds
         adj = torch.autograd.grad(loss, [*activations, *self.free])
         adj_activations, adj_free = adj[: len(activations)], adj[len(activations) :]
-        return episode.detach(), (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
+        gradients = (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
+        return episode.detach(), gradients, frames
 
     def _policy_gradient(self, decisions: Decisions, adj_activations: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Of all decisions at once: layer by layer and step by step it would be many small sums."""

@@ -16,6 +16,7 @@ from softmpm_learn.evaluation import due, evaluate
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
+from softmpm_learn.settling import SHARE
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -141,9 +142,16 @@ def step(run: Run, loss: float, value: float) -> dict[str, int]:
         value: By which the best is chosen; nan where it is not known.
     """
     conf, restarts, low = run.settings.optimizer, run.restart.count, ""
+    is_far = run.fallback.is_due(value, run.best["loss"], conf, run.settles)
     if run.restart.is_due(loss, conf):
         low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
-    elif run.fallback.is_due(value, run.best["loss"], conf):
+    elif run.begins_to_settle:
+        low = f"the run settles; {run.fall_back()}"
+    elif run.ends_elsewhere:
+        low = f"the run ends; {run.fall_back()}"
+    elif is_far and run.settles:
+        low = f"the progress was below {SHARE:g} of the best; {run.fall_back()}"
+    elif is_far:
         share = (
             f"for {conf.fallback_after} iterations the progress was below {conf.fallback_share:g} of the best"
         )

@@ -18,8 +18,8 @@ class OptimizerConf:
     """Learning rate of the policy: 2e-2 suits the linear one. null is the task's, for the mlp and adam: 5e-3, of walkers 1e-2."""
     design_rate: float = 3e-2
     """Learning rate of the design, in the unbounded space before the sigmoid."""
-    halving: float | None = 40.0
-    """Iterations in which both rates fall by half, so that the last corrections are small; null: never. Our choice."""
+    halving: float | None = None
+    """Iterations in which both rates fall by half; null: never."""
     max_norm: float | None = 1.0
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
     fade: float | None = None
@@ -37,6 +37,9 @@ class OptimizerConf:
     """First iterations, which do not count: progress is small by then, and the best of it is chance."""
     fallback_rate: float = 0.5
     """Factor of both learning rates at each fallback."""
+    settle: float = 0.2
+    """Share of the iterations, at the end, in which the run settles: it takes ever smaller steps from its best, with features that no
+    longer change, and ends there (settling.py); 0: never. Our choice."""
     restart_above: float | None = None
     """Begin anew with other first weights where the loss of no episode was below this; such a run does not go back to its best either.
     null is the task's, of walkers minus a tenth of their length; .inf: never."""
@@ -61,5 +64,6 @@ class OptimizerConf:
         if self.restart_above is not None and math.isnan(self.restart_above):
             raise ValueError("optimizer.restart_above must be a number, .inf or null, got nan.")
         share("optimizer", self, "fallback_rate")
-        if not 0.0 <= self.fallback_share < 1.0:
-            raise ValueError(f"optimizer.fallback_share must lie in [0, 1), got {self.fallback_share}.")
+        for name in ("fallback_share", "settle"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"optimizer.{name} must lie in [0, 1), got {getattr(self, name)}.")

@@ -25,6 +25,7 @@ from softmpm_learn.replay import Replay
 from softmpm_learn.restart import Restart, is_worth
 from softmpm_learn.seeding import seeded, stream, stream_seed
 from softmpm_learn.settings import Settings
+from softmpm_learn.settling import begins, pace
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
@@ -151,10 +152,40 @@ class Run:
         for parameter, safe in zip(self.parameters, self.safe, strict=True):
             parameter.lerp_(safe, 0.5)
 
+    @property
+    def settles(self) -> bool:
+        """True in the last iterations, if what the run has found is worth it, see settling.py."""
+        return self._pace < 1.0 and self._has_worth
+
+    @property
+    def begins_to_settle(self) -> bool:
+        """True in the first of them, unless the run is at its best."""
+        conf = self.settings
+        first = begins(self.iteration, conf.train.iterations, conf.optimizer.settle)
+        return first and self._has_worth and self.best["iteration"] < self.iteration
+
+    @property
+    def ends_elsewhere(self) -> bool:
+        """True in the last iteration of a run that settles, unless it is at its best."""
+        last = self.iteration == self.settings.train.iterations - 1
+        return last and self.settles and self.best["iteration"] < self.iteration
+
+    @property
+    def _pace(self) -> float:
+        return pace(self.iteration, self.settings.train.iterations, self.settings.optimizer.settle)
+
+    @property
+    def _has_worth(self) -> bool:
+        return self.best["iteration"] >= 0 and is_worth(self.best["loss"], self.settings.optimizer)
+
     def step(self) -> None:
         """Take a step along the gradient, the next one with lower rates."""
         self.snapshot()
+        rates = [group["lr"] for group in self.optimizer.param_groups]
+        self._scale_rates(self._pace if self.settles else 1.0)
         self.optimizer.step()
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate
         halving = self.settings.optimizer.halving
         if halving is not None:
             self._scale_rates(0.5 ** (1 / halving))

@@ -68,6 +68,7 @@ class Runs:
             runs=len(runs),
             keep_every=first.settings.learning.frame_every if any(run.learner for run in runs) else 0,
             fade=first.settings.optimizer.fade or math.inf,
+            records=any(run.settings.train.record_every for run in runs),
         )
 
     @property

@@ -228,7 +228,8 @@ def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | 
         if run.learner is None:
             continue
         row["replay"] = len(run.learner.replay.ids)
-        if run.iteration == 0 or (run.iteration + 1) % run.settings.learning.every == 0:
+        every = run.settings.learning.every
+        if (run.iteration == 0 or (run.iteration + 1) % every == 0) and not run.settles:
             due.append((run.learner, row))
     learned = runs.group.once(learn_side_by_side, [learner for learner, _ in due]) or [{}] * len(due)
     for (learner, row), figures in zip(due, learned, strict=True):

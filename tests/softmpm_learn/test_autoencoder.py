@@ -1,8 +1,9 @@
 import pytest
 import torch
 from learners import waves
+from torch.nn import functional
 
-from softmpm_learn.autoencoder import Autoencoder
+from softmpm_learn.autoencoder import Autoencoder, doubled
 from softmpm_learn.seeding import seeded
 
 
@@ -18,6 +19,17 @@ def test_shapes_come_back(dim, shape, fields):
     autoencoder, seen = make(dim, shape, seen=fields * dim), fields * dim
     z = autoencoder.encoder(torch.randn(3, seen, *shape))
     assert z.shape == (3, 2) and autoencoder.decode(z).shape == (3, seen, *shape)
+
+
+@pytest.mark.parametrize("size", [(7, 4), (8, 3), (8, 4), (7, 3, 5), (1, 1, 1)])
+def test_doubling_is_interpolation_by_nearest_neighbours(size):
+    """Values and gradients, for even and odd sizes."""
+    h = torch.randn(2, 3, *((n + 1) // 2 for n in size), dtype=torch.float64, requires_grad=True)
+    got, want = doubled(h, size), functional.interpolate(h, size=size)
+    assert torch.equal(got, want)
+    adj = torch.randn_like(got)
+    (a,), (b,) = (torch.autograd.grad(out, h, adj) for out in (got, want))
+    torch.testing.assert_close(a, b, rtol=1e-14, atol=1e-14)
 
 
 def test_scale_makes_units_vanish():

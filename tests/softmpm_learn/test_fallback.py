@@ -74,7 +74,9 @@ def scripted(monkeypatch):
 
 @pytest.fixture
 def falling(settings):
-    optimizer = dataclasses.replace(settings.optimizer, halving=None, fallback_after=3, fallback_from=0)
+    optimizer = dataclasses.replace(
+        settings.optimizer, halving=None, fallback_after=3, fallback_from=0, settle=0.0
+    )
     learning = dataclasses.replace(settings.learning, every=2)
     conf = dataclasses.replace(settings.train, iterations=len(LOSSES), examine=False)
     return dataclasses.replace(settings, optimizer=optimizer, learning=learning, train=conf)

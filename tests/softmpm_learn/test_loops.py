@@ -1,12 +1,14 @@
 """Closed loops that are run again and again."""
 
+import math
+
 import pytest
 import torch
 from learners import viscous
 
 import softmpm
 from softmpm_learn.design import Design
-from softmpm_learn.episode import run_episode
+from softmpm_learn.episode import Frame, run_episode
 from softmpm_learn.loops import ClosedLoop
 from softmpm_learn.observe import Centroids
 from softmpm_learn.policy import make_policy
@@ -43,3 +45,74 @@ def test_sums_in_order_are_not_captured(task, dtype, deterministic):
     loop._graph = lambda: calls.append(1) or work()
     loop(None)
     assert len(calls) == (0 if deterministic else 1)
+
+
+def recording_loop(task, device="cpu") -> ClosedLoop:
+    """A loop whose episodes will be recorded."""
+    model = softmpm.build(task.scene, device=device)
+    observer = Centroids(model, list(task.regions.values()), task.body_length)
+    policy = make_policy(PolicyConf(name="linear"), observer.size, 2, 0.1, seed=0).to(model.device)
+    weights = list(policy.parameters())
+    return ClosedLoop(
+        task, model, observer, policy, lambda: (model.params(), softmpm.Inputs()), weights, [], records=True
+    )
+
+
+def torn(text: str) -> softmpm.UnstableError:
+    return softmpm.UnstableError(
+        text, kind="fracture", world=0, particle=0, substep=0, value=math.nan, limit=math.nan
+    )
+
+
+def assert_same_frames(got: list[Frame], want: list[Frame]) -> None:
+    assert [frame.time for frame in got] == [frame.time for frame in want]
+    for a, b in zip(got, want, strict=True):
+        torch.testing.assert_close((*a.state[:4], a.features), (*b.state[:4], b.features))
+        assert (a.activation is None) == (b.activation is None)
+        if b.activation is not None:
+            torch.testing.assert_close(a.activation, b.activation)
+
+
+def test_the_frames_of_a_replay_are_shown(task):
+    """Those that the graph kept, in their order; only to a call that asks."""
+    loop, live, replayed = recording_loop(task), list[Frame](), list[Frame]()
+    episode, gradients = loop(None, live.append)
+    assert len(live) == task.control_steps + 1
+    loop._graph = lambda: (episode, gradients, [frame.detach() for frame in live])
+    loop(None)
+    assert loop(None, replayed.append) == (episode, gradients)
+    assert_same_frames(replayed, live)
+
+
+def test_frames_after_a_failure_are_not_shown(task):
+    """A replay goes on with the robot that failed; the one that is recorded is simulated again, up to its failure."""
+    loop, shown = recording_loop(task), list[Frame]()
+    episode, gradients, work = *loop(None), loop._work
+
+    def replay():
+        loop._failures.errors.append(torn("it tore"))
+        return episode, gradients, ["after the failure"]
+
+    def again():
+        work()
+        raise torn("it tore again")
+
+    loop._graph, loop._work = replay, again
+    with pytest.raises(softmpm.UnstableError, match="it tore again"):
+        loop(None, shown.append)
+    assert [type(frame) for frame in shown] == [Frame] * (task.control_steps + 1)
+    with pytest.raises(softmpm.UnstableError, match="it tore$"):
+        loop(None)
+
+
+@pytest.mark.gpu
+def test_a_captured_graph_keeps_the_frames(task):
+    """They are those of the simulation outside of a graph, of every replay, and nothing is captured for them a second time."""
+    loop, frames = recording_loop(viscous(task), "cuda"), [list[Frame]() for _ in range(3)]
+    loop(None, frames[0].append)
+    loop(None)
+    graph = loop._graph._graph
+    for some in frames[1:]:
+        loop(None, some.append)
+        assert_same_frames(some, frames[0])
+    assert graph is not None and loop._graph._graph is graph
