@@ -22,13 +22,15 @@ Row = dict[str, str]
 
 
 def shown(pair: dict | None, is_log: bool) -> str:
-    """Mean difference with its interval, of logarithms the quotient of geometric means; nothing of a job with itself."""
+    """Mean difference with its interval, of logarithms the quotient of geometric means; nothing of a job with itself. Bold where the
+    interval leaves out that there is no difference."""
     if pair is None:
         return ""
     mean, low, high = (
         math.exp(pair[name]) if is_log else pair[name] for name in ("difference", "low", "high")
     )
-    return f"{mean:.2f} [{low:.2f}, {high:.2f}]"
+    text, same = f"{mean:.2f} [{low:.2f}, {high:.2f}]", 1.0 if is_log else 0.0
+    return text if low <= same <= high else f"**{text}**"
 
 
 def lasts(row: Row) -> bool:
@@ -53,14 +55,14 @@ def of_arms(runs: Sequence[Row]) -> list[str]:
 
 
 def print_ends(rows: Sequence[Row]) -> None:
-    """How the runs of walkers ended."""
+    """How the runs of walkers ended: their best is evaluated once more."""
     walking = [row for row in rows if float(row["best"]) < WALKS]
-    torn = sum(row["last"] == "" for row in walking)
-    fell = sum(row["last"] != "" and float(row["last"]) > 0.8 * float(row["best"]) for row in walking)
+    torn = sum(row["end"] == "" for row in walking)
+    fell = sum(row["end"] != "" and float(row["end"]) > 0.8 * float(row["best"]) for row in walking)
+    gone = sum(row["later"] == "" for row in walking)
     anew = [row for row in rows if row["restarts"] != "0"]
-    print(
-        f"{len(walking)} walk; the last evaluation of {torn} failed, that of {fell} is below 0.8 of their best"
-    )
+    print(f"{len(walking)} walk, {sum(map(lasts, walking))} of which last, and {gone} tear within 6 s")
+    print(f"evaluated once more {torn} of those that walk tear, and {fell} are below 0.8 of their best")
     print(f"{len(anew)} began anew, {sum(row in walking for row in anew)} of which walk")
 
 
@@ -85,12 +87,12 @@ def main(robot: str):
         cells = [
             "yes" if design == "particle" else "no",
             "yes" if clock == "true" else "no",
-            observer,
+            observer.replace("kmeans", "k-means"),
             f"{np.median(best):.2f} [{low:.2f}, {high:.2f}]",
             *(of_arms(runs) if arm else of_walkers(runs)),
             differences.get((FIRST, " ".join(job)), ""),
         ]
-        print(f"| {' | '.join(cells)} |")
+        print(f"| {' | '.join(cells)} |".replace("-", "−").replace("k−means", "k-means"))
     sign = "divided by" if arm else "minus"
     print(f"The latent {sign} another observer, with the same design and clock:")
     for design, clock, observer in jobs:

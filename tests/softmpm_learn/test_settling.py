@@ -83,9 +83,7 @@ def test_a_run_settles_from_its_best(task, model, conf, tmp_path, scripted, capl
     assert equal(seen[7], seen[2]) and not equal(seen[8], seen[7])
     assert all(equal(seen[k], seen[2], "observer") for k in range(5, 10))
     assert not equal(seen[4], seen[2], "observer")  # learning phases before
-    assert paces == pytest.approx(
-        {0: 1, 1: 1, 2: 1, 3: 1, 5: 0.5 * 5 / 7, 7: 0.25 * 3 / 7, 8: 0.25 * 2 / 7}
-    )
+    assert paces == pytest.approx({0: 1, 1: 1, 2: 1, 3: 1, 5: 0.5 * 5 / 7, 7: 0.25 * 3 / 7, 8: 0.25 * 2 / 7})
     assert equal(result.run.policy_snapshot(), seen[7])
     with open(tmp_path / "metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))

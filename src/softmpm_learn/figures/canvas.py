@@ -4,10 +4,14 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from softmpm_learn.files import replace
 
 COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
 """Colours that people with any colour vision tell apart (Okabe and Ito 2008)."""
+DECADES = 100.0
+"""Largest over smallest value from which on an axis has the scale of logarithms."""
 
 
 def figure(width: float, height: float) -> Any:
@@ -15,6 +19,13 @@ def figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def scale(values: Any) -> str:
+    """Scale of an axis on which all of these can be told apart: that of logarithms where they are positive and span two decades."""
+    known = np.asarray(values, dtype=float)
+    known = known[np.isfinite(known)]
+    return "log" if known.size and known.min() > 0 and known.max() > DECADES * known.min() else "linear"
 
 
 def save(figure: Any, path: Path, dpi: int) -> None:

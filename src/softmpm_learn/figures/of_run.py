@@ -39,6 +39,7 @@ def loss_figure(
             axes.plot(iteration, np.fmin.accumulate(value), color="0.6", linestyle="--", label="best so far")
             axes.legend(frameon=False)
         axes.set_title(name, fontsize=9, loc="left")
+        axes.set_yscale(canvas.scale(value))
         axes.spines[["top", "right"]].set_visible(False)
         axes.margins(x=0.01)
         if place == len(names) - 1:

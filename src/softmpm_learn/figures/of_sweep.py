@@ -97,10 +97,12 @@ def curves_figure(
     widest = max(len(_count(name, members)) for lines in panels.values() for name, members in lines.items())
     columns = 2 if widest <= 42 else 1
     figure, grid = _curve_axes(len(panels), -(-len(groups) // columns))
+    scale = canvas.scale([value for line in series.values() for value in line.values()])
     for axes, (title, lines) in zip(grid, panels.items(), strict=False):
         for name, members in lines.items():
             _curve(axes, members, series, styles[name], _count(name, members))
         axes.set_title(title, fontsize=9, loc="left")
+        axes.set_yscale(scale)
         axes.spines[["top", "right"]].set_visible(False)
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.margins(x=0.01)
