@@ -1,4 +1,4 @@
-"""Print the table of docs/results.md on the features of k-means and of the latent, from the tables beside this script:
+"""Print the table of docs/results.md on the features of k-means and of the latent, from features.csv beside this script:
 `python docs/results/features.py`."""
 
 import csv
@@ -9,20 +9,12 @@ import numpy as np
 from softmpm_learn.figures.intervals import interval, pairs
 
 
-def table(name: str) -> list[dict[str, str]]:
-    """Rows of a table beside this script."""
-    with open(Path(__file__).with_name(name), newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def main():
     best = dict[str, dict[int, float]]()
-    for row in table("comparison.biped.h200.csv"):
-        if (row["design"], row["clock"]) == ("particle", "true"):
-            best.setdefault(row["observer"], {})[int(row["seed"])] = float(row["best"])
-    for row in table("features.cpu.csv"):
-        if row["robot"] == "biped":
-            best.setdefault(row["observer"], {})[int(row["seed"])] = float(row["best"])
+    with open(Path(__file__).with_name("features.csv"), newline="") as file:
+        for row in csv.DictReader(file):
+            if row["robot"] == "biped":
+                best.setdefault(row["observer"], {})[int(row["seed"])] = float(row["best"])
     for observer in ("latent", "kmeans", "k-means, 2 clusters", "latent, posture"):
         values = list(best[observer].values())
         low, high = interval(values, np.median)
