@@ -64,6 +64,7 @@ class Graph(Generic[Result]):
         if self._any_failed is not None and self._any_failed.item():
             if self._resources.widen():
                 self._graph = self._resources = None
+                del self._result  # its memory is that of the graph
                 self._warm = False
                 return self()
             if not self._resources.collect():

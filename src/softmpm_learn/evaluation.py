@@ -17,9 +17,11 @@ logger = logging.getLogger("softmpm_learn")
 
 
 def due(run: Run) -> bool:
-    """True if this iteration is evaluated: the first, and every so many; not the last, or a run that goes on would differ."""
+    """True if this iteration is evaluated: the first, every so many, and the last of a run that settles; not the last of another run,
+    which would differ if it went on."""
     every = run.settings.train.evaluate_every
-    return run.evaluated and (run.iteration == 0 or (run.iteration + 1) % every == 0)
+    regular = run.iteration == 0 or (run.iteration + 1) % every == 0
+    return run.evaluated and (regular or (run.settles and run.left == 1))
 
 
 @torch.no_grad()

@@ -10,6 +10,8 @@ Each answer compares the first term of the objective with what it was in the epi
     miss      what should reach a goal: largest distance from it from T − 0.3 s to T + 0.5 s [m]
     speed     what should come to rest: largest speed in that time [m/s]
 
+Beside them stands ``end``: the loss, or the evaluation, of the motion with which the run ended, simulated once more.
+
 A simulation that fails has no answer, and the log says why. The robot goes on from rest, so that it does not fail again in every
 control step.
 """
@@ -39,7 +41,7 @@ KICK = 0.1
 FRICTION = 0.75, 1.25
 BEFORE, AFTER = 0.3, 0.5
 """Durations before and after the end of an episode during which a held goal must be kept at rest [s]."""
-NAMES = ["later", "kicked", "friction", "finer", "tilt", "miss", "speed"]
+NAMES = ["end", "later", "kicked", "friction", "finer", "tilt", "miss", "speed"]
 """Columns of metrics.csv."""
 
 logger = logging.getLogger("softmpm_learn")

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 from softmpm_learn.optimizer_settings import OptimizerConf
-from softmpm_learn.settling import SHARE
+from softmpm_learn.settling import SETTLED_SHARE
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Fallback:
             loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing, infinite where its
                 simulation failed.
             best: The lowest so far.
-            settles: The run settles: a single iteration below :data:`softmpm_learn.settling.SHARE` decides.
+            settles: The run settles: a single iteration below :data:`softmpm_learn.settling.SETTLED_SHARE` decides.
         """
         self.iterations += 1
         if math.isnan(loss):
@@ -40,8 +40,8 @@ class Fallback:
             if math.isinf(loss):
                 return False
             self.first = loss
-        early = self.iterations <= conf.fallback_from
-        share, after = (SHARE, 1) if settles else (conf.fallback_share, conf.fallback_after)
+        early = self.iterations <= conf.fallback_from and not settles
+        share, after = (SETTLED_SHARE, 1) if settles else (conf.fallback_share, conf.fallback_after)
         low = not early and self.first - loss < share * (self.first - best)
         self.below = self.below + 1 if low else 0
         if conf.fallback_share == 0 or self.below < after:

@@ -1,8 +1,9 @@
-"""The end of a training: the best motion of each run is recorded once more and examined."""
+"""The end of a training: the best motion of each run is evaluated and recorded once more, and examined."""
 
+import contextlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -45,33 +46,55 @@ def _record_best(runs: Runs, loggers: Sequence[RunLogger], done: Sequence[int]) 
         logger.warning("The best of %s failed when it was recorded: %s", runs.name(k), in_full(error))
 
 
-@torch.no_grad()
-def finish(runs: Runs, loggers: Sequence[RunLogger], finer: "Task | None") -> dict[int, dict[str, float]]:
-    """Record the best policy and design of each finished run once more, as the episode after the last, evaluate them once more, and
-    examine them."""
-    done = [
+def finished(runs: Runs) -> list[int]:
+    """Numbers of the runs that are done and have a best motion."""
+    return [
         k
         for k, run in enumerate(runs.all)
-        if run.iteration >= run.settings.train.iterations
-        and k not in runs.errors
-        and run.best["iteration"] >= 0
+        if run.left <= 0 and k not in runs.errors and run.best["iteration"] >= 0
     ]
-    if not done:
-        return {}
-    now = [run.policy_snapshot() for run in runs.all]
+
+
+@contextlib.contextmanager
+def _at_their_best(runs: Runs) -> Iterator[list[int]]:
+    """Policies and designs of finished runs are their best until the block ends; gives their numbers."""
+    done, now = finished(runs), [run.policy_snapshot() for run in runs.all]
     for k in done:
         runs.all[k].load_policy(runs.all[k].best)
     runs.move(done)
-    if any(loggers[k].records for k in done):
-        _record_best(runs, loggers, done)
-    found = {}
-    if runs.all[0].settings.train.examine:
-        again, answers = evaluate(runs), examine(runs, finer)
-        found = {k: answers[k] for k in done}
-        for k in done:
-            value = again[k] if math.isfinite(again[k]) else math.nan
-            loggers[k].add_figures(runs.all[k].iteration, found[k] | {"evaluation": value})
-            loggers[k].flush()
+    yield done
     for run, before in zip(runs.all, now, strict=True):
         run.load_policy(before)
+
+
+def evaluate_ends(runs: Runs) -> dict[int, float]:
+    """The best of each finished run, evaluated once more, by its number; nan where that failed. In every process."""
+    if not (runs.all[0].settings.train.examine and finished(runs)):
+        return {}
+    with _at_their_best(runs) as done:
+        again = evaluate(runs)
+    return {k: again[k] if math.isfinite(again[k]) else math.nan for k in done}
+
+
+@torch.no_grad()
+def finish(
+    runs: Runs, loggers: Sequence[RunLogger], finer: "Task | None", ends: dict[int, float]
+) -> dict[int, dict[str, float]]:
+    """Record the best policy and design of each finished run once more, as the episode after the last, and examine them.
+
+    Args:
+        ends: Of :func:`evaluate_ends`.
+    """
+    if not finished(runs):
+        return {}
+    found = {}
+    with _at_their_best(runs) as done:
+        if any(loggers[k].records for k in done):
+            _record_best(runs, loggers, done)
+        if ends:
+            answers = examine(runs, finer)
+            found = {k: answers[k] | {"end": ends[k]} for k in done}
+            for k in done:
+                loggers[k].add_figures(runs.all[k].iteration, found[k])
+                loggers[k].flush()
     return found

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
 
 
-_Found = tuple[Episode, tuple[Tensor, ...], list[Frame]]
-"""Episode, gradients, and the frames that nobody has seen yet: those of a captured graph."""
+_Outcome = tuple[Episode, tuple[Tensor, ...], list[Frame]]
+"""Episode, gradients, and the frames of a captured graph, which were not passed to ``on_frame`` yet."""
 
 
 def _captures(model: Model) -> bool:
@@ -128,7 +128,7 @@ class ClosedLoop:
             raise self._failures.errors[0]
         return episode, gradients
 
-    def _run(self, on_frame: Callable[[Frame], None] | None, as_graph: bool) -> _Found:
+    def _run(self, on_frame: Callable[[Frame], None] | None, as_graph: bool) -> _Outcome:
         self._failures.errors.clear()
         self._on_frame = on_frame
         try:
@@ -145,7 +145,7 @@ class ClosedLoop:
         """Failures of the last call, those of all runs."""
         return self._failures.errors
 
-    def _work(self) -> _Found:
+    def _work(self) -> _Outcome:
         params, inputs = self.design()
         capturing = self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
         frames = list[Frame]()

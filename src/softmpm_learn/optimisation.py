@@ -16,7 +16,7 @@ from softmpm_learn.evaluation import due, evaluate
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
-from softmpm_learn.settling import SHARE
+from softmpm_learn.settling import SETTLED_SHARE
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -135,7 +135,7 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
 
 
 def step(run: Run, loss: float, value: float) -> dict[str, int]:
-    """Take the step along the gradient, go back to the best, or begin anew; how often it did the latter two, 0 or 1.
+    """Take the step along the gradient, go back to the best, or begin anew; how often it fell back and began anew, 0 or 1.
 
     Args:
         loss: That of the episode.
@@ -143,25 +143,32 @@ def step(run: Run, loss: float, value: float) -> dict[str, int]:
     """
     conf, restarts, low = run.settings.optimizer, run.restart.count, ""
     is_far = run.fallback.is_due(value, run.best["loss"], conf, run.settles)
-    if run.restart.is_due(loss, conf):
+    if settle(run):
+        return {"fallbacks": 0, "restarts": 0}
+    if not run.settles and run.restart.is_due(loss, conf):
         low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
-    elif run.begins_to_settle:
-        low = f"the run settles; {run.fall_back()}"
-    elif run.ends_elsewhere:
-        low = f"the run ends; {run.fall_back()}"
-    elif is_far and run.settles:
-        low = f"the progress was below {SHARE:g} of the best; {run.fall_back()}"
     elif is_far:
-        share = (
-            f"for {conf.fallback_after} iterations the progress was below {conf.fallback_share:g} of the best"
-        )
-        low = f"{share}; {run.fall_back()}"
+        after, share = (1, SETTLED_SHARE) if run.settles else (conf.fallback_after, conf.fallback_share)
+        low = f"for {after} iterations " if after > 1 else ""
+        low += f"the progress was below {share:g} of the best; {run.fall_back()}"
     if low:
         logger.warning("Iteration %d: %s.", run.iteration, low)
     else:
         run.step()
     anew = run.restart.count - restarts
     return {"fallbacks": int(bool(low)) - anew, "restarts": anew}
+
+
+def settle(run: Run) -> bool:
+    """Begin or end to settle, in the first and the last iteration of those; True if the run takes no step then."""
+    begins, ends = run.begins_to_settle(), run.settles and run.left == 1
+    elsewhere = run.best["iteration"] < run.iteration
+    if begins and elsewhere:
+        back = run.return_to_best(run.settings.optimizer.fallback_rate)
+        logger.info("Iteration %d: the run settles; %s.", run.iteration, back)
+    elif ends and elsewhere:
+        logger.info("Iteration %d: the run ends; %s.", run.iteration, run.return_to_best())
+    return ends or (begins and elsewhere)
 
 
 def attempt(

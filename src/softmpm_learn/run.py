@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from softmpm import Model
+from softmpm_learn import settling
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
@@ -25,10 +26,14 @@ from softmpm_learn.replay import Replay
 from softmpm_learn.restart import Restart, is_worth
 from softmpm_learn.seeding import seeded, stream, stream_seed
 from softmpm_learn.settings import Settings
-from softmpm_learn.settling import begins, pace
+from softmpm_learn.settling import Settling
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
+
+
+OLDER = {"optimizer.settle": 0.0}
+"""Settings of checkpoints that do not name them, where these are not the defaults."""
 
 
 class SettingsError(ValueError):
@@ -50,6 +55,7 @@ class Run:
         best: The lowest loss so far, that of the evaluations if there are any, and what gave it.
         fallback: Decides when the run goes back to its best.
         restart: Decides when it begins anew.
+        settling: Decides whether it settles.
     """
 
     def __init__(
@@ -73,7 +79,7 @@ class Run:
         settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
-        self.fallback, self.restart = Fallback(), Restart()
+        self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = stream(settings.train.seed, "goals")
         self.learner: Learner | None = None
         self.observer = self._make_observer(out)
@@ -153,36 +159,30 @@ class Run:
             parameter.lerp_(safe, 0.5)
 
     @property
+    def left(self) -> int:
+        """Iterations that are not done."""
+        return self.settings.train.iterations - self.iteration
+
+    @property
     def settles(self) -> bool:
-        """True in the last iterations, if what the run has found is worth it, see settling.py."""
-        return self._pace < 1.0 and self._has_worth
+        """True in the last iterations of a run that settles in them."""
+        return self.settling.active and self.left <= self._settling_iterations
 
-    @property
     def begins_to_settle(self) -> bool:
-        """True in the first of them, unless the run is at its best."""
-        conf = self.settings
-        first = begins(self.iteration, conf.train.iterations, conf.optimizer.settle)
-        return first and self._has_worth and self.best["iteration"] < self.iteration
+        """Decide in the first of them whether it does; True if it begins."""
+        worth = self.best["iteration"] >= 0 and is_worth(self.best["loss"], self.settings.optimizer)
+        return self.settling.begins(self.left, self._settling_iterations, worth)
 
     @property
-    def ends_elsewhere(self) -> bool:
-        """True in the last iteration of a run that settles, unless it is at its best."""
-        last = self.iteration == self.settings.train.iterations - 1
-        return last and self.settles and self.best["iteration"] < self.iteration
-
-    @property
-    def _pace(self) -> float:
-        return pace(self.iteration, self.settings.train.iterations, self.settings.optimizer.settle)
-
-    @property
-    def _has_worth(self) -> bool:
-        return self.best["iteration"] >= 0 and is_worth(self.best["loss"], self.settings.optimizer)
+    def _settling_iterations(self) -> int:
+        return settling.iterations(self.settings.train.iterations, self.settings.optimizer.settle)
 
     def step(self) -> None:
         """Take a step along the gradient, the next one with lower rates."""
         self.snapshot()
         rates = [group["lr"] for group in self.optimizer.param_groups]
-        self._scale_rates(self._pace if self.settles else 1.0)
+        if self.settles:
+            self._scale_rates(settling.pace(self.left, self._settling_iterations))
         self.optimizer.step()
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
@@ -200,9 +200,14 @@ class Run:
         if not is_worth(self.best["loss"], self.settings.optimizer):
             return self.begin_anew()
         self.fallback.count += 1
+        return self.return_to_best(self.settings.optimizer.fallback_rate)
+
+    def return_to_best(self, factor: float = 1.0) -> str:
+        """Go back to the best policy and design and what they saw through, without moments and with so many times the learning rates.
+        Says so."""
         self.load_policy(self.best)
         self.optimizer.state.clear()
-        self._scale_rates(self.settings.optimizer.fallback_rate)
+        self._scale_rates(factor)
         self.snapshot()
         return f"going back to iteration {self.best['iteration']}"
 
@@ -294,16 +299,18 @@ class Run:
             "best": self.best,
             "fallback": dataclasses.asdict(self.fallback),
             "restart": dataclasses.asdict(self.restart),
+            "settling": dataclasses.asdict(self.settling),
         }
 
     def load_state_dict(self, content: dict) -> None:
-        """Go on from a checkpoint of the same task and settings; one that is older than a setting was made with its default.
+        """Go on from a checkpoint of the same task and settings; one that is older than a setting was made with its default, or without
+        what :data:`OLDER` names.
 
         Raises:
             SettingsError: Task or settings are others; names each difference.
             ValueError, LookupError, TypeError, AttributeError, RuntimeError: It holds something else than a run.
         """
-        theirs = identity_of_settings(Settings()) | json.loads(content["about"])
+        theirs = identity_of_settings(Settings()) | OLDER | json.loads(content["about"])
         ours = json.loads(self.about)
         changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
         if changed:
@@ -319,6 +326,7 @@ class Run:
         self.iteration, self.best = content["iteration"], content["best"]
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
+        self.settling = Settling(**content.get("settling", {}))
         self._check_shapes()
 
     def _check_shapes(self) -> None:

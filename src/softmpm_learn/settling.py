@@ -3,21 +3,40 @@
 At the full learning rate the walk of a robot goes on changing to the end, and the last one may be far worse than one before it.
 """
 
-SHARE = 0.9
+from dataclasses import dataclass
+
+SETTLED_SHARE = 0.9
 """A run that settles goes back to its best as soon as its progress is below this share of the best progress."""
+FEWEST = 3
+"""Iterations in which a run settles, at least: in the first it goes back, and in the last it takes no step."""
 
 
-def begins(iteration: int, iterations: int, settle: float) -> bool:
-    """True for the first iteration in which a run of this many settles, see OptimizerConf.settle."""
-    return iterations - iteration == _count(iterations, settle)
+@dataclass
+class Settling:
+    """Decides in the first of the last iterations whether the run settles in them."""
+
+    active: bool = False
+    """What was decided."""
+
+    def begins(self, left: int, count: int, worth: bool) -> bool:
+        """True in the first iteration in which the run settles.
+
+        Args:
+            left: Iterations of the run that are not done.
+            count: Those in which it is to settle, of :func:`iterations`.
+            worth: There is something to settle at.
+        """
+        if left == count:
+            self.active = worth
+        return self.active and left == count
 
 
-def pace(iteration: int, iterations: int, settle: float) -> float:
-    """Length of a step in units of the learning rate: 1, and falling towards 0 in the iterations in which a run settles."""
-    count, left = _count(iterations, settle), iterations - iteration
-    return left / (count + 1) if left <= count else 1.0
+def iterations(total: int, share: float) -> int:
+    """Last iterations in which a run of so many settles, see ``OptimizerConf.settle``."""
+    count = int(share * total)
+    return count if count >= FEWEST else 0
 
 
-def _count(iterations: int, settle: float) -> int:
-    """Iterations in which a run settles."""
-    return int(settle * iterations)
+def pace(left: int, count: int) -> float:
+    """Length of a step in units of the learning rate while a run settles: below 1, and falling towards 0 in equal steps."""
+    return left / (count + 1)

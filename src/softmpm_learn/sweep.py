@@ -37,8 +37,9 @@ class Outcome:
     """Iteration of the lowest loss."""
     iterations: int = 0
     """Iterations done."""
+    end: float = math.nan
+    """This and the next seven: see examination.py; nan where a job has no answer."""
     later: float = math.nan
-    """This and the next six: see examination.py; nan where a job has no answer."""
     kicked: float = math.nan
     friction: float = math.nan
     finer: float = math.nan

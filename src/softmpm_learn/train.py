@@ -21,7 +21,7 @@ from torch import Tensor
 
 from softmpm import Model
 from softmpm_learn.distributed import Group
-from softmpm_learn.finishing import finish
+from softmpm_learn.finishing import evaluate_ends, finish
 from softmpm_learn.learning_phase import learn_side_by_side
 from softmpm_learn.loggers import Loggers
 from softmpm_learn.optimisation import clock, optimise
@@ -181,7 +181,8 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
                 work.loggers[k].flush()
                 work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     _save(work, [k for k, one in enumerate(work.loggers) if not one.is_saved])
-    found = finish(runs, work.loggers, finer) if work.loggers else {}
+    ends = evaluate_ends(runs)
+    found = finish(runs, work.loggers, finer, ends) if work.loggers else {}
     return [
         Result(
             run,

@@ -3,7 +3,7 @@ import torch
 from learners import waves
 from torch.nn import functional
 
-from softmpm_learn.autoencoder import Autoencoder, doubled
+from softmpm_learn.autoencoder import Autoencoder, upsample_nearest
 from softmpm_learn.seeding import seeded
 
 
@@ -25,7 +25,7 @@ def test_shapes_come_back(dim, shape, fields):
 def test_doubling_is_interpolation_by_nearest_neighbours(size):
     """Values and gradients, for even and odd sizes."""
     h = torch.randn(2, 3, *((n + 1) // 2 for n in size), dtype=torch.float64, requires_grad=True)
-    got, want = doubled(h, size), functional.interpolate(h, size=size)
+    got, want = upsample_nearest(h, size), functional.interpolate(h, size=size)
     assert torch.equal(got, want)
     adj = torch.randn_like(got)
     (a,), (b,) = (torch.autograd.grad(out, h, adj) for out in (got, want))

@@ -5,6 +5,7 @@ import dataclasses
 import importlib.util
 import itertools
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -28,7 +29,7 @@ SAME, SMALL = 1e-5, 1e-8
 of positions of order one, whose rounding is 6e-8 [m]."""
 ARM = [
     *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025"),
-    *("train.worlds=4", "train.goal_spread=[0.05,0.05]", "train.record_every=2", "train.examine=false"),
+    *("train.worlds=4", "train.goal_spread=[0.05,0.05]", "train.record_every=2"),
 ]
 """Three iterations; goals of their own give each world a gradient of its own."""
 
@@ -224,7 +225,7 @@ def test_one_process_goes_on_where_two_stopped(task, four, settings, both, tmp_p
     [("cpu", "float32"), pytest.param("cuda", "float64", marks=pytest.mark.gpu)],  # a GPU adds in any order
 )
 def test_the_command_line_through_torchrun(tmp_path, device, dtype):
-    """One folder with everything in it, one log, and the metrics of the same settings in one process."""
+    """One folder with everything in it, one log, and the metrics of the same settings in one process, the end included."""
     if device == "cuda" and torch.cuda.device_count() < 2:
         pytest.skip("needs two GPUs")
     words = (*ARM, f"device.name={device}", f"device.dtype={dtype}")
@@ -238,8 +239,10 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
     conf = load(out)
     task, one = make_task(conf.task), tmp_path / "one"
     train.train(task, make_model(task, conf, Group()), conf.settings, one)
-    for row, want in zip(figures(out), figures(one), strict=True):
+    (*rows, last), (*wanted, end) = figures(out), figures(one)
+    for row, want in zip(rows, wanted, strict=True):
         assert row == pytest.approx(want, rel=SAME, abs=SMALL, nan_ok=True)
+    assert last["end"] == pytest.approx(end["end"], rel=SAME) and math.isfinite(end["end"])
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="native threads are listed by Linux only")

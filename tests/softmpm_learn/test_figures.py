@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import softmpm
-from softmpm_learn.figures import VALUES, latent_figure, loss_figure, robot_figure
+from softmpm_learn.figures import VALUES, canvas, latent_figure, loss_figure, robot_figure
 from softmpm_learn.progress import ProgressBar
 
 
@@ -82,6 +82,13 @@ def test_loss_figure_draws_what_has_numbers(tmp_path):
     two, one, none = (pixels(tmp_path / f"{name}.png") for name in ("two", "one", "none"))
     assert two.shape[0] > one.shape[0] >= none.shape[0]
     assert colour_count(one, -60) > 100
+
+
+def test_losses_over_decades_are_drawn_as_logarithms(tmp_path):
+    """Where all are positive; a loss of both signs and one of a single decade are not."""
+    assert [
+        canvas.scale(v) for v in ([1.0, np.nan, 200.0], [1.0, 50.0], [-1.0, 200.0], [0.0, 200.0], [])
+    ] == [*("log", "linear", "linear", "linear", "linear")]
 
 
 def test_robot_figure_shows_activation_and_design(tmp_path, scene):

@@ -1,5 +1,6 @@
 """Closed loops that are run again and again."""
 
+import dataclasses
 import math
 
 import pytest
@@ -12,6 +13,8 @@ from softmpm_learn.episode import Frame, run_episode
 from softmpm_learn.loops import ClosedLoop
 from softmpm_learn.observe import Centroids
 from softmpm_learn.policy import make_policy
+from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
 from softmpm_learn.settings import DesignConf, PolicyConf
 
 
@@ -103,6 +106,14 @@ def test_frames_after_a_failure_are_not_shown(task):
     assert [type(frame) for frame in shown] == [Frame] * (task.control_steps + 1)
     with pytest.raises(softmpm.UnstableError, match="it tore$"):
         loop(None)
+
+
+@pytest.mark.parametrize("every", [0, 2])
+def test_runs_that_record_nothing_keep_no_frames(task, model, settings, tmp_path, every):
+    """Or the states of many robots would lie in the memory of a graph for nothing."""
+    train = dataclasses.replace(settings.train, record_every=every)
+    run = Run(task, model, dataclasses.replace(settings, train=train), tmp_path)
+    assert Runs([run]).loop.records == (every > 0)
 
 
 @pytest.mark.gpu
