@@ -1,5 +1,5 @@
 """Print a table of docs/results.md that compares observers, from comparison.ROBOT.h200.csv beside this script:
-`python docs/results/comparison.py elephant`."""
+`python docs/results/comparison.py elephant`, or that of the runs before they settled: `... elephant before_settling`."""
 
 import csv
 import math
@@ -55,19 +55,20 @@ def of_arms(runs: Sequence[Row]) -> list[str]:
 
 
 def print_ends(rows: Sequence[Row]) -> None:
-    """How the runs of walkers ended: their best is evaluated once more."""
+    """How the runs of walkers ended: their best evaluated once more, of runs that did not settle their last evaluation."""
     walking = [row for row in rows if float(row["best"]) < WALKS]
-    torn = sum(row["end"] == "" for row in walking)
-    fell = sum(row["end"] != "" and float(row["end"]) > 0.8 * float(row["best"]) for row in walking)
+    ends = [(row.get("end", row.get("last")), float(row["best"])) for row in walking]
+    torn = sum(not end for end, _ in ends)
+    fell = sum(float(end) > 0.8 * best for end, best in ends if end)
     gone = sum(row["later"] == "" for row in walking)
     anew = [row for row in rows if row["restarts"] != "0"]
     print(f"{len(walking)} walk, {sum(map(lasts, walking))} of which last, and {gone} tear within 6 s")
-    print(f"evaluated once more {torn} of those that walk tear, and {fell} are below 0.8 of their best")
+    print(f"at their end {torn} of those that walk tear, and {fell} are below 0.8 of their best")
     print(f"{len(anew)} began anew, {sum(row in walking for row in anew)} of which walk")
 
 
-def main(robot: str):
-    with open(Path(__file__).with_name(f"comparison.{robot}.h200.csv"), newline="") as file:
+def main(robot: str, folder: str = "."):
+    with open(Path(__file__).parent / folder / f"comparison.{robot}.h200.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     arm = robot == "arm"  # its losses, mean squares, lie decades apart
     jobs: dict[tuple[str, str, str], list[Row]] = {}
@@ -109,4 +110,4 @@ def main(robot: str):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])
