@@ -25,7 +25,7 @@ from softmpm_learn.tasks import ArmConf, BipedConf
 TINY = [
     *("task=arm", "task.seconds=0.05", "task.control_period=0.025", "task.hold=0.05", "device=cpu"),
     *("device.dtype=float64", "policy=linear", "train.iterations=2", "train.examine=false"),
-    *("train.record_every=0", "hydra/job_logging=none", "hydra/hydra_logging=none"),
+    *("train.record_every=0", "train.pictures=false", "hydra/job_logging=none", "hydra/hydra_logging=none"),
     "policy.clock=true",  # so that the arm moves from the first step on
 ]
 CHOICES = ("observer=centroids,nothing", "design=off,particle", "train.seeds=2")

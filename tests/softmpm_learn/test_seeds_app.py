@@ -23,7 +23,9 @@ TINY = [
     *("policy=linear", "train.iterations=2", "train.examine=false", "device.dtype=float64"),
 ]
 
-MOVING = (*TINY, "policy.clock=true")
+PLAIN = (*TINY, "train.pictures=false", "train.record_every=0")
+"""For tests of numbers and rows: pictures and recordings take most of the time of such runs."""
+MOVING = (*PLAIN, "policy.clock=true")
 """The arm moves from the first step on."""
 
 
@@ -149,12 +151,12 @@ def test_the_last_lines_name_what_chose_the_best(main, caplog, endurance, what):
 
 def test_they_go_on_with_resume(main):
     """All with the folder of all, or one with its own."""
-    main(*TINY, "train.seeds=2", "train.iterations=1", "hydra.run.dir=all")
+    main(*PLAIN, "train.seeds=2", "train.iterations=1", "hydra.run.dir=all")
     assert main("resume=all/seed_1", "train.iterations=2")[0] == 0
     assert [len(losses(Path(f"all/seed_{k}"))) for k in range(2)] == [1, 2]
     assert main("resume=all", "train.iterations=3")[0] == 0
     assert [row["iterations"] for row in rows(Path("all/sweep.csv"))] == ["3", "3"]
-    main(*TINY, "train.seeds=2", "train.iterations=3", "hydra.run.dir=whole")
+    main(*PLAIN, "train.seeds=2", "train.iterations=3", "hydra.run.dir=whole")
     for k in range(2):
         assert losses(Path(f"all/seed_{k}")) == pytest.approx(losses(Path(f"whole/seed_{k}")), rel=1e-9)
 
@@ -205,7 +207,7 @@ def test_seeds_that_were_stopped_are_no_outcome(main, monkeypatch):
     """A sweep that is asked to end does so, also where the seeds had finished a shorter run; the same command goes on."""
     words = (
         "-m",
-        *(word for word in TINY if "iterations" not in word),
+        *(word for word in PLAIN if "iterations" not in word),
         "train.seeds=2",
         "optimizer.policy_rate=0.01,0.02",
         "hydra.sweep.dir=sweep",
@@ -231,12 +233,12 @@ def torchrun(*words: str, cwd: Path, processes: int = 2) -> subprocess.Completed
 
 def test_processes_share_the_seeds(main, tmp_path):
     """Each has its own, without an exchange of gradients: three seeds in two processes are those of one."""
-    done = torchrun(*TINY, "train.seeds=3", "hydra.run.dir=two", cwd=tmp_path)
+    done = torchrun(*PLAIN, "train.seeds=3", "hydra.run.dir=two", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert main(*TINY, "train.seeds=3", "hydra.run.dir=one")[0] == 0
+    assert main(*PLAIN, "train.seeds=3", "hydra.run.dir=one")[0] == 0
     assert [row["seed"] for row in rows(Path("two/sweep.csv"))] == ["0", "1", "2"]
     for k in range(3):
         assert losses(Path(f"two/seed_{k}")) == pytest.approx(losses(Path(f"one/seed_{k}")), rel=1e-9)
-    refused = torchrun(*TINY, "train.seeds=2", "hydra.run.dir=three", cwd=tmp_path, processes=3)
+    refused = torchrun(*PLAIN, "train.seeds=2", "hydra.run.dir=three", cwd=tmp_path, processes=3)
     assert refused.returncode != 0
     assert "train.seeds must be 1, or at least the 3 processes that share the seeds; got 2" in refused.stderr
