@@ -16,7 +16,9 @@ torch.set_num_threads(1)
 NO_GPU = "needs a CUDA GPU; PyTorch sees none here"
 
 
+@pytest.hookimpl(trylast=True)  # after the order was made random
 def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: "long" not in item.keywords)  # first, or one process would wait for it at the end
     if not torch.cuda.is_available():
         for item in items:
             if "gpu" in item.keywords:

@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_short_round_of_all_fault_scripts():
     """Nothing hangs, is silently different, unclear, or written elsewhere; the whole round: ``python -m bench.faults``."""
