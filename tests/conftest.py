@@ -18,7 +18,8 @@ NO_GPU = "needs a CUDA GPU; PyTorch sees none here"
 
 @pytest.hookimpl(trylast=True)  # after the order was made random
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: "long" not in item.keywords)  # first, or one process would wait for it at the end
+    # A long one at the end of a random order would keep one process waiting.
+    items.sort(key=lambda item: "long" not in item.keywords)
     if not torch.cuda.is_available():
         for item in items:
             if "gpu" in item.keywords:
