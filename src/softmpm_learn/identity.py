@@ -18,7 +18,7 @@ MAY_CHANGE = (
     *("iterations", "save_every", "record_every", "frame_every"),
     *("examine", "pictures", "log", "side_by_side"),
 )
-"""Settings of TrainConf that a resumed run may have different."""
+"""Settings of TrainConf that a resumed run may have different. With more iterations it goes on from where it has settled."""
 
 
 def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object]:
