@@ -55,6 +55,8 @@ class Episode:
     activation: Tensor
     """Activations during the control steps [-], shape (step, world, muscle), detached."""
     decisions: "Decisions"
+    path: Path | None
+    """The motion. Differentiable; None in :meth:`detach`."""
 
     @property
     def loss(self) -> Tensor:
@@ -62,9 +64,9 @@ class Episode:
         return torch.stack(list(self.terms.values())).sum(dim=0)
 
     def detach(self) -> "Episode":
-        """The episode without its autograd graph and without the decisions."""
+        """The episode without its autograd graph, the decisions and the motion."""
         terms = {name: term.detach() for name, term in self.terms.items()}
-        return replace(self, terms=terms, end=self.end.detach(), decisions=Decisions())
+        return replace(self, terms=terms, end=self.end.detach(), decisions=Decisions(), path=None)
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,7 @@ def run_episode(
         observations=torch.stack(observations) if observations else None,
         activation=activations.detach(),
         decisions=made,
+        path=path,
     )
 
 

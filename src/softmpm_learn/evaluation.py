@@ -6,12 +6,16 @@ gaits that stumble or break soon after the episode are often those of the lowest
 
 import logging
 import math
+from dataclasses import dataclass
 
 import torch
 
 import softmpm
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
+
+ALL = 1 - 1e-4
+"""Share of the worlds above which it is all of them: a mean is rounded."""
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -24,16 +28,27 @@ def due(run: Run) -> bool:
     return run.evaluated and (regular or (run.settles and run.left == 1))
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """What was found of policy and design of a run."""
+
+    loss: float
+    """Mean over the evaluation goals, ``train.endurance`` times as long as an episode; infinite if a simulation failed."""
+    lasts: bool
+    """All these motions last, see :mod:`softmpm_learn.lasting`; True where the task does not ask."""
+
+
 @torch.no_grad()
-def evaluate(runs: Runs) -> list[float]:
-    """Mean loss of policy and design of each run as they are over the evaluation goals, ``train.endurance`` times as long as an
-    episode; infinite if one of its simulations failed."""
-    losses, failed = [], dict[int, softmpm.UnstableError]()
+def evaluate(runs: Runs) -> list[Evaluation]:
+    """Evaluate policy and design of each run as they are."""
+    found, failed = [], dict[int, softmpm.UnstableError]()
     for goal in runs.evaluation_goals() or [None]:
-        losses.append(runs.evaluator(goal).unflatten(0, (len(runs.all), -1)).mean(dim=1))
+        both = torch.stack(runs.evaluator(goal))
+        found.append(both.unflatten(1, (len(runs.all), -1)).mean(dim=2))
         failed = runs.failed(runs.evaluator.failures.errors) | failed
     for k, error in failed.items():
         logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
-        losses[0][k] = math.inf
-    means = runs.group.average(losses)  # infinite in every process if it is in one
-    return torch.stack(means).mean(dim=0).tolist()
+        found[0][0, k] = math.inf
+    means = runs.group.average(found)  # infinite in every process if it is in one
+    losses, lasts = torch.stack(means).mean(dim=0).tolist()
+    return [Evaluation(*one) for one in zip(losses, (share > ALL for share in lasts), strict=True)]

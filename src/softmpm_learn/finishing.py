@@ -73,7 +73,7 @@ def evaluate_ends(runs: Runs) -> dict[int, float]:
         return {}
     with _at_their_best(runs) as done:
         again = evaluate(runs)
-    return {k: again[k] if math.isfinite(again[k]) else math.nan for k in done}
+    return {k: again[k].loss if math.isfinite(again[k].loss) else math.nan for k in done}
 
 
 @torch.no_grad()

@@ -49,22 +49,27 @@ class Evaluator:
         goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
 
         @torch.no_grad()
-        def work() -> Tensor:
+        def work() -> tuple[Tensor, Tensor]:
             params, inputs = design()
             about: dict[str, Any] = dict(inputs=inputs, goal=goals[0] if goals else None)
-            return run_episode(task, model, observer, policy, params, **about, failures=failures).loss
+            episode = run_episode(task, model, observer, policy, params, **about, failures=failures)
+            assert episode.path is not None
+            lasts = torch.ones_like(episode.loss) if task.lasting is None else task.lasting(episode.path)
+            return episode.loss, lasts.to(episode.loss)
 
         self._goals, self._work = goals, work
         self._graph = softmpm.Graph(work, model.device) if _captures(model) else None
 
-    def __call__(self, goal: Tensor | None) -> Tensor:
-        """Loss of each world, shape (world,); of a world that failed it means nothing."""
+    def __call__(self, goal: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Loss of each world, and 1 where the motion lasts or the task does not ask, else 0, shape (world,) each; they mean
+        nothing of a world that failed."""
         self.failures.errors.clear()
         if goal is not None and not self._goals:
             self._goals.append(goal.clone())
         elif goal is not None:
             self._goals[0].copy_(goal)
-        return self._graph().clone() if self._graph else self._work()
+        loss, lasts = self._graph() if self._graph else self._work()
+        return loss.clone(), lasts.clone()
 
 
 class ClosedLoop:

@@ -43,10 +43,14 @@ class Progress(Term):
         moved = (path.states[states.stop - 1].x - path.states[states.start].x)[..., self.axis]
         return -(moved if self.particles is None else moved[:, self.on("particles", moved)]).mean(dim=-1)
 
+    def speed(self, path: Path) -> Tensor:
+        """Mean speed in the window [m/s], shape (world,)."""
+        states = self.window(path)
+        return -self.value(path) / (path.times[states.stop - 1] - path.times[states.start])
+
     def rate(self, path: Path) -> float:
         """Minus the mean speed [m/s]."""
-        states = self.window(path)
-        return super().rate(path) / (path.times[states.stop - 1] - path.times[states.start])
+        return -self.speed(path).mean().item()
 
     def worst(self, verdicts: Sequence[float]) -> float:
         return -super().worst([-one for one in verdicts])
@@ -154,14 +158,14 @@ class Tilt(Term):
         return share / (share @ self.rest[:, self.along])
 
     def value(self, path: Path) -> Tensor:
-        return self._change(path).square().mean(dim=0)
+        return self.slope(path).square().mean(dim=0)
 
     def degrees(self, path: Path) -> float:
         """The largest tilt of any world in the window."""
-        return math.degrees(math.atan(self._change(path).abs().max().item()))
+        return math.degrees(math.atan(self.slope(path).abs().max().item()))
 
-    def _change(self, path: Path) -> Tensor:
-        """Change of the slope, shape (state, world)."""
+    def slope(self, path: Path) -> Tensor:
+        """Change of the slope since rest [-], shape (state, world)."""
         x = path.x[self.window(path)]
         return x[..., self.up] @ self.on("lever", x) - float(self.lever @ self.rest[:, self.up])
 

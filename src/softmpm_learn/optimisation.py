@@ -12,7 +12,7 @@ from torch import Tensor
 import softmpm
 from softmpm_learn.distributed import OtherProcessError, in_full
 from softmpm_learn.episode import Episode
-from softmpm_learn.evaluation import due, evaluate
+from softmpm_learn.evaluation import Evaluation, due, evaluate
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
@@ -125,13 +125,15 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
     asked = [k for k in rows if due(runs.all[k])]
     evaluations = evaluate(runs) if asked else []
     for k, row in rows.items():
-        run, value = runs.all[k], row["loss"]
+        run, found = runs.all[k], Evaluation(row["loss"], lasts=True)
         if run.evaluated:
-            value = evaluations[k] if k in asked else math.nan
-            row["evaluation"] = value if math.isfinite(value) else math.nan
-        if value < run.best["loss"]:
-            run.best = {"loss": value, "iteration": run.iteration, **run.policy_snapshot()}
-        row |= {"best": run.best["loss"]} | step(run, row["loss"], value)
+            found = evaluations[k] if k in asked else Evaluation(math.nan, lasts=False)
+            known = math.isfinite(found.loss)
+            row["evaluation"], row["lasts"] = (
+                (found.loss, int(found.lasts)) if known else (math.nan, math.nan)
+            )
+        run.keep_if_best(found.loss, found.lasts)
+        row |= {"best": run.best["loss"]} | step(run, row["loss"], found.loss)
 
 
 def step(run: Run, loss: float, value: float) -> dict[str, int]:

@@ -52,7 +52,7 @@ class Run:
         learner: The learning phase, None unless the observer has an encoder.
         goals: Random stream of the goals.
         safe: Values of policy and design in the last simulation that did not fail.
-        best: The lowest loss so far, that of the evaluations if there are any, and what gave it.
+        best: The loss of the best motion so far, that of its evaluation if there are any, whether it lasts, and what gave it.
         fallback: Decides when the run goes back to its best.
         restart: Decides when it begins anew.
         settling: Decides whether it settles.
@@ -78,7 +78,7 @@ class Run:
             )
         settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
-        self.iteration, self.best = 0, {"loss": math.inf, "iteration": -1}
+        self.iteration, self.best = 0, {"loss": math.inf, "lasts": False, "iteration": -1}
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = stream(settings.train.seed, "goals")
         self.learner: Learner | None = None
@@ -176,6 +176,22 @@ class Run:
     @property
     def _settling_iterations(self) -> int:
         return settling.iterations(self.settings.train.iterations, self.settings.optimizer.settle)
+
+    def keep_if_best(self, loss: float, lasts: bool) -> None:
+        """Keep policy and design as they are if they are the best so far: a motion that lasts is better than one that does not, and of
+        two others that of the lower loss.
+
+        Args:
+            loss: nan or infinite of a motion that is not known.
+            lasts: See :mod:`softmpm_learn.lasting`.
+        """
+        if math.isfinite(loss) and (lasts, -loss) > (self.best["lasts"], -self.best["loss"]):
+            self.best = {
+                "loss": loss,
+                "lasts": lasts,
+                "iteration": self.iteration,
+                **self.policy_snapshot(),
+            }
 
     def step(self) -> None:
         """Take a step along the gradient, the next one with lower rates."""
@@ -323,7 +339,7 @@ class Run:
         if self.learner is not None:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
-        self.iteration, self.best = content["iteration"], content["best"]
+        self.iteration, self.best = content["iteration"], {"lasts": True} | content["best"]
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
         self.settling = Settling(**content.get("settling", {}))

@@ -32,7 +32,7 @@ TIMING = ["episode", "learn", "save"]
 def metrics(run: Run) -> list[str]:
     """Columns of metrics.csv; nothing in it depends on the clock."""
     return [
-        *("loss", *run.task.objective.names, "evaluation", "best", "activation"),
+        *("loss", *run.task.objective.names, "evaluation", "lasts", "best", "activation"),
         *("gradient_policy", "gradient_design", "clipped", "retries", "fallbacks", "restarts"),
         *(f"{name}_change" for name in run.design.change()),
         *("epochs", "training_loss", "validation_loss", "replay"),

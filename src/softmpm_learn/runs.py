@@ -49,9 +49,10 @@ class Runs:
             self._together = Observers(runs, self.share), Policies(runs, self.share, self._resting)
             self.observer, self.policy = self._together
             self.design = Designs(runs, self.share, self._resting)
-        longer = self.task.control_steps * (first.settings.train.endurance or 1)
+        episodes = first.settings.train.endurance or 1
+        longer = dataclasses.replace(self.task, control_steps=episodes * self.task.control_steps)
         self.evaluator = Evaluator(
-            dataclasses.replace(self.task, control_steps=longer),
+            longer if episodes > 1 else dataclasses.replace(longer, lasting=None),
             self.model,
             self.observer,
             self.policy,

@@ -10,11 +10,8 @@ from softmpm_learn.figures.intervals import interval
 from softmpm_learn.figures.of_sweep import values
 from softmpm_learn.figures.sweeps import EXAMINED
 from softmpm_learn.figures.tables import Row, compared, iteration_of
+from softmpm_learn.lasting import LEVEL, SHARE
 
-LASTING = 0.7
-"""Least share of its speed that a walker goes on with to pass."""
-LEVEL = 30.0
-"""Tilt that a walker stays below to pass [degrees]."""
 NEAR = 0.005
 """Distance from the goal in which what reaches for it stays to pass [m], from 0.3 s before the end of the episode to 0.5 s after it."""
 RESTING = 0.05
@@ -22,7 +19,7 @@ RESTING = 0.05
 
 NOTE = (
     "Medians over the finished runs, in brackets with their bootstrap interval of 95 %; in parentheses the number of runs with an "
-    f"answer, where some have none. Passed: a walker goes forward (a loss below 0), then keeps at least {LASTING:g} of its speed and "
+    f"answer, where some have none. Passed: a walker goes forward (a loss below 0), then keeps at least {SHARE:g} of its speed and "
     f"tilts by less than {LEVEL:g}°; what reaches for a goal stays within {1000 * NEAR:g} mm of it from 0.3 s before the end of the "
     f"episode to 0.5 s after it, and below {RESTING:g} m/s where it should come to rest."
 )
@@ -39,7 +36,7 @@ def passes(row: Row) -> bool:
     if row["term"] == "reach":  # it need not come to rest where the objective does not say so
         return row["miss"] <= NEAR and not row["speed"] > RESTING
     forward = row["term"] == "progress" and row["best"] < 0  # a quotient of two ways back is positive too
-    return forward and row["later"] >= LASTING and row["tilt"] < LEVEL
+    return forward and row["later"] >= SHARE and row["tilt"] < LEVEL
 
 
 def summary(

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 import softmpm
+from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Objective
 
 FORMULATIONS = ("moving", "reference")
@@ -177,6 +178,8 @@ class Task:
     before."""
     endurance: int = 1
     """Length of the evaluations that choose the best policy, in episodes; see ``train.endurance``, which goes before."""
+    lasting: Lasting | None = None
+    """Decides in those that are longer than an episode whether a motion lasts; that is better than one that does not."""
     build: dict[str, Any] = field(default_factory=dict)
     """Arguments of :func:`softmpm.build` that the task decides: formulation and contact."""
 

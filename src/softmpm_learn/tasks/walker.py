@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import softmpm
+from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Effort, Objective, Progress, Strain, Tilt
 from softmpm_learn.tasks.task import LASTING, Task, TaskConf, clock
 
@@ -151,14 +152,17 @@ def walker_task(
         dt=conf.control_period,
     )
     scene, control_steps, substeps = clock(conf, scene)
-    length = float(np.ptp(rest[:, 0]))
+    length, objective = float(np.ptp(rest[:, 0])), walking(conf, rest, torso)
+    progress, _, tilt, _ = objective.terms
+    assert isinstance(progress, Progress) and isinstance(tilt, Tilt)
+    seconds = control_steps * substeps * scene.dt
     return Task(
         name=conf.name,
         scene=scene,
         control_steps=control_steps,
         substeps=substeps,
         regions=regions,
-        objective=walking(conf, rest, torso),
+        objective=objective,
         body_length=length,
         build=conf.build,
         fade=STEP,
@@ -167,4 +171,5 @@ def walker_task(
         rate=BRISK,
         worth=WORTH * length,
         endurance=LASTING,
+        lasting=Lasting(progress=progress, tilt=tilt, seconds=seconds),
     )

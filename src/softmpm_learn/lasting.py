@@ -1,0 +1,45 @@
+"""Lasting: a motion that goes on after the episode in which it was learned, and does not tip over.
+
+Of the evaluated motions of a run the best is one that lasts, if there is any: a fast start and a fall come farther than a steady walk.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from torch import Tensor
+
+from softmpm_learn.objective import Progress, Tilt
+from softmpm_learn.term import Path
+
+SHARE = 0.7
+"""A lasting motion keeps at least this share of its speed."""
+LEVEL = 30.0
+"""Its tilt stays below this [degrees]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lasting:
+    """Judges a motion that is longer than an episode of T seconds: from T on it has at least :data:`SHARE` of its mean speed between
+    T/2 and T, and all the time it tilts by less than :data:`LEVEL`."""
+
+    progress: Progress
+    """Which way counts; its window does not."""
+    tilt: Tilt
+    seconds: float
+    """Length of an episode, T [s]."""
+
+    @cached_property
+    def _before(self) -> Progress:
+        return dataclasses.replace(self.progress, begin=self.seconds / 2, end=self.seconds)
+
+    @cached_property
+    def _after(self) -> Progress:
+        return dataclasses.replace(self.progress, begin=self.seconds, end=math.inf)
+
+    def __call__(self, path: Path) -> Tensor:
+        """True where a motion lasts, shape (world,)."""
+        before, after = self._before.speed(path), self._after.speed(path)
+        level = self.tilt.slope(path).abs().amax(dim=0) < math.tan(math.radians(LEVEL))
+        return (before > 0) & (after >= SHARE * before) & level
