@@ -4,6 +4,7 @@ Where each simulation draws a goal of its own it is taken at fixed goals, withou
 gaits that stumble or break soon after the episode are often those of the lowest loss.
 """
 
+import itertools
 import logging
 import math
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import torch
 
 import softmpm
+from softmpm_learn.lasting import STARTS
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 
@@ -33,7 +35,8 @@ class Evaluation:
     """What was found of policy and design of a run."""
 
     loss: float
-    """Mean over the evaluation goals, ``train.endurance`` times as long as an episode; infinite if a simulation failed."""
+    """Mean over the evaluation goals, ``train.endurance`` times as long as an episode; of several starts the worst; infinite if a
+    simulation failed."""
     lasts: bool
     """All these motions last, see :mod:`softmpm_learn.lasting`; True where the task does not ask."""
 
@@ -42,13 +45,15 @@ class Evaluation:
 def evaluate(runs: Runs) -> list[Evaluation]:
     """Evaluate policy and design of each run as they are."""
     found, failed = [], dict[int, softmpm.UnstableError]()
-    for goal in runs.evaluation_goals() or [None]:
-        both = torch.stack(runs.evaluator(goal))
+    starts = (0.0,) if runs.task.lasting is None else STARTS
+    for kick, goal in itertools.product(starts, runs.evaluation_goals() or [None]):
+        both = torch.stack(runs.evaluator(goal, kick))
         found.append(both.unflatten(1, (len(runs.all), -1)).mean(dim=2))
         failed = runs.failed(runs.evaluator.failures.errors) | failed
     for k, error in failed.items():
         logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
         found[0][0, k] = math.inf
     means = runs.group.average(found)  # infinite in every process if it is in one
-    losses, lasts = torch.stack(means).mean(dim=0).tolist()
-    return [Evaluation(*one) for one in zip(losses, (share > ALL for share in lasts), strict=True)]
+    losses, lasts = torch.stack(means).unflatten(0, (len(starts), -1)).mean(dim=1).unbind(dim=1)
+    worst, least = losses.max(dim=0).values.tolist(), lasts.min(dim=0).values.tolist()
+    return [Evaluation(loss, share > ALL) for loss, share in zip(worst, least, strict=True)]

@@ -17,6 +17,9 @@ SHARE = 0.7
 """A lasting motion keeps at least this share of its speed."""
 LEVEL = 30.0
 """Its tilt stays below this [degrees]."""
+STARTS = 0.0, 0.05
+"""Speeds along the first axis with which an evaluation starts, of which the worse result counts [m/s]: what lasts by luck in one
+simulation may not in another that differs by rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,10 +28,15 @@ class Lasting:
     T/2 and T, and all the time it tilts by less than :data:`LEVEL`."""
 
     progress: Progress
-    """Which way counts; its window does not."""
+    """Whose way counts; its window does not."""
     tilt: Tilt
+    """Its window does not count."""
     seconds: float
     """Length of an episode, T [s]."""
+
+    @cached_property
+    def _level(self) -> Tilt:
+        return dataclasses.replace(self.tilt, begin=0.0, end=math.inf)
 
     @cached_property
     def _before(self) -> Progress:
@@ -41,5 +49,5 @@ class Lasting:
     def __call__(self, path: Path) -> Tensor:
         """True where a motion lasts, shape (world,)."""
         before, after = self._before.speed(path), self._after.speed(path)
-        level = self.tilt.slope(path).abs().amax(dim=0) < math.tan(math.radians(LEVEL))
+        level = self._level.slope(path).abs().amax(dim=0) < math.tan(math.radians(LEVEL))
         return (before > 0) & (after >= SHARE * before) & level

@@ -47,12 +47,15 @@ class Evaluator:
     ):
         self.failures = failures = softmpm.Failures("reset")
         goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
+        self._kick = kick = torch.zeros(model.dim, dtype=model.dtype, device=model.device)
 
         @torch.no_grad()
         def work() -> tuple[Tensor, Tensor]:
             params, inputs = design()
+            rest = model.rest()
             about: dict[str, Any] = dict(inputs=inputs, goal=goals[0] if goals else None)
-            episode = run_episode(task, model, observer, policy, params, **about, failures=failures)
+            about |= dict(start=rest._replace(v=rest.v + kick), failures=failures)
+            episode = run_episode(task, model, observer, policy, params, **about)
             assert episode.path is not None
             lasts = torch.ones_like(episode.loss) if task.lasting is None else task.lasting(episode.path)
             return episode.loss, lasts.to(episode.loss)
@@ -60,10 +63,15 @@ class Evaluator:
         self._goals, self._work = goals, work
         self._graph = softmpm.Graph(work, model.device) if _captures(model) else None
 
-    def __call__(self, goal: Tensor | None) -> tuple[Tensor, Tensor]:
+    def __call__(self, goal: Tensor | None, kick: float = 0.0) -> tuple[Tensor, Tensor]:
         """Loss of each world, and 1 where the motion lasts or the task does not ask, else 0, shape (world,) each; they mean
-        nothing of a world that failed."""
+        nothing of a world that failed.
+
+        Args:
+            kick: Speed of the start along the first axis [m/s].
+        """
         self.failures.errors.clear()
+        self._kick[0] = kick
         if goal is not None and not self._goals:
             self._goals.append(goal.clone())
         elif goal is not None:

@@ -183,8 +183,9 @@ class Run:
 
         Args:
             loss: nan or infinite of a motion that is not known.
-            lasts: See :mod:`softmpm_learn.lasting`.
+            lasts: See :mod:`softmpm_learn.lasting`; of no account where the motion is not worth going on with.
         """
+        lasts = lasts and is_worth(loss, self.settings.optimizer)
         if math.isfinite(loss) and (lasts, -loss) > (self.best["lasts"], -self.best["loss"]):
             self.best = {
                 "loss": loss,
@@ -339,7 +340,8 @@ class Run:
         if self.learner is not None:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
-        self.iteration, self.best = content["iteration"], {"lasts": True} | content["best"]
+        self.iteration, best = content["iteration"], content["best"]
+        self.best = {"lasts": best["iteration"] >= 0} | best  # others were not known
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
         self.settling = Settling(**content.get("settling", {}))

@@ -313,7 +313,7 @@ def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
     train.train(task, model, conf, tmp_path)
     result = train.train(task, model, copy_of(conf, train=dict(iterations=6)), tmp_path)
     found = rows(tmp_path)
-    assert result.finished and list(found[0])[13:18] == [
+    assert result.finished and list(found[0])[14:19] == [
         f"{n}_change" for n in ("young", "poisson", "density", "strength")
     ] + ["epochs"]
     assert float(found[0]["strength_change"]) == 0 < float(found[-1]["strength_change"])

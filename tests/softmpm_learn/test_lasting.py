@@ -1,0 +1,182 @@
+"""Lasting: motions with known speeds and tilts, and the best of a run, which is one that lasts."""
+
+import csv
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import softmpm
+from softmpm_learn.episode import run_episode
+from softmpm_learn.evaluation import evaluate
+from softmpm_learn.lasting import Lasting
+from softmpm_learn.objective import Path, Progress, Tilt
+from softmpm_learn.run import Run
+from softmpm_learn.runs import Runs
+from softmpm_learn.tasks import ArmConf, BipedConf, ElephantConf, make_task
+from softmpm_learn.train import train
+
+T, PERIOD = 2.0, 0.25
+"""Length of an episode and time between two states [s]."""
+REST = np.array([(0.0, 0.0), (0.0, 0.3), (2.0, 0.1), (2.0, 0.6)])
+"""The hind and the front part of a robot that is not level at rest; the first of each is a sole [m]."""
+LASTING = Lasting(
+    progress=Progress(particles=np.array([0, 2]), begin=5.0),
+    tilt=Tilt(front=np.array([2, 3]), back=np.array([0, 1]), rest=REST),
+    seconds=T,
+)
+LASTS = {
+    (1.0, 1.0, 1.0, 1.0): True,
+    (0.0, 1.0, 0.71, 0.71): True,
+    (0.0, 1.0, 0.69, 0.69): False,
+    (0.0, 1.0, 0.38, 1.04): True,
+    (0.0, 1.0, 0.34, 1.04): False,
+    (9.0, 0.1, 0.1, 0.1): True,
+    (9.0, 0.0, 1.0, 1.0): False,
+    (9.0, -1.0, -0.5, -0.5): False,
+    (0.0, 0.0, 0.0, 0.0): False,
+}
+"""Whether a motion lasts, by its speeds from 0 to T/2, to T, to 2T and to 3T [m/s]."""
+
+
+def path_of(speeds, tilts=0.0) -> Path:
+    """Soles with these speeds, shape (world, 4), under a body that goes the other way and tilts [degrees], shape (state, world)."""
+    parts = np.repeat(np.array(speeds).T, [4, 4, 8, 8], axis=0)
+    way = PERIOD * np.concatenate([0 * parts[:1], parts]).cumsum(axis=0)
+    rise = 2.0 * np.tan(np.radians(np.broadcast_to(tilts, way.shape)))
+    moved = np.stack([way[..., None] * [1, -1, 1, -1], rise[..., None] * [0, 0, 1, 1]], axis=-1)
+    x = torch.from_numpy(REST + moved).float()
+    other = torch.zeros(x.shape[1], 4, 2, 2)
+    states = [softmpm.State(one, torch.zeros_like(one), other, other) for one in x]
+    return Path(PERIOD * np.arange(len(x)), states, torch.zeros(len(parts), len(speeds), 1))
+
+
+def test_a_motion_that_lasts_keeps_its_speed():
+    """At least 0.7 of that in the second half of the episode, in the mean after it and of the particles that count; forward."""
+    assert LASTING(path_of(list(LASTS))).tolist() == list(LASTS.values())
+
+
+def test_a_motion_that_lasts_does_not_tip_over():
+    """Not even for an instant of the episode or after it, to neither side."""
+    angles, instants = (29.0, -29.0, 31.0, -31.0), (1, 12, 24)
+    tilts = np.zeros((25, 12))
+    for world, (angle, instant) in enumerate(itertools.product(angles, instants)):
+        tilts[instant, world] = angle
+    assert LASTING(path_of(np.ones((12, 4)), tilts)).tolist() == [True] * 6 + [False] * 6
+
+
+def test_the_best_lasts_if_any_does(task, model, settings, tmp_path):
+    """Then it has the lowest loss; what is not known is never kept."""
+    run, kept = Run(task, model, settings, tmp_path), []
+    found = [
+        *((math.nan, True, -1), (math.inf, True, -1), (-1.0, False, 2), (-2.0, False, 3), (-1.5, False, 3)),
+        *((-0.1, True, 5), (-3.0, False, 5), (0.0, True, 5), (-0.2, True, 8), (-math.inf, True, 8)),
+    ]
+    for k, (loss, lasts, _) in enumerate(found):
+        run.iteration = k
+        for weights in run.policy.parameters():
+            torch.nn.init.constant_(weights, k)
+        run.keep_if_best(loss, lasts)
+        kept.append(run.best["iteration"])
+    assert kept == [best for *_, best in found] and (run.best["loss"], run.best["lasts"]) == (-0.2, True)
+    assert all((weights == 8).all() for weights in run.best["policy"].values())
+
+
+@pytest.fixture
+def judge(monkeypatch):
+    """Makes the answers for the worlds of each motion those of a list; gives that and the lengths of the motions [s]."""
+    answers, lengths = [], []
+
+    def answer(self, path: Path) -> torch.Tensor:
+        lengths.append(path.times[-1])
+        return torch.tensor(answers.pop(0))
+
+    monkeypatch.setattr(Lasting, "__call__", answer)
+    return answers, lengths
+
+
+def rows_of(task, settings, out, **conf) -> dict[str, list[float]]:
+    """Columns of metrics.csv of a run of two worlds that gets farther with every evaluation, which is every other iteration."""
+    observer = dataclasses.replace(settings.observer, name="centroids")
+    optimizer = dataclasses.replace(settings.optimizer, policy_rate=0.1)
+    conf = dataclasses.replace(settings.train, worlds=2, evaluate_every=2, **conf)
+    settings = dataclasses.replace(settings, observer=observer, optimizer=optimizer, train=conf)
+    train(task, softmpm.build(task.scene, device="cpu", worlds=2), settings, out)
+    with open(out / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [float(row[name] or "nan") for row in rows] for name in rows[0]}
+
+
+def test_the_best_of_a_run_lasts(task, settings, tmp_path, judge):
+    """In all worlds, from both starts, over three episodes: it gives way to the next one that lasts, and not to those between."""
+    answers, lengths = judge
+    answers += [[True, True]] * 2 + [[True, False], [True, True]] + [[True, True]] * 2
+    found = rows_of(dataclasses.replace(task, lasting=LASTING), settings, tmp_path, endurance=3)
+    assert found["lasts"] == pytest.approx([1, 0, math.nan, 1, math.nan], nan_ok=True)
+    first, between, _, last, _ = found["evaluation"]
+    assert last < between < first and found["best"] == [first, first, first, last, last]
+    assert lengths == pytest.approx([3 * task.seconds] * 6)
+
+
+@pytest.mark.parametrize("spread, evaluated", [([], []), ([0.2, 0.1], [0, 1, 3])])
+def test_a_single_episode_is_not_asked_to_last(task, settings, tmp_path, judge, spread, evaluated):
+    """At random goals each evaluation counts as one that lasts, and at a fixed one there is none."""
+    conf = dict(endurance=1, goal_spread=spread, evaluation_goals=2)
+    found = rows_of(dataclasses.replace(task, lasting=LASTING), settings, tmp_path, **conf)
+    assert {k: v for k, v in enumerate(found["lasts"]) if not math.isnan(v)} == dict.fromkeys(evaluated, 1)
+    assert judge == ([], [])
+
+
+def test_the_best_of_a_checkpoint_from_before_lasts(task, model, settings, tmp_path):
+    """One that says that it does not is believed."""
+    run = Run(task, model, settings, tmp_path)
+    run.keep_if_best(-1.0, lasts=False)
+    run.iteration = 1
+    content = run.state_dict()
+    before = {name: value for name, value in content["best"].items() if name != "lasts"}
+    for best, lasts in ((before, True), (content["best"], False)):
+        other = Run(task, model, settings, tmp_path / str(lasts))
+        other.load_state_dict(content | {"best": best})
+        assert other.best["lasts"] is lasts and other.best["loss"] == -1.0
+
+
+@pytest.mark.parametrize("conf", [BipedConf, ElephantConf])
+def test_walkers_should_last(conf):
+    """After as many seconds as are simulated, by the terms that they learn from; an arm need not."""
+    task = make_task(conf(seconds=1.01))
+    progress, _, tilt, _ = task.objective.terms
+    assert task.lasting.progress is progress and task.lasting.tilt is tilt
+    assert task.lasting.seconds == task.seconds != 1.01
+    assert make_task(ArmConf()).lasting is None
+
+
+def test_the_worse_start_counts(task, model, settings, tmp_path, judge):
+    """An evaluation has the larger of the losses of a simulation from rest and of one that is kicked, made without the evaluator;
+    both must last."""
+    judge[0].extend([[True], [False]])
+    settings = dataclasses.replace(settings, train=dataclasses.replace(settings.train, endurance=3))
+    runs = Runs([Run(dataclasses.replace(task, lasting=LASTING), model, settings, tmp_path)])
+    longer, (params, inputs) = dataclasses.replace(task, control_steps=3 * task.control_steps), runs.design()
+    losses = []
+    for speed in (0.0, 0.05):
+        start = model.rest()
+        start.v[..., 0] += speed
+        about = dict(inputs=inputs, start=start)
+        losses.append(run_episode(longer, model, runs.observer, runs.policy, params, **about).loss.item())
+    (found,) = evaluate(runs)
+    assert found.loss == pytest.approx(max(losses), rel=1e-6) and not found.lasts
+    assert abs(losses[0] - losses[1]) > 1e-4
+
+
+def test_a_motion_that_is_not_worth_it_need_not_last(task, settings, model, tmp_path):
+    """A robot that trembles forward lasts, but a far one that does not is better."""
+    optimizer = dataclasses.replace(settings.optimizer, restart_above=-0.1)
+    run = Run(task, model, dataclasses.replace(settings, optimizer=optimizer), tmp_path)
+    kept = []
+    for loss, lasts in ((-0.05, True), (-1.0, False), (-0.2, True)):
+        run.keep_if_best(loss, lasts)
+        kept.append((run.best["loss"], run.best["lasts"]))
+    assert kept == [(-0.05, False), (-1.0, False), (-0.2, True)]
