@@ -29,7 +29,7 @@ class Fallback:
         Args:
             loss: That of the iteration; nan where it is not known, which goes on with the count and decides nothing, infinite where its
                 simulation failed.
-            best: The lowest so far.
+            best: That of the best so far.
             settles: The run settles: a single iteration below :data:`softmpm_learn.settling.SETTLED_SHARE` decides.
         """
         self.iterations += 1

@@ -224,8 +224,8 @@ class TrainConf:
     """Iterations between two evaluations, by which the best policy is chosen where goals are drawn at random or an evaluation is longer
     than an episode; each takes the time of a few simulations without gradient."""
     endurance: int | None = None
-    """Length of these evaluations, in episodes: a motion that does not last is not the best. null is the task's, 3 for ours; 1: the
-    best is that of the lowest loss."""
+    """Length of these evaluations, in episodes: a motion that does not last is not the best (lasting.py). null is the task's, 3 for
+    ours; 1: the best is that of the lowest loss."""
     evaluation_goals: int = 8
     """Random goals: least number of fixed goals in the box, the same in every run; rounded up to fill all worlds."""
     save_every: int = 1

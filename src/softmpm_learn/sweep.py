@@ -32,9 +32,9 @@ class Outcome:
     status: str
     """finished or failed."""
     loss: float = math.inf
-    """Objective of the sweep: the lowest loss of the run, at fixed goals where goals are drawn at random; infinite if it failed."""
+    """Objective of the sweep: the loss of the best motion, of its evaluation if there are any; infinite if the run failed."""
     iteration: int = -1
-    """Iteration of the lowest loss."""
+    """Iteration of the best motion."""
     iterations: int = 0
     """Iterations done."""
     end: float = math.nan
