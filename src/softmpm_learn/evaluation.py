@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import torch
 
 import softmpm
-from softmpm_learn.lasting import STARTS
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 
@@ -45,7 +44,7 @@ class Evaluation:
 def evaluate(runs: Runs) -> list[Evaluation]:
     """Evaluate policy and design of each run as they are."""
     found, failed = [], dict[int, softmpm.UnstableError]()
-    starts = (0.0,) if runs.task.lasting is None else STARTS
+    starts = runs.evaluator.starts
     for kick, goal in itertools.product(starts, runs.evaluation_goals() or [None]):
         both = torch.stack(runs.evaluator(goal, kick))
         found.append(both.unflatten(1, (len(runs.all), -1)).mean(dim=2))

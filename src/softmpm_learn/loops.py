@@ -11,6 +11,7 @@ from torch import Tensor
 import softmpm
 from softmpm import Inputs, Model, Params
 from softmpm_learn.episode import Decisions, Episode, Frame, Policy, run_episode, times_of
+from softmpm_learn.lasting import STARTS
 from softmpm_learn.observe import Observer
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ class Evaluator:
         policy, design: As of :class:`ClosedLoop`.
 
     Attributes:
+        starts: Speeds along the first axis with which an evaluation starts [m/s]: those of :data:`softmpm_learn.lasting.STARTS` if the
+            motion should last, else rest.
         failures: Those of the last simulation. A robot that fails goes on from rest: frozen, it would fail again in every control
             step, and outside of a graph the simulation of all robots would be repeated each time.
     """
@@ -45,6 +48,7 @@ class Evaluator:
         policy: Policy,
         design: Callable[[], tuple[Params, Inputs]],
     ):
+        self.starts = (0.0,) if task.lasting is None else STARTS
         self.failures = failures = softmpm.Failures("reset")
         goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
         self._kick = kick = torch.zeros(model.dim, dtype=model.dtype, device=model.device)

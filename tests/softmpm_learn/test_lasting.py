@@ -13,6 +13,7 @@ import softmpm
 from softmpm_learn.episode import run_episode
 from softmpm_learn.evaluation import evaluate
 from softmpm_learn.lasting import Lasting
+from softmpm_learn.loops import Evaluator
 from softmpm_learn.objective import Path, Progress, Tilt
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -122,17 +123,29 @@ def test_the_best_of_a_run_lasts(task, settings, tmp_path, judge):
 
 
 @pytest.mark.parametrize("spread, evaluated", [([], []), ([0.2, 0.1], [0, 1, 3])])
-def test_a_single_episode_is_not_asked_to_last(task, settings, tmp_path, judge, spread, evaluated):
-    """At random goals each evaluation counts as one that lasts, and at a fixed one there is none."""
+def test_a_single_episode_is_not_asked_to_last(
+    task, settings, tmp_path, judge, monkeypatch, spread, evaluated
+):
+    """At random goals each evaluation counts as one that lasts and starts from rest only, and at a fixed one there is none."""
+    starts, real = [], Evaluator.__call__
+
+    def start(self, goal, kick=0.0):
+        starts.append(kick)
+        return real(self, goal, kick)
+
+    monkeypatch.setattr(Evaluator, "__call__", start)
     conf = dict(endurance=1, goal_spread=spread, evaluation_goals=2)
     found = rows_of(dataclasses.replace(task, lasting=LASTING), settings, tmp_path, **conf)
     assert {k: v for k, v in enumerate(found["lasts"]) if not math.isnan(v)} == dict.fromkeys(evaluated, 1)
-    assert judge == ([], [])
+    assert judge == ([], []) and starts == [0.0] * len(evaluated)
 
 
 def test_the_best_of_a_checkpoint_from_before_lasts(task, model, settings, tmp_path):
-    """One that says that it does not is believed."""
+    """One that says that it does not is believed, and one of a run that had none is none."""
     run = Run(task, model, settings, tmp_path)
+    other = Run(task, model, settings, tmp_path / "none")
+    other.load_state_dict(run.state_dict() | {"best": {"loss": math.inf, "iteration": -1}})
+    assert not other.best["lasts"]
     run.keep_if_best(-1.0, lasts=False)
     run.iteration = 1
     content = run.state_dict()
