@@ -47,7 +47,10 @@ class Table:
                     f"knows; put the right file there, or move it away to go on without its rows."
                 )
             if not content.startswith(header):
-                raise ValueError(f"{path} should have the columns {header.decode().strip()}.")
+                raise ValueError(
+                    f"{path} should have the columns {header.decode().strip()}; a run of an earlier version has others. Move the file "
+                    "away to go on without its rows."
+                )
         elif seal is not None:
             logger.warning("%s is missing; its rows up to here are lost, and a new one begins.", path)
         self._hash, self._bytes = hashlib.sha256(content), len(content)
