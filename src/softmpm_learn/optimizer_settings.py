@@ -24,7 +24,7 @@ class OptimizerConf:
     """Shorten a longer gradient to this length and count it in metrics.csv; null leaves gradients alone."""
     fade: float | None = None
     """Time constant with which gradients fade on their way back through the simulation [s]: what a muscle did long before a step has an
-    effect that changes of a useful size do not have (fading.py). null is the task's, 0.1 for walkers and the arm; .inf: never."""
+    effect that changes of a useful size do not have (fading.py). null is the task's, 0.1 for walkers and the arm; inf: never."""
     retries: int = 4
     """Maximum number of times that a failed step is halved towards the last successful simulation; if it still fails, the run goes back
     to its best, and ends if that fails too. 0 ends the run at once."""
@@ -42,7 +42,7 @@ class OptimizerConf:
     longer change, and ends there (settling.py); 0: never. Our choice."""
     restart_above: float | None = None
     """Begin anew with other first weights where the loss of no episode was below this; such a run does not go back to its best either.
-    null is the task's, of walkers minus a tenth of their length; .inf: never."""
+    null is the task's, of walkers minus a tenth of their length; inf: never."""
     restart_after: int = 20
     """Iterations after which that is decided. Our choice: of a hundred elephants 22 stood still after 40 iterations, and 19 of them
     would have begun anew, with 9 of the others (docs/learning.md)."""
@@ -56,13 +56,13 @@ class OptimizerConf:
             if getattr(self, name) is not None:
                 positive("optimizer", self, name)
         if self.fade is not None and not self.fade > 0:
-            raise ValueError(f"optimizer.fade must be > 0, .inf or null, got {self.fade}.")
+            raise ValueError(f"optimizer.fade must be > 0, inf or null, got {self.fade}.")
         for name in ("retries", "fallback_from"):
             if getattr(self, name) < 0:
                 raise ValueError(f"optimizer.{name} must be ≥ 0, got {getattr(self, name)}.")
         positive("optimizer", self, "fallback_after", "restart_after")
         if self.restart_above is not None and math.isnan(self.restart_above):
-            raise ValueError("optimizer.restart_above must be a number, .inf or null, got nan.")
+            raise ValueError("optimizer.restart_above must be a number, inf or null, got nan.")
         share("optimizer", self, "fallback_rate")
         for name in ("fallback_share", "settle"):
             if not 0.0 <= getattr(self, name) < 1.0:
