@@ -1,39 +1,61 @@
 """Print the figures of "What lasts" in docs/results.md, from lasting.h200.csv and the comparisons beside this script."""
 
-import csv
 import math
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
+from comparison import WALKS, Row, lasts
+from scipy.stats import fisher_exact
+from settling import table
 
-WALKS = -0.5
-"""Best evaluation of a walker that has got under way, three episodes long."""
-
-Row = dict[str, str]
-
-
-def table(name: str) -> list[Row]:
-    """Rows of a table beside this script."""
-    with open(Path(__file__).parent / name, newline="") as file:
-        return list(csv.DictReader(file))
+Count = tuple[int, int]
+"""Number of walkers with a property, and of all walkers."""
 
 
-def figures(rows: Iterable[Row], episodes: int = 3) -> str:
-    """Cells of a table: runs, and how many walk; of these how many last, tear, slow down or tilt, and end below 0.8 of their best or
-    tear there; median of the best evaluation of all.
+def walking(rows: Sequence[Row], episodes: int = 3) -> list[Row]:
+    """Runs whose robot walks.
 
     Args:
         episodes: Length of the evaluation.
     """
-    rows = list(rows)
-    walking = [row for row in rows if float(row["best"]) < WALKS * episodes / 3]
-    torn = [row for row in walking if not row["later"]]
-    lasting = [r for r in walking if r not in torn and float(r["later"]) >= 0.7 and float(r["tilt"]) < 30]
-    lucky = [row for row in walking if not row["end"] or float(row["end"]) > 0.8 * float(row["best"])]
-    rest = len(walking) - len(torn) - len(lasting)
-    counts = len(rows), len(walking), len(lasting), len(torn), rest, len(lucky)
+    return [row for row in rows if float(row["best"]) < WALKS * episodes / 3]
+
+
+def lasting(rows: Sequence[Row]) -> Count:
+    """How many walkers last."""
+    return sum(map(lasts, walking(rows))), len(walking(rows))
+
+
+def lucky(walkers: Sequence[Row]) -> Count:
+    """How many fail, or are below 0.8 of their best, when that is simulated once more."""
+    return sum(not r["end"] or float(r["end"]) > 0.8 * float(r["best"]) for r in walkers), len(walkers)
+
+
+def figures(rows: Sequence[Row], episodes: int = 3) -> str:
+    """Cells of a table: runs, and how many walk; of these how many last, tear, slow down or tilt, end by luck, and stop on the finer
+    grid; median of the best evaluation of all."""
+    walkers = walking(rows, episodes)
+    good, torn = sum(map(lasts, walkers)), sum(not row["later"] for row in walkers)
+    finer = sum(not row["finer"] for row in walkers)
+    counts = len(rows), len(walkers), good, torn, len(walkers) - torn - good, lucky(walkers)[0], finer
     return " | ".join([*map(str, counts), f"{np.median([float(row['best']) for row in rows]):.2f}"])
+
+
+def known(rows: Sequence[Row]) -> str:
+    """Of the walkers that fail in the examination, how many had lasted in their evaluation."""
+    failed = [row for row in walking(rows) if not lasts(row)]
+    return f"{len(failed)} fail, of which {sum(row['lasts'] == '1' for row in failed)} had lasted"
+
+
+def compare(what: str, now: Count, then: Count) -> None:
+    """Print two shares, and by Fisher's exact test whether they differ."""
+    p = fisher_exact([[good, every - good] for good, every in (now, then)]).pvalue
+    print(f"{what}: {now[0]} of {now[1]} after {then[0]} of {then[1]}, p = {p:.2f}")
+
+
+def both(one: Count, other: Count) -> Count:
+    """Of two groups together."""
+    return one[0] + other[0], one[1] + other[1]
 
 
 def main():
@@ -42,12 +64,24 @@ def main():
         kinds.setdefault((row["robot"], row["iterations"], row["choice"]), []).append(row)
     for (robot, iterations, choice), rows in kinds.items():
         print(f"{robot}, {iterations}, {choice} | {figures(rows, 1 if choice == 'slowest episode' else 3)}")
+        if iterations == "100":
+            print(known(rows))
+    farthest = [*kinds["biped", "60", "farthest"], *kinds["biped", "60", "farthest again"]]
+    now, then = lasting(kinds["biped", "60", "lasting, two starts"]), lasting(farthest)
+    compare("bipeds that last after 60 iterations", now, then)
+    settled = [row for row in table("settled.h200.csv") if row["robot"] == "biped"]
+    fresh = kinds["biped", "100", "lasting, two starts"]
+    compare("bipeds 960 to 979 that last after 100", (lasting(fresh)[0], 20), (lasting(settled)[0], 20))
+    ends = []
     for robot in ("biped", "elephant"):
-        then, now = (table(f"{folder}comparison.{robot}.h200.csv") for folder in ("", "lasting/"))
-        change = [float(b["best"]) - float(a["best"]) for a, b in zip(then, now, strict=True)]
+        before, after = (table(f"{folder}comparison.{robot}.h200.csv") for folder in ("", "lasting/"))
+        change = [float(b["best"]) - float(a["best"]) for a, b in zip(before, after, strict=True)]
         error = np.std(change, ddof=1) / math.sqrt(len(change))
-        print(f"{robot}, comparison, farthest | {figures(then)}")
-        print(f"{robot}, comparison, lasting | {figures(now)} | best {np.mean(change):+.2f} ({error:.2f})")
+        print(f"{robot}, comparison, farthest | {figures(before)}")
+        print(f"{robot}, comparison, lasting | {figures(after)} | best {np.mean(change):+.2f} ({error:.2f})")
+        print(known(after))
+        ends.append((lucky(walking(after)), lucky(walking(before))))
+    compare("ends of the comparison by luck", *(both(*one) for one in zip(*ends, strict=True)))
 
 
 if __name__ == "__main__":
