@@ -238,8 +238,8 @@ class TrainConf:
     examine: bool = True
     """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid."""
     pictures: bool = True
-    """Draw loss.png, latent.png and robot.png at the end, the first and the last while the run goes on too. At the end they take 1.5 s
-    for each seed."""
+    """Draw loss.png, latent.png and robot.png at the end, the first and the last while the run goes on too. At the end they take about
+    a second for each seed."""
     log: list[str] = field(default_factory=list)
     """Loggers beside the files of the run: tensorboard, wandb, or registered ones."""
 

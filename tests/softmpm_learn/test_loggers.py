@@ -352,7 +352,7 @@ def test_an_experiment_shows_its_pictures(tmp_path, main, seeds):
 
 def test_seeds_that_go_on_with_a_logger_have_all_rows(tmp_path, main):
     """It may come when all of them are resumed, or one alone."""
-    words = "train.seeds=2", "train.examine=false", "train.record_every=0"
+    words = "train.seeds=2", "train.examine=false", "train.record_every=0", "train.pictures=false"
     main("train.iterations=1", *words, f"hydra.run.dir={tmp_path}")
     main(f"resume={tmp_path}/seed_1", "train.iterations=2", "train.log=[tensorboard]")
     main(f"resume={tmp_path}", "train.iterations=3", "train.log=[tensorboard]")

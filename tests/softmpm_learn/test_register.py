@@ -22,6 +22,7 @@ HOPPER, PARTS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robots.md")
 TINY = [
     *("experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
     *("learning.epochs=1", "train.iterations=2", "train.record_every=0", "train.examine=false"),
+    "train.pictures=false",
 ]
 
 

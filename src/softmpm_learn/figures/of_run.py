@@ -14,6 +14,8 @@ STILL = 0.1
 """Nodes that never move at this share of the highest speed are cut off around a latent picture."""
 AROUND = 0.3
 """Margin around the places where a robot comes, over the height of the picture."""
+GAP = 0.08
+"""Gap between two latent pictures, over their longer side."""
 SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
@@ -59,23 +61,28 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
         fields = fields[:, :, :, :, fields.shape[4] // 2]
     fields = _moving(fields)
     features, steps, nx, ny, _ = fields.shape
-    width = 1.1 * (nx / ny) ** 0.5
-    figure = canvas.figure(2 * steps * width + 0.4, features * (width * ny / nx + 0.08) + 0.4)
-    axes = figure.subplots(features, 2 * steps, squeeze=False)
-    for feature in range(features):
-        limit = max(float(np.abs(fields[feature, ..., :2]).max()), 1e-12)  # each row has a scale of its own
-        for column in range(2 * steps):
-            component, step = divmod(column, steps)
-            panel = axes[feature, column]
-            picture = fields[feature, step, ..., component].T
-            panel.imshow(
-                picture, origin="lower", cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest"
-            )
-            panel.set(xticks=[], yticks=[])
-            if feature == 0:
-                panel.set_title(f"{'xy'[component]} velocity, {_value(step, steps):+.1f}", fontsize=7)
-            if column == 0:
-                panel.set_ylabel(f"feature {feature + 1}", fontsize=8)
+    limit = np.abs(fields[..., :2]).max(
+        axis=(1, 2, 3, 4), keepdims=True
+    )  # each feature has a scale of its own
+    shares = np.moveaxis(fields[..., :2] / np.maximum(limit, 1e-12), 4, 1).reshape(
+        features, 2 * steps, nx, ny
+    )
+    gap = max(1, round(GAP * max(nx, ny)))
+    framed = np.pad(shares, ((0, 0), (0, 0), (0, gap), (0, gap)), constant_values=np.nan)
+    # From left to right the columns, from below the features, the last one first:
+    mosaic = framed[::-1].transpose(0, 3, 1, 2).reshape(features * (ny + gap), -1)[:-gap, :-gap]
+    width = 2 * steps * 1.1 * (nx / ny) ** 0.5
+    figure = canvas.figure(width + 0.4, width * mosaic.shape[0] / mosaic.shape[1] + 0.5)
+    panel = figure.add_subplot()
+    panel.imshow(mosaic, origin="lower", cmap=SIGNED, vmin=-1.0, vmax=1.0, interpolation="nearest")
+    titles = [f"{axis} velocity, {_value(step, steps):+.1f}" for axis in "xy" for step in range(steps)]
+    panel.set_xticks((nx - 1) / 2 + (nx + gap) * np.arange(2 * steps), titles, fontsize=7)
+    rows = [f"feature {features - k}" for k in range(features)]
+    panel.set_yticks(
+        (ny - 1) / 2 + (ny + gap) * np.arange(features), rows, fontsize=8, rotation=90, va="center"
+    )
+    panel.tick_params(length=0, labeltop=True, labelbottom=False)
+    panel.spines[:].set_visible(False)
     figure.supxlabel("red: to the left, down; blue: to the right, up; a scale for each feature", fontsize=7)
     canvas.save(figure, path, dpi=120)
 
@@ -201,6 +208,6 @@ def _draw_robot(
 
 def _draw_wall(panel, wall, low: np.ndarray, high: np.ndarray) -> None:
     """Shade what of the picture lies inside a half space n·x ≤ offset."""
-    x, y = np.meshgrid(np.linspace(low[0], high[0], 200), np.linspace(low[1], high[1], 200))
+    x, y = np.meshgrid((low[0], high[0]), (low[1], high[1]))  # a plane needs no more
     depth = wall.offset - (wall.normal[0] * x + wall.normal[1] * y)
     panel.contourf(x, y, depth, levels=[0.0, max(float(depth.max()), 1e-9)], colors=["#e3e0da"], zorder=0)
