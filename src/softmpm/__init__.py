@@ -35,6 +35,7 @@ from softmpm.recording.writer import Recorder
 from softmpm.scene import presets
 from softmpm.scene.file import load_scene, save_scene
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
+from softmpm.scene.neighbours import neighbour_pairs
 from softmpm.scene.outline import Outline
 from softmpm.scene.polygons import inside
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
@@ -102,6 +103,7 @@ __all__ = [
     "mean_velocity",
     "mesh",
     "momentum",
+    "neighbour_pairs",
     "polygons",
     "presets",
     "rasterize",

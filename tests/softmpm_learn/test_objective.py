@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import softmpm
 from softmpm import State
 from softmpm_learn.objective import (
     AtMost,
@@ -18,10 +19,11 @@ from softmpm_learn.objective import (
     Progress,
     Reach,
     Still,
-    Strain,
+    Stretch,
     Term,
     Tilt,
 )
+from softmpm_learn.tasks import BipedConf, make_task
 
 
 @pytest.fixture
@@ -63,16 +65,42 @@ def test_still_is_the_mean_squared_speed_of_the_mean(path):
     torch.testing.assert_close(still.value(path), want)
 
 
-def test_strain_is_what_is_beyond_the_limit():
-    """By hand: bodies 1, 1.5 and 2 times as long, as wide as at rest, ε = (λ² − 1)/3; a rotation on top changes nothing."""
+def test_stretch_is_what_is_beyond_the_limit():
+    """By hand: four particles in a row whose pairs, 0.5, 0.25 and 1 m long at rest, are 1, 1.5 and 2 times as long, in any direction;
+    what is shorter than the limit costs nothing, and a pair that is not named does not count."""
+    rest = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.25), (0.5, 1.25)])
     turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
-    F = torch.stack([turn @ torch.diag(torch.tensor([long, 1.0])) for long in (1.0, 1.5, 2.0)])
-    state = State(torch.zeros(1, 3, 2), torch.zeros(1, 3, 2), torch.zeros(1, 3, 2, 2), F[None])
-    rest = state._replace(F=torch.eye(2).expand(1, 3, 2, 2))
-    path = Path([0.0, 0.5], [rest, state], torch.zeros(1, 1, 1))
-    beyond = [max(0.0, (long**2 - 1) / 3 - 0.3) ** 2 for long in (1.0, 1.5, 2.0)]
-    torch.testing.assert_close(Strain(most=0.3, begin=0.5).value(path), torch.tensor([sum(beyond) / 3]))
-    torch.testing.assert_close(Strain(most=0.3).value(path), torch.tensor([sum(beyond) / 6]))
+    moved = torch.tensor([(0.0, 0.0), (0.5, 0.0), (0.5, 0.375), (0.5, 2.375)]) @ turn.T + 3.0
+    nothing = torch.zeros(1, 4, 2, 2)
+    states = [
+        State(x[None].float(), nothing[..., 0], nothing, nothing) for x in (torch.from_numpy(rest), moved)
+    ]
+    path = Path([0.0, 0.5], states, torch.zeros(1, 1, 1))
+    pairs = np.array([(0, 1), (2, 1), (2, 3)])
+    one = Stretch(pairs=pairs, rest=rest, most=1.2)
+    torch.testing.assert_close(one.value(path), torch.tensor([(0.3**2 + 0.8**2) / 6]))
+    late = Stretch(pairs=pairs[:2], rest=rest, most=1.2, begin=0.5)
+    torch.testing.assert_close(late.value(path), torch.tensor([0.3**2 / 2]))
+
+
+def test_a_crack_costs_what_strains_do_not():
+    """A walker torn in two rigid halves has no strain, and pays for each pair across the crack; it costs nothing at rest, and a stretch
+    by half costs nothing either."""
+    task = make_task(BipedConf())
+    (stretch,) = (term for term in task.objective.terms if isinstance(term, Stretch))
+    rest = softmpm.build(task.scene, device="cpu").rest()
+    right = rest.x[..., :1] > rest.x[..., :1].mean()
+    torn = rest._replace(x=rest.x + torch.tensor([0.1, 0.0]) * right)
+    longer = rest._replace(x=rest.x * 1.5)
+    losses = [
+        stretch.value(Path([0.0], [state], torch.zeros(1, 1, 1))).item() for state in (rest, longer, torn)
+    ]
+    across = right[0, stretch.pairs, 0]
+    count = int((across[:, 0] != across[:, 1]).sum())
+    spacing = task.scene.grid.spacing / 2
+    assert losses[:2] == [0, 0] and count > 10
+    assert losses[2] == pytest.approx(count * (0.1 / spacing + 1 - 1.6) ** 2 / len(across), rel=1e-3)
+    assert not softmpm.von_mises_strain(torn).any()
 
 
 def test_effort_counts_the_control_steps_of_the_window(path):

@@ -1,5 +1,7 @@
 """Neighbours at rest: pairs of particles whose separation is numerical fracture."""
 
+import math
+
 import numpy as np
 
 from softmpm.scene.scene import Scene
@@ -24,6 +26,17 @@ def rest_neighbours(scene: Scene, longest: float) -> np.ndarray:
         parts.append(np.where(found < 0, -1, found + first))
         first += len(body.particles)
     return np.concatenate(parts).astype(np.int32)
+
+
+def neighbour_pairs(scene: Scene) -> np.ndarray:
+    """Pairs of particles of a body that are neighbours at rest, each pair once: indices into the particles of the scene, shape
+    (pair, 2).
+
+    Where a body tears they part, and their deformation gradients hardly tell.
+    """
+    found = rest_neighbours(scene, math.inf)
+    one, place = np.nonzero(found >= 0)
+    return np.stack([one, found[one, place]], axis=1)
 
 
 def _within(positions: np.ndarray, longest: float) -> np.ndarray:

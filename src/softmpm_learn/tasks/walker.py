@@ -9,7 +9,7 @@ import numpy as np
 
 import softmpm
 from softmpm_learn.lasting import Lasting
-from softmpm_learn.objective import Effort, Objective, Progress, Strain, Tilt
+from softmpm_learn.objective import Effort, Objective, Progress, Stretch, Tilt
 from softmpm_learn.tasks.task import LASTING, Task, TaskConf, clock
 
 STEP = 0.1
@@ -29,8 +29,8 @@ SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""
 EDGE = 0.012
 """Distance from the corner at which the bevelled edge of a sole begins [m]: one cell as a draft."""
-STRAIN = 0.5
-"""Equivalent strain of a walker that costs nothing: it is half as long again as at rest."""
+STRETCH = 1.6
+"""Stretch of neighbouring particles of a walker that costs nothing. They part for good at 2.8: 1.4 cells (:class:`softmpm.Alarms`)."""
 
 
 @dataclass(kw_only=True)
@@ -46,8 +46,8 @@ class WalkerConf(TaskConf):
     """Weight of the mean squared activation in the loss [m]; with less, gaits stretch the robot until it breaks."""
     upright: float = 1.0
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
-    strain: float = 1e4
-    """Weight of strains beyond a half in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
+    stretch: float = 5e4
+    """Weight of stretches beyond 1.6 in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
     seconds: float = 2.0
@@ -59,7 +59,7 @@ class WalkerConf(TaskConf):
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("friction", "upright", "strain")
+        self.need_not_negative("friction", "upright", "stretch")
         if self.lead is not None and not 0 <= self.lead < self.seconds:
             raise ValueError(
                 f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
@@ -85,7 +85,7 @@ class WalkerConf(TaskConf):
         return dataclasses.replace(alarms, step=None) if carried else alarms
 
 
-def walking(conf: WalkerConf, rest: np.ndarray, torso: np.ndarray) -> Objective:
+def walking(conf: WalkerConf, scene: softmpm.Scene, rest: np.ndarray, torso: np.ndarray) -> Objective:
     """Bring the soles far, without effort or overstretching, while the hind and the front quarter of the torso stay level.
 
     The soles count because they have to step for it. The whole robot also gains by leaning forward, which a gradient that fades takes
@@ -99,7 +99,7 @@ def walking(conf: WalkerConf, rest: np.ndarray, torso: np.ndarray) -> Objective:
         Progress(begin=lead, particles=np.flatnonzero(height <= SOLES * height.max())),
         Effort(weight=conf.effort),
         Tilt(weight=conf.upright, front=front, back=back, rest=rest),
-        Strain(weight=conf.strain, most=STRAIN),
+        Stretch(weight=conf.stretch, pairs=softmpm.neighbour_pairs(scene), rest=rest, most=STRETCH),
     )
 
 
@@ -152,7 +152,7 @@ def walker_task(
         dt=conf.control_period,
     )
     scene, control_steps, substeps = clock(conf, scene)
-    length, objective = float(np.ptp(rest[:, 0])), walking(conf, rest, torso)
+    length, objective = float(np.ptp(rest[:, 0])), walking(conf, scene, rest, torso)
     progress, _, tilt, _ = objective.terms
     assert isinstance(progress, Progress) and isinstance(tilt, Tilt)
     seconds = control_steps * substeps * scene.dt
