@@ -7,6 +7,7 @@ gaits that stumble or break soon after the episode are often those of the lowest
 import itertools
 import logging
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -39,20 +40,38 @@ class Evaluation:
     lasts: bool
     """All these motions last, see :mod:`softmpm_learn.lasting`; True where the task does not ask."""
 
+    def worse(self, other: "Evaluation") -> "Evaluation":
+        """The worse of both, of the same run from other starts."""
+        return Evaluation(max(self.loss, other.loss), self.lasts and other.lasts)
+
+
+def evaluate(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
+    """Evaluate policy and design of some runs as they are, by their numbers; what would be the best so far also from further starts."""
+    found, further = simulate(runs, of, runs.evaluator.starts), runs.evaluator.further
+    best = [k for k, one in found.items() if runs.all[k].would_be_best(one.loss, one.lasts)]
+    again = simulate(runs, best, further) if best and further else {}
+    return found | {k: found[k].worse(one) for k, one in again.items()}
+
+
+def evaluate_fully(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
+    """As :func:`evaluate`, from all starts."""
+    return simulate(runs, of, runs.evaluator.starts + runs.evaluator.further)
+
 
 @torch.no_grad()
-def evaluate(runs: Runs) -> list[Evaluation]:
-    """Evaluate policy and design of each run as they are."""
+def simulate(runs: Runs, of: Collection[int], starts: Sequence[float]) -> dict[int, Evaluation]:
+    """Evaluate from starts with these speeds along the first axis [m/s], of which the worst counts."""
     found, failed = [], dict[int, softmpm.UnstableError]()
-    starts = runs.evaluator.starts
     for kick, goal in itertools.product(starts, runs.evaluation_goals() or [None]):
         both = torch.stack(runs.evaluator(goal, kick))
         found.append(both.unflatten(1, (len(runs.all), -1)).mean(dim=2))
         failed = runs.failed(runs.evaluator.failures.errors) | failed
     for k, error in failed.items():
+        if k not in of:
+            continue
         logger.warning("Iteration %d: the evaluation failed: %s", runs.all[k].iteration, error)
         found[0][0, k] = math.inf
     means = runs.group.average(found)  # infinite in every process if it is in one
     losses, lasts = torch.stack(means).unflatten(0, (len(starts), -1)).mean(dim=1).unbind(dim=1)
     worst, least = losses.max(dim=0).values.tolist(), lasts.min(dim=0).values.tolist()
-    return [Evaluation(loss, share > ALL) for loss, share in zip(worst, least, strict=True)]
+    return {k: Evaluation(worst[k], least[k] > ALL) for k in of}

@@ -11,7 +11,7 @@ import torch
 from softmpm import Failures
 from softmpm_learn.distributed import in_full
 from softmpm_learn.episode import run_episode
-from softmpm_learn.evaluation import evaluate
+from softmpm_learn.evaluation import evaluate_fully
 from softmpm_learn.examination import examine
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
@@ -72,8 +72,8 @@ def evaluate_ends(runs: Runs) -> dict[int, float]:
     if not (runs.all[0].settings.train.examine and finished(runs)):
         return {}
     with _at_their_best(runs) as done:
-        again = evaluate(runs)
-    return {k: again[k].loss if math.isfinite(again[k].loss) else math.nan for k in done}
+        again = evaluate_fully(runs, done)
+    return {k: one.loss if math.isfinite(one.loss) else math.nan for k, one in again.items()}
 
 
 @torch.no_grad()

@@ -20,6 +20,8 @@ LEVEL = 30.0
 STARTS = 0.0, 0.05
 """Speeds along the first axis with which an evaluation starts, of which the worse result counts [m/s]: what lasts by luck in one
 simulation may not in another that differs by rounding."""
+FURTHER = -0.05, 0.025
+"""Further such starts of a motion that would be the best: the best of many motions is often one that was lucky."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -123,7 +123,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
 def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
     """Take the step of each run along its gradient, go back to its best, or begin anew; keeps the best, and completes the rows."""
     asked = [k for k in rows if due(runs.all[k])]
-    evaluations = evaluate(runs) if asked else []
+    evaluations = evaluate(runs, asked) if asked else {}
     for k, row in rows.items():
         run, found = runs.all[k], Evaluation(row["loss"], lasts=True)
         if run.evaluated:

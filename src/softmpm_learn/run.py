@@ -170,26 +170,33 @@ class Run:
 
     def begins_to_settle(self) -> bool:
         """Decide in the first of them whether it does; True if it begins."""
-        worth = self.best["iteration"] >= 0 and is_worth(self.best["loss"], self.settings.optimizer)
+        worth = self.best["iteration"] >= 0 and self._is_worth(self.best["loss"])
         return self.settling.begins(self.left, self._settling_iterations, worth)
 
     @property
     def _settling_iterations(self) -> int:
         return settling.iterations(self.settings.train.iterations, self.settings.optimizer.settle)
 
-    def keep_if_best(self, loss: float, lasts: bool) -> None:
-        """Keep policy and design as they are if they are the best so far: a motion that lasts is better than one that does not, and of
-        two others that of the lower loss.
+    def would_be_best(self, loss: float, lasts: bool) -> bool:
+        """True of a motion that is better than the best so far: one that lasts is better than one that does not, and of two others that
+        of the lower loss.
 
         Args:
             loss: nan or infinite of a motion that is not known.
             lasts: See :mod:`softmpm_learn.lasting`; of no account where the motion is not worth going on with.
         """
-        lasts = lasts and is_worth(loss, self.settings.optimizer)
-        if math.isfinite(loss) and (lasts, -loss) > (self.best["lasts"], -self.best["loss"]):
+        lasts = lasts and self._is_worth(loss)
+        return math.isfinite(loss) and (lasts, -loss) > (self.best["lasts"], -self.best["loss"])
+
+    def _is_worth(self, loss: float) -> bool:
+        return is_worth(loss, self.settings.optimizer)
+
+    def keep_if_best(self, loss: float, lasts: bool) -> None:
+        """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`."""
+        if self.would_be_best(loss, lasts):
             self.best = {
                 "loss": loss,
-                "lasts": lasts,
+                "lasts": lasts and self._is_worth(loss),
                 "iteration": self.iteration,
                 **self.policy_snapshot(),
             }
@@ -214,7 +221,7 @@ class Run:
     def fall_back(self) -> str:
         """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments; or begin anew
         if the best is not worth it. Says which."""
-        if not is_worth(self.best["loss"], self.settings.optimizer):
+        if not self._is_worth(self.best["loss"]):
             return self.begin_anew()
         self.fallback.count += 1
         return self.return_to_best(self.settings.optimizer.fallback_rate)

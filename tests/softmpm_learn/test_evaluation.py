@@ -75,7 +75,8 @@ def test_the_best_policy_is_that_of_the_best_evaluation(reaching, model, drawn, 
     assert result.best_loss == np.nanmin(found) != min(loss)
     assert result.best_iteration == int(np.nanargmin(found))
     result.run.load_policy(result.run.best)
-    assert evaluation.evaluate(Runs([result.run])) == [evaluation.Evaluation(result.best_loss, lasts=True)]
+    best = evaluation.Evaluation(result.best_loss, lasts=True)
+    assert evaluation.evaluate(Runs([result.run]), [0]) == {0: best}
 
 
 def test_an_evaluation_is_the_mean_over_its_goals(reaching, model, drawn, tmp_path):
@@ -84,7 +85,7 @@ def test_an_evaluation_is_the_mean_over_its_goals(reaching, model, drawn, tmp_pa
     state = run.goals.get_state()
     runs = Runs([run])
     losses = [runs.loop(goal)[0].loss.item() for goal in run.evaluation_goals()]
-    (found,) = evaluation.evaluate(runs)
+    found = evaluation.evaluate(runs, [0])[0]
     assert found.loss == pytest.approx(np.mean(losses), rel=1e-6) and found.lasts
     assert torch.equal(run.goals.get_state(), state) and len(set(losses)) == 4
 

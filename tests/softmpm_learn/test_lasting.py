@@ -11,7 +11,7 @@ import torch
 
 import softmpm
 from softmpm_learn.episode import run_episode
-from softmpm_learn.evaluation import evaluate
+from softmpm_learn.evaluation import evaluate, evaluate_fully
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.loops import Evaluator
 from softmpm_learn.objective import Path, Progress, Tilt
@@ -112,14 +112,14 @@ def rows_of(task, settings, out, **conf) -> dict[str, list[float]]:
 
 
 def test_the_best_of_a_run_lasts(task, settings, tmp_path, judge):
-    """In all worlds, from both starts, over three episodes: it gives way to the next one that lasts, and not to those between."""
+    """In all worlds, from all starts, over three episodes: it gives way to the next one that lasts, and not to those between."""
     answers, lengths = judge
-    answers += [[True, True]] * 2 + [[True, False], [True, True]] + [[True, True]] * 2
+    answers += [[True, True]] * 4 + [[True, False], [True, True]] + [[True, True]] * 4
     found = rows_of(dataclasses.replace(task, lasting=LASTING), settings, tmp_path, endurance=3)
     assert found["lasts"] == pytest.approx([1, 0, math.nan, 1, math.nan], nan_ok=True)
     first, between, _, last, _ = found["evaluation"]
-    assert last < between < first and found["best"] == [first, first, first, last, last]
-    assert lengths == pytest.approx([3 * task.seconds] * 6)
+    assert max(last, between) < first and found["best"] == [first, first, first, last, last]
+    assert lengths == pytest.approx([3 * task.seconds] * (4 + 2 + 4))
 
 
 @pytest.mark.parametrize("spread, evaluated", [([], []), ([0.2, 0.1], [0, 1, 3])])
@@ -166,22 +166,60 @@ def test_walkers_should_last(conf):
     assert make_task(ArmConf()).lasting is None
 
 
-def test_the_worse_start_counts(task, model, settings, tmp_path, judge):
-    """An evaluation has the larger of the losses of a simulation from rest and of one that is kicked, made without the evaluator;
-    both must last."""
-    judge[0].extend([[True], [False]])
-    settings = dataclasses.replace(settings, train=dataclasses.replace(settings.train, endurance=3))
-    runs = Runs([Run(dataclasses.replace(task, lasting=LASTING), model, settings, tmp_path)])
-    longer, (params, inputs) = dataclasses.replace(task, control_steps=3 * task.control_steps), runs.design()
-    losses = []
-    for speed in (0.0, 0.05):
-        start = model.rest()
+SPEEDS = 0.0, 0.05, -0.05, 0.025
+"""Those of the starts: of every evaluation the first two, of what would be the best all [m/s]."""
+
+
+def losses_of(runs: Runs) -> list[float]:
+    """Loss of the first run with each of these starts, simulated without the evaluator."""
+    task, (params, inputs), losses = runs.task, runs.design(), []
+    longer = dataclasses.replace(task, control_steps=3 * task.control_steps)
+    for speed in SPEEDS:
+        start = runs.model.rest()
         start.v[..., 0] += speed
         about = dict(inputs=inputs, start=start)
-        losses.append(run_episode(longer, model, runs.observer, runs.policy, params, **about).loss.item())
-    (found,) = evaluate(runs)
-    assert found.loss == pytest.approx(max(losses), rel=1e-6) and not found.lasts
-    assert abs(losses[0] - losses[1]) > 1e-4
+        episode = run_episode(longer, runs.model, runs.observer, runs.policy, params, **about)
+        losses.append(episode.loss[0].item())
+    return losses
+
+
+def runs_of(task, model, settings, out, count: int = 1) -> Runs:
+    """Runs, with weights of their own, whose motions should last."""
+    settings = dataclasses.replace(settings, train=dataclasses.replace(settings.train, endurance=3))
+    task = dataclasses.replace(task, lasting=LASTING)
+    each = [
+        dataclasses.replace(settings, train=dataclasses.replace(settings.train, seed=k)) for k in range(count)
+    ]
+    return Runs([Run(task, model, one, out / str(k), runs=count) for k, one in enumerate(each)])
+
+
+@pytest.mark.parametrize("known, count", [(-math.inf, 2), (math.inf, 4)])
+@pytest.mark.parametrize("failing", [0, 1, 2, 3])
+def test_the_worst_start_counts(task, model, settings, tmp_path, judge, known, count, failing):
+    """An evaluation has the largest of the losses from its starts, and a motion lasts that does from all of them: from two, and from
+    four if it would be the best by the first two."""
+    judge[0].extend([k != failing] for k in range(4))
+    runs = runs_of(task, model, settings, tmp_path)
+    runs.all[0].best |= {"loss": known, "lasts": not math.isfinite(known) and known < 0}
+    losses, found = losses_of(runs), evaluate(runs, [0])[0]
+    assert found.loss == pytest.approx(max(losses[:count]), rel=1e-6) and found.lasts == (failing >= count)
+    assert len(judge[1]) == count and min(map(abs, np.diff(sorted(losses)))) > 1e-5
+
+
+def test_further_starts_are_a_run_s_own(task, settings, tmp_path, judge):
+    """Of two side by side, one that would be the best is evaluated as if it were alone, and so is the other."""
+    model = softmpm.build(task.scene, device="cpu", worlds=2)
+    judge[0].extend([[True, True], [True, True], [False, False], [True, True]])
+    runs = runs_of(task, model, settings, tmp_path, count=2)
+    runs.all[1].best |= {"loss": -math.inf, "lasts": True}
+    losses, found = losses_of(runs), evaluate(runs, [0, 1])
+    assert found[0].loss == pytest.approx(max(losses), rel=1e-5) and not found[0].lasts and found[1].lasts
+    runs.all[0].best |= {"loss": -math.inf, "lasts": True}
+    judge[0].extend([[True, True]] * 2)
+    assert evaluate(runs, [0, 1])[1] == found[1]
+    judge[0].extend([[True, True]] * 3 + [[True, False]])
+    full = evaluate_fully(runs, [1])
+    assert list(full) == [1] and full[1].loss >= found[1].loss and not full[1].lasts
 
 
 def test_a_motion_that_is_not_worth_it_need_not_last(task, settings, model, tmp_path):
