@@ -1,4 +1,5 @@
-"""Print the figures of "What lasts" in docs/results.md, from lasting.h200.csv and the comparisons beside this script."""
+"""Print the figures of "What lasts" and "What tears" in docs/results.md, from lasting.csv, tears.csv and the comparisons beside this
+script."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +8,9 @@ import numpy as np
 from comparison import WALKS, Row, lasts
 from scipy.stats import fisher_exact
 from settling import table
+
+CALM = 1.2
+"""Largest distance of neighbours at rest in a motion far from tearing, which is at 1.4 [cells]."""
 
 Count = tuple[int, int]
 """Number of walkers with a property, and of all walkers."""
@@ -50,7 +54,7 @@ def known(rows: Sequence[Row]) -> str:
 def compare(what: str, now: Count, then: Count) -> None:
     """Print two shares, and by Fisher's exact test whether they differ."""
     p = fisher_exact([[good, every - good] for good, every in (now, then)]).pvalue
-    print(f"{what}: {now[0]} of {now[1]} after {then[0]} of {then[1]}, p = {p:.2f}")
+    print(f"{what}: {now[0]} of {now[1]} after {then[0]} of {then[1]}, p = {p:.2g}")
 
 
 def both(one: Count, other: Count) -> Count:
@@ -58,20 +62,58 @@ def both(one: Count, other: Count) -> Count:
     return one[0] + other[0], one[1] + other[1]
 
 
+def print_tears() -> None:
+    """How many of the best bipeds of each objective tear when they are simulated six times more, three episodes long."""
+    bipeds: dict[str, dict[str, list[Row]]] = {}
+    for row in table("tears.csv"):
+        if float(row["best"]) < WALKS:
+            bipeds.setdefault(row["choice"], {}).setdefault(row["seed"], []).append(row)
+    torn: dict[str, Count] = {}
+    for choice, of in bipeds.items():
+        rows = [row for some in of.values() for row in some]
+        tearing = [seed for seed, some in of.items() if any(row["torn"] == "1" for row in some)]
+        gaps = {seed: [float(r["gap"]) for r in some if r["torn"] == "0"] for seed, some in of.items()}
+        calm = [seed for seed, some in gaps.items() if max(some) < CALM]
+        torn[choice] = len(tearing), len(of)
+        many = sum(row["torn"] == "1" for row in rows)
+        print(
+            f"{choice}: {len(tearing)} of {len(of)} bipeds tear, in {many} of {len(rows)} simulations",
+            end="; ",
+        )
+        print(
+            f"gap of the others {np.median([gap for some in gaps.values() for gap in some]):.2f} cells",
+            end="; ",
+        )
+        print(f"{len(calm)} stay within {CALM} cells, of which {len({*calm} & {*tearing})} tear")
+    first, *others = torn
+    for choice in others:
+        compare(f"bipeds that tear with {choice}", torn[choice], torn[first])
+
+
 def main():
     kinds: dict[tuple[str, str, str], list[Row]] = {}
-    for row in table("lasting.h200.csv"):
+    for row in table("lasting.csv"):
         kinds.setdefault((row["robot"], row["iterations"], row["choice"]), []).append(row)
     for (robot, iterations, choice), rows in kinds.items():
         print(f"{robot}, {iterations}, {choice} | {figures(rows, 1 if choice == 'slowest episode' else 3)}")
         if iterations == "100":
             print(known(rows))
+    two = "lasting, two starts"
     farthest = [*kinds["biped", "60", "farthest"], *kinds["biped", "60", "farthest again"]]
-    now, then = lasting(kinds["biped", "60", "lasting, two starts"]), lasting(farthest)
-    compare("bipeds that last after 60 iterations", now, then)
+    chosen = [*kinds["biped", "60", two], *kinds["biped", "60", f"{two}, again"]]
+    compare("bipeds that last after 60 iterations", lasting(chosen), lasting(farthest))
+    compare("with episodes that go on", lasting(kinds["biped", "60", "continued episodes"]), lasting(chosen))
     settled = [row for row in table("settled.h200.csv") if row["robot"] == "biped"]
-    fresh = kinds["biped", "100", "lasting, two starts"]
+    fresh = kinds["biped", "100", two]
     compare("bipeds 960 to 979 that last after 100", (lasting(fresh)[0], 20), (lasting(settled)[0], 20))
+    stretch, both_robots = "stretch 5e4, four starts", ("biped", "elephant")
+    now, then = (
+        [row for robot in both_robots for row in kinds[robot, "100", choice] if 960 <= int(row["seed"]) < 980]
+        for choice in (f"{stretch}, fresh", two)
+    )
+    compare("walkers 960 to 979 that last, with stretch", lasting(now), lasting(then))
+    compare("their ends by luck", lucky(walking(now)), lucky(walking(then)))
+    print_tears()
     ends = []
     for robot in ("biped", "elephant"):
         before, after = (table(f"{folder}comparison.{robot}.h200.csv") for folder in ("", "lasting/"))
