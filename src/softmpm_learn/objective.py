@@ -182,6 +182,10 @@ class Stretch(Term):
     most: float
     """Stretch that costs nothing."""
 
+    def __post_init__(self):
+        if not len(self.pairs):
+            raise ValueError("Stretch needs pairs of particles, got none: leave the term out.")
+
     def value(self, path: Path) -> Tensor:
         x = path.x[self.window(path)]
         one, other = self.on("pairs", x).unbind(dim=1)

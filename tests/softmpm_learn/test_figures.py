@@ -65,6 +65,17 @@ def test_latent_figure_has_a_row_for_each_feature(tmp_path):
     assert (pixels(tmp_path / "solid.png") == pixels(tmp_path / "two.png")).all()
 
 
+def test_latent_figure_has_everything_in_its_place(tmp_path):
+    """The first feature has a node in the upper right that moves upwards for its last value, and one in the opposite corner that hardly
+    moves: blue is in the first row, in the last column, in its upper right quarter."""
+    fields = np.zeros((3, len(VALUES), 12, 8, 2))
+    fields[0, -1, 10, 6, 1], fields[0, :, 1, 1, 0] = 1.0, 0.2
+    latent_figure(tmp_path / "place.png", fields)
+    image = pixels(tmp_path / "place.png")
+    y, x = np.argwhere(image[..., 2] - image[..., 0] > 90).mean(axis=0) / image.shape[:2]
+    assert 0 < y < 0.25 and 0.95 < x < 1
+
+
 def test_latent_figure_leaves_out_where_nothing_moves(tmp_path):
     """The frame is cut to the nodes that move, so that a small robot on a large grid fills the picture."""
     fields = np.zeros((1, len(VALUES), 60, 40, 2))

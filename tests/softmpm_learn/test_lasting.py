@@ -194,7 +194,7 @@ def runs_of(task, model, settings, out, count: int = 1) -> Runs:
 
 
 @pytest.mark.parametrize("known, count", [(-math.inf, 2), (math.inf, 4)])
-@pytest.mark.parametrize("failing", [0, 1, 2, 3])
+@pytest.mark.parametrize("failing", range(5))
 def test_the_worst_start_counts(task, model, settings, tmp_path, judge, known, count, failing):
     """An evaluation has the largest of the losses from its starts, and a motion lasts that does from all of them: from two, and from
     four if it would be the best by the first two."""
@@ -204,6 +204,27 @@ def test_the_worst_start_counts(task, model, settings, tmp_path, judge, known, c
     losses, found = losses_of(runs), evaluate(runs, [0])[0]
     assert found.loss == pytest.approx(max(losses[:count]), rel=1e-6) and found.lasts == (failing >= count)
     assert len(judge[1]) == count and min(map(abs, np.diff(sorted(losses)))) > 1e-5
+
+
+def test_a_motion_that_fails_from_a_further_start_is_no_best(task, model, settings, tmp_path, judge, caplog):
+    """It would be the best by its first two starts; the run keeps what it had, and the log says why."""
+    judge[0].extend([[True]] * 4)
+    runs = runs_of(task, model, settings, tmp_path)
+    evaluator, count = runs.evaluator, itertools.count()
+
+    def fails(goal, kick):
+        found = Evaluator.__call__(evaluator, goal, kick)
+        if next(count) == 3:
+            what = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
+            evaluator.failures.errors.append(softmpm.UnstableError("particle 3 is inverted.", **what))
+        return found
+
+    fails.starts, fails.further, fails.failures = evaluator.starts, evaluator.further, evaluator.failures
+    runs.evaluator = fails
+    found = evaluate(runs, [0])[0]
+    assert math.isinf(found.loss) and "the evaluation failed: particle 3 is inverted" in caplog.text
+    runs.all[0].keep_if_best(found.loss, found.lasts)
+    assert runs.all[0].best["iteration"] == -1 and next(count) == 4
 
 
 def test_further_starts_are_a_run_s_own(task, settings, tmp_path, judge):

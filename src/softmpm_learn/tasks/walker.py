@@ -30,7 +30,8 @@ SOLES = 0.15
 EDGE = 0.012
 """Distance from the corner at which the bevelled edge of a sole begins [m]: one cell as a draft."""
 STRETCH = 1.6
-"""Stretch of neighbouring particles of a walker that costs nothing. They part for good at 2.8: 1.4 cells (:class:`softmpm.Alarms`)."""
+"""Stretch of neighbouring particles of a walker that costs nothing. Those on the lattice part for good at 2.8, with 1.4 cells between
+them (:class:`softmpm.Alarms`)."""
 
 
 @dataclass(kw_only=True)
