@@ -102,6 +102,7 @@ def main():
     farthest = [*kinds["biped", "60", "farthest"], *kinds["biped", "60", "farthest again"]]
     chosen = [*kinds["biped", "60", two], *kinds["biped", "60", f"{two}, again"]]
     compare("bipeds that last after 60 iterations", lasting(chosen), lasting(farthest))
+    compare("of all runs", (lasting(chosen)[0], len(chosen)), (lasting(farthest)[0], len(farthest)))
     compare("with episodes that go on", lasting(kinds["biped", "60", "continued episodes"]), lasting(chosen))
     settled = [row for row in table("settled.h200.csv") if row["robot"] == "biped"]
     fresh = kinds["biped", "100", two]
@@ -109,10 +110,16 @@ def main():
     stretch, both_robots = "stretch 5e4, four starts", ("biped", "elephant")
     now, then = (
         [row for robot in both_robots for row in kinds[robot, "100", choice] if 960 <= int(row["seed"]) < 980]
-        for choice in (f"{stretch}, fresh", two)
+        for choice in (f"{stretch}, 960 to 979", two)
     )
     compare("walkers 960 to 979 that last, with stretch", lasting(now), lasting(then))
     compare("their ends by luck", lucky(walking(now)), lucky(walking(then)))
+    for robot in both_robots:
+        some = (kinds.get((robot, "100", choice), []) for choice in (stretch, f"{stretch}, 960 to 979"))
+        others = (kinds.get((robot, "100", choice), []) for choice in ("strain 1e4, two starts", two))
+        compare(
+            f"{robot}s that last, of all with 100", *(lasting([*one, *more]) for one, more in (some, others))
+        )
     print_tears()
     ends = []
     for robot in ("biped", "elephant"):
