@@ -1,7 +1,7 @@
 """The best walkers of finished runs, simulated again and again: `python bench/again.py FOLDER [--repeats 6] [--csv again.csv]`
 
-FOLDER is that of a run, mostly of several seeds (train.seeds). Each best is simulated so often, three episodes long, from rest and with
-0.05 m/s in turn; on a GPU the sums of each simulation round differently. For each seed and repeat a row:
+FOLDER is that of a run, mostly of several seeds (train.seeds). Each best is simulated so often, as long as an evaluation, from rest and
+with 0.05 m/s in turn; on a GPU the sums of each simulation round differently. For each seed and repeat a row:
 
     best, lasts   best evaluation of the run, and 1 if that motion lasted in it
     start         speed of the start along the first axis [m/s]
@@ -10,7 +10,7 @@ FOLDER is that of a run, mostly of several seeds (train.seeds). Each best is sim
     strain        largest von Mises strain of a particle, likewise
     failed        why the simulation failed, if it did: the kind of the failure, such as torn
 
-The last lines count the seeds and simulations that failed.
+The last line counts the seeds and simulations that failed.
 """
 
 import argparse
@@ -30,15 +30,12 @@ from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.tasks import make_task
 
-EPISODES = 3
-
 
 class Extremes:
     """Largest gap and strain of each world until it fails; called at each control step."""
 
     def __init__(self, model: softmpm.Model, failures: softmpm.Failures):
-        particle, place = torch.nonzero(model.neighbours >= 0).unbind(dim=1)
-        self._pairs = particle, model.neighbours[particle, place].long()
+        self._pairs = torch.as_tensor(softmpm.neighbour_pairs(model.scene), device=model.device).T
         self._spacing, self._failures = model.scene.grid.spacing, failures
         self.found = torch.zeros(2, model.worlds, dtype=model.dtype, device=model.device)
         self.x: list[torch.Tensor] = []
@@ -73,7 +70,8 @@ def finished(folder: Path, device: str | None) -> Runs:
 def simulated(runs: Runs, speed: float) -> list[dict]:
     """A row for each run, from a start with this speed [m/s]."""
     model, failures, rest = runs.model, softmpm.Failures("reset"), runs.model.rest()
-    longer = dataclasses.replace(runs.task, control_steps=EPISODES * runs.task.control_steps)
+    episodes = runs.all[0].settings.train.endurance or 1
+    longer = dataclasses.replace(runs.task, control_steps=episodes * runs.task.control_steps)
     rest.v[..., 0] += speed
     extremes, (params, inputs) = Extremes(model, failures), runs.design()
     about = dict(inputs=inputs, start=rest, failures=failures, on_frame=extremes)

@@ -61,12 +61,9 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
         fields = fields[:, :, :, :, fields.shape[4] // 2]
     fields = _moving(fields)
     features, steps, nx, ny, _ = fields.shape
-    limit = np.abs(fields[..., :2]).max(
-        axis=(1, 2, 3, 4), keepdims=True
-    )  # each feature has a scale of its own
-    shares = np.moveaxis(fields[..., :2] / np.maximum(limit, 1e-12), 4, 1).reshape(
-        features, 2 * steps, nx, ny
-    )
+    plane = fields[..., :2]
+    limit = np.abs(plane).max(axis=(1, 2, 3, 4), keepdims=True)  # each feature has a scale of its own
+    shares = np.moveaxis(plane / np.maximum(limit, 1e-12), 4, 1).reshape(features, 2 * steps, nx, ny)
     gap = max(1, round(GAP * max(nx, ny)))
     framed = np.pad(shares, ((0, 0), (0, 0), (0, gap), (0, gap)), constant_values=np.nan)
     # From left to right the columns, from below the features, the last one first:
