@@ -9,6 +9,8 @@ from comparison import WALKS, Row, lasts
 from scipy.stats import fisher_exact
 from settling import table
 
+from softmpm_learn.figures.intervals import interval
+
 CALM = 1.2
 """Largest distance of neighbours at rest in a motion far from tearing, which is at 1.4 [cells]."""
 
@@ -69,12 +71,15 @@ def print_tears() -> None:
         if float(row["best"]) < WALKS:
             bipeds.setdefault(row["choice"], {}).setdefault(row["seed"], []).append(row)
     torn: dict[str, Count] = {}
+    near, wide = (0, 0), (0, 0)
     for choice, of in bipeds.items():
         rows = [row for some in of.values() for row in some]
         tearing = [seed for seed, some in of.items() if any(row["torn"] == "1" for row in some)]
         gaps = {seed: [float(r["gap"]) for r in some if r["torn"] == "0"] for seed, some in of.items()}
         calm = [seed for seed, some in gaps.items() if max(some) < CALM]
         torn[choice] = len(tearing), len(of)
+        hit = len({*calm} & {*tearing})
+        near, wide = both(near, (hit, len(calm))), both(wide, (len(tearing) - hit, len(of) - len(calm)))
         many = sum(row["torn"] == "1" for row in rows)
         print(
             f"{choice}: {len(tearing)} of {len(of)} bipeds tear, in {many} of {len(rows)} simulations",
@@ -84,10 +89,30 @@ def print_tears() -> None:
             f"gap of the others {np.median([gap for some in gaps.values() for gap in some]):.2f} cells",
             end="; ",
         )
-        print(f"{len(calm)} stay within {CALM} cells, of which {len({*calm} & {*tearing})} tear")
+        print(f"{len(calm)} stay within {CALM} cells, of which {hit} tear")
+    print(f"of all: {wide[0]} of {wide[1]} tear beyond that, {near[0]} of {near[1]} within it")
     first, *others = torn
     for choice in others:
         compare(f"bipeds that tear with {choice}", torn[choice], torn[first])
+    for number, what in (("1", "tear"), ("0", "do not")):
+        some = [float(r["strain"]) for rows in bipeds[first].values() for r in rows if r["torn"] == number]
+        print(f"{first}: largest strains of simulations that {what}: {min(some):.2f} to {max(some):.2f}")
+
+
+def print_change(robot: str, rows: Sequence[Row], before: Sequence[Row]) -> None:
+    """Mean change of the best evaluations, paired by seed, with its interval."""
+    was = {row["seed"]: float(row["best"]) for row in before}
+    change = [float(row["best"]) - was[row["seed"]] for row in rows]
+    low, high = interval(change)
+    print(f"{robot}, {rows[0]['choice']}: best {np.mean(change):+.2f} [{low:.2f}, {high:.2f}]")
+
+
+def print_examined(rows: Sequence[Row]) -> None:
+    """Ranges of the answers of the examination, and how many have none."""
+    for name in ("best", "later", "kicked", "friction", "finer"):
+        found = [float(row[name]) for row in rows if row[name]]
+        middle = f"{min(found):.2f} to {max(found):.2f}, median {np.median(found):.2f}"
+        print(f"  {name} {middle}; {len(rows) - len(found)} without")
 
 
 def main():
@@ -120,6 +145,12 @@ def main():
         compare(
             f"{robot}s that last, of all with 100", *(lasting([*one, *more]) for one, more in (some, others))
         )
+    for robot in both_robots:
+        rows = [row for row in now if row["robot"] == robot]
+        print_change(robot, rows, [row for row in then if row["robot"] == robot])
+        print_examined(rows)
+    for choice in ("strain 1e4 and stretch 5e4, two starts", stretch):
+        print_change("biped", kinds["biped", "100", choice], kinds["biped", "100", "strain 1e4, two starts"])
     print_tears()
     ends = []
     for robot in ("biped", "elephant"):
