@@ -18,6 +18,8 @@ from softmpm_learn.runs import Runs
 
 ALL = 1 - 1e-4
 """Share of the worlds above which it is all of them: a mean is rounded."""
+ROUNDS = 8
+"""Most evaluations of what may be the best, until one repeats itself."""
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -53,9 +55,37 @@ def evaluate(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
     return found | {k: found[k].worse(one) for k, one in again.items()}
 
 
-def evaluate_fully(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
-    """As :func:`evaluate`, from all starts."""
-    return simulate(runs, of, runs.evaluator.starts + runs.evaluator.further)
+def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
+    """Evaluate the best of some runs again, from other starts; policies and designs are theirs afterwards.
+
+    Where a best does not repeat itself what is then the best is evaluated in its place, up to :data:`ROUNDS` evaluations; the last
+    stands, whatever it says.
+    """
+    found, left = dict[int, Evaluation](), ROUNDS
+    while of:
+        left -= 1
+        for k in of:
+            runs.all[k].load_policy(runs.all[k].best)
+        again = simulate(runs, of, runs.evaluator.again)
+        found |= again
+        of = [k for k in of if left and not _repeats(runs.all[k], again[k])]
+    return found
+
+
+def _repeats(run: Run, again: Evaluation) -> bool:
+    """Count the further evaluation of the best of a run, see :meth:`softmpm_learn.run.Run.recount`; the log says what became of it."""
+    before = run.best
+    repeats = run.recount(again.loss, again.lasts)
+    if not repeats:
+        logger.info(
+            "Iteration %d: evaluated again, the best has %.3g instead of %.3g%s; the best is that of iteration %d now.",
+            run.iteration,
+            again.loss,
+            before["loss"],
+            " and does not last" if before["lasts"] and not again.lasts else "",
+            run.best["iteration"],
+        )
+    return repeats
 
 
 @torch.no_grad()

@@ -23,6 +23,10 @@ class Fallback:
     iterations: int = 0
     """Iterations so far."""
 
+    def is_below(self, loss: float, best: float, share: float) -> bool:
+        """True if the progress of a loss is below a share of the best progress; False as long as there is no first loss."""
+        return self.first - loss < share * (self.first - best)
+
     def is_due(self, loss: float, best: float, conf: OptimizerConf, settles: bool = False) -> bool:
         """True if the run should fall back after an iteration; then a new count begins.
 
@@ -42,7 +46,7 @@ class Fallback:
             self.first = loss
         early = self.iterations <= conf.fallback_from and not settles
         share, after = (SETTLED_SHARE, 1) if settles else (conf.fallback_share, conf.fallback_after)
-        low = not early and self.first - loss < share * (self.first - best)
+        low = not early and self.is_below(loss, best, share)
         self.below = self.below + 1 if low else 0
         if conf.fallback_share == 0 or self.below < after:
             return False

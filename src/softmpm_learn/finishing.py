@@ -11,7 +11,7 @@ import torch
 from softmpm import Failures
 from softmpm_learn.distributed import in_full
 from softmpm_learn.episode import run_episode
-from softmpm_learn.evaluation import evaluate_fully
+from softmpm_learn.evaluation import evaluate_best
 from softmpm_learn.examination import examine
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
@@ -68,11 +68,17 @@ def _at_their_best(runs: Runs) -> Iterator[list[int]]:
 
 
 def evaluate_ends(runs: Runs) -> dict[int, float]:
-    """The best of each finished run, evaluated once more, by its number; nan where that failed. In every process."""
+    """The best of each finished run, evaluated again, by its number; nan where that failed. In every process.
+
+    A run whose best does not repeat itself has another one afterwards, and one that settles ends there.
+    """
     if not (runs.all[0].settings.train.examine and finished(runs)):
         return {}
     with _at_their_best(runs) as done:
-        again = evaluate_fully(runs, done)
+        again = evaluate_best(runs, done)
+    for run in (runs.all[k] for k in done):
+        if run.settles:
+            run.load_policy(run.best)
     return {k: one.loss if math.isfinite(one.loss) else math.nan for k, one in again.items()}
 
 
@@ -95,6 +101,7 @@ def finish(
             answers = examine(runs, finer)
             found = {k: answers[k] | {"end": ends[k]} for k in done}
             for k in done:
-                loggers[k].add_figures(runs.all[k].iteration, found[k])
+                run = runs.all[k]
+                loggers[k].add_figures(run.iteration, found[k] | {"best": run.best["loss"]})
                 loggers[k].flush()
     return found

@@ -22,6 +22,8 @@ STARTS = 0.0, 0.05
 simulation may not in another that differs by rounding."""
 FURTHER = -0.05, 0.025
 """Further such starts of a motion that would be the best: the best of many motions is often one that was lucky."""
+AGAIN = -0.0375, -0.0125, 0.0125, 0.0375
+"""Those of the evaluation that tells whether the best repeats itself."""
 
 
 @dataclass(frozen=True, kw_only=True)

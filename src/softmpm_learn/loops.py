@@ -11,7 +11,7 @@ from torch import Tensor
 import softmpm
 from softmpm import Inputs, Model, Params
 from softmpm_learn.episode import Decisions, Episode, Frame, Policy, run_episode, times_of
-from softmpm_learn.lasting import FURTHER, STARTS
+from softmpm_learn.lasting import AGAIN, FURTHER, STARTS
 from softmpm_learn.observe import Observer
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class Evaluator:
         starts: Speeds along the first axis with which an evaluation starts [m/s]: those of :data:`softmpm_learn.lasting.STARTS` if the
             motion should last, else rest.
         further: Those of a motion that would be the best: :data:`softmpm_learn.lasting.FURTHER`, or none.
+        again: Those of the best when it is evaluated again: :data:`softmpm_learn.lasting.AGAIN`, else rest.
         failures: Those of the last simulation. A robot that fails goes on from rest: frozen, it would fail again in every control
             step, and outside of a graph the simulation of all robots would be repeated each time.
     """
@@ -49,7 +50,8 @@ class Evaluator:
         policy: Policy,
         design: Callable[[], tuple[Params, Inputs]],
     ):
-        self.starts, self.further = ((0.0,), ()) if task.lasting is None else (STARTS, FURTHER)
+        rest = ((0.0,), (), (0.0,))
+        self.starts, self.further, self.again = rest if task.lasting is None else (STARTS, FURTHER, AGAIN)
         self.failures = failures = softmpm.Failures("reset")
         goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
         self._kick = kick = torch.zeros(model.dim, dtype=model.dtype, device=model.device)

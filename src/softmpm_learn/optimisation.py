@@ -12,7 +12,7 @@ from torch import Tensor
 import softmpm
 from softmpm_learn.distributed import OtherProcessError, in_full
 from softmpm_learn.episode import Episode
-from softmpm_learn.evaluation import Evaluation, due, evaluate
+from softmpm_learn.evaluation import Evaluation, due, evaluate, evaluate_best
 from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
@@ -123,7 +123,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
 def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
     """Take the step of each run along its gradient, go back to its best, or begin anew; keeps the best, and completes the rows."""
     asked = [k for k in rows if due(runs.all[k])]
-    evaluations = evaluate(runs, asked) if asked else {}
+    evaluations, values = evaluate(runs, asked) if asked else {}, dict[int, float]()
     for k, row in rows.items():
         run, found = runs.all[k], Evaluation(row["loss"], lasts=True)
         if run.evaluated:
@@ -133,19 +133,24 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
                 (found.loss, int(found.lasts)) if known else (math.nan, math.nan)
             )
         run.keep_if_best(found.loss, found.lasts)
-        row |= {"best": run.best["loss"]} | step(run, row["loss"], found.loss)
+        values[k] = found.loss
+    begin = [k for k in rows if runs.all[k].begins_to_settle()]
+    evaluate_best(runs, [k for k in begin if runs.all[k].evaluated])
+    for k, row in rows.items():
+        row |= step(runs.all[k], row["loss"], values[k], k in begin) | {"best": runs.all[k].best["loss"]}
 
 
-def step(run: Run, loss: float, value: float) -> dict[str, int]:
+def step(run: Run, loss: float, value: float, begins: bool = False) -> dict[str, int]:
     """Take the step along the gradient, go back to the best, or begin anew; how often it fell back and began anew, 0 or 1.
 
     Args:
         loss: That of the episode.
         value: By which the best is chosen; nan where it is not known.
+        begins: The run begins to settle.
     """
     conf, restarts, low = run.settings.optimizer, run.restart.count, ""
     is_far = run.fallback.is_due(value, run.best["loss"], conf, run.settles)
-    if settle(run):
+    if settle(run, begins):
         return {"fallbacks": 0, "restarts": 0}
     if not run.settles and run.restart.is_due(loss, conf):
         low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
@@ -161,9 +166,9 @@ def step(run: Run, loss: float, value: float) -> dict[str, int]:
     return {"fallbacks": int(bool(low)) - anew, "restarts": anew}
 
 
-def settle(run: Run) -> bool:
+def settle(run: Run, begins: bool) -> bool:
     """Begin or end to settle, in the first and the last iteration of those; True if the run takes no step then."""
-    begins, ends = run.begins_to_settle(), run.settles and run.left == 1
+    ends = run.settles and run.left == 1
     elsewhere = run.best["iteration"] < run.iteration
     if begins and elsewhere:
         back = run.return_to_best(run.settings.optimizer.fallback_rate)

@@ -36,6 +36,12 @@ OLDER = {"optimizer.settle": 0.0}
 """Settings of checkpoints that do not name them, where these are not the defaults."""
 
 
+OTHERS = 6
+"""Motions that are kept besides the best."""
+REPEATED = 0.8
+"""A best repeats itself if a further evaluation makes at least this share of its progress."""
+
+
 class SettingsError(ValueError):
     """A run cannot go on with other settings than its own."""
 
@@ -53,6 +59,7 @@ class Run:
         goals: Random stream of the goals.
         safe: Values of policy and design in the last simulation that did not fail.
         best: The loss of the best motion so far, that of its evaluation if there are any, whether it lasts, and what gave it.
+        others: The next best, at most :data:`OTHERS`, the better first.
         fallback: Decides when the run goes back to its best.
         restart: Decides when it begins anew.
         settling: Decides whether it settles.
@@ -79,6 +86,7 @@ class Run:
         settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.iteration, self.best = 0, {"loss": math.inf, "lasts": False, "iteration": -1}
+        self.others: list[dict] = []
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = stream(settings.train.seed, "goals")
         self.learner: Learner | None = None
@@ -192,14 +200,33 @@ class Run:
         return is_worth(loss, self.settings.optimizer)
 
     def keep_if_best(self, loss: float, lasts: bool) -> None:
-        """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`."""
-        if self.would_be_best(loss, lasts):
-            self.best = {
-                "loss": loss,
-                "lasts": lasts and self._is_worth(loss),
-                "iteration": self.iteration,
-                **self.policy_snapshot(),
-            }
+        """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`, or among the next best."""
+        if math.isfinite(loss):
+            now = {"loss": loss, "lasts": lasts and self._is_worth(loss), "iteration": self.iteration}
+            self._rank([*self._candidates, now | self.policy_snapshot()])
+
+    @property
+    def _candidates(self) -> list[dict]:
+        return [self.best] * (self.best["iteration"] >= 0) + self.others
+
+    def _rank(self, candidates: list[dict]) -> None:
+        self.best, *others = sorted(candidates, key=lambda one: (not one["lasts"], one["loss"]))
+        self.others = others[:OTHERS]
+
+    def recount(self, loss: float, lasts: bool) -> bool:
+        """Count a further evaluation of the best, infinite where it failed: True if it repeats itself, by :data:`REPEATED` of its
+        progress, and lasts again if it did.
+
+        A best that does not is worth what this evaluation says, and the best is then the best of it and of the others. One that failed
+        is given up, unless there is no other.
+        """
+        known, best = math.isfinite(loss), self.best
+        far = known and not self.fallback.is_below(loss, best["loss"], REPEATED)
+        if (far and lasts >= best["lasts"]) or not (known or self.others):
+            return True
+        now = {"loss": max(loss, best["loss"]), "lasts": best["lasts"] and lasts}
+        self._rank(([best | now] if known else []) + self.others)
+        return False
 
     def step(self) -> None:
         """Take a step along the gradient, the next one with lower rates."""
@@ -321,6 +348,7 @@ class Run:
             "learner": None if self.learner is None else self.learner.state_dict(),
             "safe": self.safe,
             "best": self.best,
+            "others": self.others,
             "fallback": dataclasses.asdict(self.fallback),
             "restart": dataclasses.asdict(self.restart),
             "settling": dataclasses.asdict(self.settling),
@@ -349,6 +377,7 @@ class Run:
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, best = content["iteration"], content["best"]
         self.best = {"lasts": best["iteration"] >= 0} | best  # others were not known
+        self.others = list(content.get("others", []))
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
         self.settling = Settling(**content.get("settling", {}))
@@ -371,10 +400,10 @@ class Run:
             raise ValueError(
                 f"the iteration is {self.iteration!r}, that of the best loss {self.best['iteration']!r}"
             )
-        if self.best["iteration"] >= 0:
-            now = self.policy_snapshot()
-            self.load_policy(self.best)  # compares the shapes
-            self.load_policy(now)
+        now = self.policy_snapshot()
+        for one in self._candidates:
+            self.load_policy(one)  # compares the shapes
+        self.load_policy(now)
 
     @cached_property
     def about(self) -> str:

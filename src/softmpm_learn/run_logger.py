@@ -73,7 +73,7 @@ class RunLogger:
         self._recorded = seals.get("run.h5")
         self._recorder = self._open_recorder() if run.settings.train.record_every else None
         self._seal_recording(run.iteration)
-        self._saved = run.iteration if seals else -1
+        self._saved = self._stage if seals else None
         self.frames: list[tuple[float, Tensor, Tensor | None]] = []
         try:
             settings = {"task": run.task.name} | dataclasses.asdict(run.settings)
@@ -146,8 +146,12 @@ class RunLogger:
 
     @property
     def is_saved(self) -> bool:
-        """True if the checkpoint is that of the iterations done."""
-        return self._saved == self.run.iteration
+        """True if the checkpoint is that of the iterations done, with the same best."""
+        return self._saved == self._stage
+
+    @property
+    def _stage(self) -> tuple[int, int, float]:
+        return self.run.iteration, self.run.best["iteration"], self.run.best["loss"]
 
     @property
     def is_due(self) -> bool:
@@ -163,7 +167,7 @@ class RunLogger:
             ids = self.run.learner.replay.ids
             self.run.learner.replay.prune(self._named + ids)
             self._named = ids
-        self._saved = self.run.iteration
+        self._saved = self._stage
 
     @property
     def records(self) -> bool:

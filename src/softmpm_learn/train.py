@@ -180,8 +180,9 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
             if work.loggers[k].frames:
                 work.loggers[k].flush()
                 work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
-    _save(work, [k for k, one in enumerate(work.loggers) if not one.is_saved])
+    _save_all(work)
     ends = evaluate_ends(runs)
+    _save_all(work)  # the best of some is another one now
     found = finish(runs, work.loggers, finer, ends) if work.loggers else {}
     return [
         Result(
@@ -205,6 +206,11 @@ def _end_iteration(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) 
     for k in ended:
         runs.all[k].iteration += 1
     _save(work, [k for k, one in loggers.items() if one.is_due])
+
+
+def _save_all(work: _Work) -> None:
+    """Write the checkpoints of the runs that are not saved as they are."""
+    _save(work, [k for k, one in enumerate(work.loggers) if not one.is_saved])
 
 
 def _save(work: _Work, numbers: Collection[int]) -> None:

@@ -11,7 +11,7 @@ import torch
 
 import softmpm
 from softmpm_learn.episode import run_episode
-from softmpm_learn.evaluation import evaluate, evaluate_fully
+from softmpm_learn.evaluation import evaluate
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.loops import Evaluator
 from softmpm_learn.objective import Path, Progress, Tilt
@@ -238,9 +238,6 @@ def test_further_starts_are_a_run_s_own(task, settings, tmp_path, judge):
     runs.all[0].best |= {"loss": -math.inf, "lasts": True}
     judge[0].extend([[True, True]] * 2)
     assert evaluate(runs, [0, 1])[1] == found[1]
-    judge[0].extend([[True, True]] * 3 + [[True, False]])
-    full = evaluate_fully(runs, [1])
-    assert list(full) == [1] and full[1].loss >= found[1].loss and not full[1].lasts
 
 
 def test_a_motion_that_is_not_worth_it_need_not_last(task, settings, model, tmp_path):
