@@ -57,7 +57,7 @@ def optimise(
     Raises:
         TrainingError: The robot of a run failed that was at rest.
     """
-    streams = {k: runs.all[k].goals.get_state() for k in runs.active}
+    streams = {k: runs.all[k].goals.stream.get_state() for k in runs.active}
     goals, retries = runs.goals(runs.active), dict.fromkeys(runs.active, 0)
     while runs.active:
         runs.move(runs.active)
@@ -90,7 +90,7 @@ def save_before(runs: Runs, loggers: Sequence[RunLogger], streams: dict[int, Ten
     """
     for k, before in streams.items() if loggers else ():
         if not loggers[k].is_saved:
-            goals = runs.all[k].goals
+            goals = runs.all[k].goals.stream
             now = goals.get_state()
             goals.set_state(before)
             loggers[k].save()
@@ -132,7 +132,7 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
             row["evaluation"], row["lasts"] = (
                 (found.loss, int(found.lasts)) if known else (math.nan, math.nan)
             )
-        run.keep_if_best(found.loss, found.lasts)
+        run.keep(found.loss, found.lasts)
         values[k] = found.loss
     begin = [k for k in rows if runs.all[k].begins_to_settle()]
     evaluate_best(runs, [k for k in begin if runs.all[k].evaluated])

@@ -7,7 +7,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -17,14 +16,15 @@ from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
 from softmpm_learn.fallback import Fallback
+from softmpm_learn.goals import Goals
 from softmpm_learn.identity import identity, identity_of_settings
 from softmpm_learn.learner import Learner
 from softmpm_learn.observe import Latent, Observer, make_observer
 from softmpm_learn.optimizers import make_optimizer
-from softmpm_learn.policy import Goal, make_policy
+from softmpm_learn.policy import make_policy
 from softmpm_learn.replay import Replay
 from softmpm_learn.restart import Restart, is_worth
-from softmpm_learn.seeding import seeded, stream, stream_seed
+from softmpm_learn.seeding import seeded, stream_seed
 from softmpm_learn.settings import Settings
 from softmpm_learn.settling import Settling
 
@@ -56,7 +56,7 @@ class Run:
         iteration: Iterations done.
         observer, policy, design, optimizer: What is optimised, and how.
         learner: The learning phase, None unless the observer has an encoder.
-        goals: Random stream of the goals.
+        goals: Those of its simulations.
         safe: Values of policy and design in the last simulation that did not fail.
         best: The loss of the best motion so far, that of its evaluation if there are any, whether it lasts, and what gave it.
         others: The next best, at most :data:`OTHERS`, the better first.
@@ -88,10 +88,9 @@ class Run:
         self.iteration, self.best = 0, {"loss": math.inf, "lasts": False, "iteration": -1}
         self.others: list[dict] = []
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
-        self.goals = stream(settings.train.seed, "goals")
+        self.goals = Goals(task, model, settings.train, self.worlds)
         self.learner: Learner | None = None
         self.observer = self._make_observer(out)
-        self._goal = self._make_goal()
         self.policy, self.design = self._make_policy("policy"), self._make_design()
         rates = list(self.policy.parameters()), list(self.design.parameters())
         self.optimizer = make_optimizer(settings.optimizer, *rates)
@@ -102,7 +101,7 @@ class Run:
         """With first weights from the random stream of this name."""
         conf, seed = self.settings.policy, stream_seed(self.settings.train.seed, name)
         policy = make_policy(
-            conf, self.observer.size, self.model.muscle_count, self.task.seconds, seed, self._goal
+            conf, self.observer.size, self.model.muscle_count, self.task.seconds, seed, self.goals.box
         )
         return policy.to(self.model.device, self.model.dtype)
 
@@ -137,20 +136,6 @@ class Run:
         self.learner = Learner(learning, autoencoder.to(self.model.device, self.model.dtype), replay, seed)
         observer.encoder = self.learner.encoder
         return observer
-
-    def _make_goal(self) -> Goal | None:
-        spread = self.settings.train.goal_spread
-        if not any(spread):
-            return None
-        if self.task.goal is None or len(spread) != self.model.dim:
-            raise ValueError(
-                f"train.goal_spread needs a task with a goal and {self.model.dim} lengths; "
-                f"task {self.task.name} has goal {self.task.goal}, train.goal_spread is {list(spread)}."
-            )
-        centre, width = (
-            torch.tensor(np.asarray(v), dtype=self.model.dtype) for v in (self.task.goal, spread)
-        )
-        return Goal(centre, width).to(self.model.device)
 
     @property
     def parameters(self) -> list[nn.Parameter]:
@@ -199,7 +184,7 @@ class Run:
     def _is_worth(self, loss: float) -> bool:
         return is_worth(loss, self.settings.optimizer)
 
-    def keep_if_best(self, loss: float, lasts: bool) -> None:
+    def keep(self, loss: float, lasts: bool) -> None:
         """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`, or among the next best."""
         if math.isfinite(loss):
             now = {"loss": loss, "lasts": lasts and self._is_worth(loss), "iteration": self.iteration}
@@ -274,49 +259,10 @@ class Run:
         self.snapshot()
         return "beginning anew with other first weights"
 
-    def draw_goals(self) -> Tensor | None:
-        """A goal for each world [m], shape (world, dim), or None for the task's own.
-
-        Every process draws for all worlds and takes its own, so that goals do not depend on the number of processes.
-        """
-        if self._goal is None:
-            return None
-        size = self.settings.train.worlds, self.model.dim
-        return self._goals_at(self._goal, torch.rand(size, generator=self.goals, dtype=self.model.dtype))
-
-    def evaluation_goals(self) -> list[Tensor]:
-        """Goals to evaluate at, as :meth:`draw_goals`, one tensor for each simulation of all worlds.
-
-        The points of a Sobol sequence: they fill the box evenly, begin with its middle, and are the same in every run.
-        """
-        if self._goal is None:
-            return []
-        conf = self.settings.train
-        rounds = math.ceil(conf.evaluation_goals / conf.worlds)
-        sobol = torch.quasirandom.SobolEngine(self.model.dim)
-        sobol.fast_forward(1)  # past the corner
-        places = sobol.draw(rounds * conf.worlds, dtype=self.model.dtype)
-        return [self._goals_at(self._goal, place) for place in places.split(conf.worlds)]
-
-    def _goals_at(self, goal: Goal, place: Tensor) -> Tensor:
-        """Goals of this process's worlds at places in the box, shape (world, dim), each in [0, 1]."""
-        spread = torch.tensor(list(self.settings.train.goal_spread)).to(goal.centre)
-        mine = place[self.worlds.start : self.worlds.stop].to(spread.device)
-        return goal.centre + spread * (2 * mine - 1)
-
-    @property
-    def random_goals(self) -> bool:
-        """True if every simulation draws its own goal."""
-        return self._goal is not None
-
     @property
     def evaluated(self) -> bool:
         """True if evaluations choose the best, and not the loss of the episodes."""
-        return self.random_goals or (self.settings.train.endurance or 1) > 1
-
-    def middle_goals(self) -> Tensor | None:
-        """As :meth:`draw_goals`, without chance: the middle of the box."""
-        return None if self._goal is None else self._goal.centre.expand(len(self.worlds), -1)
+        return self.goals.box is not None or (self.settings.train.endurance or 1) > 1
 
     def policy_snapshot(self) -> dict:
         """Copies of what decides how the robot moves, policy, design and what the policy sees through, and of the autoencoder."""
@@ -344,7 +290,7 @@ class Run:
             "policy": self.policy.state_dict(),
             "design": self.design.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "goals": self.goals.get_state(),
+            "goals": self.goals.stream.get_state(),
             "learner": None if self.learner is None else self.learner.state_dict(),
             "safe": self.safe,
             "best": self.best,
@@ -371,7 +317,7 @@ class Run:
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])
-        self.goals.set_state(content["goals"])
+        self.goals.stream.set_state(content["goals"])
         if self.learner is not None:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]

@@ -127,7 +127,7 @@ class Runs:
 
     def goals(self, drawing: Sequence[int]) -> Tensor | None:
         """Goals of all worlds [m], shape (world, dim), drawn by these runs, for the others without chance; None for the task's own."""
-        found = [run.draw_goals() if k in drawing else run.middle_goals() for k, run in enumerate(self.all)]
+        found = [run.goals.draw() if k in drawing else run.goals.middle() for k, run in enumerate(self.all)]
         return _joined(found)
 
     def middle_goals(self) -> Tensor | None:
@@ -136,7 +136,7 @@ class Runs:
 
     def evaluation_goals(self) -> list[Tensor]:
         """Goals to evaluate at, one tensor for each simulation of all worlds."""
-        rounds = zip(*(run.evaluation_goals() for run in self.all), strict=True)
+        rounds = zip(*(run.goals.fixed() for run in self.all), strict=True)
         return [torch.cat(goals) for goals in rounds]
 
     def observations(self, k: int, pictures: Tensor) -> Tensor:

@@ -228,7 +228,7 @@ def _example(runs: Sequence[Run], members: Sequence[int], share: int) -> tuple:
     first, model = runs[members[0]], runs[0].model
     place = {"dtype": model.dtype, "device": model.device}
     shape = len(members), share, first.observer.size
-    goal = first.middle_goals()
+    goal = first.goals.middle()
     goals = None if goal is None else goal.expand(len(members), *goal.shape)
     features = torch.linspace(-1.0, 1.0, math.prod(shape), **place).view(shape)
     return features, torch.tensor(0.3, **place), goals

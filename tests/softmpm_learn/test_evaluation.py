@@ -49,8 +49,8 @@ def test_the_goals_do_not_depend_on_the_seed(reaching, model, drawn, tmp_path):
         )
         for seed in range(2)
     ]
-    first, other = (torch.cat(run.evaluation_goals()) for run in runs)
-    assert torch.equal(first, other) and not torch.equal(*(run.draw_goals() for run in runs))
+    first, other = (torch.cat(run.goals.fixed()) for run in runs)
+    assert torch.equal(first, other) and not torch.equal(*(run.goals.draw() for run in runs))
     away = (first - torch.tensor([0.6, 0.3])).abs()
     assert first.shape == (4, 2) and first.unique(dim=0).shape == (4, 2)
     assert (away <= torch.tensor([0.2, 0.1])).all() and (away.mean(dim=0) > torch.tensor([0.05, 0.025])).all()
@@ -58,11 +58,9 @@ def test_the_goals_do_not_depend_on_the_seed(reaching, model, drawn, tmp_path):
 
 def test_worlds_share_the_goals(reaching, drawn, tmp_path):
     """The first goals are the same for any number of worlds, and all worlds have one."""
-    alone = Run(reaching, softmpm.build(reaching.scene, device="cpu"), drawn, tmp_path).evaluation_goals()
+    alone = Run(reaching, softmpm.build(reaching.scene, device="cpu"), drawn, tmp_path).goals.fixed()
     conf = dataclasses.replace(drawn, train=dataclasses.replace(drawn.train, worlds=3))
-    three = Run(
-        reaching, softmpm.build(reaching.scene, device="cpu", worlds=3), conf, tmp_path
-    ).evaluation_goals()
+    three = Run(reaching, softmpm.build(reaching.scene, device="cpu", worlds=3), conf, tmp_path).goals.fixed()
     assert [goal.shape for goal in three] == [(3, 2)] * 2
     assert torch.equal(torch.cat(three)[:4], torch.cat(alone))
 
@@ -82,12 +80,12 @@ def test_the_best_policy_is_that_of_the_best_evaluation(reaching, model, drawn, 
 def test_an_evaluation_is_the_mean_over_its_goals(reaching, model, drawn, tmp_path):
     """Of the losses that the loop has with each goal alone; it keeps no gradient and leaves the goals to come as they were."""
     run = Run(reaching, model, drawn, tmp_path)
-    state = run.goals.get_state()
+    state = run.goals.stream.get_state()
     runs = Runs([run])
-    losses = [runs.loop(goal)[0].loss.item() for goal in run.evaluation_goals()]
+    losses = [runs.loop(goal)[0].loss.item() for goal in run.goals.fixed()]
     found = evaluation.evaluate(runs, [0])[0]
     assert found.loss == pytest.approx(np.mean(losses), rel=1e-6) and found.lasts
-    assert torch.equal(run.goals.get_state(), state) and len(set(losses)) == 4
+    assert torch.equal(run.goals.stream.get_state(), state) and len(set(losses)) == 4
 
 
 def test_a_failed_evaluation_is_no_best(reaching, model, drawn, tmp_path, monkeypatch, caplog):

@@ -80,7 +80,7 @@ def test_the_best_lasts_if_any_does(task, model, settings, tmp_path):
         run.iteration = k
         for weights in run.policy.parameters():
             torch.nn.init.constant_(weights, k)
-        run.keep_if_best(loss, lasts)
+        run.keep(loss, lasts)
         kept.append(run.best["iteration"])
     assert kept == [best for *_, best in found] and (run.best["loss"], run.best["lasts"]) == (-0.2, True)
     assert all((weights == 8).all() for weights in run.best["policy"].values())
@@ -146,7 +146,7 @@ def test_the_best_of_a_checkpoint_from_before_lasts(task, model, settings, tmp_p
     other = Run(task, model, settings, tmp_path / "none")
     other.load_state_dict(run.state_dict() | {"best": {"loss": math.inf, "iteration": -1}})
     assert not other.best["lasts"]
-    run.keep_if_best(-1.0, lasts=False)
+    run.keep(-1.0, lasts=False)
     run.iteration = 1
     content = run.state_dict()
     before = {name: value for name, value in content["best"].items() if name != "lasts"}
@@ -223,7 +223,7 @@ def test_a_motion_that_fails_from_a_further_start_is_no_best(task, model, settin
     runs.evaluator = fails
     found = evaluate(runs, [0])[0]
     assert math.isinf(found.loss) and "the evaluation failed: particle 3 is inverted" in caplog.text
-    runs.all[0].keep_if_best(found.loss, found.lasts)
+    runs.all[0].keep(found.loss, found.lasts)
     assert runs.all[0].best["iteration"] == -1 and next(count) == 4
 
 
@@ -246,6 +246,6 @@ def test_a_motion_that_is_not_worth_it_need_not_last(task, settings, model, tmp_
     run = Run(task, model, dataclasses.replace(settings, optimizer=optimizer), tmp_path)
     kept = []
     for loss, lasts in ((-0.05, True), (-1.0, False), (-0.2, True)):
-        run.keep_if_best(loss, lasts)
+        run.keep(loss, lasts)
         kept.append((run.best["loss"], run.best["lasts"]))
     assert kept == [(-0.05, False), (-1.0, False), (-0.2, True)]

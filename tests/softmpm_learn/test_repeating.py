@@ -27,7 +27,7 @@ def run(task, model, settings, tmp_path):
     for run.iteration, (loss, lasts) in enumerate([(0.4, False), (-0.9, False), (-0.5, True), (-1.5, True)]):
         for weights in run.policy.parameters():
             torch.nn.init.constant_(weights, run.iteration)
-        run.keep_if_best(loss, lasts)
+        run.keep(loss, lasts)
     run.iteration = 9
     return run
 
@@ -71,7 +71,7 @@ def test_the_next_best_are_kept(run):
     """The best of those that were not, and of several alike the first; what is not known is none of them."""
     found = {4: -1.2, 5: -0.3, 6: -1.6, 7: math.nan, 8: -1.2, 9: INF}
     for run.iteration, loss in found.items():
-        run.keep_if_best(loss, True)
+        run.keep(loss, True)
     assert [one["iteration"] for one in (run.best, *run.others)] == [6, 3, 4, 8, 2, 5, 1] and OTHERS == 6
     assert all((weights == 3).all() for weights in run.others[0]["policy"].values())
 
@@ -143,7 +143,7 @@ def test_runs_side_by_side_go_back_on_their_own(task, settings, tmp_path, script
         for one.iteration in range(2):
             for weights in one.policy.parameters():
                 torch.nn.init.constant_(weights, 10 * number + one.iteration)
-            one.keep_if_best(-1.0 - one.iteration, True)
+            one.keep(-1.0 - one.iteration, True)
     answers |= {0: [(-1.9, True)], 1: [(-0.1, True), (-0.9, True)]}
     found = evaluate_best(runs, [0, 1])
     assert asked == [{0: 1.0, 1: 11.0}, {1: 10.0}] and [one.best["iteration"] for one in runs.all] == [1, 0]

@@ -6,6 +6,7 @@ import itertools
 import pytest
 import torch
 
+from softmpm_learn.goals import Goals
 from softmpm_learn.run import Run
 from softmpm_learn.seeding import seeded, stream, stream_seed
 from softmpm_learn.train import train
@@ -46,8 +47,8 @@ def changed(settings, **groups):
 @pytest.mark.parametrize("part", CHANGES)
 def test_another_part_leaves_the_goals_as_they_are(task, model, settings, tmp_path, monkeypatch, part):
     """Runs with one seed draw the same goals whatever observes, learns or acts, so that they can be compared in pairs."""
-    drawn, real = [], Run.draw_goals
-    monkeypatch.setattr(Run, "draw_goals", lambda run: drawn.append(real(run)) or drawn[-1])
+    drawn, real = [], Goals.draw
+    monkeypatch.setattr(Goals, "draw", lambda goals: drawn.append(real(goals)) or drawn[-1])
     settings = changed(settings, train=dict(goal_spread=[0.1, 0.1], iterations=3, evaluation_goals=1))
     for number, conf in enumerate((settings, changed(settings, **CHANGES[part]))):
         train(task, model, conf, tmp_path / str(number))

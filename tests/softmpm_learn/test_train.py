@@ -352,7 +352,7 @@ def test_random_goals_are_drawn_anew(task, settings, tmp_path):
     model = softmpm.build(task.scene, device="cpu", worlds=3)
     conf = copy_of(settings, train=dict(worlds=3, iterations=2, goal_spread=[0.1, 0.0], record_every=1))
     run = train.Run(task, model, conf, tmp_path)
-    goals = torch.stack([run.draw_goals() for _ in range(200)])
+    goals = torch.stack([run.goals.draw() for _ in range(200)])
     assert goals[..., 0].unique().numel() == 600 and ((goals[..., 0] - 0.6).abs() <= 0.1).all()
     assert goals[..., 0].std() > 0.04 and (goals[..., 1] == 0.3).all()
     assert train.train(task, model, conf, tmp_path / "out").finished
