@@ -1,5 +1,6 @@
 """Print a table of docs/results.md that compares observers, from comparison.ROBOT.h200.csv beside this script:
-`python docs/results/comparison.py elephant`, or that of the runs before they settled: `... elephant before_settling`."""
+`python docs/results/comparison.py elephant`, or an earlier one: `... elephant before_settling`; `settled`, whose best motions were the
+farthest; or `lasting`, whose best motions had lasted."""
 
 import csv
 import math

@@ -154,7 +154,7 @@ def main():
     print_tears()
     ends = []
     for robot in ("biped", "elephant"):
-        before, after = (table(f"{folder}comparison.{robot}.h200.csv") for folder in ("", "lasting/"))
+        before, after = (table(f"{folder}comparison.{robot}.h200.csv") for folder in ("settled/", "lasting/"))
         change = [float(b["best"]) - float(a["best"]) for a, b in zip(before, after, strict=True)]
         error = np.std(change, ddof=1) / math.sqrt(len(change))
         print(f"{robot}, comparison, farthest | {figures(before)}")
