@@ -58,32 +58,41 @@ def evaluate(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
 def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
     """Evaluate the best of some runs again, from other starts; policies and designs are theirs afterwards.
 
-    Where a best does not repeat itself what is then the best is evaluated in its place, up to :data:`ROUNDS` evaluations; the last
-    stands, whatever it says.
+    Where the best of a run that settles does not repeat itself what is then the best is evaluated in its place, up to :data:`ROUNDS`
+    evaluations; the last stands, whatever it says. If nothing is left that is worth going on with all stays as it was.
     """
+    first, before = dict[int, Evaluation](), {k: runs.all[k].candidates for k in of}
     found, left = dict[int, Evaluation](), ROUNDS
     while of:
         left -= 1
         for k in of:
             runs.all[k].load_policy(runs.all[k].best)
         again = simulate(runs, of, runs.evaluator.again)
-        found |= again
-        of = [k for k in of if left and not _repeats(runs.all[k], again[k])]
+        first, found = again | first, found | again
+        of = [k for k in of if left and runs.all[k].settles and not _repeats(runs.all[k], again[k])]
+        of = [k for k in of if runs.all[k].is_at_work]
+    for k, candidates in before.items():
+        if candidates and not runs.all[k].is_at_work:
+            runs.all[k].rank(candidates)
+            runs.all[k].load_policy(runs.all[k].best)
+            found[k] = first[k]
     return found
 
 
 def _repeats(run: Run, again: Evaluation) -> bool:
-    """Count the further evaluation of the best of a run, see :meth:`softmpm_learn.run.Run.recount`; the log says what became of it."""
+    """Count the further evaluation of the best of a run, see :meth:`softmpm_learn.run.Run.recount`; the log says what followed."""
     before = run.best
     repeats = run.recount(again.loss, again.lasts)
     if not repeats:
         logger.info(
-            "Iteration %d: evaluated again, the best has %.3g instead of %.3g%s; the best is that of iteration %d now.",
+            "Iteration %d: evaluated again, the best has %.3g instead of %.3g%s; %s.",
             run.iteration,
             again.loss,
             before["loss"],
             " and does not last" if before["lasts"] and not again.lasts else "",
-            run.best["iteration"],
+            f"the best is that of iteration {run.best['iteration']} now"
+            if run.is_at_work
+            else "no other is better",
         )
     return repeats
 

@@ -10,7 +10,7 @@ Each answer compares the first term of the objective with what it was in the epi
     miss      what should reach a goal: largest distance from it from T − 0.3 s to T + 0.5 s [m]
     speed     what should come to rest: largest speed in that time [m/s]
 
-Beside them stands ``end``: the loss, or the evaluation, of the motion with which the run ended, simulated once more.
+Beside them stands ``end``: the loss, or the evaluation, of the best motion, simulated once more, of a walker from other starts.
 
 A simulation that fails has no answer, and the log says why. The robot goes on from rest, so that it does not fail again in every
 control step.

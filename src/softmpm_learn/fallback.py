@@ -23,6 +23,10 @@ class Fallback:
     iterations: int = 0
     """Iterations so far."""
 
+    def next(self) -> "Fallback":
+        """Of a run that begins anew; its first loss stays that."""
+        return Fallback(first=self.first, count=self.count)
+
     def is_below(self, loss: float, best: float, share: float) -> bool:
         """True if the progress of a loss is below a share of the best progress; False as long as there is no first loss."""
         return self.first - loss < share * (self.first - best)

@@ -13,6 +13,7 @@ from softmpm_learn.distributed import in_full
 from softmpm_learn.episode import run_episode
 from softmpm_learn.evaluation import evaluate_best
 from softmpm_learn.examination import examine
+from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
 
@@ -70,16 +71,28 @@ def _at_their_best(runs: Runs) -> Iterator[list[int]]:
 def evaluate_ends(runs: Runs) -> dict[int, float]:
     """The best of each finished run, evaluated again, by its number; nan where that failed. In every process.
 
-    A run whose best does not repeat itself has another one afterwards, and one that settles ends there.
+    A run that settles and whose best does not repeat itself has another one afterwards, and ends there. What is known from before, of a
+    run that had ended, stays.
     """
-    if not (runs.all[0].settings.train.examine and finished(runs)):
+    if not runs.all[0].settings.train.examine:
         return {}
-    with _at_their_best(runs) as done:
-        again = evaluate_best(runs, done)
-    for run in (runs.all[k] for k in done):
-        if run.settles:
-            run.load_policy(run.best)
-    return {k: one.loss if math.isfinite(one.loss) else math.nan for k, one in again.items()}
+    done = finished(runs)
+    best = {k: runs.all[k].best for k in done if _end(runs.all[k]) is None}
+    if best:
+        with _at_their_best(runs):
+            again = evaluate_best(runs, list(best))
+        for k, one in again.items():
+            run = runs.all[k]
+            run.end = run.iteration, one.loss if math.isfinite(one.loss) else math.nan
+            if run.settles and run.best is not best[k]:
+                run.return_to_best()
+    ends = {k: _end(runs.all[k]) for k in done}
+    return {k: end for k, end in ends.items() if end is not None}
+
+
+def _end(run: Run) -> float | None:
+    """What the evaluation at the end of a run said, if it was made."""
+    return run.end[1] if run.end and run.end[0] == run.iteration else None
 
 
 @torch.no_grad()

@@ -60,6 +60,7 @@ class Run:
         safe: Values of policy and design in the last simulation that did not fail.
         best: The loss of the best motion so far, that of its evaluation if there are any, whether it lasts, and what gave it.
         others: The next best, at most :data:`OTHERS`, the better first.
+        end: The iterations after which the best was evaluated for the end of the run, and its loss then; None: it was not.
         fallback: Decides when the run goes back to its best.
         restart: Decides when it begins anew.
         settling: Decides whether it settles.
@@ -87,6 +88,7 @@ class Run:
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.iteration, self.best = 0, {"loss": math.inf, "lasts": False, "iteration": -1}
         self.others: list[dict] = []
+        self.end: tuple[int, float] | None = None
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = Goals(task, model, settings.train, self.worlds)
         self.learner: Learner | None = None
@@ -163,8 +165,7 @@ class Run:
 
     def begins_to_settle(self) -> bool:
         """Decide in the first of them whether it does; True if it begins."""
-        worth = self.best["iteration"] >= 0 and self._is_worth(self.best["loss"])
-        return self.settling.begins(self.left, self._settling_iterations, worth)
+        return self.settling.begins(self.left, self._settling_iterations, self.is_at_work)
 
     @property
     def _settling_iterations(self) -> int:
@@ -182,35 +183,46 @@ class Run:
         return math.isfinite(loss) and (lasts, -loss) > (self.best["lasts"], -self.best["loss"])
 
     def _is_worth(self, loss: float) -> bool:
-        return is_worth(loss, self.settings.optimizer)
+        return math.isfinite(loss) and is_worth(loss, self.settings.optimizer)
+
+    @property
+    def is_at_work(self) -> bool:
+        """True if the best is worth going on with."""
+        return self.best["iteration"] >= 0 and self._is_worth(self.best["loss"])
 
     def keep(self, loss: float, lasts: bool) -> None:
         """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`, or among the next best."""
-        if math.isfinite(loss):
-            now = {"loss": loss, "lasts": lasts and self._is_worth(loss), "iteration": self.iteration}
-            self._rank([*self._candidates, now | self.policy_snapshot()])
+        now = {"loss": loss, "lasts": lasts and self._is_worth(loss), "iteration": self.iteration}
+        full = len(self.others) == OTHERS
+        if math.isfinite(loss) and not (full and _rank(now) >= _rank(self.others[-1])):
+            self.rank([*self.candidates, now | self.policy_snapshot()])
 
     @property
-    def _candidates(self) -> list[dict]:
+    def candidates(self) -> list[dict]:
+        """The best motion and the next best."""
         return [self.best] * (self.best["iteration"] >= 0) + self.others
 
-    def _rank(self, candidates: list[dict]) -> None:
-        self.best, *others = sorted(candidates, key=lambda one: (not one["lasts"], one["loss"]))
+    def rank(self, candidates: list[dict]) -> None:
+        """Keep the best of some motions, and the next best."""
+        self.best, *others = sorted(candidates, key=_rank)
         self.others = others[:OTHERS]
 
     def recount(self, loss: float, lasts: bool) -> bool:
-        """Count a further evaluation of the best, infinite where it failed: True if it repeats itself, by :data:`REPEATED` of its
-        progress, and lasts again if it did.
+        """Count a further evaluation of the best: True if it repeats itself, by :data:`REPEATED` of its progress, and lasts again if it
+        did, or if it is not worth going on with anyway.
 
-        A best that does not is worth what this evaluation says, and the best is then the best of it and of the others. One that failed
-        is given up, unless there is no other.
+        A best that does not is worth the worse of both, and the best is then the best of it and of the others.
+
+        Args:
+            loss: Infinite where it failed.
         """
-        known, best = math.isfinite(loss), self.best
-        far = known and not self.fallback.is_below(loss, best["loss"], REPEATED)
-        if (far and lasts >= best["lasts"]) or not (known or self.others):
+        best = self.best
+        known = math.isfinite(loss) and not self.fallback.is_below(loss, best["loss"], REPEATED)
+        if (known and lasts >= best["lasts"]) or not self._is_worth(best["loss"]):
             return True
-        now = {"loss": max(loss, best["loss"]), "lasts": best["lasts"] and lasts}
-        self._rank(([best | now] if known else []) + self.others)
+        worse = max(loss, best["loss"])
+        now = {"loss": worse, "lasts": best["lasts"] and lasts and self._is_worth(worse)}
+        self.rank([best | now, *self.others])
         return False
 
     def step(self) -> None:
@@ -250,7 +262,7 @@ class Run:
     def begin_anew(self) -> str:
         """Take other first weights of the policy and the first design, with the first rates; the encoder keeps what it has learned.
         Says so."""
-        self.restart, self.fallback = self.restart.next(), Fallback(count=self.fallback.count)
+        self.restart, self.fallback = self.restart.next(), self.fallback.next()
         self.policy.load_state_dict(self._make_policy(f"policy {self.restart.count}").state_dict())
         self.design.load_state_dict(self._make_design().state_dict())
         self.optimizer.state.clear()
@@ -295,6 +307,7 @@ class Run:
             "safe": self.safe,
             "best": self.best,
             "others": self.others,
+            "end": self.end,
             "fallback": dataclasses.asdict(self.fallback),
             "restart": dataclasses.asdict(self.restart),
             "settling": dataclasses.asdict(self.settling),
@@ -323,7 +336,7 @@ class Run:
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
         self.iteration, best = content["iteration"], content["best"]
         self.best = {"lasts": best["iteration"] >= 0} | best  # others were not known
-        self.others = list(content.get("others", []))
+        self.others, self.end = list(content.get("others", [])), content.get("end")
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
         self.settling = Settling(**content.get("settling", {}))
@@ -347,7 +360,7 @@ class Run:
                 f"the iteration is {self.iteration!r}, that of the best loss {self.best['iteration']!r}"
             )
         now = self.policy_snapshot()
-        for one in self._candidates:
+        for one in self.candidates:
             self.load_policy(one)  # compares the shapes
         self.load_policy(now)
 
@@ -355,6 +368,11 @@ class Run:
     def about(self) -> str:
         """Identity of the run, which a resumed run must share, as JSON; its tensors are read once."""
         return json.dumps(identity(self.task, self.model, self.settings), sort_keys=True)
+
+
+def _rank(motion: dict) -> tuple[bool, float]:
+    """Lower of a better motion, see :meth:`Run.would_be_best`."""
+    return not motion["lasts"], motion["loss"]
 
 
 def _moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> list[Tensor]:

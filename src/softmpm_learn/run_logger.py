@@ -146,12 +146,12 @@ class RunLogger:
 
     @property
     def is_saved(self) -> bool:
-        """True if the checkpoint is that of the iterations done, with the same best."""
+        """True if the checkpoint is that of the iterations done, and of the end if there was one."""
         return self._saved == self._stage
 
     @property
-    def _stage(self) -> tuple[int, int, float]:
-        return self.run.iteration, self.run.best["iteration"], self.run.best["loss"]
+    def _stage(self) -> tuple:
+        return self.run.iteration, self.run.end
 
     @property
     def is_due(self) -> bool:

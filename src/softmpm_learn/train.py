@@ -182,7 +182,7 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
                 work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     _save_all(work)
     ends = evaluate_ends(runs)
-    _save_all(work)  # the best of some is another one now
+    _save_all(work)  # with what became of the best
     found = finish(runs, work.loggers, finer, ends) if work.loggers else {}
     return [
         Result(

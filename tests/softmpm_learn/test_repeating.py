@@ -21,9 +21,9 @@ INF = math.inf
 
 @pytest.fixture
 def run(task, model, settings, tmp_path):
-    """With a first loss of 0.5 and four bests, the weights of whose policies are their iterations."""
+    """One that settles, with a first loss of 0.5 and four bests, the weights of whose policies are their iterations."""
     run = Run(task, model, settings, tmp_path)
-    run.fallback.first = 0.5
+    run.fallback.first, run.settling.active = 0.5, True
     for run.iteration, (loss, lasts) in enumerate([(0.4, False), (-0.9, False), (-0.5, True), (-1.5, True)]):
         for weights in run.policy.parameters():
             torch.nn.init.constant_(weights, run.iteration)
@@ -41,30 +41,42 @@ def run(task, model, settings, tmp_path):
         ((-0.4, True), False, [2, 3, 1, 0]),
         ((-1.4, False), False, [2, 3, 1, 0]),
         ((-0.8, False), False, [2, 1, 3, 0]),
-        ((INF, False), False, [2, 1, 0]),
-        ((INF, True), False, [2, 1, 0]),
+        ((INF, False), False, [2, 1, 0, 3]),
     ],
 )
 def test_a_best_that_does_not_repeat_itself(run, again, repeats, left):
-    """It counts by the second value among the others, and one that fails not at all."""
+    """It counts by the worse value among the others, and one that fails comes last."""
     first = run.best["loss"]
     assert run.recount(*again) is repeats
     assert [one["iteration"] for one in (run.best, *run.others)] == left
     values = {one["iteration"]: (one["loss"], one["lasts"]) for one in (run.best, *run.others)}
-    assert values.get(3, again) == ((first, True) if repeats else again)
+    assert values[3] == ((first, True) if repeats else again)
     assert all((weights == left[0]).all() for weights in run.best["policy"].values())
 
 
-def test_the_only_best_is_kept_although_it_fails(run):
-    """There is nothing to go back to; one that is slower is worth what it does."""
-    run.others = []
-    assert run.recount(INF, False) and run.best["loss"] == -1.5 and run.best["lasts"]
-    assert not run.recount(-0.2, True) and (run.best["loss"], run.best["lasts"], run.others) == (
-        -0.2,
-        True,
-        [],
+def test_a_best_that_is_not_worth_it_need_not_repeat_itself(task, model, settings, tmp_path):
+    """What comes to be such a one does not last, however long, and stands behind what walks."""
+    optimizer = dataclasses.replace(settings.optimizer, restart_above=-0.5)
+    run = Run(task, model, dataclasses.replace(settings, optimizer=optimizer), tmp_path)
+    run.fallback.first = 0.0
+    run.keep(0.1, True)
+    assert (
+        not run.is_at_work and run.recount(0.3, True) and run.recount(INF, False) and run.best["loss"] == 0.1
     )
-    assert run.recount(-0.2, True)
+    run.keep(-1.4, False)
+    run.keep(-1.5, True)
+    assert not run.recount(-0.1, True) and run.is_at_work
+    assert [(one["loss"], one["lasts"]) for one in run.candidates] == [
+        (-1.4, False),
+        (-0.1, False),
+        (0.1, False),
+    ]
+
+
+def test_the_first_loss_stays_when_a_run_begins_anew(run):
+    """Or nothing could be told from it until the next evaluation."""
+    run.begin_anew()
+    assert run.fallback.first == 0.5 and run.fallback.iterations == 0 and not run.recount(-0.4, True)
 
 
 def test_the_next_best_are_kept(run):
@@ -116,13 +128,26 @@ def test_the_next_one_is_evaluated_until_one_repeats(run, scripted, caplog):
     assert second == f"{both}-0.2 instead of -0.5; the best is that of iteration 2 now."
 
 
-def test_where_all_fail_the_last_one_stands(run, scripted):
-    """Its further evaluation says that it failed."""
+@pytest.mark.parametrize("others", [True, False])
+def test_where_all_fail_the_best_is_kept(run, scripted, others, caplog):
+    """There is nothing to go back to; its further evaluation says that it failed."""
+    caplog.set_level("INFO", "softmpm_learn")
     answers, asked = scripted
+    run.others = run.others if others else []
+    before, tried = run.candidates, [3.0, 2.0, 1.0, 0.0] if others else [3.0]
     answers[0] = [(INF, False)] * 4
     assert evaluate_best(Runs([run]), [0]) == {0: Evaluation(INF, False)}
-    assert [one[0] for one in asked] == [3.0, 2.0, 1.0, 0.0]
-    assert run.best["iteration"] == 0 and run.best["loss"] == 0.4
+    assert [one[0] for one in asked] == tried and run.candidates == before
+    assert next(run.policy.parameters()).flatten()[0] == 3.0
+    assert caplog.messages[-1].endswith("no other is better.") and len(caplog.messages) == len(tried)
+
+
+def test_a_run_that_does_not_settle_keeps_its_best(run, scripted):
+    """It could go on, and would not be the unbroken run then."""
+    run.settling.active, (answers, asked) = False, scripted
+    answers[0] = [(INF, False)]
+    assert evaluate_best(Runs([run]), [0]) == {0: Evaluation(INF, False)} and len(asked) == 1
+    assert run.best["iteration"] == 3 and run.best["loss"] == -1.5
 
 
 def test_there_is_an_end_to_it(run, scripted):
@@ -144,6 +169,7 @@ def test_runs_side_by_side_go_back_on_their_own(task, settings, tmp_path, script
             for weights in one.policy.parameters():
                 torch.nn.init.constant_(weights, 10 * number + one.iteration)
             one.keep(-1.0 - one.iteration, True)
+        one.settling.active, one.iteration = True, 9
     answers |= {0: [(-1.9, True)], 1: [(-0.1, True), (-0.9, True)]}
     found = evaluate_best(runs, [0, 1])
     assert asked == [{0: 1.0, 1: 11.0}, {1: 10.0}] and [one.best["iteration"] for one in runs.all] == [1, 0]
@@ -196,7 +222,13 @@ def test_a_run_settles_from_a_best_that_repeats_itself(lasting, model, conf, tmp
     assert asked == [6, 6, 6, 10, 10] and result.run.settling.active
     assert (result.best_iteration, result.best_loss, result.examination["end"]) == (7, -1.3, -1.25)
     saved = checkpoint.load(tmp_path)
-    assert saved["best"]["iteration"] == 7 and [one["iteration"] for one in saved["others"]] == [1, 5, 3, 0]
+    assert saved["best"]["iteration"] == 7 and [one["iteration"] for one in saved["others"]] == [
+        1,
+        5,
+        3,
+        0,
+        9,
+    ]
     for name, part in (("policy", result.run.policy), ("observer", result.run.observer)):
         for key, value in part.state_dict().items():
             assert torch.equal(value, saved["best"][name][key])
@@ -207,12 +239,44 @@ def test_a_run_settles_from_a_best_that_repeats_itself(lasting, model, conf, tmp
 
 
 def test_a_finished_run_stays_as_it_is(lasting, model, conf, tmp_path, monkeypatch):
-    """Begun again it evaluates the best that it has, and does not settle once more."""
-    script(monkeypatch, VALUES, [-1.9, INF, -1.9])
+    """Begun again it knows its end, which on a GPU would be another one."""
+    script(monkeypatch, VALUES, [-1.9, INF, -1.85])
     once = train(lasting, model, conf, tmp_path)
-    asked = script(monkeypatch, VALUES, [-1.9])
+    asked = script(monkeypatch, VALUES, [])
     twice = train(lasting, model, conf, tmp_path)
-    assert asked == [10] and twice.best_iteration == once.best_iteration == 5
+    assert asked == [] and twice.best_iteration == once.best_iteration == 5
+    assert twice.examination["end"] == once.examination["end"] == -1.85
+
+
+def test_what_a_run_went_back_from_is_forgotten(lasting, model, conf, tmp_path, monkeypatch):
+    """If it is extended it has no moments of the motion that was given up, nor goes halfway back to it."""
+    script(monkeypatch, VALUES, [-0.9, -0.9, -0.9, INF, -1.25])
+    run = train(lasting, model, conf, tmp_path).run
+    assert not run.optimizer.state
+    assert all(torch.equal(p, safe) for p, safe in zip(run.parameters, run.safe, strict=True))
+
+
+def test_a_run_that_does_not_settle_goes_on_as_if_unbroken(lasting, model, conf, tmp_path, monkeypatch):
+    """Ended in between, with a best that fails then."""
+    values, rows = VALUES | {11: -1.0, 13: -1.2, 14: 0.0}, []
+    optimizer = dataclasses.replace(conf.optimizer, settle=0.0)
+    for name, lengths in (("whole", [14]), ("parts", [10, 14])):
+        for length in lengths:
+            script(monkeypatch, values, [INF])
+            some = dataclasses.replace(conf.train, iterations=length)
+            train(lasting, model, dataclasses.replace(conf, optimizer=optimizer, train=some), tmp_path / name)
+        with open(tmp_path / name / "metrics.csv", newline="") as file:
+            rows.append([(row["loss"], row["best"]) for row in csv.DictReader(file)])
+    assert rows[0] == rows[1] and rows[0][-1][1] == "-2.0"
+
+
+def test_a_run_settles_although_nothing_repeats_itself(lasting, model, conf, tmp_path, monkeypatch):
+    """From its best, and with the best of settling as its end."""
+    optimizer = dataclasses.replace(conf.optimizer, restart_above=-0.5)
+    asked = script(monkeypatch, VALUES | {7: -1.9, 9: -2.1}, [INF, INF, INF, -2.1])
+    result = train(lasting, model, dataclasses.replace(conf, optimizer=optimizer), tmp_path)
+    assert asked == [6, 6, 6, 10] and result.run.settles
+    assert (result.best_iteration, result.run.restart.count) == (9, 0)
 
 
 def test_the_further_starts_are_others():
