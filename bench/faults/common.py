@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
+import torch._dynamo  # any optimiser loads it, which here would take most of the time of each child
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
@@ -35,6 +36,7 @@ TINY = [
     *("task=arm", "experiment=smoke", "task.seconds=0.025", "task.control_period=0.0125", "device=cpu"),
     *("task.young=1e3", "task.strength=50", "task.safety=0.8"),  # so soft that two substeps will do
     *("learning.epochs=1", "learning.batches=1", "learning.simulations=2", "train.iterations=4"),
+    "train.pictures=false",
 ]
 LIMIT = 60.0
 """Time limit of a child [s], beyond which it counts as hung; an undisturbed one takes about a second."""

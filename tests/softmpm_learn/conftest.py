@@ -54,6 +54,16 @@ def model(task) -> softmpm.Model:
 
 @pytest.fixture
 def settings() -> Settings:
+    return small_settings()
+
+
+@pytest.fixture(scope="session")
+def make_settings():
+    """:func:`small_settings`, for fixtures that several tests share."""
+    return small_settings
+
+
+def small_settings() -> Settings:
     return Settings(
         observer=ObserverConf(latent_size=3, channels=[4, 4]),
         policy=PolicyConf(name="linear"),

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.global_hydra import GlobalHydra
 
-from softmpm_learn import plugins, register
+from softmpm_learn import app, plugins, register
 from softmpm_learn.policy import make_policy
 from softmpm_learn.register import POLICIES, TABLES
 from softmpm_learn.settings import ObserverConf, PolicyConf
@@ -116,12 +117,22 @@ def test_help_lists_what_files_register(folder):
         (("parts.py", "policy=spring", "+policy.options.gian=1"), "no setting policy.options.gian; policy spring has gain"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said_in_a_sentence(folder, words, says):
+def test_what_is_wrong_is_said_in_a_sentence(folder, monkeypatch, capsys, words, says):
     """Files that are missing, raise, are no Python or start a run when imported; names and options that nobody registered."""
     (folder / "broken.py").write_text("x = 1\nx / 0\n")
     (folder / "torn.py").write_text("def\n")
     (folder / "eager.py").write_text("import softmpm_learn\nsoftmpm_learn.main()\n")
-    assert re.search(says, refusal(run(folder, *words, "hydra.run.dir=run")))
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    files, words = plugins.split(words)
+    quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words, "hydra.run.dir=run", *quiet])
+    GlobalHydra.instance().clear()
+    with pytest.raises(SystemExit) as stop:
+        app.main(own=files)
+    GlobalHydra.instance().clear()
+    (said,) = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 1 and said.startswith("softmpm_learn: ") and re.search(says, said)
 
 
 def test_an_entry_point_is_imported_once(folder, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import softmpm
+from softmpm.recording import reader
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,12 @@ def recorded(tmp_path_factory):
 @pytest.fixture
 def copy(recorded, tmp_path):
     return shutil.copy(recorded, tmp_path / "copy.h5")
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    """No writer is at work that a reader of a damaged file should wait for."""
+    monkeypatch.setattr(reader, "_PAUSE", 1e-4)
 
 
 def read_all(path) -> int:
