@@ -418,11 +418,10 @@ def test_a_signal_at_start_up_is_answered(tmp_path, number):
     assert done.stderr == "softmpm_learn: interrupted. No iteration had begun, so nothing is lost.\n"
 
 
-@pytest.mark.parametrize("every", [1, 1000])
-def test_ctrl_c_ends_cleanly_and_saves(tmp_path, every):
-    """After SIGINT the iteration is finished and saved; exit code 0, and the last line says how to go on."""
+def test_ctrl_c_ends_cleanly_and_saves(tmp_path):
+    """After SIGINT the iteration is finished and saved though none was due; exit code 0, and the last line says how to go on."""
     words = [sys.executable, "-m", "softmpm_learn", *TINY, "train.iterations=1000", "hydra.run.dir=run"]
-    words.append(f"train.save_every={every}")
+    words.append("train.save_every=1000")
     process = subprocess.Popen(
         words,
         cwd=tmp_path,

@@ -205,11 +205,11 @@ def tensor_bytes() -> int:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_calls_of_a_closed_loop_share_the_budget(kind, monkeypatch):
-    """With memory for one call, a model that is told of six keeps no more than that, one that is not six times as much; and one
-    with memory for six keeps what they need. It is what the formula says.
+    """With memory for one call, a model that is told of four keeps no more than that, one that is not four times as much; and one
+    with memory for four keeps what they need. It is what the formula says.
     """
     monkeypatch.setattr(memory, "LONGEST", 8)
-    scene, calls, held, adj = busy_scene(2, per_law=400), 6, [], []
+    scene, calls, held, adj = busy_scene(2, per_law=400), 4, [], []
     sizes = softmpm.build(scene, device="cpu", **KINDS[kind]).sizes()
     budget = 21 * (sizes.inside + sizes.nodes) + 3 * sizes.inside
     for told, enough in ((1, budget), (calls, budget), (calls, calls * (budget + sizes.start))):
