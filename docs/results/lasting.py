@@ -11,7 +11,7 @@ from settling import table
 
 from softmpm_learn.figures.intervals import interval
 
-CALM = 1.2
+NARROW = 1.2
 """Largest distance of neighbours at rest in a motion far from tearing, which is at 1.4 [cells]."""
 
 Count = tuple[int, int]
@@ -76,10 +76,13 @@ def print_tears() -> None:
         rows = [row for some in of.values() for row in some]
         tearing = [seed for seed, some in of.items() if any(row["torn"] == "1" for row in some)]
         gaps = {seed: [float(r["gap"]) for r in some if r["torn"] == "0"] for seed, some in of.items()}
-        calm = [seed for seed, some in gaps.items() if max(some) < CALM]
+        narrow = [seed for seed, some in gaps.items() if max(some) < NARROW]
         torn[choice] = len(tearing), len(of)
-        hit = len({*calm} & {*tearing})
-        near, wide = both(near, (hit, len(calm))), both(wide, (len(tearing) - hit, len(of) - len(calm)))
+        cracked = len({*narrow} & {*tearing})
+        near, wide = (
+            both(near, (cracked, len(narrow))),
+            both(wide, (len(tearing) - cracked, len(of) - len(narrow))),
+        )
         many = sum(row["torn"] == "1" for row in rows)
         print(
             f"{choice}: {len(tearing)} of {len(of)} bipeds tear, in {many} of {len(rows)} simulations",
@@ -89,7 +92,7 @@ def print_tears() -> None:
             f"gap of the others {np.median([gap for some in gaps.values() for gap in some]):.2f} cells",
             end="; ",
         )
-        print(f"{len(calm)} stay within {CALM} cells, of which {hit} tear")
+        print(f"{len(narrow)} stay within {NARROW} cells, of which {cracked} tear")
     print(f"of all: {wide[0]} of {wide[1]} tear beyond that, {near[0]} of {near[1]} within it")
     first, *others = torn
     for choice in others:
