@@ -56,10 +56,11 @@ def evaluate(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
 
 
 def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
-    """Evaluate the best of some runs again, from other starts; policies and designs are theirs afterwards.
+    """Evaluate the best of some runs again, from other starts. Afterwards each of these runs has the policy and the design of its best.
 
-    Where the best of a run that settles does not repeat itself what is then the best is evaluated in its place, up to :data:`ROUNDS`
-    evaluations; the last stands, whatever it says. If nothing is left that is worth going on with all stays as it was.
+    If the best of a run that settles does not repeat itself, the next best takes its place and is evaluated too. There are at most
+    :data:`ROUNDS` evaluations, the last of which is accepted in any case. If no motion is left that is worth going on with, the run
+    keeps its best.
     """
     first, before = dict[int, Evaluation](), {k: runs.all[k].candidates for k in of}
     found, left = dict[int, Evaluation](), ROUNDS
@@ -69,8 +70,8 @@ def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
             runs.all[k].load_policy(runs.all[k].best)
         again = simulate(runs, of, runs.evaluator.again)
         first, found = again | first, found | again
-        of = [k for k in of if left and runs.all[k].settles and not _repeats(runs.all[k], again[k])]
-        of = [k for k in of if runs.all[k].is_at_work]
+        tried = [k for k in of if left and runs.all[k].settles and not _repeats(runs.all[k], again[k])]
+        of = [k for k in tried if runs.all[k].is_at_work]
     for k, candidates in before.items():
         if candidates and not runs.all[k].is_at_work:
             runs.all[k].rank(candidates)

@@ -71,8 +71,7 @@ def _at_their_best(runs: Runs) -> Iterator[list[int]]:
 def evaluate_ends(runs: Runs) -> dict[int, float]:
     """The best of each finished run, evaluated again, by its number; nan where that failed. In every process.
 
-    A run that settles and whose best does not repeat itself has another one afterwards, and ends there. What is known from before, of a
-    run that had ended, stays.
+    A run that settles, and whose best does not repeat itself, ends at the next best. A run that had ended before keeps its value.
     """
     if not runs.all[0].settings.train.examine:
         return {}

@@ -179,8 +179,11 @@ class Run:
             loss: nan or infinite of a motion that is not known.
             lasts: See :mod:`softmpm_learn.lasting`; of no account where the motion is not worth going on with.
         """
-        lasts = lasts and self._is_worth(loss)
-        return math.isfinite(loss) and (lasts, -loss) > (self.best["lasts"], -self.best["loss"])
+        return math.isfinite(loss) and _rank(self._counted(loss, lasts)) < _rank(self.best)
+
+    def _counted(self, loss: float, lasts: bool) -> dict:
+        """What a motion counts by; one that is not worth going on with does not last."""
+        return {"loss": loss, "lasts": lasts and self._is_worth(loss)}
 
     def _is_worth(self, loss: float) -> bool:
         return math.isfinite(loss) and is_worth(loss, self.settings.optimizer)
@@ -192,7 +195,7 @@ class Run:
 
     def keep(self, loss: float, lasts: bool) -> None:
         """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`, or among the next best."""
-        now = {"loss": loss, "lasts": lasts and self._is_worth(loss), "iteration": self.iteration}
+        now = self._counted(loss, lasts) | {"iteration": self.iteration}
         full = len(self.others) == OTHERS
         if math.isfinite(loss) and not (full and _rank(now) >= _rank(self.others[-1])):
             self.rank([*self.candidates, now | self.policy_snapshot()])
@@ -218,11 +221,10 @@ class Run:
         """
         best = self.best
         known = math.isfinite(loss) and not self.fallback.is_below(loss, best["loss"], REPEATED)
-        if (known and lasts >= best["lasts"]) or not self._is_worth(best["loss"]):
+        if (known and lasts >= best["lasts"]) or not self.is_at_work:
             return True
-        worse = max(loss, best["loss"])
-        now = {"loss": worse, "lasts": best["lasts"] and lasts and self._is_worth(worse)}
-        self.rank([best | now, *self.others])
+        worse = self._counted(max(loss, best["loss"]), best["lasts"] and lasts)
+        self.rank([best | worse, *self.others])
         return False
 
     def step(self) -> None:
@@ -245,7 +247,7 @@ class Run:
     def fall_back(self) -> str:
         """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments; or begin anew
         if the best is not worth it. Says which."""
-        if not self._is_worth(self.best["loss"]):
+        if not self.is_at_work:
             return self.begin_anew()
         self.fallback.count += 1
         return self.return_to_best(self.settings.optimizer.fallback_rate)
