@@ -148,14 +148,13 @@ train.optimise = optimise
 train.train(task, softmpm.build(task.scene, device="cpu"), conf, {str(out)!r})
 """
     ends, lasts, lines = [], [], []
-    for n in (4, 2, None):
-        if n is None:
-            train.train(task, model, changed(conf, train=dict(record_every=0)), out)
-        else:
-            ends.append(subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode)
+    for n in (4, 2):
+        ends.append(subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode)
         lasts.append(checkpoint.load(out)["iteration"])
         lines.append((out / "metrics.csv").read_text().count("\n"))
-    assert ends == [-signal.SIGKILL, -signal.SIGKILL] and lasts == [3, 3, 7] and lines == [4, 4, 8]
+    assert ends == [-signal.SIGKILL, -signal.SIGKILL] and lasts == [3, 3] and lines == [4, 4]
+    train.train(task, model, changed(conf, train=dict(record_every=0)), out)
+    assert checkpoint.load(out)["iteration"] == 7 and (out / "metrics.csv").read_text().count("\n") == 8
     assert_same(out, tmp_path / "unbroken")
 
 

@@ -186,7 +186,7 @@ def reading(path: Path, times: str) -> None:
 
 def test_a_writer_waits_for_readers_that_open_the_file(tmp_path):
     """They hold a lock for a moment, which a writer that begins or resumes then would take for an error."""
-    run_here("opening", tmp_path / "run.h5", "60")
+    run_here("opening", tmp_path / "run.h5", "200")
 
 
 def test_a_file_that_stays_locked_is_named(tmp_path, monkeypatch):
