@@ -1,5 +1,6 @@
 """Shared setup of all tests: quiet Warp, one thread, and fixtures for both schemes and every device, the CPU and a GPU if present."""
 
+import gc
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -24,6 +25,14 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if "gpu" in item.keywords:
                 item.add_marker(pytest.mark.skip(reason=NO_GPU))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def only_new_objects_are_looked_through():
+    """What is there before a module stays: Python's collector of cycles would look through it again and again, in a tenth of all time
+    and more where tests call it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
