@@ -1,6 +1,7 @@
 """The robots: what they are made of, that they stand where they should, and that their muscles move them."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 import softmpm
 from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
 from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
-from softmpm_learn.tasks.task import Resolution, TaskConf
+from softmpm_learn.tasks.task import Resolution, Task, TaskConf
 from softmpm_learn.tasks.walker import EDGE
 
 ROBOTS = ("elephant", "arm", "biped")
@@ -21,6 +22,13 @@ SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 def task(request):
     """Each task at its own settings."""
     return make_task(TASKS[request.param][0]())
+
+
+@functools.cache
+def robot(name: str, resolution: Resolution, formulation="moving", contact="auto") -> Task:
+    """A task that several tests look at; none changes it."""
+    conf, build = TASKS[name]
+    return build(conf(resolution=resolution, formulation=formulation, contact=contact))
 
 
 def simulate(task, activation, seconds):
@@ -35,7 +43,7 @@ def test_elephant_has_its_particles_at_each_resolution():
     """At least 5,000 at the standard resolution, about 2,000 as a draft; the outline's area is the same to 3 %."""
     count, area = {}, {}
     for resolution in Resolution:
-        task = elephant(ElephantConf(resolution=resolution))
+        task = robot("elephant", resolution)
         particles = task.scene.bodies[0].particles
         count[resolution.name], area[resolution.name] = len(particles), particles.volume.sum()
     assert count["standard"] >= 5000 and 1500 <= count["draft"] <= 2500 and count["fine"] > 10000
@@ -63,9 +71,9 @@ def test_a_pair_of_muscles_splits_a_limb(task):
 
 def test_legs_stand_on_the_floor():
     """The soles of all legs are at the same height, half a cell above the floor's nodes if those meet it, at every resolution."""
-    for build, conf in ((elephant, ElephantConf), (biped, BipedConf)):
+    for name in ("elephant", "biped"):
         for resolution in Resolution:
-            task = build(conf(resolution=resolution, contact="nodes"))
+            task = robot(name, resolution, contact="nodes")
             scene, positions = task.scene, task.scene.bodies[0].particles.positions
             floor = scene.walls[0].offset
             legs = [region for name, region in task.regions.items() if name not in ("body", "trunk")]
@@ -79,9 +87,8 @@ def test_legs_stand_on_the_floor():
 @pytest.mark.parametrize("resolution", Resolution)
 def test_outlines_fit_their_robots(name, resolution):
     """The outline closes around the volume of the particles: to half a spacing of the lattice, to 5e-4 with cut cells."""
-    conf, build = TASKS[name]
     for formulation, contact, tolerance in (("moving", "nodes", 0.01), ("reference", "auto", 5e-4)):
-        task = build(conf(resolution=resolution, formulation=formulation, contact=contact))
+        task = robot(name, resolution, formulation, contact)
         particles, spacing = task.scene.bodies[0].particles, task.scene.grid.spacing / 2
         outline = particles.outline
         assert np.linalg.norm(outline.areas @ outline.normals) < 1e-12
@@ -96,14 +103,13 @@ def test_outlines_fit_their_robots(name, resolution):
 def test_soles_meet_the_floor_on_spline_knots(name, resolution):
     """With surface contact, soles and floor are at one height, in the middle between two rows of nodes, and are exactly level; nodes
     meet a floor that is half a cell lower."""
-    conf, build = TASKS[name]
     for formulation, contact, gap in (
         ("moving", "auto", 0.0),
         ("reference", "auto", 0.0),
         ("reference", "surface", 0.0),
         ("reference", "nodes", 0.5),
     ):
-        task = build(conf(resolution=resolution, formulation=formulation, contact=contact))
+        task = robot(name, resolution, formulation, contact)
         scene, outline = task.scene, task.scene.bodies[0].particles.outline
         lowest = outline.points[:, 1].min()
         assert (lowest / scene.grid.spacing) % 1 == pytest.approx(0.5, abs=1e-9)
