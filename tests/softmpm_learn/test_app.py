@@ -290,8 +290,9 @@ def test_a_folder_with_a_run_is_not_overwritten(monkeypatch, capsys, finished):
 def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finished):
     """Two iterations and one more give the metrics of three in one go, to the last bit."""
     shutil.copytree(finished[0], tmp_path / "run")
-    main(monkeypatch, f"resume={tmp_path}/run", "train.iterations=3")
-    main(monkeypatch, *TINY, "train.iterations=3", f"hydra.run.dir={tmp_path}/whole")
+    more = ("train.iterations=3", "train.pictures=false")
+    main(monkeypatch, f"resume={tmp_path}/run", *more)
+    main(monkeypatch, *TINY, *more, f"hydra.run.dir={tmp_path}/whole")
     resumed, whole = (rows(tmp_path / name / "metrics.csv") for name in ("run", "whole"))
     assert resumed == whole and len(whole) == 3
     assert load(tmp_path / "run").task.name == "arm"
@@ -320,7 +321,7 @@ def test_the_objective_is_part_of_a_run(monkeypatch, capsys, tmp_path, finished)
 
 def test_the_log_follows_the_run(monkeypatch, tmp_path, finished):
     """It holds what was said from the start, and what a resumed run says comes after that."""
-    main(monkeypatch, *TINY, f"hydra.run.dir={tmp_path}/run")
+    main(monkeypatch, *TINY, "train.pictures=false", f"hydra.run.dir={tmp_path}/run")
     first = (tmp_path / "run" / "softmpm_learn.log").read_text()
     assert first.startswith("softmpm model: 2D") and "after 2 of 2 iterations" in first
     main(monkeypatch, f"resume={tmp_path}/run", "train.iterations=3")
@@ -353,8 +354,8 @@ def test_a_deterministic_run_repeats_itself(monkeypatch, tmp_path):
     """A run with all parts takes no operation that PyTorch refuses, and gives the same metrics again."""
     try:
         for name in ("one", "two"):
-            words = ("device.deterministic=true", "train.record_every=0", f"hydra.run.dir={tmp_path}/{name}")
-            main(monkeypatch, *TINY, *words)
+            words = ("device.deterministic=true", "train.record_every=0", "train.pictures=false")
+            main(monkeypatch, *TINY, *words, f"hydra.run.dir={tmp_path}/{name}")
     finally:
         torch.use_deterministic_algorithms(False)
     one, two = (rows(tmp_path / name / "metrics.csv") for name in ("one", "two"))

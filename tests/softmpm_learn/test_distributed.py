@@ -6,12 +6,12 @@ import importlib.util
 import itertools
 import json
 import math
-import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 import torch
 
@@ -23,7 +23,6 @@ from softmpm_learn.saved import load
 from softmpm_learn.settings import Settings
 from softmpm_learn.tasks import make_task
 
-HERE = Path(__file__).parent
 SAME, SMALL = 1e-5, 1e-8
 """Relative and absolute: sums over the worlds have another order. A rounding of 1e-7, a few iterations on; and a loss is a difference
 of positions of order one, whose rounding is 6e-8 [m]."""
@@ -101,15 +100,8 @@ def one_of_two(out: Path, group: Group) -> None:
 
 
 def torchrun(*words: str, cwd: Path) -> subprocess.CompletedProcess:
-    paths = [str(HERE.parents[1] / "src"), str(HERE), os.environ.get("PYTHONPATH", "")]
-    return subprocess.run(
-        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *words],
-        cwd=cwd,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    start = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
+    return forked.python(*start, *words, folder=cwd)
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,12 @@
 """Robots, observers, policies and optimisers of one's own: written as on docs/robots.md, run by one command, refused in a sentence."""
 
 import csv
-import os
 import re
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import forked
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
@@ -44,10 +43,8 @@ def folder(tmp_path):
 
 
 def run(folder, *words, python=("-m", "softmpm_learn")):
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    environment.pop("HYDRA_FULL_ERROR", None)  # main() sets it, also in tests of this process
-    command = [sys.executable, *python, *words]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    """``python -m softmpm_learn WORDS`` in a process that has registered nothing yet."""
+    return forked.python(*python, *words, folder=folder)
 
 
 def iterations(folder) -> int:

@@ -2,11 +2,11 @@
 
 import dataclasses
 import itertools
+import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import pytest
 import torch
 
@@ -18,9 +18,6 @@ from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.seeds import split
 from softmpm_learn.settings import Settings, TrainConf
 
-HERE = Path(__file__).parent
-SOURCE = HERE.parents[1] / "src"
-
 
 def changed(settings: Settings, **changes) -> Settings:
     """Settings with other values, given as group=dict(name=value)."""
@@ -30,8 +27,7 @@ def changed(settings: Settings, **changes) -> Settings:
     return dataclasses.replace(settings, **parts)
 
 
-@pytest.fixture
-def conf(settings) -> Settings:
+def every_third(settings: Settings) -> Settings:
     """A checkpoint every third iteration of seven, random goals, every episode recorded, and a buffer of only two simulations."""
     return changed(
         settings,
@@ -42,10 +38,16 @@ def conf(settings) -> Settings:
 
 
 @pytest.fixture
-def unbroken(task, model, conf, tmp_path) -> Path:
-    """Folder of that run with a checkpoint in every iteration, undisturbed."""
-    train.train(task, model, changed(conf, train=dict(save_every=1)), tmp_path / "unbroken")
-    return tmp_path / "unbroken"
+def conf(settings) -> Settings:
+    return every_third(settings)
+
+
+@pytest.fixture(scope="module")
+def unbroken(task, model, make_settings, tmp_path_factory) -> Path:
+    """Folder of that run with a checkpoint in every iteration, undisturbed; tests read it only."""
+    out = tmp_path_factory.mktemp("unbroken")
+    train.train(task, model, changed(every_third(make_settings()), train=dict(save_every=1)), out)
+    return out
 
 
 def assert_same(folder: Path, unbroken: Path) -> None:
@@ -123,37 +125,32 @@ def test_killed_between_two_checkpoints_it_goes_on(task, model, conf, unbroken, 
     assert_same(out, unbroken)
 
 
+def train_till(number: int, task, conf: Settings, out: Path) -> None:
+    """A run in a process that kills itself at the end of the update of this number."""
+    calls, real = itertools.count(), train.optimise
+
+    def optimise(*args):
+        found = real(*args)
+        if next(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return found
+
+    train.optimise = optimise
+    train.train(task, softmpm.build(task.scene, device="cpu"), conf, out)
+
+
 def test_killed_processes_resume(task, model, conf, tmp_path):
     """Killed by SIGKILL one or two iterations after a checkpoint, the run ends as one that was not; its rows are those till then."""
     out, often = tmp_path / "out", changed(conf, train=dict(record_every=0, save_every=1))
     train.train(task, model, often, tmp_path / "unbroken")
-    script = f"""
-import os, signal, sys
-sys.path[:0] = [{str(SOURCE)!r}, {str(HERE)!r}]
-import torch
-torch.set_num_threads(1)
-import conftest, test_save_every
-from softmpm_learn import train
-import softmpm
-task = conftest.task.__wrapped__()
-conf = test_save_every.conf.__wrapped__(conftest.settings.__wrapped__())
-conf.train.record_every = 0
-kill_at, calls, real = int(sys.argv[1]), iter(range(999)), train.optimise
-def optimise(*args):
-    found = real(*args)
-    if next(calls) == kill_at:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return found
-train.optimise = optimise
-train.train(task, softmpm.build(task.scene, device="cpu"), conf, {str(out)!r})
-"""
+    silent = changed(conf, train=dict(record_every=0))
     ends, lasts, lines = [], [], []
     for n in (4, 2):
-        ends.append(subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode)
+        ends.append(forked.exit_code(train_till, n, task, silent, out))
         lasts.append(checkpoint.load(out)["iteration"])
         lines.append((out / "metrics.csv").read_text().count("\n"))
     assert ends == [-signal.SIGKILL, -signal.SIGKILL] and lasts == [3, 3] and lines == [4, 4]
-    train.train(task, model, changed(conf, train=dict(record_every=0)), out)
+    train.train(task, model, silent, out)
     assert checkpoint.load(out)["iteration"] == 7 and (out / "metrics.csv").read_text().count("\n") == 8
     assert_same(out, tmp_path / "unbroken")
 

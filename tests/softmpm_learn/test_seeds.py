@@ -6,12 +6,12 @@ import dataclasses
 import gc
 import itertools
 import math
+import os
 import re
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -31,7 +31,6 @@ from softmpm_learn.settings import Settings, TrainConf
 from softmpm_learn.train import Plan, Result, train, train_side_by_side
 
 HERE = Path(__file__).parent
-SOURCE = HERE.parents[1] / "src"
 SEEDS = 3
 CLOSE = 1e-9
 
@@ -44,10 +43,14 @@ def changed(settings: Settings, **changes) -> Settings:
     return dataclasses.replace(settings, **parts)
 
 
-@pytest.fixture
-def conf(settings) -> Settings:
+def three_seeds(settings: Settings) -> Settings:
     """Three seeds of the crawler with a network as policy and every particle's material designed."""
     return changed(settings, policy=dict(name="mlp", hidden=[8]), train=dict(seeds=SEEDS, seed=4))
+
+
+@pytest.fixture
+def conf(settings) -> Settings:
+    return three_seeds(settings)
 
 
 def built(task, conf: Settings, runs: int = 1, device: str = "cpu") -> softmpm.Model:
@@ -420,8 +423,16 @@ def test_a_gradient_that_is_not_finite_is_that_of_one_seed(task, conf, tmp_path,
 # Resuming
 
 
+@pytest.fixture(scope="module")
+def whole(task, make_settings, tmp_path_factory) -> Path:
+    """Folder of the three seeds, undisturbed."""
+    out = tmp_path_factory.mktemp("whole")
+    together(task, three_seeds(make_settings()), out)
+    return out
+
+
 @pytest.mark.parametrize("nth", [0, 7, 8, 11])
-def test_killed_between_two_checkpoints_it_goes_on(task, conf, tmp_path, monkeypatch, nth):
+def test_killed_between_two_checkpoints_it_goes_on(task, conf, whole, tmp_path, monkeypatch, nth):
     """Seeds may then be at different iterations; resumed, all end as they would have, to the last bit."""
     real, count = checkpoint.save, itertools.count()
 
@@ -435,36 +446,31 @@ def test_killed_between_two_checkpoints_it_goes_on(task, conf, tmp_path, monkeyp
         together(task, conf, tmp_path / "killed")
     monkeypatch.undo()
     assert all(result.finished for result in together(task, conf, tmp_path / "killed"))
-    together(task, conf, tmp_path / "whole")
     for k in range(SEEDS):
-        assert_same(tmp_path / "killed" / str(k), tmp_path / "whole" / str(k))
-        killed, whole = (tmp_path / name / str(k) / "metrics.csv" for name in ("killed", "whole"))
-        assert killed.read_bytes() == whole.read_bytes()
+        assert_same(tmp_path / "killed" / str(k), whole / str(k))
+        one, other = (folder / str(k) / "metrics.csv" for folder in (tmp_path / "killed", whole))
+        assert one.read_bytes() == other.read_bytes()
 
 
-def test_a_killed_process_resumes(task, conf, tmp_path):
+def together_till(number: int, task, conf: Settings, out: Path) -> None:
+    """:func:`together` in a process that kills itself when it calls the simulator for this time."""
+    calls, real = itertools.count(), softmpm.simulate
+
+    def simulate(*args, **kwargs):
+        if next(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*args, **kwargs)
+
+    softmpm.simulate = simulate
+    together(task, conf, out)
+
+
+def test_a_killed_process_resumes(task, conf, whole, tmp_path):
     """Killed by SIGKILL within an iteration, in the folder of a seed too, the seeds end as those that were not."""
-    script = f"""
-import os, signal, sys
-sys.path[:0] = [{str(SOURCE)!r}, {str(HERE)!r}]
-import torch
-torch.set_num_threads(1)
-import conftest, test_seeds, softmpm
-task, conf = conftest.task.__wrapped__(), test_seeds.conf.__wrapped__(conftest.settings.__wrapped__())
-kill_at, calls, real = int(sys.argv[1]), iter(range(999)), softmpm.simulate
-def simulate(*args, **kwargs):
-    if next(calls) == kill_at:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return real(*args, **kwargs)
-softmpm.simulate = simulate
-from pathlib import Path
-test_seeds.together(task, conf, Path({str(tmp_path / "killed")!r}))
-"""
-    ends = [subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode for n in (9, 999)]
+    ends = [forked.exit_code(together_till, n, task, conf, tmp_path / "killed") for n in (9, 999)]
     assert ends == [-signal.SIGKILL, 0]
-    together(task, conf, tmp_path / "whole")
     for k in range(SEEDS):
-        assert_same(tmp_path / "killed" / str(k), tmp_path / "whole" / str(k))
+        assert_same(tmp_path / "killed" / str(k), whole / str(k))
 
 
 def test_a_seed_goes_on_alone(task, conf, tmp_path):

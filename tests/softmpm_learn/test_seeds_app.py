@@ -3,13 +3,13 @@
 import csv
 import logging
 import math
-import os
 import statistics
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import forked
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
@@ -20,7 +20,6 @@ from softmpm_learn.figures import __main__ as figures
 from softmpm_learn.saved import load
 from softmpm_learn.settings import TrainConf
 
-ROOT = Path(__file__).parents[2]
 TINY = [
     *("task=arm", "observer=centroids", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
     *("policy=linear", "train.iterations=2", "train.examine=false", "device.dtype=float64"),
@@ -226,10 +225,8 @@ def test_seeds_that_were_stopped_are_no_outcome(main, monkeypatch):
 
 
 def torchrun(*words: str, cwd: Path) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
-    start = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
-    command = [*start, "-m", "softmpm_learn", *words]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+    start = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "softmpm_learn")
+    return forked.python(*start, *words, folder=cwd)
 
 
 def test_processes_share_the_seeds(main, tmp_path):

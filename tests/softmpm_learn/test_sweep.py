@@ -22,7 +22,7 @@ TINY = [
         "train.iterations=2",
         "train.examine=false",
         "train.record_every=0",
-        "train.examine=false",
+        "train.pictures=false",
     ),
 ]
 FAILS, WORKS = "task.poisson=0.45", "task.poisson=0.3"

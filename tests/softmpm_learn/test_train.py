@@ -5,11 +5,10 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import weakref
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -23,9 +22,6 @@ from softmpm_learn.pictures import design
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
-
-HERE = Path(__file__).parent
-SOURCE = HERE.parents[1] / "src"
 
 
 def copy_of(settings: Settings, **changes) -> Settings:
@@ -131,28 +127,23 @@ def test_interrupted_anywhere_it_goes_on_as_if_nothing_had_been(
     assert_same(out, unbroken)
 
 
+def train_till(number: int, task, settings: Settings, out: Path) -> None:
+    """A run in a process that kills itself when it calls the simulator for this time."""
+    calls, real = itertools.count(), softmpm.simulate
+
+    def simulate(*args, **kwargs):
+        if next(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*args, **kwargs)
+
+    softmpm.simulate = simulate
+    train.train(task, softmpm.build(task.scene, device="cpu"), settings, out)
+
+
 def test_killed_processes_resume(task, model, settings, unbroken, tmp_path):
     """Killed by SIGKILL in the middle of three different iterations, the run ends as the unbroken one did."""
     out = tmp_path / "out"
-    script = f"""
-import os, signal, sys
-sys.path[:0] = [{str(SOURCE)!r}, {str(HERE)!r}]
-import torch
-torch.set_num_threads(1)
-import conftest
-from softmpm_learn import train
-import softmpm
-task = conftest.task.__wrapped__()
-settings = conftest.settings.__wrapped__()
-kill_at, calls, real = int(sys.argv[1]), iter(range(999)), softmpm.simulate
-def simulate(*args, **kwargs):
-    if next(calls) == kill_at:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return real(*args, **kwargs)
-softmpm.simulate = simulate
-train.train(task, softmpm.build(task.scene, device="cpu"), settings, {str(out)!r})
-"""
-    ends = [subprocess.run([sys.executable, "-c", script, str(n)], check=False).returncode for n in (8, 10)]
+    ends = [forked.exit_code(train_till, n, task, settings, out) for n in (8, 10)]
     assert ends == [-signal.SIGKILL, -signal.SIGKILL]
     train.train(task, model, settings, out)
     assert_same(out, unbroken)

@@ -11,8 +11,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -22,7 +24,6 @@ import softmpm
 from softmpm.recording import file as recording_file
 from softmpm.recording.writer import strain
 
-ROOT = Path(__file__).parents[3]
 COUNT, NODES = 400, (16, 16)
 
 
@@ -161,10 +162,10 @@ def test_a_recording_is_read_while_it_is_written(tmp_path):
 
 def test_a_live_writer_never_disturbs_a_reader(tmp_path):
     """Read again and again while another process writes as fast as it can, all that is there is whole."""
-    run_here("reading", tmp_path / "run.h5", "15")
+    run_here(reading, tmp_path / "run.h5", 15)
 
 
-def reading(path: Path, times: str) -> None:
+def reading(path: Path, times: int) -> None:
     """Fork a writer, and read what it writes."""
     model, count = small_model(), 0
     with softmpm.Recorder(path, model) as recorder:
@@ -174,7 +175,7 @@ def reading(path: Path, times: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         write_for_ever(path, model, 1)
     try:
-        while count < int(times):
+        while count < times:
             with softmpm.Recording(path) as recording:
                 assert check(recording, model, 0) == 4 and recording.episodes[-1] >= count
                 assert all(check(recording, model, k) == 3 for k in recording.episodes[-3:-1] if k)
@@ -186,7 +187,7 @@ def reading(path: Path, times: str) -> None:
 
 def test_a_writer_waits_for_readers_that_open_the_file(tmp_path):
     """They hold a lock for a moment, which a writer that begins or resumes then would take for an error."""
-    run_here("opening", tmp_path / "run.h5", "200")
+    run_here(opening, tmp_path / "run.h5", 200)
 
 
 def test_a_file_that_stays_locked_is_named(tmp_path, monkeypatch):
@@ -202,7 +203,7 @@ def test_a_file_that_stays_locked_is_named(tmp_path, monkeypatch):
     recording_file.open_to_append(path).close()
 
 
-def opening(path: Path, times: str) -> None:
+def opening(path: Path, times: int) -> None:
     """Fork a reader that opens the file all the time, and resume again and again."""
     model = small_model()
     with softmpm.Recorder(path, model) as recorder:
@@ -212,7 +213,7 @@ def opening(path: Path, times: str) -> None:
         with softmpm.Recording(path):
             pass
     try:
-        for _ in range(int(times)):
+        for _ in range(times):
             softmpm.Recorder(path, model, resume_before=1).close()
     finally:
         os.kill(child, signal.SIGKILL)
@@ -326,13 +327,13 @@ KILLS = 12
 
 def test_killed_at_any_instant(tmp_path):
     """After kill -9 at random instants every frame that was acknowledged is there, whole, and a resumed run goes on."""
-    run_here("killing", tmp_path / "run.h5", str(KILLS))
+    run_here(killing, tmp_path / "run.h5", KILLS)
 
 
-def killing(path: Path, kills: str) -> None:
+def killing(path: Path, kills: int) -> None:
     """Fork a writer that goes on where the last one was killed, kill it, look; again and again."""
     model, start, frames_seen = small_model(), 0, 0
-    for trial in range(int(kills)):
+    for trial in range(kills):
         ears, mouth = os.pipe()
         child = os.fork()
         if child == 0:
@@ -360,15 +361,15 @@ def killing(path: Path, kills: str) -> None:
             told = [int(line[1]) for line in heard if line[0] == "scalars"]
             assert not told or recording.scalars["norm"][0][-1] >= told[-1]
             start = recording.episodes[-1] if 0 < len(recording.episodes) < 9 else 0
-    assert frames_seen > int(kills)
+    assert frames_seen > kills
 
 
 def test_dying_at_any_line(tmp_path):
     """Whichever line of the recorder was its last one, the file is there, readable, and holds what was acknowledged."""
-    run_here("dying", tmp_path, "first time")
+    run_here(dying, tmp_path)
 
 
-def dying(folder: Path, _: str) -> None:
+def dying(folder: Path) -> None:
     """Fork a writer that ends, as if killed, when it reaches its n-th new line; for every other n until it gets through."""
     model, begun, path = small_model(), folder / "begun.h5", folder / "run.h5"
     with softmpm.Recorder(begun, model) as recorder:
@@ -427,23 +428,23 @@ def write_for_ever(path: Path, model: softmpm.Model, start: int, until: int = 10
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="needs posix_fallocate to claim room")
 def test_a_full_disk_is_an_error_and_nothing_is_lost(tmp_path):
     """Without room ``frame`` raises OSError, also twice; the frames before are there, and the process lives."""
-    run_here("filling", tmp_path, "60000 61000 100000 123456")
+    run_here(filling, tmp_path, (60000, 61000, 100000, 123456))
 
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="needs posix_fallocate to claim room")
 def test_a_full_disk_at_the_start_is_an_error(tmp_path):
     """Without room for the beginning the file is named, and no draft stays."""
-    run_here("starting", tmp_path, "")
+    run_here(starting, tmp_path)
 
 
-def filling(folder: Path, rooms: str) -> None:
+def filling(folder: Path, rooms: Sequence[int]) -> None:
     """Record until the file meets a limit of the system on its size."""
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    for room in rooms.split():
-        fill(folder / f"{room}.h5", int(room))
+    for room in rooms:
+        fill(folder / f"{room}.h5", room)
 
 
-def starting(folder: Path, _: str) -> None:
+def starting(folder: Path) -> None:
     """Begin a recording where not even its beginning has room."""
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     model = small_model()
@@ -478,14 +479,9 @@ def fill(path: Path, room: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
-def run_here(function: str, *arguments: object) -> None:
+def run_here(function: Callable, *arguments: object) -> None:
     """Run a function of this file in a process of its own, to fork and die in."""
-    environment = os.environ | {
-        "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT / 'tests'}",
-        "OMP_NUM_THREADS": "1",
-    }
-    command = [sys.executable, __file__, function, *map(str, arguments)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
+    done = forked.said(function, *arguments, timeout=100.0)
     assert done.returncode == 0, done.stderr
 
 
@@ -496,8 +492,3 @@ def test_the_name_of_a_contact_fits(monkeypatch):
     layout = importlib.util.module_from_spec(found)
     found.loader.exec_module(layout)
     assert layout.STATIC["wall_contact"][0].itemsize == len("separate_slowly")
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    globals()[sys.argv[1]](Path(sys.argv[2]), sys.argv[3])
