@@ -31,7 +31,7 @@ def _record_best(runs: Runs, loggers: Sequence[RunLogger], done: Sequence[int]) 
     failures = Failures("freeze")
     params, inputs = runs.design()
     about = [{"of": runs.all[k].best["iteration"], "kind": "best"} for k in done]
-    with recorded(runs, [loggers[k] for k in done], about) as on_frame:
+    with recorded(runs, [loggers[k] for k in done], about) as on_frames:
         run_episode(
             runs.task,
             runs.model,
@@ -40,7 +40,7 @@ def _record_best(runs: Runs, loggers: Sequence[RunLogger], done: Sequence[int]) 
             params,
             inputs=inputs,
             goal=runs.middle_goals(),
-            on_frame=on_frame,
+            on_frame=on_frames and (lambda frame: on_frames([frame])),
             failures=failures,
         )
     for k, error in runs.failed(failures.errors).items():

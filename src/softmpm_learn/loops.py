@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 _Outcome = tuple[Episode, tuple[Tensor, ...], list[Frame]]
-"""Episode, gradients, and the frames of a captured graph, which were not passed to ``on_frame`` yet."""
+"""Episode, gradients, and the frames of a captured graph, which were not passed to ``on_frames`` yet."""
+OnFrames = Callable[[Sequence[Frame]], None]
+"""Takes frames that are known at once, in the order of time."""
 
 
 def _captures(model: Model) -> bool:
@@ -119,38 +121,37 @@ class ClosedLoop:
         self.design, self.weights, self.free = design, weights, free
         self.runs, self.keep_every = runs, keep_every
         self._goal: Tensor | None = None
-        self._on_frame: Callable[[Frame], None] | None = None
+        self._on_frames: OnFrames | None = None
         self._failures = softmpm.Failures("reset")
         self._captures = _captures(model)
         loop = weakref.proxy(self)  # a strong reference would be a cycle through the graph
         self._graph = softmpm.Graph(lambda: loop._work(), model.device)
 
     def __call__(
-        self, goal: Tensor | None, on_frame: Callable[[Frame], None] | None = None
+        self, goal: Tensor | None, on_frames: OnFrames | None = None
     ) -> tuple[Episode, tuple[Tensor, ...]]:
         """The episode, detached, and the gradient of each run's mean loss with respect to ``weights``, then to ``free``; overwritten
-        by the next call. ``on_frame`` is called for each control step, after a replay for all of them.
+        by the next call. ``on_frames`` is called at each control step, after a replay once with all of them.
 
         Raises:
             softmpm.UnstableError: One of :attr:`errors`.
         """
         if goal is not None:
             self._goal = goal.clone() if self._goal is None else self._goal.copy_(goal)
-        episode, gradients, frames = self._run(on_frame, self._captures and (self.records or not on_frame))
-        if on_frame and frames and self._failures and self.runs == 1:
+        episode, gradients, frames = self._run(on_frames, self._captures and (self.records or not on_frames))
+        if on_frames and frames and self._failures and self.runs == 1:
             del episode, gradients, frames  # a frame after the failure shows nothing
-            episode, gradients, frames = self._run(on_frame, as_graph=False)
-        if on_frame:
-            for frame in frames:
-                on_frame(frame)
+            episode, gradients, frames = self._run(on_frames, as_graph=False)
+        if on_frames and frames:
+            on_frames(frames)
         if self._failures:
             del episode, gradients, frames
             raise self._failures.errors[0]
         return episode, gradients
 
-    def _run(self, on_frame: Callable[[Frame], None] | None, as_graph: bool) -> _Outcome:
+    def _run(self, on_frames: OnFrames | None, as_graph: bool) -> _Outcome:
         self._failures.errors.clear()
-        self._on_frame = on_frame
+        self._on_frames = on_frames
         try:
             return self._graph() if as_graph else self._work()
         except softmpm.UnstableError as error:
@@ -158,7 +159,7 @@ class ClosedLoop:
                 self._failures.errors.append(error)
             raise
         finally:
-            self._on_frame = None
+            self._on_frames = None
 
     @property
     def errors(self) -> list[softmpm.UnstableError]:
@@ -169,9 +170,11 @@ class ClosedLoop:
         params, inputs = self.design()
         capturing = self.model.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
         frames = list[Frame]()
-        on_frame = self._on_frame
+        on_frames, on_frame = self._on_frames, None
         if capturing:
             on_frame = (lambda frame: frames.append(frame.detach())) if self.records else None
+        elif on_frames:
+            on_frame = lambda frame: on_frames([frame])  # noqa: E731
         # A failure must not hide those of other runs, and while a graph is captured none is known yet; a single run may stop at once.
         failures = self._failures if capturing or self.runs > 1 else None
         about: dict[str, Any] = dict(

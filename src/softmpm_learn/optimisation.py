@@ -187,8 +187,8 @@ def attempt(
     """
     due = [loggers[k] for k in runs.active if loggers and loggers[k].due(runs.all[k].iteration)]
     with clock(seconds, "episode"):
-        with runs.failing_together(), recorded(runs, due) as on_frame:
-            episode, gradients = runs.loop(goals, on_frame)
+        with runs.failing_together(), recorded(runs, due) as on_frames:
+            episode, gradients = runs.loop(goals, on_frames)
         return episode, take_gradients(runs, episode, gradients)
 
 

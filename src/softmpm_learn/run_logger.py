@@ -18,6 +18,7 @@ from softmpm_learn.csv_log import Table
 from softmpm_learn.episode import Frame
 from softmpm_learn.examination import NAMES
 from softmpm_learn.loggers import Loggers
+from softmpm_learn.loops import OnFrames
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 
@@ -181,6 +182,11 @@ class RunLogger:
             iteration % conf.record_every == 0 or iteration == conf.iterations - 1
         )
 
+    def together(self) -> contextlib.AbstractContextManager[None]:
+        """Frames recorded inside count together, see :meth:`softmpm.Recorder.together`."""
+        assert self._recorder is not None
+        return self._recorder.together()
+
     @contextlib.contextmanager
     def episode(self, world: int, **about) -> Iterator[Callable[..., None]]:
         """Record an episode of this world: gives what to call at each frame, with grid velocity and contact forces."""
@@ -219,12 +225,13 @@ class RunLogger:
 @contextlib.contextmanager
 def recorded(
     runs: Runs, loggers: Sequence[RunLogger], about: Sequence[dict] = ()
-) -> Iterator[Callable[[Frame], None] | None]:
-    """Record an episode of some runs: gives what to call at each frame, or None if nothing is recorded.
+) -> Iterator[OnFrames | None]:
+    """Record an episode of some runs: gives what to call with its frames, or None if nothing is recorded.
 
     Args:
         about: What to keep with the episode of each.
     """
+    recording = [one for one in loggers if one.records]
     with contextlib.ExitStack() as open_episodes:
         keep = [
             open_episodes.enter_context(one.episode(runs.worlds(runs.all.index(one.run)).start, **note))
@@ -233,12 +240,17 @@ def recorded(
         ]
 
         @torch.no_grad()
-        def on_frame(frame: Frame) -> None:
-            model, state = runs.model, frame.state
-            velocity, forces = softmpm.rasterize(model, state).velocity, None
-            if state.surface is not None or (model.surface is not None and state.nodes is not None):
-                forces = softmpm.contact_forces(model, state)
-            for one in keep:
-                one(frame, velocity, forces)
+        def on_frames(frames: Sequence[Frame]) -> None:
+            model = runs.model
+            with contextlib.ExitStack() as together:
+                for one in recording:
+                    together.enter_context(one.together())
+                for frame in frames:
+                    state, forces = frame.state, None
+                    velocity = softmpm.rasterize(model, state).velocity
+                    if state.surface is not None or (model.surface is not None and state.nodes is not None):
+                        forces = softmpm.contact_forces(model, state)
+                    for one in keep:
+                        one(frame, velocity, forces)
 
-        yield on_frame if keep else None
+        yield on_frames if keep else None

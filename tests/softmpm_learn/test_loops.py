@@ -79,11 +79,11 @@ def assert_same_frames(got: list[Frame], want: list[Frame]) -> None:
 def test_the_frames_of_a_replay_are_shown(task):
     """Those that the graph kept, in their order; only to a call that asks."""
     loop, live, replayed = recording_loop(task), list[Frame](), list[Frame]()
-    episode, gradients = loop(None, live.append)
+    episode, gradients = loop(None, live.extend)
     assert len(live) == task.control_steps + 1
     loop._graph = lambda: (episode, gradients, [frame.detach() for frame in live])
     loop(None)
-    assert loop(None, replayed.append) == (episode, gradients)
+    assert loop(None, replayed.extend) == (episode, gradients)
     assert_same_frames(replayed, live)
 
 
@@ -102,7 +102,7 @@ def test_frames_after_a_failure_are_not_shown(task):
 
     loop._graph, loop._work = replay, again
     with pytest.raises(softmpm.UnstableError, match="it tore again"):
-        loop(None, shown.append)
+        loop(None, shown.extend)
     assert [type(frame) for frame in shown] == [Frame] * (task.control_steps + 1)
     with pytest.raises(softmpm.UnstableError, match="it tore$"):
         loop(None)
@@ -120,10 +120,10 @@ def test_runs_that_record_nothing_keep_no_frames(task, model, settings, tmp_path
 def test_a_captured_graph_keeps_the_frames(task):
     """They are those of the simulation outside of a graph, of every replay, and nothing is captured for them a second time."""
     loop, frames = recording_loop(viscous(task), "cuda"), [list[Frame]() for _ in range(3)]
-    loop(None, frames[0].append)
+    loop(None, frames[0].extend)
     loop(None)
     graph = loop._graph._graph
     for some in frames[1:]:
-        loop(None, some.append)
+        loop(None, some.extend)
         assert_same_frames(some, frames[0])
     assert graph is not None and loop._graph._graph is graph

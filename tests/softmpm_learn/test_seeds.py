@@ -270,12 +270,12 @@ def test_seeds_that_fail_in_one_simulation_go_back_at_once(task, conf, tmp_path,
     conf, calls = changed(conf, observer=dict(name="centroids")), []
     real = ClosedLoop.__call__
 
-    def counted(self, goal, on_frame=None):
+    def counted(self, goal, on_frames=None):
         calls.append(1)
         with pytest.MonkeyPatch.context() as patch:
             if len(calls) == 3:
                 fails_in((0, 2), patch)
-            return real(self, goal, on_frame)
+            return real(self, goal, on_frames)
 
     monkeypatch.setattr(ClosedLoop, "__call__", counted)
     together(task, conf, tmp_path)

@@ -6,8 +6,11 @@ writes so that the file is always consistent; and a frame counts only once its r
 followed its data. Layout: ``format.py``.
 """
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +21,9 @@ from softmpm.recording.digest import Content, Hash
 from softmpm.recording.file import begin, open_to_append, put_in_place, room
 from softmpm.recording.format import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
 from softmpm.state import ContactForces, GridField, State
+
+FURTHER_FRAME = 2**16
+"""Bytes that HDF5 may need for itself with each further frame that is written together with others: a page for each row of a table."""
 
 
 class Recorder:
@@ -94,6 +100,7 @@ class Recorder:
         self._file = open_to_append(self.path)
         self._tables = tables(self._file)
         self._count = {name: len(table) for name, table in self._tables.items()}
+        self._waiting: list[_Waiting] | None = None
 
     @property
     def digest(self) -> str:
@@ -118,19 +125,47 @@ class Recorder:
         for row in rows:
             self._content.scalar(*row)
 
-    def _frame(
-        self, episode: int, time: float, values: dict[str, np.ndarray], parts: dict[str, np.ndarray]
-    ) -> None:
-        """One row in each table of a frame; it counts once the last, ``frame/index``, is written."""
-        rows = {f"frame/{name}": ("frame/index", one) for name, one in values.items()}
-        rows |= {PARTS[name]: (PARTS[name], one) for name, one in parts.items()}
-        with room(self._file, sum(one.nbytes for _, one in rows.values())):
-            for table, (counted, one) in rows.items():
-                put(self._tables[table], self._count[counted], one[None])
-        at = (self._count[PARTS[name]] if name in parts else -1 for name in PARTS)
-        self._write("frame/index", np.array([(episode, time, *at)], FRAME))
-        for name in parts:
-            self._count[PARTS[name]] += 1
+    @contextlib.contextmanager
+    def together(self) -> Iterator[None]:
+        """Frames recorded inside count once the block ends, all of them or none; for frames that are known at once. A disk is asked
+        to keep what was written twice in all, and not twice for each frame.
+        """
+        if self._waiting is not None:
+            raise ValueError("frames are being recorded together already.")
+        self._waiting = []
+        try:
+            yield
+            if self._waiting:
+                self._write_together(self._waiting)
+        finally:
+            self._waiting = None
+
+    def _frame(self, frame: "_Waiting") -> None:
+        """Write a frame, or let it wait for others."""
+        if self._waiting is None:
+            self._write_together([frame])
+        else:
+            self._waiting.append(frame)
+
+    def _write_together(self, frames: "list[_Waiting]") -> None:
+        """One row in each table for each frame; they count once the last rows, those of ``frame/index``, are written."""
+        self._need_open()
+        count, index = dict(self._count), []
+        first = count["frame/index"]
+        further = (len(frames) - 1) * FURTHER_FRAME
+        with room(self._file, sum(frame.bytes for frame in frames) + further):
+            for k, frame in enumerate(frames):
+                for name, one in frame.values.items():
+                    put(self._tables[f"frame/{name}"], first + k, one[None])
+                at = {name: count[table] if name in frame.parts else -1 for name, table in PARTS.items()}
+                for name, one in frame.parts.items():
+                    put(self._tables[PARTS[name]], at[name], one[None])
+                    count[PARTS[name]] += 1
+                index.append((frame.episode._row, frame.time, *at.values()))
+        self._write("frame/index", np.array(index, FRAME))
+        self._count |= {table: count[table] for table in PARTS.values()}
+        for frame in frames:
+            Content.frame(frame.episode._content, frame.time, frame.values | frame.parts)
 
     def _contact(self, forces: ContactForces, world: int) -> dict[str, np.ndarray]:
         """Forces of the walls, and tractions and places of the recorded points, of one world."""
@@ -168,6 +203,19 @@ class Recorder:
 
     def __exit__(self, *_) -> None:
         self.close()
+
+
+class _Waiting(NamedTuple):
+    """A frame that is to be written."""
+
+    episode: "Episode"
+    time: float
+    values: dict[str, np.ndarray]
+    parts: dict[str, np.ndarray]
+
+    @property
+    def bytes(self) -> int:
+        return sum(one.nbytes for one in (self.values | self.parts).values())
 
 
 class Episode:
@@ -223,8 +271,7 @@ class Episode:
             parts["latent"] = _one_world("latent", latent, world, size)
         if forces is not None:
             parts |= recorder._contact(forces, world)
-        recorder._frame(self._row, float(time), values, parts)
-        Content.frame(self._content, float(time), values | parts)
+        recorder._frame(_Waiting(self, float(time), values, parts))
 
     def __enter__(self) -> "Episode":
         return self

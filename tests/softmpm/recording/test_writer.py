@@ -102,6 +102,44 @@ def test_what_was_recorded_is_read(tmp_path):
         assert static["wall_offset"] == np.float32(0.1) and static["wall_contact"] == b"separate"
 
 
+def test_frames_that_are_recorded_together_count_together(tmp_path):
+    """They are those recorded one by one, with the same digest; none is there before the block ends, or if it fails."""
+    model = small_model()
+    with softmpm.Recorder(tmp_path / "one by one.h5", model) as recorder:
+        for iteration in (3, 4):
+            record(recorder, model, iteration)
+        digest = recorder.digest
+    path = tmp_path / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        with recorder.together():
+            record(recorder, model, 3)
+            with softmpm.Recording(path) as recording:
+                assert len(recording.rows(3)) == 0
+            with pytest.raises(ValueError, match="together already"), recorder.together():
+                pass
+        with softmpm.Recording(path) as recording:
+            assert check(recording, model, 3) == 4
+        with pytest.raises(ValueError, match="shape"):
+            together(recorder, [model.rest(), model.rest()._replace(x=torch.zeros(1, 3, 2))])
+        with softmpm.Recording(path) as recording:
+            assert recording.episodes == (3, 4) and len(recording.rows(4)) == 0
+        with recorder.together():
+            pass
+        with recorder.together():
+            record(recorder, model, 4)
+    with softmpm.Recording(path) as recording:
+        assert check(recording, model, 3) == 4 and check(recording, model, 4) == 4
+    with softmpm.Recorder(path, model, resume_before=5) as recorder:
+        assert recorder.digest == digest
+
+
+def together(recorder: softmpm.Recorder, states: list[softmpm.State]) -> None:
+    """Record these states together, as iteration 4, with a field each."""
+    with recorder.together(), recorder.episode(4) as episode:
+        for state in states:
+            episode.frame(0.0, state, field=torch.rand(*NODES, 2))
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_one_world_of_a_simulation_is_recorded(tmp_path, dim):
     """Of states, activations and rasterized fields of many worlds in float64, the chosen world is kept."""
@@ -429,6 +467,27 @@ def write_for_ever(path: Path, model: softmpm.Model, start: int, until: int = 10
 def test_a_full_disk_is_an_error_and_nothing_is_lost(tmp_path):
     """Without room ``frame`` raises OSError, also twice; the frames before are there, and the process lives."""
     run_here(filling, tmp_path, (60000, 61000, 100000, 123456))
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="needs posix_fallocate to claim room")
+def test_a_full_disk_loses_all_frames_recorded_together_and_none_before(tmp_path):
+    run_here(filling_together, tmp_path / "run.h5")
+
+
+def filling_together(path: Path) -> None:
+    """Record where there is room for one frame, but not for many."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    model = small_model()
+    with softmpm.Recorder(path, model) as recorder:
+        episode = recorder.episode(0)
+        limit = path.stat().st_size + 2**20 + 123456
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        episode.frame(0.0, model.rest())
+        with pytest.raises(OSError, match="no room to record"):
+            together(recorder, [model.rest()] * 50)
+        episode.frame(0.0, model.rest())
+    with softmpm.Recording(path) as recording:
+        assert len(recording.frames(0)["x"]) == 2
 
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="needs posix_fallocate to claim room")
