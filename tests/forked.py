@@ -1,8 +1,10 @@
 """Processes of their own that need not import PyTorch first: a server that has imported it forks them."""
 
+import itertools
 import multiprocessing
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tempfile
@@ -10,6 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+
+import softmpm
 
 PATH = os.pathsep.join([str(Path(__file__).parents[1] / "src"), str(Path(__file__).parent)])
 METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
@@ -80,3 +84,15 @@ def _python(words: Sequence[str], folder: Path) -> None:
     else:
         sys.argv[:] = words
         runpy.run_path(words[0], run_name="__main__")
+
+
+def kill_at_simulation(number: int) -> None:
+    """Let this process kill itself when the simulator is called for this time, counted from 0."""
+    calls, real = itertools.count(), softmpm.simulate
+
+    def simulate(*args, **kwargs):
+        if next(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*args, **kwargs)
+
+    softmpm.simulate = simulate

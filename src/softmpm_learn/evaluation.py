@@ -56,7 +56,7 @@ def evaluate(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
 
 
 def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
-    """Evaluate the best of some runs again, from other starts. Afterwards each of these runs has the policy and the design of its best.
+    """Evaluate the best motions of some runs again, from other starts. These runs are left with the policies and designs of their best.
 
     If the best of a run that settles does not repeat itself, the next best takes its place and is evaluated too. There are at most
     :data:`ROUNDS` evaluations, the last of which is accepted in any case. If no motion is left that is worth going on with, the run

@@ -231,19 +231,19 @@ def recorded(
     Args:
         about: What to keep with the episode of each.
     """
-    recording = [one for one in loggers if one.records]
+    notes = zip(loggers, about or [{}] * len(loggers), strict=True)
+    recording = [(one, note) for one, note in notes if one.records]
     with contextlib.ExitStack() as open_episodes:
         keep = [
             open_episodes.enter_context(one.episode(runs.worlds(runs.all.index(one.run)).start, **note))
-            for one, note in zip(loggers, about or [{}] * len(loggers), strict=True)
-            if one.records
+            for one, note in recording
         ]
 
         @torch.no_grad()
         def on_frames(frames: Sequence[Frame]) -> None:
             model = runs.model
             with contextlib.ExitStack() as together:
-                for one in recording:
+                for one, _ in recording:
                     together.enter_context(one.together())
                 for frame in frames:
                     state, forces = frame.state, None

@@ -6,7 +6,6 @@ import dataclasses
 import gc
 import itertools
 import math
-import os
 import re
 import signal
 from pathlib import Path
@@ -454,14 +453,7 @@ def test_killed_between_two_checkpoints_it_goes_on(task, conf, whole, tmp_path, 
 
 def together_till(number: int, task, conf: Settings, out: Path) -> None:
     """:func:`together` in a process that kills itself when it calls the simulator for this time."""
-    calls, real = itertools.count(), softmpm.simulate
-
-    def simulate(*args, **kwargs):
-        if next(calls) == number:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return real(*args, **kwargs)
-
-    softmpm.simulate = simulate
+    forked.kill_at_simulation(number)
     together(task, conf, out)
 
 

@@ -129,14 +129,7 @@ def test_interrupted_anywhere_it_goes_on_as_if_nothing_had_been(
 
 def train_till(number: int, task, settings: Settings, out: Path) -> None:
     """A run in a process that kills itself when it calls the simulator for this time."""
-    calls, real = itertools.count(), softmpm.simulate
-
-    def simulate(*args, **kwargs):
-        if next(calls) == number:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return real(*args, **kwargs)
-
-    softmpm.simulate = simulate
+    forked.kill_at_simulation(number)
     train.train(task, softmpm.build(task.scene, device="cpu"), settings, out)
 
 

@@ -1,7 +1,7 @@
 """Thread-safe kernel definition and loading: Warp's module registry is not thread-safe (undocumented), so one lock serialises both.
 
-Modules are compiled one after another. In threads of their own (Warp 1.19), the modules of a chunk and of its adjoint took 1.5 and
-0.8 s instead of 1.3 and 0.9 s for a GPU, and 3.1 and 2.1 s instead of 2.1 and 2.4 s for a CPU of two cores.
+Modules are compiled one after another. In a trial with a thread for each (Warp 1.19) the modules of a chunk and of its adjoint took
+1.5 and 0.8 s instead of 1.3 and 0.9 s for an H100, and 3.1 and 2.1 s instead of 2.1 and 2.4 s for a CPU of two cores.
 
 Modules of :func:`in_order` have Warp's deterministic mode: on a GPU ``wp.atomic_add`` writes a record (node, thread, term) instead of
 adding, and after the kernel Warp sorts the records and adds up those of each node in the order of the threads, as the CPU does.

@@ -127,9 +127,8 @@ class Recorder:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """Frames recorded inside count once the block ends, all of them or none; for frames that are known at once. A disk is asked
-        to keep what was written twice in all, and not twice for each frame.
-        """
+        """Write the frames that are recorded inside at the end of the block, all of them or none: the file is flushed twice in all,
+        instead of twice for each frame."""
         if self._waiting is not None:
             raise ValueError("frames are being recorded together already.")
         self._waiting = []
@@ -151,12 +150,11 @@ class Recorder:
         """One row in each table for each frame; they count once the last rows, those of ``frame/index``, are written."""
         self._need_open()
         count, index = dict(self._count), []
-        first = count["frame/index"]
-        further = (len(frames) - 1) * FURTHER_FRAME
-        with room(self._file, sum(frame.bytes for frame in frames) + further):
-            for k, frame in enumerate(frames):
+        size = sum(one.nbytes for frame in frames for one in (frame.values | frame.parts).values())
+        with room(self._file, size + (len(frames) - 1) * FURTHER_FRAME):
+            for row, frame in enumerate(frames, start=count["frame/index"]):
                 for name, one in frame.values.items():
-                    put(self._tables[f"frame/{name}"], first + k, one[None])
+                    put(self._tables[f"frame/{name}"], row, one[None])
                 at = {name: count[table] if name in frame.parts else -1 for name, table in PARTS.items()}
                 for name, one in frame.parts.items():
                     put(self._tables[PARTS[name]], at[name], one[None])
@@ -212,10 +210,6 @@ class _Waiting(NamedTuple):
     time: float
     values: dict[str, np.ndarray]
     parts: dict[str, np.ndarray]
-
-    @property
-    def bytes(self) -> int:
-        return sum(one.nbytes for one in (self.values | self.parts).values())
 
 
 class Episode:
