@@ -60,11 +60,16 @@ CUDA_CALLABLE inline void meet()
 #endif
 }
 
-// Wait for all threads of a cluster of blocks; they see what the others have written before.
-CUDA_CALLABLE inline void meet_cluster()
+// Wait for all threads of a cluster of blocks; they see what the others have written before. With ALIGNED the threads of a warp wait for
+// each other first, and the compiler relies on it.
+template <bool ALIGNED> CUDA_CALLABLE inline void meet_cluster()
 {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    asm volatile("barrier.cluster.arrive.release;\n\tbarrier.cluster.wait.acquire;" ::: "memory");
+    if (ALIGNED) {
+        __syncwarp();
+        asm volatile("barrier.cluster.arrive.release.aligned;\n\tbarrier.cluster.wait.acquire.aligned;" ::: "memory");
+    } else
+        asm volatile("barrier.cluster.arrive.release;\n\tbarrier.cluster.wait.acquire;" ::: "memory");
 #endif
 }
 
@@ -77,29 +82,36 @@ template <int ACROSS, int ALONG, unsigned DIM> CUDA_CALLABLE inline void meet_sl
 #endif
 }
 
-// Copy a nodal field of the window; complete after meet().
-template <int FIELD, int NODES, int THREADS, typename T, unsigned DIM>
-CUDA_CALLABLE inline void stage(
-    const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int lane)
+// Nodes of the window that a thread copies, or -1.
+template <int NODES, int THREADS>
+CUDA_CALLABLE inline wp::vec_t<(NODES + THREADS - 1) / THREADS, int> window_nodes(const wp::array_t<int>& window, int brick, int lane)
 {
     constexpr int EACH = (NODES + THREADS - 1) / THREADS;
-    Node<T, DIM>* nodes = shared_nodes<FIELD, NODES, T, DIM>();
     const int* node = window.data + brick * NODES;
+    wp::vec_t<EACH, int> at;
+#pragma unroll
+    for (int n = 0; n < EACH; ++n)
+        at.c[n] = node[lane + n * THREADS < NODES ? lane + n * THREADS : 0];
+    return at;
+}
+
+// Copy a nodal field of the window; complete after meet().
+template <int FIELD, int NODES, int THREADS, unsigned EACH, typename T, unsigned DIM>
+CUDA_CALLABLE inline void stage(
+    const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::vec_t<EACH, int>& at, int world, int lane)
+{
+    Node<T, DIM>* nodes = shared_nodes<FIELD, NODES, T, DIM>();
     const wp::vec_t<DIM, T>* first = values.data + size_t(world) * values.shape[1];
-    int at[EACH];
     wp::vec_t<DIM, T> value[EACH];
 #pragma unroll
-    for (int n = 0; n < EACH; ++n)
-        at[n] = node[lane + n * THREADS < NODES ? lane + n * THREADS : 0];
+    for (int n = 0; n < int(EACH); ++n)
+        value[n] = first[at.c[n] > 0 ? at.c[n] : 0];
 #pragma unroll
-    for (int n = 0; n < EACH; ++n)
-        value[n] = first[at[n] > 0 ? at[n] : 0];
-#pragma unroll
-    for (int n = 0; n < EACH; ++n)
+    for (int n = 0; n < int(EACH); ++n)
         if (lane + n * THREADS < NODES) {
             Node<T, DIM> node = {};  // stored as a whole, as it is read
             for (unsigned axis = 0; axis < DIM; ++axis)
-                node.at[axis] = at[n] >= 0 ? value[n].c[axis] : T(0);
+                node.at[axis] = at.c[n] >= 0 ? value[n].c[axis] : T(0);
             nodes[lane + n * THREADS] = node;
         }
 }
@@ -174,16 +186,17 @@ CUDA_CALLABLE inline void clear_sums(const wp::array_t<wp::vec_t<DIM, T>>& parti
 }
 
 // Write the sums that each thread has for one component of the COUNT nodes of a cell, of which `corner` is the first in the window, or -1.
-// Sums of each component are taken in three planes, one for each first offset of a node in its cell. Within a plane only cells with the
-// same first coordinate share nodes, and these add one offset after the other.
-template <int NODES, int THREADS, int COUNT, int ACROSS, int ALONG, typename T, unsigned DIM>
+// Components of FIELDS fields are counted on. Sums of each component are taken in three planes, one for each first offset of a node in its
+// cell. Within a plane only cells with the same first coordinate share nodes, and these add one offset after the other.
+template <int SIZE, int NODES, int THREADS, int COUNT, int ACROSS, int ALONG, int FIELDS, typename T, unsigned DIM>
 CUDA_CALLABLE inline void write_sums(
-    const wp::vec_t<COUNT, T>& total, const wp::array_t<wp::vec_t<DIM, T>>& partial, int world, int brick, int corner, int axis,
-    int lane)
+    const wp::vec_t<COUNT, T>& total, const wp::array_t<wp::vec_t<DIM, T>>& first, const wp::array_t<wp::vec_t<DIM, T>>& second,
+    int world, int brick, int corner, int axis, int lane)
 {
-    constexpr int TURNS = COUNT / 3;
-    T* sums = shared_terms<3 * NODES * int(DIM), T>();
-    for (int k = lane; k < 3 * NODES * int(DIM); k += THREADS)
+    constexpr int TURNS = COUNT / 3, ALL = NODES * int(DIM);
+    static_assert(3 * ALL * FIELDS <= SIZE);
+    T* sums = shared_terms<SIZE, T>();  // in place of what the particles gave
+    for (int k = lane; k < 3 * ALL * FIELDS; k += THREADS)
         sums[k] = T(0);
     meet();
 #pragma unroll
@@ -197,10 +210,11 @@ CUDA_CALLABLE inline void write_sums(
         meet_slice<ACROSS, ALONG, DIM>();
     }
     meet();
-    T* out = reinterpret_cast<T*>(partial.data + size_t(world) * partial.shape[1] + brick * NODES);
-    for (int k = lane; k < NODES * int(DIM); k += THREADS) {
-        const T* own = sums + k % DIM * 3 * NODES + k / DIM;
-        out[k] = own[0] + own[NODES] + own[2 * NODES];
+    const size_t place = size_t(world) * first.shape[1] + brick * NODES;
+    for (int n = lane; n < ALL * FIELDS; n += THREADS) {
+        const int field = n / ALL, k = n - field * ALL;
+        const T* own = sums + (field * int(DIM) + k % DIM) * 3 * NODES + k / DIM;
+        reinterpret_cast<T*>((field == 0 ? first : second).data + place)[k] = own[0] + own[NODES] + own[2 * NODES];
     }
     meet();  // the sums may be used again
 }

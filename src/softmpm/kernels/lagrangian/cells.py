@@ -16,8 +16,10 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
+from softmpm.kernels.lagrangian.pair_sums import pair_sums
 from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
 from softmpm.kernels.lagrangian.rest import rest
+from softmpm.kernels.lagrangian.seats import seats
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
 
@@ -29,7 +31,9 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     check, check_step, memory = one.check, one.check_step, chunk(dim, spec.dtype)
     Chunk, state_of = memory.Chunk, memory.state_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number) for number in range(2))
-    stage_u, stage_v, gradient_u, gradient_v = of_u.stage, of_v.stage, of_u.gradient, of_v.gradient
+    stage, stage_u, stage_v = of_u.stage, of_u.stage_at, of_v.stage_at
+    gradient_u, gradient_v, seat = of_u.gradient, of_v.gradient, seats(spec, bricks)
+    Seat, seat_of, occupant_of = seat.Seat, seat.seat_of, seat.occupant_of
     viscous, loaded, settings = spec.viscosity, "force" in spec.given, bricks.settings
     of_f = sums(dim, spec.dtype, bricks, loaded)
     line, clear, add, write, place_of = of_f.line, of_f.clear, of_f.add, of_f.write, of_f.place_of
@@ -41,6 +45,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         world: int,
         brick: int,
         lane: int,
+        seat: Seat,
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
@@ -50,40 +55,38 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         now = state_of(at, s)
         u = at.u[now]
         v = at.v[now]
-        first = inside.rows[brick]  # loaded while the nodes are awaited
-        last = inside.rows[brick + 1]
-        corner = inside.corners[brick, lane % count]
-        p = place_of(inside, first, lane)
-        stage_u(u, inside, world, brick, lane)
+        corner = seat.corner
+        who = seat.occupant
+        stage_u(u, seat.nodes, world, lane)
         if wp.static(viscous):
-            stage_v(v, inside, world, brick, lane)
+            stage_v(v, seat.nodes, world, lane)
         clear(at.partial, world, brick)
         meet()
         total = line()
-        for row in range(first, last):
+        for row in range(seat.first, seat.last):
             for slot in range(lane, turns, threads):
                 if wp.static(serial):
                     corner = inside.corners[brick, slot % count]
-                    p = place_of(inside, row, slot)
-                fx = vec()
+                    who = occupant_of(inside, inputs, world, row, slot)
+                p = who.place
                 A = mat()
                 b = vec()
                 if p >= 0:
-                    fx = inside.fraction[p]
-                    H = gradient_u(u, inside, world, brick, corner, fx, constants.rate)  # (Q1)
+                    H = gradient_u(u, inside, world, brick, corner, who.fx, constants.rate)  # (Q1)
                     rate = mat()
                     if wp.static(viscous):
-                        rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
-                    A = constants.rate * forced(inputs, world, p, H, rate)  # (Q2)
+                        rate = gradient_v(v, inside, world, brick, corner, who.fx, constants.rate)
+                    A = constants.rate * forced(who.given, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
                     if s > 0:  # last, so that nothing waits for it
                         check(constants, at.words, world, inside.order[p], s - 1, H)
+                fx = who.fx
                 if wp.static(not serial):
-                    if row + 1 < last:
-                        p = place_of(inside, row + 1, lane)
+                    if row + 1 < seat.last:  # loaded while the sums are taken
+                        who = occupant_of(inside, inputs, world, row + 1, lane)
                 total = add(total, at.partial, world, brick, slot, corner, fx, A, b)
-        write(total, at.partial, inside, world, brick, lane)
+        write(total, at.partial, corner, world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def forces(
@@ -94,7 +97,8 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         s: int,
     ):
         world, brick, lane = wp.tid()
-        forces_at(world, brick, lane, constants, inputs, inside, at, s)
+        seat = seat_of(inside, inputs, world, brick, lane)
+        forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
 
     @wp.kernel(module=module, **settings)
     def check_end(
@@ -109,7 +113,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     ):
         """Check the final state of a chunk, of which no forces are computed."""
         world, brick, lane = wp.tid()
-        stage_u(u, inside, world, brick, lane)
+        stage(u, inside, world, brick, lane)
         meet()
         for row in range(inside.rows[brick], inside.rows[brick + 1]):
             for slot in range(lane, turns, threads):
@@ -134,7 +138,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     ):
         """Check the state at the beginning of a substep, with the step limit."""
         world, brick, lane = wp.tid()
-        stage_u(u, inside, world, brick, lane)
+        stage(u, inside, world, brick, lane)
         meet()
         for row in range(inside.rows[brick], inside.rows[brick + 1]):
             for slot in range(lane, turns, threads):
@@ -149,7 +153,13 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         at = place
                     check_step(constants, inputs, words, world, at, p, substep, H)
 
-    return SimpleNamespace(forces=forces, forces_at=forces_at, check_end=check_end, check_start=check_start)
+    return SimpleNamespace(
+        seat_of=seat_of,
+        forces=forces,
+        forces_at=forces_at,
+        check_end=check_end,
+        check_start=check_start,
+    )
 
 
 @kernel_factory
@@ -164,16 +174,17 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     forced_adj, check_adj = one.forced_adj, one.check_adj
     of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number) for number in range(3))
-    stage_u, stage_f, stage_v = of_u.stage, of_f.stage, of_v.stage
+    stage_u, stage_f, stage_v = of_u.stage_at, of_f.stage_at, of_v.stage_at
     gradient_u, gradient_f, gradient_v, value_f = of_u.gradient, of_f.gradient, of_v.gradient, of_f.value
-    total_of, viscous, loaded = sums(dim, spec.dtype, bricks, False), spec.viscosity, "force" in wanted
-    line, clear, add, write, place_of = (
-        total_of.line,
-        total_of.clear,
-        total_of.add,
-        total_of.write,
-        total_of.place_of,
+    one_sum, both, viscous = (
+        sums(dim, spec.dtype, bricks, False),
+        pair_sums(dim, spec.dtype, bricks),
+        spec.viscosity,
     )
+    clear, add, write, add_both, write_both = one_sum.clear, one_sum.add, one_sum.write, both.add, both.write
+    lines, loaded = both.Lines if viscous else one_sum.line, "force" in wanted
+    seat = seats(spec, bricks)
+    Seat, seat_of, occupant_of = seat.Seat, seat.seat_of, seat.occupant_of
     count, turns, threads, settings = bricks.cell_count, bricks.turns, bricks.threads, bricks.settings
     serial, memory = bricks.serial, chunk(dim, spec.dtype)
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
@@ -184,6 +195,7 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         world: int,
         brick: int,
         lane: int,
+        seat: Seat,
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
@@ -194,50 +206,51 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
     ):
         u = at.u[s]
         v = at.v[s]
-        first = inside.rows[brick]  # loaded while the nodes are awaited
-        last = inside.rows[brick + 1]
-        corner = inside.corners[brick, lane % count]
-        p = place_of(inside, first, lane)
-        stage_u(u, inside, world, brick, lane)
-        stage_f(bar.f, inside, world, brick, lane)
+        corner = seat.corner
+        who = seat.occupant
+        stage_u(u, seat.nodes, world, lane)
+        stage_f(bar.f, seat.nodes, world, lane)
         clear(bar.partial_u, world, brick)
         if wp.static(viscous):
-            stage_v(v, inside, world, brick, lane)
+            stage_v(v, seat.nodes, world, lane)
             clear(bar.partial_v, world, brick)
         meet()
-        total_u = line()
-        total_v = line()
-        for row in range(first, last):
+        total = lines()
+        for row in range(seat.first, seat.last):
             for slot in range(lane, turns, threads):
                 if wp.static(serial):
                     corner = inside.corners[brick, slot % count]
-                    p = place_of(inside, row, slot)
-                fx = vec()
+                    who = occupant_of(inside, inputs, world, row, slot)
+                p = who.place
                 A = mat()
                 B = mat()
                 if p >= 0:
-                    fx = inside.fraction[p]
-                    H = gradient_u(u, inside, world, brick, corner, fx, constants.rate)
-                    G = gradient_f(bar.f, inside, world, brick, corner, fx, constants.rate)
+                    H = gradient_u(u, inside, world, brick, corner, who.fx, constants.rate)
+                    G = gradient_f(bar.f, inside, world, brick, corner, who.fx, constants.rate)
                     rate = mat()
                     if wp.static(viscous):
-                        rate = gradient_v(v, inside, world, brick, corner, fx, constants.rate)
-                    adj = forced_adj(inputs, world, p, H, rate, G, adj_inputs)
+                        rate = gradient_v(v, inside, world, brick, corner, who.fx, constants.rate)
+                    adj = forced_adj(who.given, H, rate, G, world, p, adj_inputs)
                     check_adj(at.words, world, inside.order[p], at.length - 1 - s, adj)
                     A = constants.rate * adj.F  # (Q1.adj)
                     B = constants.rate * adj.rate
                     if wp.static(loaded):
-                        share = value_f(bar.f, inside, world, brick, corner, fx)
+                        share = value_f(bar.f, inside, world, brick, corner, who.fx)
                         adj_inputs.force[world, p] = adj_inputs.force[world, p] + share
+                fx = who.fx
                 if wp.static(not serial):
-                    if row + 1 < last:
-                        p = place_of(inside, row + 1, lane)
-                total_u = add(total_u, bar.partial_u, world, brick, slot, corner, fx, A, vec())
+                    if row + 1 < seat.last:
+                        who = occupant_of(inside, inputs, world, row + 1, lane)
                 if wp.static(viscous):
-                    total_v = add(total_v, bar.partial_v, world, brick, slot, corner, fx, B, vec())
-        write(total_u, bar.partial_u, inside, world, brick, lane)
+                    total = add_both(
+                        total, bar.partial_u, bar.partial_v, world, brick, slot, corner, fx, A, B
+                    )
+                else:
+                    total = add(total, bar.partial_u, world, brick, slot, corner, fx, A, vec())
         if wp.static(viscous):
-            write(total_v, bar.partial_v, inside, world, brick, lane)
+            write_both(total, bar.partial_u, bar.partial_v, corner, world, brick, lane)
+        else:
+            write(total, bar.partial_u, corner, world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def forces_adj(
@@ -250,6 +263,7 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         s: int,
     ):
         world, brick, lane = wp.tid()
-        forces_adj_at(world, brick, lane, constants, inputs, inside, at, bar, adj_inputs, s)
+        seat = seat_of(inside, inputs, world, brick, lane)
+        forces_adj_at(world, brick, lane, seat, constants, inputs, inside, at, bar, adj_inputs, s)
 
-    return SimpleNamespace(forces_adj=forces_adj, forces_adj_at=forces_adj_at)
+    return SimpleNamespace(seat_of=seat_of, forces_adj=forces_adj, forces_adj_at=forces_adj_at)

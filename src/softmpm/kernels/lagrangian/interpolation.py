@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, meet
+from softmpm.kernels.lagrangian.bricks import Bricks, meet, window
 from softmpm.kernels.lagrangian.fours import fours
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
@@ -27,11 +27,11 @@ def field(dim: int, dtype: str, bricks: Bricks, number: int, layered: bool = Fal
     real, vec, mat, Rest, weights, lean = t.real, t.vec, t.mat, r.Rest, r.weights, r.lean
     nodes, across, along = bricks.nodes, bricks.window[-2], bricks.window[-1]
     threads, of_one = bricks.layer_threads if layered else bricks.threads, fours(dim, dtype, bricks).gradient
+    windows = window(bricks, threads)
+    Window, window_of = windows.Window, windows.window_of
 
-    @wp.func_native(f"softmpm::stage<{number}, {nodes}, {threads}>(values, window, world, brick, lane);")
-    def copy_window(
-        values: wp.array2d(dtype=vec), window: wp.array2d(dtype=wp.int32), world: int, brick: int, lane: int
-    ): ...
+    @wp.func_native(f"softmpm::stage<{number}, {nodes}, {threads}>(values, at, world, lane);")
+    def copy_window(values: wp.array2d(dtype=vec), at: Window, world: int, lane: int): ...
 
     @wp.func_native(f"return softmpm::fetch<{number}, {nodes}>(values, window, world, brick, k);")
     def fetch(
@@ -39,10 +39,14 @@ def field(dim: int, dtype: str, bricks: Bricks, number: int, layered: bool = Fal
     ) -> vec: ...
 
     @wp.func
-    def stage(values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, lane: int):
+    def stage_at(values: wp.array2d(dtype=vec), at: Window, world: int, lane: int):
         """Make a field ready, after :func:`meet`."""
         if wp.static(not bricks.serial):
-            copy_window(values, inside.window, world, brick, lane)
+            copy_window(values, at, world, lane)
+
+    @wp.func
+    def stage(values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, lane: int):
+        stage_at(values, window_of(inside.window, brick, lane), world, lane)
 
     @wp.func
     def node(values: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, k: int) -> vec:
@@ -156,7 +160,7 @@ def field(dim: int, dtype: str, bricks: Bricks, number: int, layered: bool = Fal
             w = weights(fx)
             return rate * of_one(values, inside.window, world, brick, corner, w, lean(w, fx))
 
-    return SimpleNamespace(stage=stage, gradient=gradient, value=value)
+    return SimpleNamespace(stage=stage, stage_at=stage_at, gradient=gradient, value=value)
 
 
 @kernel_factory
@@ -171,8 +175,8 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
     parts, slots, serial = bricks.parts, bricks.slots, bricks.serial
     across, along, kinds = bricks.window[-2], bricks.window[-1], dim + (2 if loaded else 1)
     line = wp.types.vector(count, real)
-    terms, add_of_one = f"{kinds * dim * slots}, {slots}", fours(dim, dtype, bricks).add
-    sizes = f"{nodes}, {threads}, {count}, {across}, {along}"
+    add_of_one, size = fours(dim, dtype, bricks).add, bricks.terms(kinds * dim, 1)
+    terms, sizes = f"{size}, {slots}", f"{size}, {nodes}, {threads}, {count}, {across}, {along}, 1"
 
     @wp.func_native(f"softmpm::give<{terms}>(number, lane, value);")
     def give(number: int, lane: int, value: vec): ...
@@ -180,7 +184,9 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
     @wp.func_native(f"return softmpm::given<{terms}, {t.c_name}, {dim}>(number, lane);")
     def given(number: int, lane: int) -> vec: ...
 
-    @wp.func_native(f"softmpm::write_sums<{sizes}>(total, partial, world, brick, corner, axis, lane);")
+    @wp.func_native(
+        f"softmpm::write_sums<{sizes}>(total, partial, partial, world, brick, corner, axis, lane);"
+    )
     def write_shared(
         total: line,
         partial: wp.array2d(dtype=vec),
@@ -285,12 +291,14 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
             return new
 
     @wp.func
-    def write(total: line, partial: wp.array2d(dtype=vec), inside: Rest, world: int, brick: int, lane: int):
-        """Write the sums that ``add`` returned last."""
+    def write(total: line, partial: wp.array2d(dtype=vec), corner: int, world: int, brick: int, lane: int):
+        """Write the sums that ``add`` returned last; ``corner`` is that of cell ``lane`` modulo their number."""
         if wp.static(not serial):
-            corner = int(-1)
+            own = int(-1)
             if lane < cells * dim:
-                corner = inside.corners[brick, lane % cells]
-            write_shared(total, partial, world, brick, corner, lane / cells, lane)
+                own = corner
+            write_shared(total, partial, world, brick, own, lane / cells, lane)
 
-    return SimpleNamespace(line=line, clear=clear, place_of=place_of, add=add, write=write)
+    return SimpleNamespace(
+        line=line, with_term=with_term, row_of=row_of, clear=clear, place_of=place_of, add=add, write=write
+    )

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.nodes import nodes
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
@@ -107,12 +108,9 @@ def mirror(spec: Spec) -> SimpleNamespace:
 def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one, Mirror = types(spec.dim, spec.dtype), mirror(spec), mirror_type(spec.dim, spec.dtype)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, rest(spec.dim, spec.dtype).Rest
-    GridInputs, node_velocity, place = (
-        input_types(spec).GridInputs,
-        grid(spec).node_velocity,
-        nodes(spec).place,
-    )
-    total_mass, mean, exact_vec = one.total_mass, one.mean, types(spec.dim, "float64").vec
+    GridInputs, node_velocity = input_types(spec).GridInputs, grid(spec).node_velocity
+    node_of, exact = nodes(spec).node_of, frame(spec.dim, spec.dtype).exact
+    total_mass, mean = one.total_mass, one.mean
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -130,8 +128,9 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         """Velocity before the reflection."""
         world, i = wp.tid()
-        here = place(constants, inside, i, exact_vec(), u[world, i])  # such worlds have no shift
-        v[world, i] = node_velocity(constants, inputs, world, here, p[world, i], mass[world, i])
+        node = node_of(constants, inside, mass, world, i)
+        here = node.rest + exact(u[world, i])  # such worlds have no shift
+        v[world, i] = node_velocity(constants, inputs, world, here, p[world, i], node.m)
 
     @wp.kernel(module=module, enable_backward=False)
     def reflect_adj(

@@ -14,15 +14,15 @@ from softmpm.kernels.structs import types
 
 @kernel_factory
 def node_sums(dim: int, dtype: str) -> SimpleNamespace:
-    t, Rest, gathered = types(dim, dtype), rest(dim, dtype).Rest, gathering(dim, dtype)
-    real, vec = t.real, t.vec
+    t, Rest, one = types(dim, dtype), rest(dim, dtype).Rest, gathering(dim, dtype)
+    real, vec, entries_of, gathered = t.real, t.vec, one.entries_of, one.gathered
     module = lagrangian_module(f"softmpm.d{dim}.{dtype}.node_sums")
 
     @wp.kernel(module=module, enable_backward=False)
     def mass(inside: Rest, partial: wp.array2d(dtype=vec), out: wp.array2d(dtype=real)):
         """(Q2)"""
         world, i = wp.tid()
-        out[world, i] = gathered(partial, inside, world, i)[0]
+        out[world, i] = gathered(partial, entries_of(inside, i), world)[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def fields(
@@ -34,8 +34,9 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
     ):
         """(Q5.adj)"""
         world, i = wp.tid()
-        u[world, i] = gathered(partial_u, inside, world, i)
-        v[world, i] = gathered(partial_v, inside, world, i)
+        entries = entries_of(inside, i)
+        u[world, i] = gathered(partial_u, entries, world)
+        v[world, i] = gathered(partial_v, entries, world)
 
     @wp.kernel(module=module, enable_backward=False)
     def means(
@@ -49,9 +50,10 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
         """(Q6); nodes at the very edge of a spline have no mass."""
         world, i = wp.tid()
         m = mass[world, i]
+        entries = entries_of(inside, i)
         if m > real(0.0):
-            u[world, i] = gathered(partial_u, inside, world, i) / m
-            v[world, i] = gathered(partial_v, inside, world, i) / m
+            u[world, i] = gathered(partial_u, entries, world) / m
+            v[world, i] = gathered(partial_v, entries, world) / m
         else:
             u[world, i] = vec()
             v[world, i] = vec()

@@ -23,51 +23,75 @@ from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_
 
 
 @kernel_factory
-def gathering(dim: int, dtype: str):
+def gathering(dim: int, dtype: str) -> SimpleNamespace:
     vec, Rest, most = types(dim, dtype).vec, rest(dim, dtype).Rest, 2**dim
-    entries = wp.types.vector(most, wp.int32)
+    Entries = wp.types.vector(most, wp.int32)
 
     @wp.func
-    def gathered(partial: wp.array2d(dtype=vec), inside: Rest, world: int, i: int) -> vec:
-        """Sum of what the bricks around a node have for it, in a fixed order. Loads without branches wait for memory together."""
-        entry = entries()
+    def entries_of(inside: Rest, i: int) -> Entries:
+        """Where the partial sums for a node are, or -1."""
+        out = Entries()
         for n in range(most):
-            entry[n] = inside.shares[n, i]
+            out[n] = inside.shares[n, i]
+        return out
+
+    @wp.func
+    def gathered(partial: wp.array2d(dtype=vec), entries: Entries, world: int) -> vec:
+        """Sum of what the bricks around a node have for it, in a fixed order. Loads without branches wait for memory together."""
         total = vec()
         for n in range(most):
-            share = partial[world, wp.max(entry[n], 0)]
-            if entry[n] >= 0:
+            share = partial[world, wp.max(entries[n], 0)]
+            if entries[n] >= 0:
                 total += share
         return total
 
-    return gathered
+    return SimpleNamespace(Entries=Entries, entries_of=entries_of, gathered=gathered)
 
 
 @kernel_factory
 def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
-    vec, Constants, Rest = t.vec, t.Constants, r.Rest
+    real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
     exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
-    position, node_velocity = g.position, g.node_velocity
-    gathered, surface = gathering(spec.dim, spec.dtype), bool(spec.surface_walls)
+    position, node_velocity, sums = g.position, g.node_velocity, gathering(spec.dim, spec.dtype)
+    Entries, entries_of, gathered, surface = (
+        sums.Entries,
+        sums.entries_of,
+        sums.gathered,
+        bool(spec.surface_walls),
+    )
     apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
     Chunk, state_of, momenta_of = memory.Chunk, memory.state_of, memory.momenta_of
     module = lagrangian_module(spec.module + ".lagrangian")
 
+    @wp.struct
+    class Node:
+        """What is the same in every substep of a chunk."""
+
+        rest: exact_vec  # its position at rest [m]
+        m: real
+        entries: Entries
+        touched: int  # 1 if surface points act on it
+
     @wp.func
-    def place(constants: Constants, inside: Rest, i: int, shift: exact_vec, u: vec) -> exact_vec:
-        """Present position of a node [m]."""
-        return position(constants, inside.nodes[i]) + shift + exact(u)
+    def node_of(constants: Constants, inside: Rest, mass: wp.array2d(dtype=real), world: int, i: int) -> Node:
+        out = Node()
+        out.m = mass[world, i]
+        out.entries = entries_of(inside, i)
+        out.rest = position(constants, inside.nodes[i])
+        if wp.static(surface):
+            out.touched = inside.touched[i]
+        return out
 
     @wp.func
     def advance_at(
         world: int,
         i: int,
+        node: Node,
         constants: Constants,
         inputs: GridInputs,
-        inside: Rest,
         body: Frame,
         at: Chunk,
         s: int,
@@ -79,22 +103,21 @@ def nodes(spec: Spec) -> SimpleNamespace:
         here = at.u[now, world, i]  # all of it loaded while the status is awaited
         middle = at.u[now, world, body.middle]
         new = at.v[now, world, i]
-        m = at.mass[world, i]
-        f = gathered(at.partial, inside, world, i)
-        x = place(constants, inside, i, at.shift[now, world], here)
+        shift = at.shift[now, world]
+        f = gathered(at.partial, node.entries, world)
         d = vec()
         if running(at.words, world):
             d = recentring(body, middle)
-            momentum = m * new + constants.dt * f  # (Q3)
+            momentum = node.m * new + constants.dt * f  # (Q3)
             at.p[p, world, i] = momentum
-            new = node_velocity(constants, inputs, world, x, momentum, m)
+            new = node_velocity(constants, inputs, world, node.rest + shift + exact(here), momentum, node.m)
             here = (here - d) + constants.dt * new  # (Q4)
         if i == 0:
-            at.shift[then, world] = at.shift[now, world] + exact(d)
+            at.shift[then, world] = shift + exact(d)
         if wp.static(surface):
             at.free[world, i] = new
         if wp.static(apart):
-            if inside.touched[i] == 0:
+            if node.touched == 0:
                 at.u[then, world, i] = here
                 at.v[then, world, i] = new
         if wp.static(not surface):
@@ -111,80 +134,110 @@ def nodes(spec: Spec) -> SimpleNamespace:
         s: int,
     ):
         world, i = wp.tid()
-        advance_at(world, i, constants, inputs, inside, body, at, s)
+        node = node_of(constants, inside, at.mass, world, i)
+        advance_at(world, i, node, constants, inputs, body, at, s)
 
-    return SimpleNamespace(advance=advance, advance_at=advance_at, place=place)
+    return SimpleNamespace(Node=Node, node_of=node_of, advance=advance, advance_at=advance_at)
 
 
 @kernel_factory
 def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, r, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), nodes(spec)
-    vec, Constants, Rest = t.vec, t.Constants, r.Rest
+    real, vec, exact_vec, Constants, Rest = t.real, t.vec, types(spec.dim, "float64").vec, t.Constants, r.Rest
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
-    gathered, place = gathering(spec.dim, spec.dtype), one.place
+    node_velocity_adj, sums = grid_adj(spec, wanted).node_velocity_adj, gathering(spec.dim, spec.dtype)
+    entries_of, gathered, Node, node_of = sums.entries_of, sums.gathered, one.Node, one.node_of
     viscous, surface, moving = spec.viscosity, bool(spec.surface_walls), spec.moving
-    constrained, memory = spec.constrained, chunk(spec.dim, spec.dtype)
+    constrained, memory, exact = (
+        spec.constrained,
+        chunk(spec.dim, spec.dtype),
+        frame(spec.dim, spec.dtype).exact,
+    )
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
+
+    @wp.struct
+    class Before:
+        """A node before a substep."""
+
+        x: exact_vec  # [m]
+        v: vec
+        p: vec  # without contact and constraints, after the substep
+
+    @wp.struct
+    class NodeAdj:
+        u: vec
+        v: vec
+        m: real
+
+    @wp.func
+    def before(world: int, i: int, node: Node, at: Chunk, s: int) -> Before:
+        out = Before()
+        out.x = node.rest + at.shift[s, world] + exact(at.u[s, world, i])
+        out.v = at.v[s, world, i]
+        out.p = at.p[s, world, i]
+        return out
+
+    @wp.func
+    def adj_of(world: int, i: int, bar: Adjoint) -> NodeAdj:
+        out = NodeAdj()
+        out.u = bar.u[world, i]
+        out.v = bar.v[world, i]
+        out.m = bar.mass[world, i]
+        return out
+
+    @wp.func
+    def complete(world: int, i: int, node: Node, at: Chunk, bar: Adjoint, s: int) -> NodeAdj:
+        """Adjoint of a node after substep ``s``, with what the forces of the next one give, unless it has been added already."""
+        out = adj_of(world, i, bar)
+        if wp.static(not constrained):
+            if s < at.length - 1:
+                out.u += gathered(bar.partial_u, node.entries, world)  # (Q1.adj)
+                if wp.static(viscous):
+                    out.v += gathered(bar.partial_v, node.entries, world)
+        return out
 
     @wp.func
     def moved_adj(
         world: int,
         i: int,
+        node: Node,
+        was: Before,
+        after: NodeAdj,
         constants: Constants,
         inputs: GridInputs,
-        inside: Rest,
-        at: Chunk,
         bar: Adjoint,
         adj_inputs: GridInputsAdj,
-        s: int,
-        adj_new: vec,
     ):
-        """(Q3.adj) of a node, from v̄'."""
-        m = at.mass[world, i]
-        here = place(constants, inside, i, at.shift[s, world], at.u[s, world, i])
-        p = at.p[s, world, i]
+        """(Q3.adj) of a node, from v̄', m̄ and ū."""
         number = world * bar.held + i
-        adj = node_velocity_adj(constants, inputs, world, here, p, m, adj_new, number, adj_inputs)
-        bar.mass[world, i] = bar.mass[world, i] + adj.m + wp.dot(at.v[s, world, i], adj.p)
+        adj = node_velocity_adj(constants, inputs, world, was.x, was.p, node.m, after.v, number, adj_inputs)
+        bar.mass[world, i] = after.m + adj.m + wp.dot(was.v, adj.p)
         bar.f[world, i] = constants.dt * adj.p
-        bar.v[world, i] = m * adj.p
+        bar.v[world, i] = node.m * adj.p
+        adj_u = after.u
         if wp.static(moving):
-            bar.u[world, i] = bar.u[world, i] + adj.x
-
-    @wp.func
-    def gather(world: int, i: int, inside: Rest, bar: Adjoint):
-        """What the forces of a substep give to its displacements and velocities (Q1.adj)."""
-        bar.u[world, i] = bar.u[world, i] + gathered(bar.partial_u, inside, world, i)
-        if wp.static(viscous):
-            bar.v[world, i] = bar.v[world, i] + gathered(bar.partial_v, inside, world, i)
-
-    @wp.func
-    def gather_pending(world: int, i: int, inside: Rest, at: Chunk, bar: Adjoint, s: int):
-        """What the forces of the substep after ``s`` have given, unless it has been added already."""
-        if wp.static(not constrained):
-            if s < at.length - 1:
-                gather(world, i, inside, bar)
+            adj_u += adj.x
+        bar.u[world, i] = adj_u
 
     @wp.func
     def advance_adj_at(
         world: int,
         i: int,
+        node: Node,
         constants: Constants,
         inputs: GridInputs,
-        inside: Rest,
         at: Chunk,
         bar: Adjoint,
         adj_inputs: GridInputsAdj,
         s: int,
     ):
         """(Q4.adj), (Q3.adj); after surface contact v̄' has been computed already."""
-        gather_pending(world, i, inside, at, bar, s)
-        adj_new = bar.v[world, i]
+        was = before(world, i, node, at, s)  # all of it loaded before anything is stored
+        adj = complete(world, i, node, at, bar, s)
         if wp.static(not surface):
-            adj_new += constants.dt * bar.u[world, i]
-        moved_adj(world, i, constants, inputs, inside, at, bar, adj_inputs, s, adj_new)
+            adj.v += constants.dt * adj.u
+        moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 
     @wp.kernel(module=module, enable_backward=False)
     def advance_adj(
@@ -197,17 +250,24 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         s: int,
     ):
         world, i = wp.tid()
-        advance_adj_at(world, i, constants, inputs, inside, at, bar, adj_inputs, s)
+        node = node_of(constants, inside, at.mass, world, i)
+        advance_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def gather_adj(inside: Rest, bar: Adjoint):
+        """Add what the forces of a substep give to its displacements and velocities (Q1.adj)."""
         world, i = wp.tid()
-        gather(world, i, inside, bar)
+        entries = entries_of(inside, i)
+        bar.u[world, i] = bar.u[world, i] + gathered(bar.partial_u, entries, world)
+        if wp.static(viscous):
+            bar.v[world, i] = bar.v[world, i] + gathered(bar.partial_v, entries, world)
 
     return SimpleNamespace(
+        before=before,
+        adj_of=adj_of,
+        complete=complete,
+        moved_adj=moved_adj,
         advance_adj=advance_adj,
         advance_adj_at=advance_adj_at,
         gather_adj=gather_adj,
-        gather_pending=gather_pending,
-        moved_adj=moved_adj,
     )

@@ -12,9 +12,10 @@ import warp as wp
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
+from softmpm.kernels.physics.accumulate import accumulate
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.rest_step import rest_step
-from softmpm.kernels.physics.stress import total_stress, total_stress_adj
+from softmpm.kernels.physics.stress import material, total_stress, total_stress_adj
 from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
@@ -28,26 +29,44 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     rotation, stress, identity = total_of.rotation, total_of.stress, k.identity
     volume_change, inverse_transpose = k.volume_change, k.inverse_transpose
     viscous_stress, viscous = viscosity(dim, spec.dtype).viscous_stress, spec.viscosity
+    Material, material_ahead = material(spec).Material, material(spec).material_ahead
     report, largest = status.report(dim, spec.dtype).report, 1.0e12
     collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
     step_is_stable = rest_step(spec).step_is_stable
 
+    @wp.struct
+    class Given:
+        """What a particle is given for a control step."""
+
+        material: Material
+        viscosity: real  # [Pa s]
+        volume: real
+
     @wp.func
-    def piola(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat, L: mat, R: mat) -> mat:
-        """P of (Q2) [Pa]; R is F⁻ᵀ."""
-        tau = stress(inputs, world, p, H, Q)
+    def given_to(inputs: ParticleInputs, world: int, p: int) -> Given:
+        out = Given()
+        out.material = material_ahead(inputs, world, p)
+        out.volume = inputs.volume[world, p]
         if wp.static(viscous):
-            tau += viscous_stress(identity() + H, L, inputs.viscosity[world, p])
+            out.viscosity = inputs.viscosity[world, p]
+        return out
+
+    @wp.func
+    def piola(own: Given, H: mat, Q: mat, L: mat, R: mat) -> mat:
+        """P of (Q2) [Pa]; R is F⁻ᵀ."""
+        tau = stress(own.material, H, Q)
+        if wp.static(viscous):
+            tau += viscous_stress(identity() + H, L, own.viscosity)
         return tau * R
 
     @wp.func
-    def forced(inputs: ParticleInputs, world: int, p: int, H: mat, rate: mat) -> mat:
+    def forced(own: Given, H: mat, rate: mat) -> mat:
         """−V P of a particle; ``rate`` is Ḟ."""
         R = inverse_transpose(H)
         L = mat()
         if wp.static(viscous):
             L = rate * wp.transpose(R)
-        return -inputs.volume[world, p] * piola(inputs, world, p, H, rotation(inputs, world, p, H), L, R)
+        return -own.volume * piola(own, H, rotation(own.material, H), L, R)
 
     @wp.func
     def check(
@@ -77,7 +96,9 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
             if not step_is_stable(constants, inputs, world, place, H):
                 report(words, world, substep, too_long, p)
 
-    return SimpleNamespace(piola=piola, forced=forced, check=check, check_step=check_step)
+    return SimpleNamespace(
+        Given=Given, given_to=given_to, piola=piola, forced=forced, check=check, check_step=check_step
+    )
 
 
 @kernel_factory
@@ -85,11 +106,15 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     """Adjoint of the functions of one particle."""
     mat, k = types(spec.dim, spec.dtype).mat, kinematics(spec.dim, spec.dtype)
     identity, inverse_transpose = k.identity, k.inverse_transpose
-    rotation, piola = total_stress(spec).rotation, particle_forces(spec).piola
-    ParticleInputs = input_types(spec).ParticleInputs
+    rotation, piola, Given = (
+        total_stress(spec).rotation,
+        particle_forces(spec).piola,
+        particle_forces(spec).Given,
+    )
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     stress_adj, viscous = total_stress_adj(spec, wanted).stress_adj, spec.viscosity
     viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
+    to_particle = accumulate(spec.dtype).to_particle
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
 
     @wp.struct
@@ -99,32 +124,32 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
     @wp.func
     def forced_adj(
-        inputs: ParticleInputs,
-        world: int,
-        p: int,
+        own: Given,
         H: mat,
         rate: mat,
         G: mat,  # Σ f̄_i ⊗ g_i
+        world: int,
+        p: int,
         adj_inputs: ParticleInputsAdj,
     ) -> ForceAdj:
         """(Q2.adj)"""
         R = inverse_transpose(H)
-        Q = rotation(inputs, world, p, H)
+        Q = rotation(own.material, H)
         L = mat()
         if wp.static(viscous):
             L = rate * wp.transpose(R)
-        P = piola(inputs, world, p, H, Q, L, R)
-        adj_P = -inputs.volume[world, p] * G
+        P = piola(own, H, Q, L, R)
+        adj_P = -own.volume * G
         adj_tau = adj_P * wp.transpose(R)
         adj = ForceAdj()
-        adj.F = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
+        adj.F = stress_adj(own.material, H, Q, adj_tau, world, p, adj_inputs)
         adj.F -= R * (wp.transpose(adj_P) * P)
         if wp.static(viscous):
-            found = viscous_stress_adj(identity() + H, L, inputs.viscosity[world, p], adj_tau)
+            found = viscous_stress_adj(identity() + H, L, own.viscosity, adj_tau)
             adj.rate = found.C * R
             adj.F += found.F - wp.transpose(L) * adj.rate
             if wp.static("viscosity" in wanted):
-                adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + found.eta
+                to_particle(adj_inputs.viscosity, world, p, found.eta)
         return adj
 
     @wp.func

@@ -5,51 +5,22 @@ barrier of the hardware. The stages are the functions of the kernels that are la
 rounding, see docs/decisions/0010-reference-formulation.md. On the CPU, for tests, one thread does everything.
 """
 
-from types import SimpleNamespace
-from typing import NamedTuple
-
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet_cluster
+from softmpm.kernels.lagrangian.bricks import brick_module, meet_cluster, meet_cluster_adj
 from softmpm.kernels.lagrangian.cells import cells, cells_adj
 from softmpm.kernels.lagrangian.chunk import chunk
+from softmpm.kernels.lagrangian.cluster import Cluster, holdings, numbering
 from softmpm.kernels.lagrangian.frame import frame
-from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj, layers
+from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj
+from softmpm.kernels.lagrangian.layers import layers
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import rest
-from softmpm.kernels.lagrangian.surface import LANES, surface, surface_type
+from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_adj import surface_adj
+from softmpm.kernels.lagrangian.surface_sums import surface_type
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
-
-
-class Cluster(NamedTuple):
-    """Blocks of threads that have a world."""
-
-    bricks: Bricks
-    blocks: int
-    groups: int
-    """Groups of threads in a block; each has a brick."""
-
-    @property
-    def group_threads(self) -> int:
-        """Threads of a group."""
-        return self.bricks.layer_threads if self.bricks.lattice else self.bricks.threads
-
-    @property
-    def threads(self) -> int:
-        """Of a block."""
-        return self.groups * self.group_threads
-
-    @property
-    def settings(self) -> dict:
-        """Of the kernels."""
-        bounds = dict(enable_backward=False, grid_stride=False, launch_bounds=(self.threads, 1))
-        return bounds if self.bricks.serial else bounds | dict(cluster_dim=self.blocks)
-
-    @property
-    def name(self) -> str:
-        return f"{self.bricks.name}.c{self.blocks}x{self.groups}"
 
 
 @kernel_factory
@@ -61,12 +32,13 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
     Frame, Surface = frame(spec.dim, spec.dtype).Frame, surface_type(spec.dim, spec.dtype)
     Lattice, lattice = layers(spec.dim, spec.dtype, bricks).Lattice, bricks.lattice
     forces_at = lattice_cells(spec, bricks).forces_at if lattice else cells(spec, bricks).forces_at
-    advance_at, contact = nodes(spec).advance_at, bool(spec.surface_walls)
-    press_at = surface(spec).press_at if contact else None
-    settle_at = surface(spec).settle_at if contact else None
+    advance_at, contact, of_thread = nodes(spec).advance_at, bool(spec.surface_walls), holdings(spec, cluster)
+    held_by, seat_at, node_at = of_thread.held_by, of_thread.seat_at, of_thread.node_at
+    if contact:
+        press_at, settle_at = surface(spec).press_at, surface(spec).settle_at
+        point_at, entry_at = of_thread.point_at, of_thread.entry_at
     size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    numbers, lanes = numbering(cluster), 1 if bricks.serial else LANES[spec.dim]
-    number, rounded = numbers.number, numbers.rounded
+    lanes, rounded = cluster.lanes, numbering(cluster).rounded
     module = brick_module(f"{spec.module}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -84,27 +56,32 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
         anew: int,  # 1 if a control step begins with the first substep, but not with the chunk
     ):
         world, block, thread = wp.tid()
-        own = number(block, thread)
         lane = thread % size
+        held = held_by(block, thread, constants, inputs, inside, body, at.mass, world)
+        own = held.number
         for s in range(first, last):
-            for brick in range(block + blocks * (thread / size), inside.corners.shape[0], blocks * groups):
+            for brick in range(held.brick, inside.corners.shape[0], blocks * groups):
+                seat = seat_at(held, inputs, inside, world, brick, lane)
                 if wp.static(lattice):
-                    forces_at(world, brick, lane, constants, inputs, inside, weights, at, s)
+                    forces_at(world, brick, lane, seat, constants, inputs, inside, weights, at, s)
                 else:
-                    forces_at(world, brick, lane, constants, inputs, inside, at, s)
+                    forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
             meet_cluster()
             for i in range(own, inside.nodes.shape[0], blocks * threads):
-                advance_at(world, i, constants, grid_inputs, inside, moving, at, s)
+                node = node_at(held, constants, inside, at.mass, world, i)
+                advance_at(world, i, node, constants, grid_inputs, moving, at, s)
             meet_cluster()
             if wp.static(contact):
                 begins = wp.where(s == first, anew, 0)
                 for p in range(own, body.points.shape[0], blocks * threads):
-                    press_at(world, p, constants, grid_inputs, body, moving, at, s, begins)
+                    point = point_at(held, body, p)
+                    press_at(world, p, point, constants, grid_inputs, body, moving, at, s, begins)
                 meet_cluster()
                 count = body.nodes.shape[0]
                 for k in range(own, rounded(count * lanes), blocks * threads):
                     n = wp.min(k / lanes, count - 1)
-                    settle_at(world, n, k - n * lanes, constants, body, moving, at, s)
+                    entry = entry_at(held, body, k, n)
+                    settle_at(world, k - n * lanes, entry, constants, body, moving, at, s)
                 meet_cluster()
 
     return march
@@ -122,12 +99,14 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
     Lattice, lattice = layers(spec.dim, spec.dtype, bricks).Lattice, bricks.lattice
     of_cells = lattice_cells_adj(spec, wanted, bricks) if lattice else cells_adj(spec, wanted, bricks)
     forces_adj_at, advance_adj_at = of_cells.forces_adj_at, nodes_adj(spec, wanted).advance_adj_at
-    settle_adj_at = surface_adj(spec, wanted).settle_adj_at if contact else None
-    press_adj_at = surface_adj(spec, wanted).press_adj_at if contact else None
-    spread_adj_at = surface_adj(spec, wanted).spread_adj_at if contact else None
+    of_thread = holdings(spec, cluster)
+    held_by, seat_at, node_at = of_thread.held_by, of_thread.seat_at, of_thread.node_at
+    if contact:
+        one = surface_adj(spec, wanted)
+        settle_adj_at, press_adj_at, spread_adj_at = one.settle_adj_at, one.press_adj_at, one.spread_adj_at
+        point_at, entry_at, touched_at = of_thread.point_at, of_thread.entry_at, of_thread.touched_at
     size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    numbers, lanes = numbering(cluster), 1 if bricks.serial else LANES[spec.dim]
-    number, rounded = numbers.number, numbers.rounded
+    lanes, rounded = cluster.lanes, numbering(cluster).rounded
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -147,59 +126,44 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
         anew: int,
     ):
         world, block, thread = wp.tid()
-        own = number(block, thread)
         lane = thread % size
+        held = held_by(block, thread, constants, inputs, inside, body, at.mass, world)
+        own = held.number
         for back in range(last - first):
             s = last - 1 - back
+            for i in range(own, inside.nodes.shape[0], blocks * threads):
+                node = node_at(held, constants, inside, at.mass, world, i)
+                if wp.static(contact):
+                    settle_adj_at(world, i, node, constants, grid_inputs, at, bar, adj_grid_inputs, s)
+                else:
+                    advance_adj_at(world, i, node, constants, grid_inputs, at, bar, adj_grid_inputs, s)
+            meet_cluster_adj()
             if wp.static(contact):
-                for i in range(own, inside.nodes.shape[0], blocks * threads):
-                    settle_adj_at(world, i, constants, grid_inputs, inside, at, bar, adj_grid_inputs, s)
-                meet_cluster()
                 begins = wp.where(s == first, anew, 0)
                 for p in range(own, body.points.shape[0], blocks * threads):
-                    press_adj_at(world, p, constants, grid_inputs, body, at, bar, adj_grid_inputs, s, begins)
-                meet_cluster()
+                    point = point_at(held, body, p)
+                    press_adj_at(
+                        world, p, point, constants, grid_inputs, body, at, bar, adj_grid_inputs, s, begins
+                    )
+                meet_cluster_adj()
                 count = body.nodes.shape[0]
                 for k in range(own, rounded(count * lanes), blocks * threads):
                     n = wp.min(k / lanes, count - 1)
+                    entry = entry_at(held, body, k, n)
+                    node = touched_at(held, constants, inside, at.mass, world, k, entry.i)
                     turn = k - n * lanes
                     spread_adj_at(
-                        world, n, turn, constants, grid_inputs, inside, body, at, bar, adj_grid_inputs, s
+                        world, turn, entry, node, constants, grid_inputs, body, at, bar, adj_grid_inputs, s
                     )
-            else:
-                for i in range(own, inside.nodes.shape[0], blocks * threads):
-                    advance_adj_at(world, i, constants, grid_inputs, inside, at, bar, adj_grid_inputs, s)
-            meet_cluster()
-            for brick in range(block + blocks * (thread / size), inside.corners.shape[0], blocks * groups):
+                meet_cluster_adj()
+            for brick in range(held.brick, inside.corners.shape[0], blocks * groups):
+                seat = seat_at(held, inputs, inside, world, brick, lane)
                 if wp.static(lattice):
                     forces_adj_at(
-                        world, brick, lane, constants, inputs, inside, weights, at, bar, adj_inputs, s
+                        world, brick, lane, seat, constants, inputs, inside, weights, at, bar, adj_inputs, s
                     )
                 else:
-                    forces_adj_at(world, brick, lane, constants, inputs, inside, at, bar, adj_inputs, s)
-            meet_cluster()
+                    forces_adj_at(world, brick, lane, seat, constants, inputs, inside, at, bar, adj_inputs, s)
+            meet_cluster_adj()
 
     return march_adj
-
-
-@kernel_factory
-def numbering(cluster: Cluster) -> SimpleNamespace:
-    blocks, serial = cluster.blocks, cluster.bricks.serial
-
-    @wp.func
-    def number(block: int, thread: int) -> int:
-        """Number of a thread in its cluster; warps take turns among the blocks."""
-        if wp.static(serial):
-            return 0
-        else:
-            return (thread / 32 * blocks + block) * 32 + thread % 32
-
-    @wp.func
-    def rounded(count: int) -> int:
-        """Number of threads, in whole warps: those that sum together must all be there."""
-        if wp.static(serial):
-            return count
-        else:
-            return (count + 31) / 32 * 32
-
-    return SimpleNamespace(number=number, rounded=rounded)

@@ -54,7 +54,7 @@ def masses(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     fx = inside.fraction[p]
                     b[0] = mass[world, p]
                 total = add(total, partial, world, brick, slot, corner, fx, mat(), b)
-        write(total, partial, inside, world, brick, lane)
+        write(total, partial, inside.corners[brick, lane % cells], world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def masses_adj(inside: Rest, adj_nodes: wp.array2d(dtype=real), adj_mass: wp.array2d(dtype=real)):
@@ -186,8 +186,8 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     d = adj_v[world, p]
                 total_u = add(total_u, partial_u, world, brick, slot, corner, fx, A, b)
                 total_v = add(total_v, partial_v, world, brick, slot, corner, fx, B, d)
-        write(total_u, partial_u, inside, world, brick, lane)
-        write(total_v, partial_v, inside, world, brick, lane)
+        write(total_u, partial_u, inside.corners[brick, lane % cells], world, brick, lane)
+        write(total_v, partial_v, inside.corners[brick, lane % cells], world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def project(
@@ -230,8 +230,8 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     d = m * v[world, p]
                 total_u = add(total_u, partial_u, world, brick, slot, corner, fx, A, b)
                 total_v = add(total_v, partial_v, world, brick, slot, corner, fx, B, d)
-        write(total_u, partial_u, inside, world, brick, lane)
-        write(total_v, partial_v, inside, world, brick, lane)
+        write(total_u, partial_u, inside.corners[brick, lane % cells], world, brick, lane)
+        write(total_v, partial_v, inside.corners[brick, lane % cells], world, brick, lane)
 
     @wp.kernel(module=module, **settings)
     def project_adj(

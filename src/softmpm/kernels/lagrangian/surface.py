@@ -6,8 +6,7 @@
     f_s += A_s J / T, the mean force of a wall on a point in a control step of T                     (K7)
     v'_i = v*_i + Σ w_si A_s J / m_i,  u'_i = u_i + Δt v'_i                                          (K5)
 
-Nodes gather what the points give them in a fixed order; on a GPU the threads of a node share this work. Only the height over a wall
-sees the shift; anchors move with the frame. The adjoint is in surface_adj.py.
+Only the height over a wall sees the shift; anchors move with the frame. The adjoint is in surface_adj.py.
 """
 
 from types import SimpleNamespace
@@ -19,49 +18,11 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face
 from softmpm.kernels.structs import Spec, input_types, types
-
-LANES = {2: 8, 3: 32}
-"""Threads of a node on a GPU; the CPU has one."""
-BATCH = 4
-"""Entries that a thread reads at once."""
-TOGETHER = """
-    auto total = value;
-#if defined(__CUDA_ARCH__)
-    for (int other = {lanes} / 2; other > 0; other /= 2)
-        for (unsigned axis = 0; axis < {dim}; ++axis)
-            total.c[axis] += __shfl_xor_sync(0xffffffffu, total.c[axis], other);
-#endif
-    return total;
-"""
-
-
-@kernel_factory
-def surface_type(dim: int, dtype: str):
-    t, exact_vec = types(dim, dtype), types(dim, "float64").vec
-
-    class Surface:
-        """See :class:`softmpm.surface_grid.SurfaceGrid`."""
-
-        points: wp.array(dtype=exact_vec)
-        areas: wp.array(dtype=t.real)
-        newtons: wp.array(dtype=t.real)  # areas in the units of force
-        width: t.real  # over which contact sets in
-        lanes: int  # threads of a node
-        deepest: wp.array(dtype=t.real)
-        stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
-        loads: wp.array(dtype=t.real)
-        stencil: wp.array2d(dtype=wp.int32)
-        weights: wp.array2d(dtype=t.real)
-        nodes: wp.array(dtype=wp.int32)
-        first: wp.array(dtype=wp.int32)
-        members: wp.array(dtype=wp.int32)
-        shares: wp.array(dtype=t.real)
-
-    return wp.struct(Surface, module=f"softmpm.types.d{dim}.{dtype}")
 
 
 @kernel_factory
@@ -81,13 +42,16 @@ def surface(spec: Spec) -> SimpleNamespace:
     number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
     count, friction_of = len(walls), wall_face(spec).friction_of
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
-    Frame, recentring, exact_of, memory = f.Frame, f.recentring, f.exact, chunk(dim, spec.dtype)
+    Frame, recentring, memory = f.Frame, f.recentring, chunk(dim, spec.dtype)
     Chunk, state_of = memory.Chunk, memory.state_of
     face, depth = wall_face(spec).face, wall_face(spec).depth
     running, was_running, report = (
         getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
     )
     vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
+    sums = surface_sums(dim, spec.dtype)
+    Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
+    Touched, touched_of, from_points = sums.Touched, sums.touched_of, sums.from_points
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.struct
@@ -119,36 +83,6 @@ def surface(spec: Spec) -> SimpleNamespace:
             out.friction[q] = friction_of(inputs, world, k)
         return out
 
-    @wp.func
-    def at_point(body: Surface, nodal: wp.array2d(dtype=vec), world: int, p: int) -> vec:
-        """Σ w a of a nodal field."""
-        total = vec()
-        for n in range(r.count):
-            total += body.weights[p, n] * nodal[world, body.stencil[p, n]]
-        return total
-
-    @wp.func_native(TOGETHER.format(lanes=LANES[dim], dim=dim))
-    def together(value: vec) -> vec:
-        """Sum over the threads of a node, for all of them."""
-
-    @wp.func
-    def from_points(body: Surface, values: wp.array2d(dtype=vec), world: int, n: int, lane: int) -> vec:
-        """Σ w a of a field of the surface points, at node ``n`` of those they act on, in a fixed order."""
-        last = body.first[n + 1]
-        total = vec()
-        for m in range(body.first[n] + lane, last, BATCH * body.lanes):
-            for k in range(BATCH):  # several that wait for memory together
-                entry = wp.min(m + k * body.lanes, last - 1)
-                share = body.shares[entry] * values[world, body.members[entry]]
-                if m + k * body.lanes < last:
-                    total += share
-        return together(total)
-
-    @wp.func
-    def present(body: Surface, p: int, u: vec) -> exact_vec:
-        """x of (K2) without the shift."""
-        return body.points[p] + exact_of(u)
-
     @wp.kernel(module=module, enable_backward=False)
     def delassus(body: Surface, mass: wp.array2d(dtype=real), D: wp.array2d(dtype=real)):
         """(K1)"""
@@ -164,6 +98,7 @@ def surface(spec: Spec) -> SimpleNamespace:
     def press_at(
         world: int,
         p: int,
+        point: Point,
         constants: Constants,
         inputs: GridInputs,
         body: Surface,
@@ -178,11 +113,10 @@ def surface(spec: Spec) -> SimpleNamespace:
         u = at.u[now]
         anchor = at.anchor[now]
         middle = u[world, moving.middle]  # all of it loaded while the status is awaited
-        x = present(body, p, at_point(body, u, world, p))
-        v = at_point(body, at.free, world, p)
+        x = present(point, at_point(point, u, world))
+        v = at_point(point, at.free, world)
         dv = at.D[world, p]
-        stiffness = body.stiffness[p]
-        per_force = at.rate[0] * body.newtons[p]
+        per_force = at.rate[0] * point.newtons
         wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[now, world])
         after = vecs()
         pushed = vecs()
@@ -190,15 +124,13 @@ def surface(spec: Spec) -> SimpleNamespace:
             after[q] = anchor[world, q, p]
             if anew == 0:
                 pushed[q] = at.force[world, q, p]
-        deepest = body.deepest[p]
-        area = body.areas[p]
         total = vec()
         last = wp.max(s - 1, 0)
         deep = int(-1)
         if was_running(at.words, world, last, in_wall):
             d = recentring(moving, middle)
             for q in range(count):
-                if wall.depth[q] > deepest:
+                if wall.depth[q] > point.deepest:
                     deep = q
                 found = touch(
                     wall.n[q],
@@ -208,7 +140,7 @@ def surface(spec: Spec) -> SimpleNamespace:
                     wall.anchor[q],
                     dv,
                     wall.friction[q],
-                    stiffness,
+                    point.stiffness,
                     constants.dt,
                     body.width,
                     constants.spacing,
@@ -221,15 +153,15 @@ def surface(spec: Spec) -> SimpleNamespace:
                 at.force[world, q, p] = pushed[q]
         for q in range(count):
             at.anchor[then, world, q, p] = after[q]
-        at.impulse[world, p] = area * total
+        at.impulse[world, p] = point.area * total
         if deep >= 0:
             report(at.words, world, last, in_wall, deep * body.points.shape[0] + p)
 
     @wp.func
     def settle_at(
         world: int,
-        n: int,
         lane: int,
+        node: Touched,
         constants: Constants,
         body: Surface,
         moving: Frame,
@@ -239,17 +171,19 @@ def surface(spec: Spec) -> SimpleNamespace:
         """(K5), at the nodes that surface points act on."""
         now = state_of(at, s)
         then = state_of(at, s + 1)
-        i = body.nodes[n]
+        i = node.i
         here = at.u[now, world, i]
-        new = at.free[world, i]  # loaded while the status is awaited
+        new = at.free[world, i]  # all of it loaded while the status is awaited
+        m = at.mass[world, i]
+        old = at.v[now, world, i]
         middle = at.u[now, world, moving.middle]
-        push = from_points(body, at.impulse, world, n, lane)
+        push = from_points(body, node, at.impulse, world)
         if running(at.words, world):
-            if body.first[n + 1] > body.first[n]:
-                new += push / at.mass[world, i]
+            if node.last > node.first - lane:
+                new += push / m
             here = (here - recentring(moving, middle)) + constants.dt * new
         else:
-            new = at.v[now, world, i]
+            new = old
         if lane == 0:
             at.u[then, world, i] = here
             at.v[then, world, i] = new
@@ -265,12 +199,12 @@ def surface(spec: Spec) -> SimpleNamespace:
         anew: int,
     ):
         world, p = wp.tid()
-        press_at(world, p, constants, inputs, body, moving, at, s, anew)
+        press_at(world, p, point_of(body, p), constants, inputs, body, moving, at, s, anew)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(constants: Constants, body: Surface, moving: Frame, at: Chunk, s: int):
         world, n, lane = wp.tid()
-        settle_at(world, n, lane, constants, body, moving, at, s)
+        settle_at(world, lane, touched_of(body, n, lane), constants, body, moving, at, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_depth(
@@ -288,9 +222,10 @@ def surface(spec: Spec) -> SimpleNamespace:
     ):
         """Check a state that no contact is computed of: the final one of a chunk, or the initial one of a call."""
         world, p = wp.tid()
-        x = present(body, p, at_point(body, u, world, p)) + shift[world]
+        point = point_of(body, p)
+        x = present(point, at_point(point, u, world)) + shift[world]
         for q in range(count):
-            if depth(inputs, world, number[q], later, x) > body.deepest[p]:
+            if depth(inputs, world, number[q], later, x) > point.deepest:
                 report(words, world, substep, in_wall, q * body.points.shape[0] + p)
 
     return SimpleNamespace(
@@ -302,8 +237,6 @@ def surface(spec: Spec) -> SimpleNamespace:
         check_depth=check_depth,
         faces_of=faces_of,
         vecs=vecs,
-        at_point=at_point,
-        from_points=from_points,
-        present=present,
+        reals=reals,
         number=number,
     )

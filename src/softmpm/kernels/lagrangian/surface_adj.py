@@ -17,7 +17,8 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
-from softmpm.kernels.lagrangian.surface import surface, surface_type
+from softmpm.kernels.lagrangian.surface import surface
+from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face_adj
@@ -35,11 +36,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         len(spec.surface_walls),
     )
     touch, touch_adj, number = block.touch, block.touch_adj, one.number
-    faces_of, face_adj, present = one.faces_of, wall_face_adj(spec, wanted), one.present
-    at_point, from_points, node_velocity = one.at_point, one.from_points, grid(spec).node_velocity
-    mirrored, constrained = bool(spec.mirrors), spec.constrained
-    place, vecs, back = nodes(spec).place, one.vecs, nodes_adj(spec, wanted)
-    gather_pending, moved_adj, memory = back.gather_pending, back.moved_adj, chunk(dim, spec.dtype)
+    faces_of, face_adj, node_velocity = one.faces_of, wall_face_adj(spec, wanted), grid(spec).node_velocity
+    mirrored, constrained, rough = bool(spec.mirrors), spec.constrained, "friction" in wanted
+    sums = surface_sums(dim, spec.dtype)
+    Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
+    Touched, touched_of, from_points = sums.Touched, sums.touched_of, sums.from_points
+    Node, node_of, vecs, reals = nodes(spec).Node, nodes(spec).node_of, one.vecs, one.reals
+    back, memory = nodes_adj(spec, wanted), chunk(dim, spec.dtype)
+    before, adj_of, complete, moved_adj = back.before, back.adj_of, back.complete, back.moved_adj
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
@@ -47,37 +51,41 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     def settle_adj_at(
         world: int,
         i: int,
+        node: Node,
         constants: Constants,
         inputs: GridInputs,
-        inside: Rest,
         at: Chunk,
         bar: Adjoint,
         adj_inputs: GridInputsAdj,
         s: int,
     ):
         """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m. Nodes that no surface points act on are done here."""
-        gather_pending(world, i, inside, at, bar, s)
-        adj = bar.v[world, i] + constants.dt * bar.u[world, i]
-        if inside.touched[i] == 1:
-            m = at.mass[world, i]
-            x = place(constants, inside, i, at.shift[s, world], at.u[s, world, i])
-            free_v = node_velocity(constants, inputs, world, x, at.p[s, world, i], m)
-            if wp.static(mirrored):
-                free_v = at.free[world, i]  # reflected already
+        was = before(world, i, node, at, s)  # all of it loaded before anything is stored
+        after = at.v[s + 1, world, i]
+        free_v = vec()
+        if wp.static(mirrored):
+            free_v = at.free[world, i]  # reflected already
+        adj = complete(world, i, node, at, bar, s)
+        adj.v += constants.dt * adj.u
+        if node.touched == 1:
+            if wp.static(not mirrored):
+                free_v = node_velocity(constants, inputs, world, was.x, was.p, node.m)
             at.free[world, i] = free_v
-            bar.v[world, i] = adj
             each = vec()
-            if m > real(0.0):
-                each = adj / m
+            if node.m > real(0.0):
+                each = adj.v / node.m
+            bar.u[world, i] = adj.u
+            bar.v[world, i] = adj.v
             bar.shared[world, i] = each
-            bar.mass[world, i] = bar.mass[world, i] - wp.dot(at.v[s + 1, world, i] - free_v, each)
+            bar.mass[world, i] = adj.m - wp.dot(after - free_v, each)
         else:
-            moved_adj(world, i, constants, inputs, inside, at, bar, adj_inputs, s, adj)
+            moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 
     @wp.func
     def press_adj_at(
         world: int,
         p: int,
+        point: Point,
         constants: Constants,
         inputs: GridInputs,
         body: Surface,
@@ -90,20 +98,24 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         """(K7.adj), and (K4.adj), (K3.adj), (K6.adj) from the last wall to the first."""
         u = at.u[s]
         anchor = at.anchor[s]
-        x = present(body, p, at_point(body, u, world, p))
-        v = at_point(body, at.free, world, p)
+        x = present(point, at_point(point, u, world))  # all of it loaded before anything is stored
+        v = at_point(point, at.free, world)
         dv = at.D[world, p]
-        stiffness = body.stiffness[p]
-        per_force = at.rate[0] * body.newtons[p]
+        per_force = at.rate[0] * point.newtons
         wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[s, world])
-        before = vecs()
-        adj_after = vecs()
+        i = world * bar.held + p
+        anchored = vecs()
+        adj_anchor = vecs()
         pushed = vecs()
+        rubbed = reals()
         for q in range(count):
-            before[q] = anchor[world, q, p]
-            adj_after[q] = bar.anchor[world, q, p]
+            anchored[q] = anchor[world, q, p]
+            adj_anchor[q] = bar.anchor[world, q, p]
             pushed[q] = bar.force[world, q, p]
-        adj_J = body.areas[p] * at_point(body, bar.shared, world, p)
+            if wp.static(rough):
+                rubbed[q] = adj_inputs.friction[number[q], i]
+        adj_D = bar.D[world, p]
+        adj_J = point.area * at_point(point, bar.shared, world)
         reached = vecs()
         for q in range(count):
             reached[q] = v
@@ -115,7 +127,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 wall.anchor[q],
                 dv,
                 wall.friction[q],
-                stiffness,
+                point.stiffness,
                 constants.dt,
                 body.width,
                 constants.spacing,
@@ -123,9 +135,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             v += dv * found.J
         back_x = vec()
         back_v = vec()
-        total_D = real(0.0)
         after = v
-        i = world * bar.held + p
         for back in range(count):
             q = count - 1 - back
             k = number[q]
@@ -138,36 +148,39 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 wall.anchor[q],
                 dv,
                 wall.friction[q],
-                stiffness,
+                point.stiffness,
                 constants.dt,
                 body.width,
                 constants.spacing,
                 adj_J + dv * back_v + per_force * pushed[q],
-                adj_after[q],
+                adj_anchor[q],
             )
-            total_D += wp.dot(after - here, back_v) / dv + adj.D
+            adj_D += wp.dot(after - here, back_v) / dv + adj.D
             back_v += adj.v
             back_x += adj.x
-            bar.anchor[world, q, p] = face_adj(
-                constants, inputs, world, k, before[q], adj.n, adj.y, adj.anchor, i, adj_inputs
+            adj_anchor[q] = face_adj(
+                constants, inputs, world, k, anchored[q], adj.n, adj.y, adj.anchor, i, adj_inputs
             )
+            rubbed[q] += adj.friction
+            after = here
+        for q in range(count):
+            bar.anchor[world, q, p] = adj_anchor[q]
             if anew == 1:  # the mean before is dropped
                 bar.force[world, q, p] = vec()
-            if wp.static("friction" in wanted):
-                adj_inputs.friction[k, i] = adj_inputs.friction[k, i] + adj.friction
-            after = here
+            if wp.static(rough):
+                adj_inputs.friction[number[q], i] = rubbed[q]
         bar.x[world, p] = back_x
         bar.free[world, p] = back_v
-        bar.D[world, p] = bar.D[world, p] + total_D
+        bar.D[world, p] = adj_D
 
     @wp.func
     def spread_adj_at(
         world: int,
-        n: int,
         lane: int,
+        entry: Touched,
+        node: Node,
         constants: Constants,
         inputs: GridInputs,
-        inside: Rest,
         body: Surface,
         at: Chunk,
         bar: Adjoint,
@@ -175,16 +188,17 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         s: int,
     ):
         """(K2.adj), then (Q3.adj), at the nodes that surface points act on; the adjoint of constraints comes between."""
-        i = body.nodes[n]
-        more_u = from_points(body, bar.x, world, n, lane)
-        more_v = from_points(body, bar.free, world, n, lane)
+        i = entry.i
+        was = before(world, i, node, at, s)  # all of it loaded before anything is stored
+        adj = adj_of(world, i, bar)
+        adj.u += from_points(body, entry, bar.x, world)
+        adj.v += from_points(body, entry, bar.free, world)
         if lane == 0:
-            bar.u[world, i] = bar.u[world, i] + more_u
-            adj_new = bar.v[world, i] + more_v
             if wp.static(constrained):
-                bar.v[world, i] = adj_new
+                bar.u[world, i] = adj.u
+                bar.v[world, i] = adj.v
             else:
-                moved_adj(world, i, constants, inputs, inside, at, bar, adj_inputs, s, adj_new)
+                moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle_adj(
@@ -197,7 +211,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         s: int,
     ):
         world, i = wp.tid()
-        settle_adj_at(world, i, constants, inputs, inside, at, bar, adj_inputs, s)
+        node = node_of(constants, inside, at.mass, world, i)
+        settle_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def press_adj(
@@ -211,7 +226,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         anew: int,
     ):
         world, p = wp.tid()
-        press_adj_at(world, p, constants, inputs, body, at, bar, adj_inputs, s, anew)
+        press_adj_at(world, p, point_of(body, p), constants, inputs, body, at, bar, adj_inputs, s, anew)
 
     @wp.kernel(module=module, enable_backward=False)
     def spread_adj(
@@ -225,7 +240,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         s: int,
     ):
         world, n, lane = wp.tid()
-        spread_adj_at(world, n, lane, constants, inputs, inside, body, at, bar, adj_inputs, s)
+        entry = touched_of(body, n, lane)
+        node = node_of(constants, inside, at.mass, world, entry.i)
+        spread_adj_at(world, lane, entry, node, constants, inputs, body, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus_adj(

@@ -16,7 +16,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.kinematics import kinematics
-from softmpm.kernels.physics.stress import total_stress, total_stress_adj
+from softmpm.kernels.physics.stress import material, total_stress, total_stress_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 STEPS = {2: 3, 3: 5}
@@ -35,7 +35,7 @@ def alarm(spec: Spec) -> SimpleNamespace:
     total, stress_adj = total_stress(spec), total_stress_adj(spec, wanted).stress_adj
     rotation, stiffness_bound, largest_square = total.rotation, total.stiffness_bound, total.largest_square
     identity, dim, steps = kinematics(spec.dim, spec.dtype).identity, spec.dim, STEPS[spec.dim]
-    viscous = spec.viscosity
+    viscous, Material, material_of = spec.viscosity, material(spec).Material, material(spec).material_of
 
     @wp.func
     def viscous_rate(constants: Constants, inputs: ParticleInputs, world: int, p: int) -> real:
@@ -45,10 +45,10 @@ def alarm(spec: Spec) -> SimpleNamespace:
         return real(0.0)
 
     @wp.func
-    def stiffer(inputs: ParticleInputs, world: int, p: int, H: mat, limit: real, rate: real) -> bool:
+    def stiffer(own: Material, H: mat, limit: real, rate: real) -> bool:
         """True if K > ``limit`` [Pa] (W3), viscosity included; false if K is not a number, which another alarm reports."""
         F = identity() + H
-        Q = rotation(inputs, world, p, H)
+        Q = rotation(own, H)
         G = F * wp.transpose(F)
         G = G / wp.sqrt(wp.ddot(G, G))
         for i in range(dim):
@@ -63,7 +63,7 @@ def alarm(spec: Spec) -> SimpleNamespace:
         beta = real(0.0)
         pivot = real(1.0)
         for _step in range(steps):
-            A = stress_adj(inputs, world, p, H, Q, G, ParticleInputsAdj()) * wp.transpose(F)
+            A = stress_adj(own, H, Q, G, 0, 0, ParticleInputsAdj()) * wp.transpose(F)
             A = real(0.5) * (A + wp.transpose(A))
             if wp.static(viscous):
                 B = F * wp.transpose(F)
@@ -84,7 +84,8 @@ def alarm(spec: Spec) -> SimpleNamespace:
         reach = constants.spacing / constants.dt
         limit = constants.step * inputs.mass[world, p] / inputs.volume[world, p] * reach * reach
         rate = viscous_rate(constants, inputs, world, p)
-        bound = stiffness_bound(inputs, world, p, H)
+        own = material_of(inputs, world, p)
+        bound = stiffness_bound(own, H)
         if wp.static(viscous):
             F = identity() + H
             square = largest_square(F * wp.transpose(F))
@@ -92,7 +93,7 @@ def alarm(spec: Spec) -> SimpleNamespace:
         # Nearly all particles of a scene at half its stable step need no more than this:
         if not bound > limit:
             return True
-        return not stiffer(inputs, world, p, H, limit, rate)
+        return not stiffer(own, H, limit, rate)
 
     @wp.func
     def near(constants: Constants, cells: ivec, apart: vec) -> bool:

@@ -19,7 +19,7 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.kinematics import kinematics
-from softmpm.kernels.physics.stress import total_stress, total_stress_adj
+from softmpm.kernels.physics.stress import material, total_stress, total_stress_adj
 from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
@@ -29,10 +29,10 @@ def particle(spec: Spec) -> SimpleNamespace:
     t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
     real, vec, mat, ivec, Constants, divide = t.real, t.vec, t.mat, t.ivec, t.Constants, t.divide
     ParticleInputs, total = input_types(spec).ParticleInputs, total_stress(spec)
-    rotation, stress, identity = total.rotation, total.stress, k.identity
+    rotation_of, stress, identity = total.rotation, total.stress, k.identity
     valid, dim, rounds = status.check(spec).valid, spec.dim, spec.dtype == "float32"
     viscous, forced, driven = spec.viscosity, "force" in spec.given, spec.driven
-    viscous_stress = viscosity(spec.dim, spec.dtype).viscous_stress
+    viscous_stress, material_of = viscosity(spec.dim, spec.dtype).viscous_stress, material(spec).material_of
 
     @wp.struct
     class Particle:
@@ -43,6 +43,11 @@ def particle(spec: Spec) -> SimpleNamespace:
         C: mat
         H: mat
         valid: bool
+
+    @wp.func
+    def rotation(inputs: ParticleInputs, world: int, p: int, H: mat) -> mat:
+        """Q of F, if the law of the particle asks for it."""
+        return rotation_of(material_of(inputs, world, p), H)
 
     @wp.func
     def impulse(constants: Constants, inputs: ParticleInputs, world: int, p: int) -> real:
@@ -63,13 +68,10 @@ def particle(spec: Spec) -> SimpleNamespace:
         constants: Constants, inputs: ParticleInputs, world: int, p: int, C: mat, H: mat, Q: mat
     ) -> mat:
         """A per cell [kg m/s] (T1)."""
+        tau = stress(material_of(inputs, world, p), H, Q)
         if wp.static(viscous):
-            tau = stress(inputs, world, p, H, Q)
             tau += viscous_stress(identity() + H, C, inputs.viscosity[world, p])
-            return constants.width * (inputs.mass[world, p] * C - impulse(constants, inputs, world, p) * tau)
-        return constants.width * (
-            inputs.mass[world, p] * C - impulse(constants, inputs, world, p) * stress(inputs, world, p, H, Q)
-        )
+        return constants.width * (inputs.mass[world, p] * C - impulse(constants, inputs, world, p) * tau)
 
     @wp.func
     def moved(
@@ -128,7 +130,12 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     )
     stress_adj, impulse, identity = total_stress_adj(spec, wanted).stress_adj, one.impulse, one.identity
     viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
-    material, viscous, driven = "material" in wanted, spec.viscosity, spec.driven
+    moduli, viscous, driven, material_of = (
+        "material" in wanted,
+        spec.viscosity,
+        spec.driven,
+        material(spec).material_of,
+    )
     forced, steered = "force" in wanted, "velocity" in wanted
 
     @wp.struct
@@ -160,14 +167,14 @@ def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj.v = m * adj_mv
         adj.C = m * adj_A
         adj_tau = -impulse(constants, inputs, world, p) * adj_A
-        adj.H = stress_adj(inputs, world, p, H, Q, adj_tau, adj_inputs)
+        adj.H = stress_adj(material_of(inputs, world, p), H, Q, adj_tau, world, p, adj_inputs)
         if wp.static(viscous):
             adj_viscous = viscous_stress_adj(identity() + H, C, inputs.viscosity[world, p], adj_tau)
             adj.C += adj_viscous.C
             adj.H += adj_viscous.F
             if wp.static("viscosity" in wanted):
                 adj_inputs.viscosity[world, p] = adj_inputs.viscosity[world, p] + adj_viscous.eta
-        if wp.static(material):
+        if wp.static(moduli):
             adj_inputs.mass[world, p] = (
                 adj_inputs.mass[world, p] + adj_m + wp.dot(adj_mv, v) + wp.ddot(adj_A, C)
             )

@@ -9,21 +9,20 @@ from softmpm.kernels.physics.actuators import actuator
 from softmpm.kernels.physics.alarms import alarm
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.laws import law
-from softmpm.kernels.physics.stress import choices
+from softmpm.kernels.physics.stress import material
 from softmpm.kernels.physics.tangent import moduli_type, tangent
 from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
 def rest_step(spec: Spec) -> SimpleNamespace:
-    t, k, choose = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype), choices(spec)
-    real, mat, Constants, ParticleInputs = t.real, t.mat, t.Constants, input_types(spec).ParticleInputs
-    law_of, actuator_of, slots, Moduli = (
-        choose.law_of,
-        choose.actuator_of,
-        spec.muscle_slots,
-        moduli_type(spec.dtype),
+    t, k, material_of = (
+        types(spec.dim, spec.dtype),
+        kinematics(spec.dim, spec.dtype),
+        material(spec).material_of,
     )
+    real, mat, Constants, ParticleInputs = t.real, t.mat, t.Constants, input_types(spec).ParticleInputs
+    slots, Moduli = spec.muscle_slots, moduli_type(spec.dtype)
     identity, volume_change = k.identity, k.volume_change
     stiffer, viscous_rate = tangent(spec.dim, spec.dtype).stiffer, alarm(spec).viscous_rate
     laws = [law(name, spec.dim, spec.dtype) for name in spec.laws]
@@ -64,12 +63,12 @@ def rest_step(spec: Spec) -> SimpleNamespace:
         """K ≤ s² ρ₀ dx²/Δt². True if K is not a number, which another alarm reports."""
         F = identity() + H
         j = volume_change(H)
-        m = moduli_of(law_of(inputs, world, p), j, wp.ddot(F, F), inputs.mu[world, p], inputs.lam[world, p])
+        own = material_of(inputs, world, p)
+        m = moduli_of(own.law, j, wp.ddot(F, F), own.mu, own.lam)
         if wp.static(slots > 0):
             for slot in range(slots):
-                k = inputs.muscle[world, p, slot]
-                if k >= 0:
-                    active = active_moduli_of(actuator_of(inputs, k), inputs.active_stress[world, k])
+                if own.muscle[slot] >= 0:
+                    active = active_moduli_of(own.kind[slot], own.active_stress[slot])
                     m.shear += active.shear
                     m.slope += active.slope
         reach = constants.spacing / constants.dt

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.physics.accumulate import accumulate
 from softmpm.kernels.physics.actuators import actuator, actuator_adj_type
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.laws import law, law_adj_type
@@ -14,11 +15,10 @@ from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input
 @kernel_factory
 def total_stress(spec: Spec) -> SimpleNamespace:
     t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
-    real, vec, mat, ParticleInputs = t.real, t.vec, t.mat, input_types(spec).ParticleInputs
+    real, vec, mat, Material = t.real, t.vec, t.mat, material(spec).Material
     laws = [law(name, spec.dim, spec.dtype) for name in spec.laws]
     actuators = [actuator(name, spec.dim, spec.dtype) for name in spec.actuators]
-    choose, slots, dim = choices(spec), spec.muscle_slots, spec.dim
-    law_of, actuator_of, fibre_of = choose.law_of, choose.actuator_of, choose.fibre_of
+    slots, dim = spec.muscle_slots, spec.dim
     identity, volume_change = k.identity, k.volume_change
 
     def rotation_from(k: int) -> wp.Function:
@@ -97,21 +97,18 @@ def total_stress(spec: Spec) -> SimpleNamespace:
     )
 
     @wp.func
-    def rotation(inputs: ParticleInputs, world: int, p: int, H: mat) -> mat:
+    def rotation(own: Material, H: mat) -> mat:
         """Q of F, if the law of this particle asks for it."""
-        return rotation_of(law_of(inputs, world, p), H)
+        return rotation_of(own.law, H)
 
     @wp.func
-    def stress(inputs: ParticleInputs, world: int, p: int, H: mat, Q: mat) -> mat:
+    def stress(own: Material, H: mat, Q: mat) -> mat:
         """Kirchhoff stress τ [Pa]."""
-        tau = stress_of(law_of(inputs, world, p), H, Q, inputs.mu[world, p], inputs.lam[world, p])
+        tau = stress_of(own.law, H, Q, own.mu, own.lam)
         if wp.static(slots > 0):
             for slot in range(slots):
-                k = inputs.muscle[world, p, slot]
-                if k >= 0:
-                    tau += active_stress_of(
-                        actuator_of(inputs, k), H, fibre_of(inputs, world, k), inputs.active_stress[world, k]
-                    )
+                if own.muscle[slot] >= 0:
+                    tau += active_stress_of(own.kind[slot], H, own.fibre[slot], own.active_stress[slot])
         return tau
 
     @wp.func
@@ -126,25 +123,16 @@ def total_stress(spec: Spec) -> SimpleNamespace:
         return square
 
     @wp.func
-    def stiffness_bound(inputs: ParticleInputs, world: int, p: int, H: mat) -> real:
+    def stiffness_bound(own: Material, H: mat) -> real:
         """At least the stiffness K of (W3) [Pa], at a small part of its price; K itself at rest (E4)."""
         F = identity() + H
         B = F * wp.transpose(F)
         j = volume_change(H)
-        law = law_of(inputs, world, p)
-        mu = inputs.mu[world, p]
-        K = bound_of(law, largest_square(B), j, wp.trace(B), mu, inputs.lam[world, p])
+        K = bound_of(own.law, largest_square(B), j, wp.trace(B), own.mu, own.lam)
         if wp.static(slots > 0):
             for slot in range(slots):
-                k = inputs.muscle[world, p, slot]
-                if k >= 0:
-                    K += active_bound_of(
-                        actuator_of(inputs, k),
-                        F,
-                        j,
-                        fibre_of(inputs, world, k),
-                        inputs.active_stress[world, k],
-                    )
+                if own.muscle[slot] >= 0:
+                    K += active_bound_of(own.kind[slot], F, j, own.fibre[slot], own.active_stress[slot])
         return K
 
     return SimpleNamespace(
@@ -153,52 +141,77 @@ def total_stress(spec: Spec) -> SimpleNamespace:
 
 
 @kernel_factory
-def choices(spec: Spec) -> SimpleNamespace:
-    """Functions for the law of a particle and the kind and fibre direction of an actuator; a single law or kind needs no index."""
-    vec, ParticleInputs = types(spec.dim, spec.dtype).vec, input_types(spec).ParticleInputs
+def material(spec: Spec) -> SimpleNamespace:
+    """What a particle is made of: its law with the moduli, and its actuators."""
+    t, ParticleInputs = types(spec.dim, spec.dtype), input_types(spec).ParticleInputs
+    real, slots, dim = t.real, spec.muscle_slots, spec.dim
     several_laws, several_kinds = len(spec.laws) > 1, len(spec.actuators) > 1
     fibres, each_world = spec.fibres, "direction" in spec.given
 
-    @wp.func
-    def law_of(inputs: ParticleInputs, world: int, p: int) -> int:
-        """Index into ``spec.laws``."""
-        if wp.static(several_laws):
-            return inputs.law[world, p]
-        else:
-            return 0
+    class Material:
+        law: int  # index into ``spec.laws``
+        mu: real
+        lam: real
+
+    if slots:
+        numbers, reals = wp.types.vector(slots, wp.int32), wp.types.vector(slots, real)
+        Material.__annotations__ |= {
+            "muscle": numbers,  # actuator of each slot, or -1
+            "kind": numbers,  # index into ``spec.actuators``
+            "active_stress": reals,
+            "fibre": wp.types.matrix((slots, dim), real),
+        }
+    Material = wp.struct(Material)
 
     @wp.func
-    def actuator_of(inputs: ParticleInputs, k: int) -> int:
-        """Index into ``spec.actuators``."""
+    def with_actuator(own: Material, inputs: ParticleInputs, world: int, slot: int, k: int) -> Material:
+        out = own
+        out.active_stress[slot] = inputs.active_stress[world, k]
         if wp.static(several_kinds):
-            return inputs.actuator[k]
-        else:
-            return 0
-
-    @wp.func
-    def fibre_of(inputs: ParticleInputs, world: int, k: int) -> vec:
+            out.kind[slot] = inputs.actuator[k]
         if wp.static(fibres and each_world):
-            return inputs.fibre[world, k]
+            out.fibre[slot] = inputs.fibre[world, k]
         elif wp.static(fibres):
-            return inputs.fibre[k]
-        else:
-            return vec()
+            out.fibre[slot] = inputs.fibre[k]
+        return out
 
-    return SimpleNamespace(law_of=law_of, actuator_of=actuator_of, fibre_of=fibre_of)
+    def reader(ahead: bool) -> wp.Function:
+        """Loads ``ahead`` are without branches, so that they wait for memory together; others take fewer registers."""
+
+        @wp.func
+        def material_of(inputs: ParticleInputs, world: int, p: int) -> Material:
+            own = Material()
+            own.mu = inputs.mu[world, p]
+            own.lam = inputs.lam[world, p]
+            if wp.static(several_laws):
+                own.law = inputs.law[world, p]
+            if wp.static(slots > 0):
+                for slot in range(slots):
+                    k = inputs.muscle[world, p, slot]
+                    own.muscle[slot] = k
+                    if wp.static(ahead):
+                        own = with_actuator(own, inputs, world, slot, wp.max(k, 0))
+                    else:
+                        if k >= 0:
+                            own = with_actuator(own, inputs, world, slot, k)
+            return own
+
+        return material_of
+
+    return SimpleNamespace(Material=Material, material_of=reader(False), material_ahead=reader(True))
 
 
 @kernel_factory
 def total_stress_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t = types(spec.dim, spec.dtype)
-    real, vec, mat, ParticleInputs = t.real, t.vec, t.mat, input_types(spec).ParticleInputs
+    real, vec, mat, Material = t.real, t.vec, t.mat, material(spec).Material
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     LawAdj, ActuatorAdj = law_adj_type(spec.dim, spec.dtype), actuator_adj_type(spec.dim, spec.dtype)
     laws = [law(name, spec.dim, spec.dtype) for name in spec.laws]
     actuators = [actuator(name, spec.dim, spec.dtype) for name in spec.actuators]
-    choose, slots = choices(spec), spec.muscle_slots
-    law_of, actuator_of, fibre_of = choose.law_of, choose.actuator_of, choose.fibre_of
-    material, activation = "material" in wanted, "activation" in wanted
+    slots, moduli, activation = spec.muscle_slots, "material" in wanted, "activation" in wanted
     direction = "direction" in wanted and "direction" in spec.given
+    to_particle, to_slot = accumulate(spec.dtype).to_particle, accumulate(spec.dtype).to_slot
 
     def stress_adj_from(k: int) -> wp.Function:
         """Adjoint of τ by the laws from number ``k`` on."""
@@ -233,37 +246,23 @@ def total_stress_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
     @wp.func
     def stress_adj(
-        inputs: ParticleInputs,
-        world: int,
-        p: int,
-        H: mat,
-        Q: mat,
-        adj_tau: mat,
-        adj_inputs: ParticleInputsAdj,
+        own: Material, H: mat, Q: mat, adj_tau: mat, world: int, p: int, adj_inputs: ParticleInputsAdj
     ) -> mat:
-        """∂L/∂F; adds what is wanted of the material and of the actuators into ``adj_inputs``."""
-        law = law_of(inputs, world, p)
-        adj = stress_adj_of(law, H, Q, inputs.mu[world, p], inputs.lam[world, p], adj_tau)
+        """∂L/∂F; adds what is wanted of the material and of the actuators of particle ``p`` into ``adj_inputs``."""
+        adj = stress_adj_of(own.law, H, Q, own.mu, own.lam, adj_tau)
         adj_F = adj.F
-        if wp.static(material):
-            adj_inputs.mu[world, p] = adj_inputs.mu[world, p] + adj.mu
-            adj_inputs.lam[world, p] = adj_inputs.lam[world, p] + adj.lam
+        if wp.static(moduli):
+            to_particle(adj_inputs.mu, world, p, adj.mu)
+            to_particle(adj_inputs.lam, world, p, adj.lam)
         if wp.static(slots > 0):
             for slot in range(slots):
-                k = inputs.muscle[world, p, slot]
-                if k >= 0:
+                if own.muscle[slot] >= 0:
                     adj_active = active_stress_adj_of(
-                        actuator_of(inputs, k),
-                        H,
-                        fibre_of(inputs, world, k),
-                        inputs.active_stress[world, k],
-                        adj_tau,
+                        own.kind[slot], H, own.fibre[slot], own.active_stress[slot], adj_tau
                     )
                     adj_F += adj_active.F
                     if wp.static(activation):
-                        adj_inputs.active_stress[world, p, slot] = (
-                            adj_inputs.active_stress[world, p, slot] + adj_active.active_stress
-                        )
+                        to_slot(adj_inputs.active_stress, world, p, slot, adj_active.active_stress)
                     if wp.static(direction):
                         adj_inputs.fibre[world, p, slot] = adj_inputs.fibre[world, p, slot] + adj_active.fibre
         return adj_F

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.lagrangian.lattice import layers
+from softmpm.kernels.lagrangian.layers import layers
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
 from softmpm.model import Model

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 from typing import Any
 
 from softmpm.kernels.compile import clusters_are_launchable
-from softmpm.kernels.lagrangian.lattice import layers
-from softmpm.kernels.lagrangian.persistent import Cluster, march, march_adj
-from softmpm.kernels.lagrangian.surface import surface_type
+from softmpm.kernels.lagrangian.cluster import Cluster
+from softmpm.kernels.lagrangian.layers import layers
+from softmpm.kernels.lagrangian.persistent import march, march_adj
+from softmpm.kernels.lagrangian.surface_sums import surface_type
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.lagrangian.bricks import lattice_struct

@@ -7,8 +7,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.kernels.lagrangian.surface import LANES, surface, surface_type
+from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_adj import surface_adj
+from softmpm.kernels.lagrangian.surface_sums import LANES, surface_type
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
