@@ -205,4 +205,4 @@ def meet_cluster(): ...
 
 @wp.func_native("softmpm::meet_cluster<false>();")
 def meet_cluster_adj():
-    """For the adjoint, which took 5 % longer with the other one (biped on an H200, Warp 1.19); substeps forward took 11 % less."""
+    """For the adjoint, which took 5 % longer with the other one in a trial (biped, H200, Warp 1.19); forward took 11 % less."""
