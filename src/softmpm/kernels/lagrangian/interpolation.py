@@ -15,6 +15,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, meet, window
+from softmpm.kernels.lagrangian.exchange import exchange
 from softmpm.kernels.lagrangian.fours import fours
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
@@ -171,31 +172,18 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
     """
     t, r = types(dim, dtype), rest(dim, dtype)
     real, vec, mat, Rest, weights, lean = t.real, t.vec, t.mat, r.Rest, r.weights, r.lean
-    nodes, threads, count, cells = bricks.nodes, bricks.threads, r.count, bricks.cell_count
-    parts, slots, serial = bricks.parts, bricks.slots, bricks.serial
-    across, along, kinds = bricks.window[-2], bricks.window[-1], dim + (2 if loaded else 1)
-    line = wp.types.vector(count, real)
-    add_of_one, size = fours(dim, dtype, bricks).add, bricks.terms(kinds * dim, 1)
-    terms, sizes = f"{size}, {slots}", f"{size}, {nodes}, {threads}, {count}, {across}, {along}, 1"
-
-    @wp.func_native(f"softmpm::give<{terms}>(number, lane, value);")
-    def give(number: int, lane: int, value: vec): ...
-
-    @wp.func_native(f"return softmpm::given<{terms}, {t.c_name}, {dim}>(number, lane);")
-    def given(number: int, lane: int) -> vec: ...
-
-    @wp.func_native(
-        f"softmpm::write_sums<{sizes}>(total, partial, partial, world, brick, corner, axis, lane);"
+    nodes, cells, parts, slots, serial = (
+        bricks.nodes,
+        bricks.cell_count,
+        bricks.parts,
+        bricks.slots,
+        bricks.serial,
     )
-    def write_shared(
-        total: line,
-        partial: wp.array2d(dtype=vec),
-        world: int,
-        brick: int,
-        corner: int,
-        axis: int,
-        lane: int,
-    ): ...
+    memory, add_of_one = (
+        exchange(dim, dtype, bricks, dim + (2 if loaded else 1), 1),
+        fours(dim, dtype, bricks).add,
+    )
+    line, give, given, write_shared = memory.line, memory.give, memory.taken, memory.write
 
     if dim == 2:
 
@@ -297,7 +285,7 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
             own = int(-1)
             if lane < cells * dim:
                 own = corner
-            write_shared(total, partial, world, brick, own, lane / cells, lane)
+            write_shared(total, partial, partial, world, brick, own, lane / cells, lane)
 
     return SimpleNamespace(
         line=line, with_term=with_term, row_of=row_of, clear=clear, place_of=place_of, add=add, write=write

@@ -6,6 +6,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.bricks import Bricks, meet
+from softmpm.kernels.lagrangian.exchange import exchange
 from softmpm.kernels.lagrangian.interpolation import sums
 from softmpm.kernels.structs import types
 
@@ -16,32 +17,8 @@ def pair_sums(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     t, one, cells, parts = types(dim, dtype), sums(dim, dtype, bricks, False), bricks.cell_count, bricks.parts
     real, vec, mat, line, with_term, row_of = t.real, t.vec, t.mat, one.line, one.with_term, one.row_of
     add_one, write_one, slots, components = one.add, one.write, bricks.slots, 2 * cells * dim
-    at_once, size = bricks.pairs, bricks.terms((2 * dim + 1) * dim, 2)
-    terms, window = (
-        f"{size}, {slots}",
-        f"{bricks.nodes}, {bricks.threads}, {3**dim}, {bricks.window[-2]}, {bricks.window[-1]}",
-    )
-    sizes = f"{size}, {window}, 2"
-
-    @wp.func_native(f"softmpm::give<{terms}>(number, lane, value);")
-    def give(number: int, lane: int, value: vec): ...
-
-    @wp.func_native(f"return softmpm::given<{terms}, {t.c_name}, {dim}>(number, lane);")
-    def given(number: int, lane: int) -> vec: ...
-
-    @wp.func_native(
-        f"softmpm::write_sums<{sizes}>(total, first, second, world, brick, corner, component, lane);"
-    )
-    def write_shared(
-        total: line,
-        first: wp.array2d(dtype=vec),
-        second: wp.array2d(dtype=vec),
-        world: int,
-        brick: int,
-        corner: int,
-        component: int,
-        lane: int,
-    ): ...
+    at_once, memory = bricks.pairs, exchange(dim, dtype, bricks, 2 * dim + 1, 2)
+    give, given, write_shared = memory.give, memory.taken, memory.write
 
     @wp.struct
     class Lines:
