@@ -28,7 +28,8 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     vec, mat, Constants, dim = t.vec, t.mat, t.Constants, spec.dim
     ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
-    check, check_step, memory = one.check, one.check_step, chunk(dim, spec.dtype)
+    check, check_step, check_now = one.check, one.check_step, one.check_now
+    memory = chunk(dim, spec.dtype)
     Chunk, state_of = memory.Chunk, memory.state_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number) for number in range(2))
     stage, stage_u, stage_v = of_u.stage, of_u.stage_at, of_v.stage_at
@@ -79,8 +80,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     A = constants.rate * forced(who.given, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
-                    if s > 0:  # last, so that nothing waits for it
-                        check(constants, at.words, world, inside.order[p], s - 1, H)
+                    check_now(constants, inputs, inside, at.words, world, p, s, H)  # last: nothing waits for it
                 fx = who.fx
                 if wp.static(not serial):
                     if row + 1 < seat.last:  # loaded while the sums are taken
@@ -101,42 +101,20 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
 
     @wp.kernel(module=module, **settings)
-    def check_end(
-        # Parameters:
-        constants: Constants,
-        inside: Rest,
-        substep: int,
-        # In:
-        u: wp.array2d(dtype=vec),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-    ):
-        """Check the final state of a chunk, of which no forces are computed."""
-        world, brick, lane = wp.tid()
-        stage(u, inside, world, brick, lane)
-        meet()
-        for row in range(inside.rows[brick], inside.rows[brick + 1]):
-            for slot in range(lane, turns, threads):
-                p = place_of(inside, row, slot)
-                if p >= 0:
-                    corner = inside.corners[brick, slot % count]
-                    H = gradient_u(u, inside, world, brick, corner, inside.fraction[p], constants.rate)
-                    check(constants, words, world, inside.order[p], substep, H)
-
-    @wp.kernel(module=module, **settings)
-    def check_start(
+    def check_state(
         # Parameters:
         constants: Constants,
         inputs: ParticleInputs,
         inside: Rest,
         substep: int,
+        limited: bool,  # whether Δt is compared with its limit
         placed: bool,  # whether the inputs are in the order of the places, or in the user's
         # In:
         u: wp.array2d(dtype=vec),
         # Out:
         words: wp.array(dtype=wp.int64),
     ):
-        """Check the state at the beginning of a substep, with the step limit."""
+        """Check a state; failures are reported for ``substep``."""
         world, brick, lane = wp.tid()
         stage(u, inside, world, brick, lane)
         meet()
@@ -151,14 +129,14 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     at = p
                     if placed:
                         at = place
-                    check_step(constants, inputs, words, world, at, p, substep, H)
+                    if limited:
+                        check_step(constants, inputs, words, world, at, p, substep, H)
 
     return SimpleNamespace(
         seat_of=seat_of,
         forces=forces,
         forces_at=forces_at,
-        check_end=check_end,
-        check_start=check_start,
+        check_state=check_state,
     )
 
 

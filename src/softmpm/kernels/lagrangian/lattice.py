@@ -29,7 +29,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     Constants, dim = t.Constants, spec.dim
     ParticleInputs, forced, given_to = input_types(spec).ParticleInputs, one.forced, one.given_to
-    check, memory = one.check, chunk(dim, spec.dtype)
+    check_now, memory = one.check_now, chunk(dim, spec.dtype)
     Chunk, state_of = memory.Chunk, memory.state_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage_at, of_v.stage_at, sums(dim, spec.dtype, bricks, False).clear
@@ -83,8 +83,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         own = given_to(inputs, world, p)
                         A_n = forced(own, Hn, constants.rate * taken(rate, n))  # (Q2)
                         A = put(A, n, constants.rate * A_n)
-                        if s > 0:  # last, so that nothing waits for it
-                            check(constants, at.words, world, inside.order[p], s - 1, Hn)
+                        check_now(constants, inputs, inside, at.words, world, p, s, Hn)  # last: nothing waits
             add(A, at.partial, world, brick, corner, layer, lane, lattice)
 
     @wp.kernel(module=module, **bricks.layer_settings(resident(spec, bricks, WARPS)))

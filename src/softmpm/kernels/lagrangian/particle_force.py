@@ -11,6 +11,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.accumulate import accumulate
 from softmpm.kernels.physics.kinematics import kinematics
@@ -18,6 +19,11 @@ from softmpm.kernels.physics.rest_step import rest_step
 from softmpm.kernels.physics.stress import material, total_stress, total_stress_adj
 from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
+
+CHECKED = wp.constant(8)
+"""Substeps from one check of the step limit to the next: an instability takes several substeps to grow. A chunk that failed is run
+again substep by substep, with a check at the beginning of each.
+"""
 
 
 @kernel_factory
@@ -32,7 +38,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     Material, material_ahead = material(spec).Material, material(spec).material_ahead
     report, largest = status.report(dim, spec.dtype).report, 1.0e12
     collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
-    step_is_stable = rest_step(spec).step_is_stable
+    step_is_stable, Rest = rest_step(spec).step_is_stable, rest(dim, spec.dtype).Rest
 
     @wp.struct
     class Given:
@@ -96,8 +102,30 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
             if not step_is_stable(constants, inputs, world, place, H):
                 report(words, world, substep, too_long, p)
 
+    @wp.func
+    def check_now(
+        constants: Constants,
+        inputs: ParticleInputs,
+        inside: Rest,
+        words: wp.array(dtype=wp.int64),
+        world: int,
+        place: int,
+        s: int,
+        H: mat,
+    ):
+        """Check a particle with this H at the beginning of substep ``s``, in some substeps with the step limit."""
+        check(constants, words, world, inside.order[place], wp.max(s - 1, 0), H)
+        if s % CHECKED == 0:
+            check_step(constants, inputs, words, world, place, inside.order[place], s, H)
+
     return SimpleNamespace(
-        Given=Given, given_to=given_to, piola=piola, forced=forced, check=check, check_step=check_step
+        Given=Given,
+        given_to=given_to,
+        piola=piola,
+        forced=forced,
+        check=check,
+        check_step=check_step,
+        check_now=check_now,
     )
 
 

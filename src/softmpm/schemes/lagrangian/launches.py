@@ -15,11 +15,6 @@ from softmpm.schemes.lagrangian.nodal import launch_masses
 from softmpm.schemes.lagrangian.persistent import cluster_of, launch_march, launch_march_adj, segments
 from softmpm.schemes.launch import KernelLauncher
 
-CHECKED = 8
-"""Substeps from one check of the step limit to the next: an instability takes several substeps to grow. A chunk that failed is run
-again substep by substep, with a check at the beginning of each.
-"""
-
 
 def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     """Advance the first state by all substeps of the chunk, then check the last one."""
@@ -28,35 +23,29 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     launch_masses(model, launch, buffers.rest, *masses)
     if buffers.contact is not None:
         buffers.contact.begin(launch, buffers.struct)
-    cluster, checked = cluster_of(model), model.alarms.step is not None
-    for first, last in segments(buffers.chunk, CHECKED if checked else buffers.chunk.length):
-        if checked and first % CHECKED == 0:
-            _check_step(buffers, first, buffers.index(first), launch)
+    cluster = cluster_of(model)
+    for first, last in segments(buffers.chunk):
         if cluster is not None:
             launch_march(buffers, cluster, first, last, launch)
         else:
             for s in range(first, last):
                 _forces(buffers, s, launch)
                 _advance(buffers, s, launch)
-    last = buffers.chunk.length
-    if model.alarms.step is not None and last > 1:  # else the next substep is checked
-        _check_step(buffers, last - 1, buffers.index(last), launch)
-    kernel, u = cells(model.spec, model.rest_grid.bricks).check_end, buffers.u_arrays[buffers.index(last)]
-    if buffers.contact is not None:
-        inputs = buffers.inputs.grid_struct(last - 1)
-        shift = buffers.shift_arrays[buffers.index(last)]
-        buffers.contact.check_end(launch, inputs, last - 1, shift, u, buffers.words_array)
-    brick_launch(model, launch, kernel, model.constants, buffers.rest, last - 1, u, buffers.words_array)
-    if buffers.overlap is not None:
-        buffers.overlap.check(launch, last - 1, u, buffers.words_array)
+    _check_end(buffers, buffers.chunk.length - 1, launch)
 
 
-def _check_step(buffers: ChunkBuffers, s: int, state: int, launch: KernelLauncher) -> None:
-    """Compare Δt with the limit of each particle in a stored state, with the inputs of substep ``s``."""
+def _check_end(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
+    """Check the state after the last substep ``s``, of which no forces are computed."""
     model, inputs = buffers.model, buffers.inputs.particle_struct(s, s)
-    arguments = (s, True, buffers.u_arrays[state], buffers.words_array)
-    kernel = cells(model.spec, model.rest_grid.bricks).check_start
+    u, words = buffers.u_arrays[buffers.index(s + 1)], buffers.words_array
+    limited = model.alarms.step is not None and s > 0  # else the next substep is checked
+    kernel, arguments = cells(model.spec, model.rest_grid.bricks).check_state, (s, limited, True, u, words)
     brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
+    if buffers.contact is not None:
+        shift = buffers.shift_arrays[buffers.index(s + 1)]
+        buffers.contact.check_end(launch, buffers.inputs.grid_struct(s), s, shift, u, words)
+    if buffers.overlap is not None:
+        buffers.overlap.check(launch, s, u, words)
 
 
 def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
@@ -102,7 +91,7 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     model, chunk = forward.model, forward.chunk
     cluster = cluster_of(model)
-    for first, last in reversed(list(segments(chunk, chunk.length))):
+    for first, last in reversed(list(segments(chunk))):
         if cluster is not None:
             launch_march_adj(adjoint, cluster, first, last, launch)
             if first == 0:

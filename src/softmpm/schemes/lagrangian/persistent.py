@@ -44,9 +44,9 @@ def _cluster_of(model: Model) -> Cluster | None:
     return cluster if launchable else None
 
 
-def segments(chunk: Chunk, longest: int) -> Iterator[tuple[int, int]]:
-    """Substeps of a chunk, cut where a control step begins and after ``longest`` of them."""
-    begins = sorted({*range(0, chunk.length, longest), *chunk.shape[1], chunk.length})
+def segments(chunk: Chunk) -> Iterator[tuple[int, int]]:
+    """Substeps of a chunk, cut where a control step begins."""
+    begins = sorted({0, *chunk.shape[1], chunk.length})
     yield from itertools.pairwise(begins)
 
 

@@ -156,8 +156,8 @@ class Lagrangian:
         words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         u = view(start.u.detach().contiguous(), types(model.spec.dim, model.spec.dtype).vec)
         inputs = self._start_inputs.of(model.fixed | stiffest(model, values))
-        arguments = (model.constants, inputs, rest_struct(model), 0, False, u, view(words, wp.int64))
-        kernel = cells(model.spec, model.rest_grid.bricks).check_start
+        arguments = (model.constants, inputs, rest_struct(model), 0, True, False, u, view(words, wp.int64))
+        kernel = cells(model.spec, model.rest_grid.bricks).check_state
         launch = KernelLauncher(model, stream_of(model.device))
         brick_launch(model, launch, kernel, *arguments)
         if model.surface is not None:
