@@ -220,7 +220,7 @@ CUDA_CALLABLE inline void write_sums(
 }
 
 // Lattices: the particles of every cell have the same K places along each axis. A thread has those of a cell with one place along the
-// last axis; w and e are the weights w and w (o - f) of node o, [axis][place][o] in rows of three.
+// last axis; w and e are the weights w and 4/dx w (o - f) of node o, [axis][place][o] in rows of three.
 
 // The three weights of a layer, of K rows from `FIRST` on. A row chosen by its number would put the table into local memory.
 template <int FIRST, int K, typename T, unsigned ROWS>
@@ -235,7 +235,7 @@ CUDA_CALLABLE inline void layer_weights(const wp::mat_t<ROWS, 3, T>& table, int 
     }
 }
 
-// Sums a (x) g / rate over the nodes of a cell, for the K^(DIM - 1) particles of a layer, DIM rows for each.
+// Sums a (x) g over the nodes of a cell, for the K^(DIM - 1) particles of a layer, DIM rows for each.
 template <int FIELD, int NODES, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
 CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradients(
     const wp::array_t<wp::vec_t<DIM, T>>& values, const wp::array_t<int>& window, int world, int brick, int corner, int layer,
@@ -294,7 +294,7 @@ CUDA_CALLABLE inline wp::mat_t<(DIM == 2 ? K : K * K) * DIM, DIM, T> layer_gradi
 #endif
 }
 
-// Add A g / rate of the particles of a layer to the sums of the brick. All threads of a block come here together, those without a cell
+// Add A g of the particles of a layer to the sums of the brick. All threads of a block come here together, those without a cell
 // with a negative corner. Each layer has planes of its own, for every first offset.
 template <int NODES, int CELLS, int ACROSS, int ALONG, int K, typename T, unsigned DIM>
 CUDA_CALLABLE inline void add_layer(

@@ -79,10 +79,9 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                 for n in range(points):
                     p = place[n]
                     if p >= 0:
-                        Hn = constants.rate * taken(H, n)
+                        Hn = taken(H, n)
                         own = given_to(inputs, world, p)
-                        A_n = forced(own, Hn, constants.rate * taken(rate, n))  # (Q2)
-                        A = put(A, n, constants.rate * A_n)
+                        A = put(A, n, forced(own, Hn, taken(rate, n)))  # (Q2)
                         check_now(constants, inputs, inside, at.words, world, p, s, Hn)  # last: nothing waits
             add(A, at.partial, world, brick, corner, layer, lane, lattice)
 
@@ -175,15 +174,15 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
                 for n in range(points):
                     p = place[n]
                     if p >= 0:
-                        Hn = constants.rate * taken(H, n)
-                        Gn = constants.rate * taken(G, n)
+                        Hn = taken(H, n)
+                        Gn = taken(G, n)
                         own = given_to(inputs, world, p)
-                        rate_n = constants.rate * taken(rate, n)
+                        rate_n = taken(rate, n)
                         adj = forced_adj(own, Hn, rate_n, Gn, world, p, adj_inputs)
                         check_adj(at.words, world, inside.order[p], at.length - 1 - s, adj)
-                        A = put(A, n, constants.rate * adj.F)  # (Q1.adj)
+                        A = put(A, n, adj.F)  # (Q1.adj)
                         if wp.static(viscous):
-                            B = put(B, n, constants.rate * adj.rate)
+                            B = put(B, n, adj.rate)
             add(A, bar.partial_u, world, brick, corner, layer, lane, lattice)
             if wp.static(viscous):
                 add(B, bar.partial_v, world, brick, corner, layer, lane, lattice)

@@ -24,12 +24,12 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
 
     class Lattice:
         w: table  # [axis and place, node]
-        e: table  # w (o − f)
+        e: table  # 4/dx w (o − f)
 
     Lattice = wp.struct(Lattice, module=f"softmpm.types.d{dim}.{dtype}.lattice{K}")
 
     def gradients(number: int):
-        """Σ a ⊗ g / rate of nodal field ``number``, ``dim`` rows for each particle."""
+        """Σ a ⊗ g of nodal field ``number``, ``dim`` rows for each particle."""
 
         @wp.func_native(f"return softmpm::layer_gradients<{number}, {gathers}")
         def gathered(
@@ -55,7 +55,7 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         lane: int,
         lattice: Lattice,
     ):
-        """Add A g / rate of each particle, and write the sums."""
+        """Add A g of each particle, and write the sums."""
 
     @wp.func
     def places_of(inside: Rest, brick: int, slot: int) -> Places:

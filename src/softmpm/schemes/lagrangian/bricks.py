@@ -43,7 +43,7 @@ def lattice_struct(model: Model) -> Any:
         square = (f - 1.0) ** 2 + 0.5 - 0.5  # as in kernels/physics/spline.py
         outer = 0.125 + 0.5 * square
         w = torch.stack([outer - 0.5 * (f - 1.0), 0.75 - square, outer + 0.5 * (f - 1.0)], -1)
-        e = w * (torch.arange(3) - f[:, None])
+        e = 4.0 / model.scene.grid.spacing * w * (torch.arange(3) - f[:, None])
         e[:, 1] = -(e[:, 0] + e[:, 2])  # their sum is zero to the last bit
         lattice.w, lattice.e = w.flatten().tolist(), e.flatten().tolist()
         return lattice

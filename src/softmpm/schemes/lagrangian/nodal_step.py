@@ -71,7 +71,16 @@ class NodalStep:
         model, words = self.model, self.words.clone()
         u = view(end.u, types(model.spec.dim, model.spec.dtype).vec)
         inputs = particle_struct(model, model.fixed | values)
-        arguments = (model.constants, inputs, rest_struct(model), self.last, True, False, u, view(words, wp.int64))
+        arguments = (
+            model.constants,
+            inputs,
+            rest_struct(model),
+            self.last,
+            True,
+            False,
+            u,
+            view(words, wp.int64),
+        )
         kernel = cells(model.spec, model.rest_grid.bricks).check_state
         brick_launch(model, KernelLauncher(model, self.stream), kernel, *arguments)
         return words
