@@ -187,8 +187,8 @@ class _Call:
     def state(self, tensors: Sequence) -> Any:
         """A state of the model's formulation from its tensors and those of its low-order parts."""
         if self.model.formulation == "reference":
-            *found, shift = tensors
-            return Nodal.of(found)._replace(shift=shift)
+            *found, shift, low = tensors
+            return Nodal.of(found)._replace(shift=shift, low=low)
         *found, low_x, low_F = tensors
         return State.of(found)._replace(low=None if low_x is None else Low(low_x, low_F))
 
@@ -200,8 +200,8 @@ class _Call:
         return 4 if self.model.surface is None else 6
 
     def rounding(self, state: Any) -> tuple:
-        """What is not differentiable of a state: the shift, or in the moving formulation the low-order parts or None in their place."""
-        return (state.shift,) if isinstance(state, Nodal) else tuple(state.low or (None, None))
+        """What is not differentiable of a state: shift and ``low`` of nodes, or low-order parts of particles or None in their place."""
+        return (state.shift, state.low) if isinstance(state, Nodal) else tuple(state.low or (None, None))
 
     def run(self, start: Any, values: Values) -> Any:
         """The end, after the trail is kept."""

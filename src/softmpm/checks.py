@@ -86,6 +86,8 @@ def _check_nodes(model: Sizes, nodes: Nodal) -> None:
         check_tensor(model, "state.nodes.reaction", nodes.reaction, model.reaction_shape)
     if nodes.shift is not None:
         check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
+    if nodes.low is not None:
+        check_tensor(model, "state.nodes.low", nodes.low, (shape[0], 2, *shape[1:]))
 
 
 def _check_surface(model: Sizes, surface: SurfaceState) -> None:

@@ -66,6 +66,9 @@ class Nodal(NamedTuple):
     reaction: Tensor | None = None
     """Mean force of clamps and planes of symmetry on each group of nodes that are images of each other, in the last control step [N],
     shape (world, group, dim); see :func:`softmpm.clamp_forces`. A call does not read it."""
+    low: Tensor | None = None
+    """What rounding has kept from u [m] and v [m/s] so far, shape (world, 2, node, dim); None is nothing. The next substep adds it. A
+    constant of the gradient."""
 
     @staticmethod
     def of(tensors: Sequence[Tensor]) -> "Nodal":
@@ -199,7 +202,10 @@ def chosen(worlds: Tensor, there: Kind, elsewhere: Kind) -> Kind:
     pairs = zip(there.differentiable(), elsewhere.differentiable(), strict=True)
     found: Any = type(elsewhere).of([mixed(*pair) for pair in pairs])
     if isinstance(elsewhere, Nodal):
-        return found._replace(shift=mixed(getattr(there, "shift", None), elsewhere.shift))
+        constants = {
+            name: mixed(getattr(there, name, None), getattr(elsewhere, name)) for name in ("shift", "low")
+        }
+        return found._replace(**constants)
     if elsewhere.low is None:
         return found
     low = getattr(there, "low", None) or (None, None)

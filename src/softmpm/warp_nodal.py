@@ -15,7 +15,8 @@ from softmpm.state import Nodal
 
 @dataclass(eq=False, frozen=True, kw_only=True)
 class WarpNodal:
-    """State of all nodes in Warp arrays, as :class:`softmpm.Nodal` has it; all but ``shift`` can carry a gradient.
+    """State of all nodes in Warp arrays, as :class:`softmpm.Nodal` has it; all but ``shift`` and ``low`` can carry a
+    gradient.
 
     Arrays are written into (``wp.copy``), not replaced.
     """
@@ -36,12 +37,15 @@ class WarpNodal:
     reaction: wp.array
     """Mean force of clamps and planes of symmetry on each group of nodes in the latest step [N], vectors of shape (world, group). Not
     read by a step."""
+    low: wp.array
+    """What rounding has kept from u [m] and v [m/s] so far, vectors of shape (world, 2, node)."""
 
     def __post_init__(self):
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)
         nodes, points = (model.worlds, model.rest_grid.count), model.anchor_shape[:-1]
         for name, array in self.arrays().items():
-            other = {"u": nodes, "v": nodes, "shift": nodes[:1], "reaction": model.reaction_shape[:-1]}
+            other = {"u": nodes, "v": nodes, "low": (nodes[0], 2, nodes[1])}
+            other |= {"shift": nodes[:1], "reaction": model.reaction_shape[:-1]}
             shape = other.get(name, points)
             kind = types(model.spec.dim, "float64").vec if name == "shift" else t.vec
             check_array(model, name, array, shape, kind)
@@ -65,10 +69,10 @@ class WarpNodal:
 def warp_nodal(model: Model, nodes: Nodal, requires_grad: bool) -> WarpNodal:
     """Copy of a nodal state that has all parts."""
     vec, exact = (types(model.spec.dim, dtype).vec for dtype in (model.spec.dtype, "float64"))
-    assert nodes.shift is not None
+    assert nodes.shift is not None and nodes.low is not None
     arrays = Nodal.of([owned(tensor, vec, requires_grad) for tensor in nodes.differentiable()])  # pyright: ignore[reportArgumentType]
-    shift = owned(nodes.shift, exact, False)
-    return WarpNodal(model=model, **arrays._replace(shift=shift)._asdict())
+    constants = dict(shift=owned(nodes.shift, exact, False), low=owned(nodes.low, vec, False))
+    return WarpNodal(model=model, **arrays._replace(**constants)._asdict())
 
 
 def owned(tensor: Tensor, dtype, requires_grad: bool) -> wp.array:

@@ -37,7 +37,8 @@ def flying(model: softmpm.Model, speed: float) -> softmpm.State:
 
 
 def test_the_strain_of_a_body_that_flew_1000_cells(device):
-    """In float32 within 1e-4 of that in float64; with one number per displacement it was 2e-3 off. u stays within a few cells."""
+    """In float32 within 2e-5 of that in float64; with one number per displacement it was 2e-3 off, and 1e-4 without what rounding kept
+    from the velocities. u stays within a few cells."""
     substeps, found = 4000, []
     for dtype in (torch.float32, torch.float64):
         made = block()
@@ -50,8 +51,8 @@ def test_the_strain_of_a_body_that_flew_1000_cells(device):
     way = found[1].x - model.rest().x
     assert way[..., 0].mean().item() == pytest.approx(1000 * DX, rel=1e-6)
     assert found[1].F.sub(torch.eye(2).to(found[1].F)).abs().max() > 0.02
-    assert (found[0].F.double() - found[1].F).abs().max() <= 1e-4
-    assert (found[0].x.double() - found[1].x).abs().max() <= 1e-4 * 1000 * DX
+    assert (found[0].F.double() - found[1].F).abs().max() <= 2e-5
+    assert (found[0].x.double() - found[1].x).abs().max() <= 2e-5 * 1000 * DX
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -23,6 +23,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
         mass: wp.array2d(dtype=real)
         partial: wp.array2d(dtype=vec)
         shift: wp.array2d(dtype=exact_vec)
+        low: wp.array3d(dtype=vec)  # of u and of v
         u: wp.array3d(dtype=vec)
         v: wp.array3d(dtype=vec)
         p: wp.array3d(dtype=vec)
@@ -67,4 +68,9 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
     def momenta_of(of: Chunk, s: int) -> int:
         return of.keep * s
 
-    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, momenta_of=momenta_of)
+    @wp.func
+    def lost(a: vec, b: vec) -> vec:
+        """What rounding keeps from a + b, where b is small."""
+        return b - ((a + b) - a)
+
+    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, momenta_of=momenta_of, lost=lost)

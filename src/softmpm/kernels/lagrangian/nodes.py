@@ -1,12 +1,13 @@
 """Motion of the nodes. Derivation: docs/math/lagrangian.md.
 
-    v* = exp(−γ Δt) (p/m + Δt g),  p = m v + Δt f                                                    (Q3)
+    v* = exp(−γ Δt) (v + dv),  dv = Δt (f/m + g)                                                     (Q3)
     v' = W(v*) at X + shift + u,  u' = u − d + Δt v'                                                 (Q4), (Q9)
     v̄' += Δt ū'                                                                                      (Q4.adj)
-    p̄ and m̄ by (G1.adj),  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
+    p̄ and m̄ by (G1.adj) with p = m v + Δt f,  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
 
-(Q3) and (Q4) are the grid stage (G1), (G2) of the momentum p. The side of a wall on which a node lies is constant in the adjoint; the
-speed of a wall that turns depends on the place of the node.
+What rounding keeps from v + dv and from u' is added in the next substep (Q12). (Q3) and (Q4) are the grid stage (G1), (G2) of the
+momentum p. The side of a wall on which a node lies is constant in the adjoint; the speed of a wall that turns depends on the place of
+the node.
 """
 
 from types import SimpleNamespace
@@ -53,7 +54,12 @@ def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
     exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
-    position, node_velocity, sums = g.position, g.node_velocity, gathering(spec.dim, spec.dtype)
+    position, increment, after_free, sums = (
+        g.position,
+        g.increment,
+        g.after_free,
+        gathering(spec.dim, spec.dtype),
+    )
     Entries, entries_of, gathered, surface = (
         sums.Entries,
         sums.entries_of,
@@ -63,7 +69,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
-    Chunk, state_of, momenta_of = memory.Chunk, memory.state_of, memory.momenta_of
+    Chunk, state_of, momenta_of, lost = memory.Chunk, memory.state_of, memory.momenta_of, memory.lost
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.struct
@@ -101,6 +107,8 @@ def nodes(spec: Spec) -> SimpleNamespace:
         then = state_of(at, s + 1)
         p = momenta_of(at, s)
         here = at.u[now, world, i]  # all of it loaded while the status is awaited
+        low_u = at.low[world, 0, i]
+        low_v = at.low[world, 1, i]
         middle = at.u[now, world, body.middle]
         new = at.v[now, world, i]
         shift = at.shift[now, world]
@@ -108,10 +116,17 @@ def nodes(spec: Spec) -> SimpleNamespace:
         d = vec()
         if running(at.words, world):
             d = recentring(body, middle)
-            momentum = node.m * new + constants.dt * f  # (Q3)
-            at.p[p, world, i] = momentum
-            new = node_velocity(constants, inputs, world, node.rest + shift + exact(here), momentum, node.m)
-            here = (here - d) + constants.dt * new  # (Q4)
+            impulse = constants.dt * f
+            at.p[p, world, i] = node.m * new + impulse  # (Q3)
+            x = node.rest + shift + exact(here)
+            dv = increment(constants, inputs, world, impulse, node.m) + low_v
+            low_v = lost(new, dv)
+            new = after_free(constants, inputs, world, x, new + dv, node.m)
+            here = here - d
+            du = constants.dt * new + low_u
+            low_u = lost(here, du)
+            here = here + du  # (Q4)
+        at.low[world, 1, i] = low_v
         if i == 0:
             at.shift[then, world] = shift + exact(d)
         if wp.static(surface):
@@ -119,9 +134,11 @@ def nodes(spec: Spec) -> SimpleNamespace:
         if wp.static(apart):
             if node.touched == 0:
                 at.u[then, world, i] = here
+                at.low[world, 0, i] = low_u
                 at.v[then, world, i] = new
         if wp.static(not surface):
             at.u[then, world, i] = here
+            at.low[world, 0, i] = low_u
             at.v[then, world, i] = new
 
     @wp.kernel(module=module, enable_backward=False)

@@ -43,7 +43,7 @@ def surface(spec: Spec) -> SimpleNamespace:
     count, friction_of = len(walls), wall_face(spec).friction_of
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, memory = f.Frame, f.recentring, chunk(dim, spec.dtype)
-    Chunk, state_of = memory.Chunk, memory.state_of
+    Chunk, state_of, lost = memory.Chunk, memory.state_of, memory.lost
     face, depth = wall_face(spec).face, wall_face(spec).depth
     running, was_running, report = (
         getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
@@ -173,6 +173,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         then = state_of(at, s + 1)
         i = node.i
         here = at.u[now, world, i]
+        low = at.low[world, 0, i]
         new = at.free[world, i]  # all of it loaded while the status is awaited
         m = at.mass[world, i]
         old = at.v[now, world, i]
@@ -181,11 +182,15 @@ def surface(spec: Spec) -> SimpleNamespace:
         if running(at.words, world):
             if node.last > node.first - lane:
                 new += push / m
-            here = (here - recentring(moving, middle)) + constants.dt * new
+            here = here - recentring(moving, middle)
+            du = constants.dt * new + low
+            low = lost(here, du)
+            here = here + du
         else:
             new = old
         if lane == 0:
             at.u[then, world, i] = here
+            at.low[world, 0, i] = low
             at.v[then, world, i] = new
 
     @wp.kernel(module=module, enable_backward=False)

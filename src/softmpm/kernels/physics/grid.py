@@ -94,6 +94,29 @@ def grid(spec: Spec) -> SimpleNamespace:
             v = after_all_walls(constants, inputs, world, x, free)  # (G2)
         return v
 
+    @wp.func
+    def increment(constants: Constants, inputs: GridInputs, world: int, impulse: vec, m: real) -> vec:
+        """Change of the velocity of a node by the impulse of its forces [N s] and by gravity."""
+        dv = vec()
+        if m > real(0.0):
+            dv = impulse / m
+            if wp.static(spec.gravity):
+                dv += constants.dt * gravity(constants, inputs, world)
+        return dv
+
+    @wp.func
+    def after_free(
+        constants: Constants, inputs: GridInputs, world: int, x: exact_vec, free: vec, m: real
+    ) -> vec:
+        """Velocity of the node at ``x`` [m] from that without damping and walls."""
+        v = vec()
+        if m > real(0.0):
+            u = free
+            if wp.static(spec.damping):
+                u = decay(constants, inputs, world) * u
+            v = after_all_walls(constants, inputs, world, x, u)
+        return v
+
     @wp.kernel(module=spec.module, enable_backward=False)
     def grid_velocity(
         # Parameters:
@@ -115,6 +138,8 @@ def grid(spec: Spec) -> SimpleNamespace:
         decay=decay,
         free_velocity=free_velocity,
         node_velocity=node_velocity,
+        increment=increment,
+        after_free=after_free,
         grid_velocity=grid_velocity,
     )
 

@@ -29,6 +29,7 @@ class ChunkBuffers:
 
     Attributes:
         u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns.
+        low: What rounding has kept from u and v of the latest state.
         force: Mean forces of the walls on the surface points in the present control step.
         p: Momenta of the nodes, one for each substep if ``keep``, else one.
         mass: Masses of the nodes.
@@ -46,7 +47,11 @@ class ChunkBuffers:
         nodal = model.worlds, model.rest_grid.count, model.dim
         stored, momenta = (chunk.length + 1, chunk.length) if keep else (2, 1)
         self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
-        self.p, self.mass = self.tensor(momenta, *nodal), self.tensor(*nodal[:2])
+        self.p, self.mass, self.low = (
+            self.tensor(momenta, *nodal),
+            self.tensor(*nodal[:2]),
+            self.tensor(nodal[0], 2, *nodal[1:]),
+        )
         self.anchor, self.partial = self.tensor(stored, *model.anchor_shape), empty_partial(model)
         self.shift = torch.empty(stored, model.worlds, model.dim, dtype=torch.float64, device=model.device)
         self.force, self.frame = self.tensor(*model.anchor_shape), frame_struct(model)
@@ -80,14 +85,16 @@ class ChunkBuffers:
         struct = memory(self.model.spec.dim, self.model.spec.dtype).Chunk()
         struct.length, struct.keep = self.chunk.length, int(self.keep)
         struct.words, struct.mass, struct.shift = self.words_array, self.mass_array, view(self.shift, exact)
-        for name in ("partial", "u", "v", "p", "anchor", "force"):
+        for name in ("partial", "low", "u", "v", "p", "anchor", "force"):
             setattr(struct, name, view(getattr(self, name), t.vec))
         return struct
 
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        states = sum(one.nbytes for one in (self.u, self.v, self.p, self.mass, self.anchor, self.partial))
+        states = sum(
+            one.nbytes for one in (self.u, self.v, self.low, self.p, self.mass, self.anchor, self.partial)
+        )
         return states + (0 if self.overlap is None else self.overlap.bytes)
 
     def index(self, s: int) -> int:
@@ -107,6 +114,10 @@ class ChunkBuffers:
         given_states = (*start[:3], shift_of(self.model, start))
         for own, given in zip((self.u, self.v, self.anchor, self.shift), given_states, strict=True):
             own[0].copy_(given.detach())
+        if start.low is None:
+            clear(self.low)
+        else:
+            self.low.copy_(start.low.detach())
         if chunk.begins:
             clear(self.force)
         else:
@@ -119,7 +130,7 @@ class ChunkBuffers:
         """Copy of the final state: a result must not keep all states alive."""
         last = self.index(self.chunk.length)
         u, v, anchor, shift = (one[last].clone() for one in (self.u, self.v, self.anchor, self.shift))
-        return Nodal(u, v, anchor, self.force.clone(), shift)
+        return Nodal(u, v, anchor, self.force.clone(), shift, low=self.low.clone())
 
 
 class SharedAdjoint:

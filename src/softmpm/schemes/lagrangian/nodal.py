@@ -53,7 +53,7 @@ def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
 
 
 def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = None) -> Nodal:
-    """Nodal state with a shift that a call starts from: that of the state, or :func:`nodes_of` its particles if it has none.
+    """Nodal state that a call starts from, with all parts: that of the state, or :func:`nodes_of` its particles if it has none.
 
     Raises:
         ValueError: The particles do not show the nodes of the state, or clamps do not allow them; not checked during a capture.
@@ -65,7 +65,9 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
         check_shown(state, particles_of(model, nodes.detach()))
         if model.mirror is not None:
             check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
-    return with_reaction(model, nodes._replace(shift=shift_of(model, nodes).detach()), nodes.reaction)
+    low = torch.stack([torch.zeros_like(nodes.u)] * 2, 1) if nodes.low is None else nodes.low
+    nodes = nodes._replace(shift=shift_of(model, nodes).detach(), low=low.detach())
+    return with_reaction(model, nodes, nodes.reaction)
 
 
 def with_reaction(model: Model, nodes: Nodal, reaction: Tensor | None = None) -> Nodal:
