@@ -15,7 +15,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
 
     class Chunk:
         """See :class:`softmpm.schemes.lagrangian.buffers.ChunkBuffers`. The first axis of u, v, anchor and shift counts states, that of
-        p substeps; without ``keep`` two states take turns, and p has one."""
+        w substeps; without ``keep`` two states take turns, and w has one."""
 
         length: int
         keep: int
@@ -26,7 +26,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
         low: wp.array3d(dtype=vec)  # of u and of v
         u: wp.array3d(dtype=vec)
         v: wp.array3d(dtype=vec)
-        p: wp.array3d(dtype=vec)
+        w: wp.array3d(dtype=vec)
         # Of surface contact:
         rate: wp.array(dtype=real)  # 1/T
         D: wp.array2d(dtype=real)
@@ -65,7 +65,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
             return s % 2
 
     @wp.func
-    def momenta_of(of: Chunk, s: int) -> int:
+    def stored_of(of: Chunk, s: int) -> int:
         return of.keep * s
 
     @wp.func
@@ -73,4 +73,4 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
         """What rounding keeps from a + b, where b is small."""
         return b - ((a + b) - a)
 
-    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, momenta_of=momenta_of, lost=lost)
+    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, stored_of=stored_of, lost=lost)

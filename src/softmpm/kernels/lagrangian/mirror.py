@@ -108,7 +108,7 @@ def mirror(spec: Spec) -> SimpleNamespace:
 def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one, Mirror = types(spec.dim, spec.dtype), mirror(spec), mirror_type(spec.dim, spec.dtype)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, rest(spec.dim, spec.dtype).Rest
-    GridInputs, node_velocity = input_types(spec).GridInputs, grid(spec).node_velocity
+    GridInputs, after_free = input_types(spec).GridInputs, grid(spec).after_free
     node_of, exact = nodes(spec).node_of, frame(spec.dim, spec.dtype).exact
     total_mass, mean = one.total_mass, one.mean
     module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
@@ -122,7 +122,7 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         mass: wp.array2d(dtype=real),
         # In:
         u: wp.array2d(dtype=vec),
-        p: wp.array2d(dtype=vec),
+        w: wp.array2d(dtype=vec),
         # Out:
         v: wp.array2d(dtype=vec),
     ):
@@ -130,7 +130,7 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, i = wp.tid()
         node = node_of(constants, inside, mass, world, i)
         here = node.rest + exact(u[world, i])  # such worlds have no shift
-        v[world, i] = node_velocity(constants, inputs, world, here, p[world, i], node.m)
+        v[world, i] = after_free(constants, inputs, world, here, w[world, i], node.m)
 
     @wp.kernel(module=module, enable_backward=False)
     def reflect_adj(

@@ -1,11 +1,11 @@
 """Motion of the nodes. Derivation: docs/math/lagrangian.md.
 
-    v* = exp(−γ Δt) (v + dv),  dv = Δt (f/m + g)                                                     (Q3)
+    v* = exp(−γ Δt) w,  w = v + dv,  dv = Δt (f/m + g)                                               (Q3)
     v' = W(v*) at X + shift + u,  u' = u − d + Δt v'                                                 (Q4), (Q9)
     v̄' += Δt ū'                                                                                      (Q4.adj)
-    p̄ and m̄ by (G1.adj) with p = m v + Δt f,  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                                            (Q3.adj)
+    p̄ and m̄ by (G1.adj) for p = m v + Δt f,  f̄ = Δt p̄,  v̄ = m p̄,  m̄ += v·p̄                          (Q3.adj)
 
-What rounding keeps from v + dv and from u' is added in the next substep (Q12). (Q3) and (Q4) are the grid stage (G1), (G2) of the
+What rounding keeps from w and from u' is added in the next substep (Q12). (Q3) and (Q4) are the grid stage (G1), (G2) of the
 momentum p. The side of a wall on which a node lies is constant in the adjoint; the speed of a wall that turns depends on the place of
 the node.
 """
@@ -69,7 +69,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
-    Chunk, state_of, momenta_of, lost = memory.Chunk, memory.state_of, memory.momenta_of, memory.lost
+    Chunk, state_of, stored_of, lost = memory.Chunk, memory.state_of, memory.stored_of, memory.lost
     module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.struct
@@ -105,7 +105,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         """(Q3), (Q4). Where surface points act on a node, the velocity without contact goes to ``free``, and surface.py goes on."""
         now = state_of(at, s)
         then = state_of(at, s + 1)
-        p = momenta_of(at, s)
+        stored = stored_of(at, s)
         here = at.u[now, world, i]  # all of it loaded while the status is awaited
         low_u = at.low[world, 0, i]
         low_v = at.low[world, 1, i]
@@ -116,12 +116,12 @@ def nodes(spec: Spec) -> SimpleNamespace:
         d = vec()
         if running(at.words, world):
             d = recentring(body, middle)
-            impulse = constants.dt * f
-            at.p[p, world, i] = node.m * new + impulse  # (Q3)
             x = node.rest + shift + exact(here)
-            dv = increment(constants, inputs, world, impulse, node.m) + low_v
+            dv = increment(constants, inputs, world, constants.dt * f, node.m) + low_v
             low_v = lost(new, dv)
-            new = after_free(constants, inputs, world, x, new + dv, node.m)
+            w = new + dv
+            at.w[stored, world, i] = w
+            new = after_free(constants, inputs, world, x, w, node.m)  # (Q3)
             here = here - d
             du = constants.dt * new + low_u
             low_u = lost(here, du)
@@ -162,7 +162,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, r, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), nodes(spec)
     real, vec, exact_vec, Constants, Rest = t.real, t.vec, types(spec.dim, "float64").vec, t.Constants, r.Rest
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    node_velocity_adj, sums = grid_adj(spec, wanted).node_velocity_adj, gathering(spec.dim, spec.dtype)
+    after_free_adj, sums = grid_adj(spec, wanted).after_free_adj, gathering(spec.dim, spec.dtype)
     entries_of, gathered, Node, node_of = sums.entries_of, sums.gathered, one.Node, one.node_of
     viscous, surface, moving = spec.viscosity, bool(spec.surface_walls), spec.moving
     constrained, memory, exact = (
@@ -179,7 +179,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
         x: exact_vec  # [m]
         v: vec
-        p: vec  # without contact and constraints, after the substep
+        w: vec  # after the substep, without damping, walls, contact and constraints
 
     @wp.struct
     class NodeAdj:
@@ -192,7 +192,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         out = Before()
         out.x = node.rest + at.shift[s, world] + exact(at.u[s, world, i])
         out.v = at.v[s, world, i]
-        out.p = at.p[s, world, i]
+        out.w = at.w[s, world, i]
         return out
 
     @wp.func
@@ -228,7 +228,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         """(Q3.adj) of a node, from v̄', m̄ and ū."""
         number = world * bar.held + i
-        adj = node_velocity_adj(constants, inputs, world, was.x, was.p, node.m, after.v, number, adj_inputs)
+        adj = after_free_adj(constants, inputs, world, was.x, was.w, node.m, after.v, number, adj_inputs)
         bar.mass[world, i] = after.m + adj.m + wp.dot(was.v, adj.p)
         bar.f[world, i] = constants.dt * adj.p
         bar.v[world, i] = node.m * adj.p

@@ -36,7 +36,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         len(spec.surface_walls),
     )
     touch, touch_adj, number = block.touch, block.touch_adj, one.number
-    faces_of, face_adj, node_velocity = one.faces_of, wall_face_adj(spec, wanted), grid(spec).node_velocity
+    faces_of, face_adj, after_free = one.faces_of, wall_face_adj(spec, wanted), grid(spec).after_free
     mirrored, constrained, rough = bool(spec.mirrors), spec.constrained, "friction" in wanted
     sums = surface_sums(dim, spec.dtype)
     Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
@@ -69,7 +69,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj.v += constants.dt * adj.u
         if node.touched == 1:
             if wp.static(not mirrored):
-                free_v = node_velocity(constants, inputs, world, was.x, was.p, node.m)
+                free_v = after_free(constants, inputs, world, was.x, was.w, node.m)
             at.free[world, i] = free_v
             each = vec()
             if node.m > real(0.0):

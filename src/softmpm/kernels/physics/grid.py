@@ -106,15 +106,15 @@ def grid(spec: Spec) -> SimpleNamespace:
 
     @wp.func
     def after_free(
-        constants: Constants, inputs: GridInputs, world: int, x: exact_vec, free: vec, m: real
+        constants: Constants, inputs: GridInputs, world: int, x: exact_vec, w: vec, m: real
     ) -> vec:
         """Velocity of the node at ``x`` [m] from that without damping and walls."""
         v = vec()
         if m > real(0.0):
-            u = free
+            free = w
             if wp.static(spec.damping):
-                u = decay(constants, inputs, world) * u
-            v = after_all_walls(constants, inputs, world, x, u)
+                free = decay(constants, inputs, world) * free
+            v = after_all_walls(constants, inputs, world, x, free)
         return v
 
     @wp.kernel(module=spec.module, enable_backward=False)
@@ -242,6 +242,40 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 adj_inputs.gravity[i] = adj_inputs.gravity[i] + (m * constants.dt) * adj.p
         return adj
 
+    @wp.func
+    def after_free_adj(
+        constants: Constants,
+        inputs: GridInputs,
+        world: int,
+        x: exact_vec,
+        w: vec,
+        m: real,
+        adj_velocity: vec,
+        i: int,
+        adj_inputs: GridInputsAdj,
+    ) -> NodeAdj:
+        """As ``node_velocity_adj``, of ``after_free``: w = p/m + Δt g."""
+        adj = NodeAdj()
+        if m > real(0.0):
+            free = w
+            if wp.static(damped):
+                free = decay(constants, inputs, world) * free
+            back = after_all_walls_adj(constants, inputs, world, x, free, adj_velocity, i, adj_inputs)
+            adj_v = back.v
+            adj.x = back.x
+            adj.p = adj_v / m
+            if wp.static(damped):
+                adj.p = decay(constants, inputs, world) * adj.p
+            u = w
+            if wp.static(spec.gravity):
+                u -= constants.dt * gravity(constants, inputs, world)
+            adj.m = -wp.dot(adj.p, u)
+            if wp.static("damping" in wanted):
+                adj_inputs.decay[i] = adj_inputs.decay[i] + wp.dot(adj_v, w)
+            if wp.static("gravity" in wanted):
+                adj_inputs.gravity[i] = adj_inputs.gravity[i] + (m * constants.dt) * adj.p
+        return adj
+
     @wp.kernel(module=adj_module(spec, wanted) + ".grid", enable_backward=False)
     def grid_velocity_adj(
         # Parameters:
@@ -272,4 +306,8 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         )
         adj_node[world, n] = pack(adj.p, adj.m)
 
-    return SimpleNamespace(node_velocity_adj=node_velocity_adj, grid_velocity_adj=grid_velocity_adj)
+    return SimpleNamespace(
+        node_velocity_adj=node_velocity_adj,
+        after_free_adj=after_free_adj,
+        grid_velocity_adj=grid_velocity_adj,
+    )

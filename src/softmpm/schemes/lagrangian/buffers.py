@@ -31,7 +31,7 @@ class ChunkBuffers:
         u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns.
         low: What rounding has kept from u and v of the latest state.
         force: Mean forces of the walls on the surface points in the present control step.
-        p: Momenta of the nodes, one for each substep if ``keep``, else one.
+        w: Velocities of the nodes after each substep if ``keep``, else one, without damping, walls and contact.
         mass: Masses of the nodes.
         partial: Sums of the bricks for the nodes of their windows.
         words: Status words, see errors.py; shape (world,).
@@ -45,10 +45,10 @@ class ChunkBuffers:
         self.model, self.chunk, self.keep = model, chunk, keep
         self.types, self.rest = types(model.spec.dim, model.spec.dtype), rest_struct(model)
         nodal = model.worlds, model.rest_grid.count, model.dim
-        stored, momenta = (chunk.length + 1, chunk.length) if keep else (2, 1)
+        stored, pushed = (chunk.length + 1, chunk.length) if keep else (2, 1)
         self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
-        self.p, self.mass, self.low = (
-            self.tensor(momenta, *nodal),
+        self.w, self.mass, self.low = (
+            self.tensor(pushed, *nodal),
             self.tensor(*nodal[:2]),
             self.tensor(nodal[0], 2, *nodal[1:]),
         )
@@ -60,8 +60,8 @@ class ChunkBuffers:
         order = model.rest_grid.order.expand(model.worlds, -1).contiguous()
         self.order, self.inputs = order, SortedInputs(model, chunk, order)
         vec, real = self.types.vec, self.types.real
-        self.u_arrays, self.v_arrays, self.p_arrays = (
-            [view(one, vec) for one in stored] for stored in (self.u, self.v, self.p)
+        self.u_arrays, self.v_arrays, self.w_arrays = (
+            [view(one, vec) for one in stored] for stored in (self.u, self.v, self.w)
         )
         self.shift_arrays = [view(one, types(model.spec.dim, "float64").vec) for one in self.shift]
         self.mass_array, self.partial_array = view(self.mass, real), view(self.partial, vec)
@@ -85,7 +85,7 @@ class ChunkBuffers:
         struct = memory(self.model.spec.dim, self.model.spec.dtype).Chunk()
         struct.length, struct.keep = self.chunk.length, int(self.keep)
         struct.words, struct.mass, struct.shift = self.words_array, self.mass_array, view(self.shift, exact)
-        for name in ("partial", "low", "u", "v", "p", "anchor", "force"):
+        for name in ("partial", "low", "u", "v", "w", "anchor", "force"):
             setattr(struct, name, view(getattr(self, name), t.vec))
         return struct
 
@@ -93,7 +93,7 @@ class ChunkBuffers:
     def bytes(self) -> int:
         """Bytes of the buffers."""
         states = sum(
-            one.nbytes for one in (self.u, self.v, self.low, self.p, self.mass, self.anchor, self.partial)
+            one.nbytes for one in (self.u, self.v, self.low, self.w, self.mass, self.anchor, self.partial)
         )
         return states + (0 if self.overlap is None else self.overlap.bytes)
 

@@ -1,4 +1,4 @@
-"""Memory of the reference formulation: displacement, velocity and momentum of the nodes around the particles at rest."""
+"""Memory of the reference formulation: displacement and velocities of the nodes around the particles at rest."""
 
 import math
 from collections.abc import Sequence

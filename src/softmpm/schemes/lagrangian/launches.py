@@ -117,7 +117,7 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     state = shared.u_array, shared.v_array
     drive_adj(model, launch, shared.wanted, model.scene.dt, *state, adj_inputs)
     if reflection is not None:
-        stored = forward.u_arrays[s], forward.p_arrays[s], forward.v_arrays[s + 1]
+        stored = forward.u_arrays[s], forward.w_arrays[s], forward.v_arrays[s + 1]
         reflection.begin(launch, *given, *stored, *state)
     if adjoint.contact is not None:
         adjoint.contact.advance(launch, *given, *out, forward.u_arrays[s])

@@ -104,14 +104,14 @@ class ReflectionAdj:
         inputs: Any,
         rest: Any,
         u: wp.array,
-        p: wp.array,
+        w: wp.array,
         new_v: wp.array,
         adj_u: wp.array,
         adj_v: wp.array,
     ) -> None:
         """The velocity before the reflection once more; with surface contact also the adjoint of the second reflection."""
         one = self.forward
-        arguments = (one.model.constants, inputs, rest, one.mass, u, p)
+        arguments = (one.model.constants, inputs, rest, one.mass, u, w)
         launch(self._kernels.free_again, one.mass.shape, *arguments, self._free, part=NODE_PART)
         if self.contact is not None:
             launch(self._kernels.free_again, one.mass.shape, *arguments, self.contact.free, part=NODE_PART)
