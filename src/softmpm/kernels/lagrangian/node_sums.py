@@ -8,6 +8,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.nodes import gathering
+from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.structs import types
 
@@ -21,8 +22,9 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def mass(inside: Rest, partial: wp.array2d(dtype=vec), out: wp.array2d(dtype=real)):
         """(Q2)"""
-        world, i = wp.tid()
-        out[world, i] = gathered(partial, entries_of(inside, i), world)[0]
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            out[world, i] = gathered(partial, entries_of(inside, i), world)[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def fields(
@@ -33,10 +35,11 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
         v: wp.array2d(dtype=vec),
     ):
         """(Q5.adj)"""
-        world, i = wp.tid()
-        entries = entries_of(inside, i)
-        u[world, i] = gathered(partial_u, entries, world)
-        v[world, i] = gathered(partial_v, entries, world)
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            entries = entries_of(inside, i)
+            u[world, i] = gathered(partial_u, entries, world)
+            v[world, i] = gathered(partial_v, entries, world)
 
     @wp.kernel(module=module, enable_backward=False)
     def means(
@@ -48,15 +51,16 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
         v: wp.array2d(dtype=vec),
     ):
         """(Q6); nodes at the very edge of a spline have no mass."""
-        world, i = wp.tid()
-        m = mass[world, i]
-        entries = entries_of(inside, i)
-        if m > real(0.0):
-            u[world, i] = gathered(partial_u, entries, world) / m
-            v[world, i] = gathered(partial_v, entries, world) / m
-        else:
-            u[world, i] = vec()
-            v[world, i] = vec()
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            m = mass[world, i]
+            entries = entries_of(inside, i)
+            if m > real(0.0):
+                u[world, i] = gathered(partial_u, entries, world) / m
+                v[world, i] = gathered(partial_v, entries, world) / m
+            else:
+                u[world, i] = vec()
+                v[world, i] = vec()
 
     @wp.kernel(module=module, enable_backward=False)
     def means_adj(
@@ -70,15 +74,16 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
         adj_mass: wp.array2d(dtype=real),
     ):
         """ũ, ṽ and the last term of the mass in (Q6.adj)"""
-        world, i = wp.tid()
-        m = mass[world, i]
-        each_u = vec()
-        each_v = vec()
-        if m > real(0.0):
-            each_u = adj_u[world, i] / m
-            each_v = adj_v[world, i] / m
-        adj_u[world, i] = each_u
-        adj_v[world, i] = each_v
-        adj_mass[world, i] = -wp.dot(each_u, u[world, i]) - wp.dot(each_v, v[world, i])
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, mass.shape[1])):
+            m = mass[world, i]
+            each_u = vec()
+            each_v = vec()
+            if m > real(0.0):
+                each_u = adj_u[world, i] / m
+                each_v = adj_v[world, i] / m
+            adj_u[world, i] = each_u
+            adj_v[world, i] = each_v
+            adj_mass[world, i] = -wp.dot(each_u, u[world, i]) - wp.dot(each_v, v[world, i])
 
     return SimpleNamespace(mass=mass, fields=fields, means=means, means_adj=means_adj)

@@ -17,6 +17,7 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
+from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
@@ -150,9 +151,10 @@ def nodes(spec: Spec) -> SimpleNamespace:
         at: Chunk,
         s: int,
     ):
-        world, i = wp.tid()
-        node = node_of(constants, inside, at.mass, world, i)
-        advance_at(world, i, node, constants, inputs, body, at, s)
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            node = node_of(constants, inside, at.mass, world, i)
+            advance_at(world, i, node, constants, inputs, body, at, s)
 
     return SimpleNamespace(Node=Node, node_of=node_of, advance=advance, advance_at=advance_at)
 
@@ -266,18 +268,20 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: GridInputsAdj,
         s: int,
     ):
-        world, i = wp.tid()
-        node = node_of(constants, inside, at.mass, world, i)
-        advance_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            node = node_of(constants, inside, at.mass, world, i)
+            advance_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def gather_adj(inside: Rest, bar: Adjoint):
         """Add what the forces of a substep give to its displacements and velocities (Q1.adj)."""
-        world, i = wp.tid()
-        entries = entries_of(inside, i)
-        bar.u[world, i] = bar.u[world, i] + gathered(bar.partial_u, entries, world)
-        if wp.static(viscous):
-            bar.v[world, i] = bar.v[world, i] + gathered(bar.partial_v, entries, world)
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            entries = entries_of(inside, i)
+            bar.u[world, i] = bar.u[world, i] + gathered(bar.partial_u, entries, world)
+            if wp.static(viscous):
+                bar.v[world, i] = bar.v[world, i] + gathered(bar.partial_v, entries, world)
 
     return SimpleNamespace(
         before=before,

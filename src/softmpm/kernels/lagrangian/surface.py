@@ -17,6 +17,7 @@ from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
+from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics import status
@@ -203,13 +204,15 @@ def surface(spec: Spec) -> SimpleNamespace:
         s: int,
         anew: int,
     ):
-        world, p = wp.tid()
-        press_at(world, p, point_of(body, p), constants, inputs, body, moving, at, s, anew)
+        world, k = wp.tid()
+        for p in range(first_of(k), end_of(k, body.points.shape[0])):
+            press_at(world, p, point_of(body, p), constants, inputs, body, moving, at, s, anew)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(constants: Constants, body: Surface, moving: Frame, at: Chunk, s: int):
-        world, n, lane = wp.tid()
-        settle_at(world, lane, touched_of(body, n, lane), constants, body, moving, at, s)
+        world, k, lane = wp.tid()
+        for n in range(first_of(k), end_of(k, body.nodes.shape[0])):
+            settle_at(world, lane, touched_of(body, n, lane), constants, body, moving, at, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def check_depth(

@@ -16,6 +16,7 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
+from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
@@ -210,9 +211,10 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: GridInputsAdj,
         s: int,
     ):
-        world, i = wp.tid()
-        node = node_of(constants, inside, at.mass, world, i)
-        settle_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
+        world, k = wp.tid()
+        for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
+            node = node_of(constants, inside, at.mass, world, i)
+            settle_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def press_adj(
@@ -225,8 +227,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         s: int,
         anew: int,
     ):
-        world, p = wp.tid()
-        press_adj_at(world, p, point_of(body, p), constants, inputs, body, at, bar, adj_inputs, s, anew)
+        world, k = wp.tid()
+        for p in range(first_of(k), end_of(k, body.points.shape[0])):
+            press_adj_at(world, p, point_of(body, p), constants, inputs, body, at, bar, adj_inputs, s, anew)
 
     @wp.kernel(module=module, enable_backward=False)
     def spread_adj(
@@ -239,10 +242,11 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: GridInputsAdj,
         s: int,
     ):
-        world, n, lane = wp.tid()
-        entry = touched_of(body, n, lane)
-        node = node_of(constants, inside, at.mass, world, entry.i)
-        spread_adj_at(world, lane, entry, node, constants, inputs, body, at, bar, adj_inputs, s)
+        world, k, lane = wp.tid()
+        for n in range(first_of(k), end_of(k, body.nodes.shape[0])):
+            entry = touched_of(body, n, lane)
+            node = node_of(constants, inside, at.mass, world, entry.i)
+            spread_adj_at(world, lane, entry, node, constants, inputs, body, at, bar, adj_inputs, s)
 
     @wp.kernel(module=module, enable_backward=False)
     def delassus_adj(

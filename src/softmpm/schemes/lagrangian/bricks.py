@@ -7,6 +7,7 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.kernels.lagrangian.layers import layers
+from softmpm.kernels.lagrangian.portions import PORTION
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
 from softmpm.model import Model
@@ -60,11 +61,17 @@ def brick_launch(model: Model, launch: KernelLauncher, kernel, *inputs, layered:
 
 def node_launch(model: Model, launch: KernelLauncher, kernel, *inputs) -> None:
     """Launch a kernel of nodes."""
-    launch(kernel, (model.worlds, model.rest_grid.count), *inputs, block_dim=NODE_BLOCK, part=NODE_PART)
+    dim = model.worlds, portions(model, model.rest_grid.count)
+    launch(kernel, dim, *inputs, block_dim=NODE_BLOCK, part=NODE_PART // PORTION)
+
+
+def portions(model: Model, count: int) -> int:
+    """Threads that have so many nodes or surface points."""
+    return count if model.device.type == "cuda" else -(-count // PORTION)
 
 
 NODE_BLOCK, NODE_PART = 128, 512
-"""Threads per block of kernels of nodes, and in each of the parts into which a CPU divides the launch."""
+"""Threads per block of kernels of nodes, and nodes in each of the parts into which a CPU divides the launch."""
 
 
 def empty_partial(model: Model) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from softmpm.kernels.lagrangian.portions import PORTION
 from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_adj import surface_adj
 from softmpm.kernels.lagrangian.surface_sums import LANES, surface_type
@@ -14,7 +15,7 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import clear, view
-from softmpm.schemes.lagrangian.bricks import NODE_PART
+from softmpm.schemes.lagrangian.bricks import NODE_PART, portions
 from softmpm.schemes.lagrangian.driven import drive
 from softmpm.schemes.lagrangian.frame import frame_struct
 from softmpm.schemes.penetration import deepest
@@ -91,8 +92,13 @@ class SurfaceContact:
         """Substep ``s``, from the velocities without contact and the state before to that after."""
         constants, kernels = self.model.constants, surface(self.model.spec)
         arguments = (constants, inputs, self.struct, self._frame, at, s, self.chunk.anew(s))
-        launch(kernels.press, self.points, *arguments, part=POINT_PART)
-        launch(kernels.settle, self.touched, constants, self.struct, self._frame, at, s, part=NODE_PART)
+        launch(kernels.press, self.in_portions(self.points), *arguments, part=POINT_PART // PORTION)
+        arguments = (constants, self.struct, self._frame, at, s)
+        launch(kernels.settle, self.in_portions(self.touched), *arguments, part=NODE_PART // PORTION)
+
+    def in_portions(self, dim: tuple[int, ...]) -> tuple[int, ...]:
+        """Dimensions of a launch whose threads have portions of the points or nodes."""
+        return dim[0], portions(self.model, dim[1]), *dim[2:]
 
     def check_end(
         self, launch: Callable[..., None], inputs: Any, s: int, shift: wp.array, u: wp.array, words: wp.array
@@ -146,12 +152,14 @@ class SurfaceContactAdj:
         nodes to that of the velocity without contact, in v̄. ``u`` are the displacements before the substep."""
         one = self.forward
         constants, out = one.model.constants, (at, bar, adj_inputs, s)
-        launch(self._kernels.settle_adj, one.nodes, constants, inputs, rest, *out, part=NODE_PART)
+        dim, part = one.in_portions(one.nodes), NODE_PART // PORTION
+        launch(self._kernels.settle_adj, dim, constants, inputs, rest, *out, part=part)
         drive(one.model, launch, inputs, at.words, u, self._scratch, one.free)
         arguments = (constants, inputs, one.struct, *out, one.chunk.anew(s))
-        launch(self._kernels.press_adj, one.points, *arguments, part=POINT_PART)
+        dim = one.in_portions(one.points)
+        launch(self._kernels.press_adj, dim, *arguments, part=POINT_PART // PORTION)
         arguments = (constants, inputs, rest, one.struct, *out)
-        launch(self._kernels.spread_adj, one.touched, *arguments, part=NODE_PART)
+        launch(self._kernels.spread_adj, one.in_portions(one.touched), *arguments, part=part)
 
     def finish(self, launch: Callable[..., None], at: Any, bar: Any) -> None:
         """Add what the mobility D of all substeps gives to the masses."""
