@@ -154,3 +154,35 @@ def test_the_quantum_is_a_power_of_two():
         fake = SimpleNamespace(scene=scene, mirror=None, spec=SimpleNamespace(moving=False))
         q = quantum(fake)
         assert spacing <= q < 2 * spacing and np.log2(q) == round(np.log2(q))
+
+
+def test_a_body_that_turns_keeps_its_angular_momentum_in_float32():
+    """To 5e-8 in 600 substeps, with what rounding kept from displacements and velocities. Without one of the two it is 1e-7 off."""
+
+    def spin(state: softmpm.State) -> float:
+        grid, nodes = model.rest_grid, state.nodes
+        assert nodes is not None
+        x, v = grid.nodes * DX + nodes.u[0].double(), nodes.v[0].double()
+        x = x - grid.weight @ x / grid.weight.sum()
+        return (grid.weight @ (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])).item()
+
+    def drift(kept: tuple[float, float]) -> float:
+        """Largest change over 600 calls of a substep, with these shares of the remainders of u and v."""
+        state, changes = start, []
+        for _ in range(600):
+            nodes = state.nodes
+            assert nodes is not None and nodes.low is not None
+            low = nodes.low * torch.tensor(kept)[:, None, None]
+            state = state._replace(nodes=nodes._replace(low=low))
+            state = softmpm.simulate(model, state, None, model.params(), substeps=1)
+            changes.append(abs(spin(state) / spin(start) - 1))
+        return max(changes)
+
+    model = build(block(), torch.float32)
+    turning = model.rest()
+    turning.C[..., 0, 1], turning.C[..., 1, 0] = -5.0, 5.0
+    x = turning.x - turning.x.mean(1, keepdim=True)
+    turning.v[:] = (turning.C @ x[..., None])[..., 0]
+    start = softmpm.simulate(model, turning, None, model.params(), substeps=1)
+    assert drift((1.0, 1.0)) <= 5e-8
+    assert drift((0.0, 1.0)) >= 8e-8 and drift((1.0, 0.0)) >= 8e-8
