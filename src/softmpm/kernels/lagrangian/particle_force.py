@@ -1,8 +1,7 @@
 """Force of one particle on its nodes, and its adjoint. Derivation: docs/math/lagrangian.md.
 
-P = τ F⁻ᵀ,  the force is −V P g_i                                                                (Q2)
+P = τ F⁻ᵀ of law and actuators, and that of viscosity (E6.P),  the force is −V P g_i              (Q2)
 P̄ = −V Σ f̄_i ⊗ g_i,  τ̄ = P̄ F⁻¹,  F̄ −= F⁻ᵀ P̄ᵀ P                                                  (Q2.adj)
-with viscosity, L = Ḟ F⁻¹:  Ḟ̄ = L̄ F⁻ᵀ,  F̄ −= Lᵀ L̄ F⁻ᵀ
 """
 
 from types import SimpleNamespace
@@ -34,7 +33,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     ParticleInputs, total_of = input_types(spec).ParticleInputs, total_stress(spec)
     rotation, stress, identity = total_of.rotation, total_of.stress, k.identity
     volume_change, inverse_transpose = k.volume_change, k.inverse_transpose
-    viscous_stress, viscous = viscosity(dim, spec.dtype).viscous_stress, spec.viscosity
+    viscous_piola, viscous = viscosity(dim, spec.dtype).viscous_piola, spec.viscosity
     Material, material_ahead = material(spec).Material, material(spec).material_ahead
     report, largest = status.report(dim, spec.dtype).report, 1.0e12
     collapsed, not_finite, too_long = int(Kind.COLLAPSED), int(Kind.NOT_FINITE), int(Kind.STEP)
@@ -58,21 +57,17 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         return out
 
     @wp.func
-    def piola(own: Given, H: mat, Q: mat, L: mat, R: mat) -> mat:
-        """P of (Q2) [Pa]; R is F⁻ᵀ."""
-        tau = stress(own.material, H, Q)
-        if wp.static(viscous):
-            tau += viscous_stress(identity() + H, L, own.viscosity)
-        return tau * R
+    def piola(own: Given, H: mat, Q: mat, R: mat) -> mat:
+        """P of law and actuators [Pa]; R is F⁻ᵀ."""
+        return stress(own.material, H, Q) * R
 
     @wp.func
     def forced(own: Given, H: mat, rate: mat) -> mat:
         """−V P of a particle; ``rate`` is Ḟ."""
-        R = inverse_transpose(H)
-        L = mat()
+        P = piola(own, H, rotation(own.material, H), inverse_transpose(H))
         if wp.static(viscous):
-            L = rate * wp.transpose(R)
-        return -own.volume * piola(own, H, rotation(own.material, H), L, R)
+            P += viscous_piola(identity() + H, rate, own.viscosity)
+        return -own.volume * P
 
     @wp.func
     def check(
@@ -141,7 +136,7 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     )
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     stress_adj, viscous = total_stress_adj(spec, wanted).stress_adj, spec.viscosity
-    viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
+    viscous_piola_adj = viscosity(spec.dim, spec.dtype).viscous_piola_adj
     to_particle = accumulate(spec.dtype).to_particle
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
 
@@ -163,19 +158,15 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         """(Q2.adj)"""
         R = inverse_transpose(H)
         Q = rotation(own.material, H)
-        L = mat()
-        if wp.static(viscous):
-            L = rate * wp.transpose(R)
-        P = piola(own, H, Q, L, R)
+        P = piola(own, H, Q, R)
         adj_P = -own.volume * G
-        adj_tau = adj_P * wp.transpose(R)
         adj = ForceAdj()
-        adj.F = stress_adj(own.material, H, Q, adj_tau, world, p, adj_inputs)
+        adj.F = stress_adj(own.material, H, Q, adj_P * wp.transpose(R), world, p, adj_inputs)
         adj.F -= R * (wp.transpose(adj_P) * P)
         if wp.static(viscous):
-            found = viscous_stress_adj(identity() + H, L, own.viscosity, adj_tau)
-            adj.rate = found.C * R
-            adj.F += found.F - wp.transpose(L) * adj.rate
+            found = viscous_piola_adj(identity() + H, rate, own.viscosity, adj_P)
+            adj.F += found.F
+            adj.rate = found.rate
             if wp.static("viscosity" in wanted):
                 to_particle(adj_inputs.viscosity, world, p, found.eta)
         return adj

@@ -9,9 +9,10 @@ import warp as wp
 from blocks import apply, special_deformations, svd_rotation
 from helpers import LAWS as LAW_CLASSES
 
-from softmpm import reference
+from softmpm import reference, reference_stress
 from softmpm.kernels.physics.actuators import actuator
 from softmpm.kernels.physics.laws import law as law_of
+from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import types
 
 MU, LAM = 3.0, 5.0
@@ -175,6 +176,41 @@ def test_active_stress_and_its_adjoint(kind, dim, device):
     want = torch.autograd.grad((W * stress(F, p)).sum(), (F, p))
     wanted = torch.cat([want[0].flatten(1), want[1][:, None]], 1)
     torch.testing.assert_close(adj, wanted, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_first_piola_kirchhoff_stress_of_viscosity(dim, device):
+    """P = τ F⁻ᵀ for C = Ḟ F⁻¹, and the derivatives of ⟨W, P⟩ for random W, as PyTorch finds them."""
+    t, blocks = types(dim, "float64"), viscosity(dim, "float64")
+    generator = torch.Generator().manual_seed(4)
+    F, rate, W = torch.randn(3, 6, dim, dim, generator=generator, dtype=torch.float64)
+    eta = torch.rand(6, generator=generator, dtype=torch.float64)
+    given = ((F.to(device), t.mat), (rate.to(device), t.mat), (eta.to(device), t.real))
+
+    def P_of(F, rate, eta):
+        inverse = torch.linalg.inv(F)
+        return reference_stress.viscous_stress(F, rate @ inverse, eta) @ inverse.mT
+
+    got = apply(blocks.viscous_piola, t.mat, (dim, dim), *given).cpu()
+    torch.testing.assert_close(got, P_of(F, rate, eta), rtol=1e-10, atol=1e-10)
+    piola_adj, flat = blocks.viscous_piola_adj, wp.types.vector(2 * dim * dim + 1, wp.float64)
+
+    @wp.func
+    def flattened(F: t.mat, rate: t.mat, eta: t.real, adj_P: t.mat) -> flat:
+        adj = piola_adj(F, rate, eta, adj_P)
+        out = flat()
+        for i in range(dim):
+            for j in range(dim):
+                out[i * dim + j] = adj.F[i, j]
+                out[dim * dim + i * dim + j] = adj.rate[i, j]
+        out[2 * dim * dim] = adj.eta
+        return out
+
+    adj = apply(flattened, flat, (2 * dim * dim + 1,), *given, (W.to(device), t.mat)).cpu()
+    leaves = [tensor.clone().requires_grad_() for tensor in (F, rate, eta)]
+    slopes = torch.autograd.grad((W * P_of(*leaves)).sum(), leaves)
+    want = torch.cat([slopes[0].flatten(1), slopes[1].flatten(1), slopes[2][:, None]], 1)
+    torch.testing.assert_close(adj, want, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("law", LAWS)
