@@ -157,7 +157,7 @@ def test_the_quantum_is_a_power_of_two():
 
 
 def test_a_body_that_turns_keeps_its_angular_momentum_in_float32():
-    """To 5e-8 in 600 substeps, with what rounding kept from displacements and velocities. Without one of the two it is 1e-7 off."""
+    """To 5e-8 in 600 substeps, with what rounding kept from displacements and velocities; without either, twice as badly or worse."""
 
     def spin(state: softmpm.State) -> float:
         grid, nodes = model.rest_grid, state.nodes
@@ -184,5 +184,6 @@ def test_a_body_that_turns_keeps_its_angular_momentum_in_float32():
     x = turning.x - turning.x.mean(1, keepdim=True)
     turning.v[:] = (turning.C @ x[..., None])[..., 0]
     start = softmpm.simulate(model, turning, None, model.params(), substeps=1)
-    assert drift((1.0, 1.0)) <= 5e-8
-    assert drift((0.0, 1.0)) >= 8e-8 and drift((1.0, 0.0)) >= 8e-8
+    least = drift((1.0, 1.0))
+    assert least <= 5e-8
+    assert drift((0.0, 1.0)) > 2 * least and drift((1.0, 0.0)) > 2 * least

@@ -80,9 +80,8 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     A = constants.rate * forced(who.given, H, rate)  # (Q2)
                     if wp.static(loaded):
                         b = inputs.force[world, p]
-                    check_now(
-                        constants, inputs, inside, at.words, world, p, s, H
-                    )  # last: nothing waits for it
+                    # Last, so that nothing waits for it:
+                    check_now(constants, inputs, inside, at.words, world, p, s, H)
                 fx = who.fx
                 if wp.static(not serial):
                     if row + 1 < seat.last:  # loaded while the sums are taken

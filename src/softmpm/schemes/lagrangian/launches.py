@@ -38,7 +38,7 @@ def _check_end(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Check the state after the last substep ``s``, of which no forces are computed."""
     model, inputs = buffers.model, buffers.inputs.particle_struct(s, s)
     u, words = buffers.u_arrays[buffers.index(s + 1)], buffers.words_array
-    limited = model.alarms.step is not None and s > 0  # else the next substep is checked
+    limited = s > 0  # else the next substep is checked
     kernel, arguments = cells(model.spec, model.rest_grid.bricks).check_state, (s, limited, True, u, words)
     brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
     if buffers.contact is not None:
