@@ -19,6 +19,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.rest import UNROLLED
+from softmpm.kernels.lagrangian.rows import ROWS_HEADER
 from softmpm.kernels.parts import in_parts
 
 HEADER, FOURS_HEADER = (Path(__file__).with_name(name) for name in ("bricks.h", "fours.h"))
@@ -159,7 +160,10 @@ def brick_module(name: str, groups: int = 1) -> str:
     """
     options = {
         "extra_build_options": in_parts(
-            f"#define SOFTMPM_GROUPS {groups}\n" * (groups > 1) + HEADER.read_text(), FOURS_HEADER.read_text()
+            f"#define SOFTMPM_GROUPS {groups}\n" * (groups > 1)
+            + ROWS_HEADER.read_text()
+            + HEADER.read_text(),
+            FOURS_HEADER.read_text(),
         ),
         "max_unroll": UNROLLED,
         "cuda_output": "cubin",

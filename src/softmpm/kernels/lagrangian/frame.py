@@ -22,6 +22,7 @@ def frame(dim: int, dtype: str) -> SimpleNamespace:
     class Frame:
         middle: int  # node m
         quantum: real  # q [m]
+        per_quantum: real  # 1/q
 
     Frame = wp.struct(Frame, module=f"softmpm.types.d{dim}.{dtype}")
 
@@ -30,8 +31,8 @@ def frame(dim: int, dtype: str) -> SimpleNamespace:
         """d of (Q9) from u_m."""
         d = vec()
         for axis in range(dim):
-            if wp.abs(here[axis]) > body.quantum:
-                d[axis] = body.quantum * wp.round(here[axis] / body.quantum)
+            whole = body.quantum * wp.round(here[axis] * body.per_quantum)  # exact, since q is a power of two
+            d[axis] = wp.where(wp.abs(here[axis]) > body.quantum, whole, real(0.0))
         return d
 
     @wp.func

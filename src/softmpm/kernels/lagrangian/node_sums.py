@@ -10,6 +10,7 @@ from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.nodes import gathering
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.structs import types
 
 
@@ -17,14 +18,14 @@ from softmpm.kernels.structs import types
 def node_sums(dim: int, dtype: str) -> SimpleNamespace:
     t, Rest, one = types(dim, dtype), rest(dim, dtype).Rest, gathering(dim, dtype)
     real, vec, entries_of, gathered = t.real, t.vec, one.entries_of, one.gathered
-    module = lagrangian_module(f"softmpm.d{dim}.{dtype}.node_sums")
+    row, module = rows(dim, dtype), lagrangian_module(f"softmpm.d{dim}.{dtype}.node_sums")
 
     @wp.kernel(module=module, enable_backward=False)
     def mass(inside: Rest, partial: wp.array2d(dtype=vec), out: wp.array2d(dtype=real)):
         """(Q2)"""
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
-            out[world, i] = gathered(partial, entries_of(inside, i), world)[0]
+            out[world, i] = gathered(row(partial, world), entries_of(inside, i))[0]
 
     @wp.kernel(module=module, enable_backward=False)
     def fields(
@@ -38,8 +39,8 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             entries = entries_of(inside, i)
-            u[world, i] = gathered(partial_u, entries, world)
-            v[world, i] = gathered(partial_v, entries, world)
+            u[world, i] = gathered(row(partial_u, world), entries)
+            v[world, i] = gathered(row(partial_v, world), entries)
 
     @wp.kernel(module=module, enable_backward=False)
     def means(
@@ -56,8 +57,8 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
             m = mass[world, i]
             entries = entries_of(inside, i)
             if m > real(0.0):
-                u[world, i] = gathered(partial_u, entries, world) / m
-                v[world, i] = gathered(partial_v, entries, world) / m
+                u[world, i] = gathered(row(partial_u, world), entries) / m
+                v[world, i] = gathered(row(partial_v, world), entries) / m
             else:
                 u[world, i] = vec()
                 v[world, i] = vec()

@@ -19,6 +19,7 @@ from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
@@ -38,11 +39,11 @@ def gathering(dim: int, dtype: str) -> SimpleNamespace:
         return out
 
     @wp.func
-    def gathered(partial: wp.array2d(dtype=vec), entries: Entries, world: int) -> vec:
+    def gathered(partial: wp.array(dtype=vec), entries: Entries) -> vec:
         """Sum of what the bricks around a node have for it, in a fixed order. Loads without branches wait for memory together."""
         total = vec()
         for n in range(most):
-            share = partial[world, wp.max(entries[n], 0)]
+            share = partial[wp.max(entries[n], 0)]
             if entries[n] >= 0:
                 total += share
         return total
@@ -71,7 +72,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
     Chunk, state_of, stored_of, lost = memory.Chunk, memory.state_of, memory.stored_of, memory.lost
-    module = lagrangian_module(spec.module + ".lagrangian")
+    row, module = rows(spec.dim, spec.dtype), lagrangian_module(spec.module + ".lagrangian")
 
     @wp.struct
     class Node:
@@ -79,13 +80,15 @@ def nodes(spec: Spec) -> SimpleNamespace:
 
         rest: exact_vec  # its position at rest [m]
         m: real
+        per_m: real  # 1/m, or 0
         entries: Entries
         touched: int  # 1 if surface points act on it
 
     @wp.func
     def node_of(constants: Constants, inside: Rest, mass: wp.array2d(dtype=real), world: int, i: int) -> Node:
         out = Node()
-        out.m = mass[world, i]
+        out.m = row(mass, world)[i]
+        out.per_m = wp.where(out.m > real(0.0), real(1.0) / out.m, real(0.0))
         out.entries = entries_of(inside, i)
         out.rest = position(constants, inside.nodes[i])
         if wp.static(surface):
@@ -107,40 +110,43 @@ def nodes(spec: Spec) -> SimpleNamespace:
         now = state_of(at, s)
         then = state_of(at, s + 1)
         stored = stored_of(at, s)
-        here = at.u[now, world, i]  # all of it loaded while the status is awaited
-        low_u = at.low[world, 0, i]
-        low_v = at.low[world, 1, i]
-        middle = at.u[now, world, body.middle]
-        new = at.v[now, world, i]
+        u = row(at.u, now, world)
+        lost_u = row(at.low, world, 0)
+        lost_v = row(at.low, world, 1)
+        here = u[i]  # all of it loaded while the status is awaited
+        low_u = lost_u[i]
+        low_v = lost_v[i]
+        middle = u[body.middle]
+        new = row(at.v, now, world)[i]
         shift = at.shift[now, world]
-        f = gathered(at.partial, node.entries, world)
+        f = gathered(row(at.partial, world), node.entries)
         d = vec()
         if running(at.words, world):
             d = recentring(body, middle)
             x = node.rest + shift + exact(here)
-            dv = increment(constants, inputs, world, constants.dt * f, node.m) + low_v
+            dv = increment(constants, inputs, world, constants.dt * f, node.per_m) + low_v
             low_v = lost(new, dv)
             w = new + dv
-            at.w[stored, world, i] = w
+            row(at.w, stored, world)[i] = w
             new = after_free(constants, inputs, world, x, w, node.m)  # (Q3)
             here = here - d
             du = constants.dt * new + low_u
             low_u = lost(here, du)
             here = here + du  # (Q4)
-        at.low[world, 1, i] = low_v
+        lost_v[i] = low_v
         if i == 0:
             at.shift[then, world] = shift + exact(d)
         if wp.static(surface):
-            at.free[world, i] = new
+            row(at.free, world)[i] = new
         if wp.static(apart):
             if node.touched == 0:
-                at.u[then, world, i] = here
-                at.low[world, 0, i] = low_u
-                at.v[then, world, i] = new
+                row(at.u, then, world)[i] = here
+                lost_u[i] = low_u
+                row(at.v, then, world)[i] = new
         if wp.static(not surface):
-            at.u[then, world, i] = here
-            at.low[world, 0, i] = low_u
-            at.v[then, world, i] = new
+            row(at.u, then, world)[i] = here
+            lost_u[i] = low_u
+            row(at.v, then, world)[i] = new
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
@@ -173,7 +179,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         frame(spec.dim, spec.dtype).exact,
     )
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
-    module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
+    row, module = rows(spec.dim, spec.dtype), lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.struct
     class Before:
@@ -192,17 +198,17 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     @wp.func
     def before(world: int, i: int, node: Node, at: Chunk, s: int) -> Before:
         out = Before()
-        out.x = node.rest + at.shift[s, world] + exact(at.u[s, world, i])
-        out.v = at.v[s, world, i]
-        out.w = at.w[s, world, i]
+        out.x = node.rest + at.shift[s, world] + exact(row(at.u, s, world)[i])
+        out.v = row(at.v, s, world)[i]
+        out.w = row(at.w, s, world)[i]
         return out
 
     @wp.func
     def adj_of(world: int, i: int, bar: Adjoint) -> NodeAdj:
         out = NodeAdj()
-        out.u = bar.u[world, i]
-        out.v = bar.v[world, i]
-        out.m = bar.mass[world, i]
+        out.u = row(bar.u, world)[i]
+        out.v = row(bar.v, world)[i]
+        out.m = row(bar.mass, world)[i]
         return out
 
     @wp.func
@@ -211,9 +217,9 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         out = adj_of(world, i, bar)
         if wp.static(not constrained):
             if s < at.length - 1:
-                out.u += gathered(bar.partial_u, node.entries, world)  # (Q1.adj)
+                out.u += gathered(row(bar.partial_u, world), node.entries)  # (Q1.adj)
                 if wp.static(viscous):
-                    out.v += gathered(bar.partial_v, node.entries, world)
+                    out.v += gathered(row(bar.partial_v, world), node.entries)
         return out
 
     @wp.func
@@ -230,14 +236,16 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         """(Q3.adj) of a node, from v̄', m̄ and ū."""
         number = world * bar.held + i
-        adj = after_free_adj(constants, inputs, world, was.x, was.w, node.m, after.v, number, adj_inputs)
-        bar.mass[world, i] = after.m + adj.m + wp.dot(was.v, adj.p)
-        bar.f[world, i] = constants.dt * adj.p
-        bar.v[world, i] = node.m * adj.p
+        adj = after_free_adj(
+            constants, inputs, world, was.x, was.w, node.m, node.per_m, after.v, number, adj_inputs
+        )
+        row(bar.mass, world)[i] = after.m + adj.m + wp.dot(was.v, adj.p)
+        row(bar.f, world)[i] = constants.dt * adj.p
+        row(bar.v, world)[i] = node.m * adj.p
         adj_u = after.u
         if wp.static(moving):
             adj_u += adj.x
-        bar.u[world, i] = adj_u
+        row(bar.u, world)[i] = adj_u
 
     @wp.func
     def advance_adj_at(
@@ -279,9 +287,9 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             entries = entries_of(inside, i)
-            bar.u[world, i] = bar.u[world, i] + gathered(bar.partial_u, entries, world)
+            bar.u[world, i] = bar.u[world, i] + gathered(row(bar.partial_u, world), entries)
             if wp.static(viscous):
-                bar.v[world, i] = bar.v[world, i] + gathered(bar.partial_v, entries, world)
+                bar.v[world, i] = bar.v[world, i] + gathered(row(bar.partial_v, world), entries)
 
     return SimpleNamespace(
         before=before,

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.rows import ROWS_HEADER
 from softmpm.kernels.parts import in_parts
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
@@ -15,7 +16,11 @@ UNROLLED = 27
 
 def lagrangian_module(name: str) -> str:
     """Set the compile options of the Warp module of this name; returns the name."""
-    options = {"max_unroll": UNROLLED, "enable_backward": False, "extra_build_options": in_parts()}
+    options = {
+        "max_unroll": UNROLLED,
+        "enable_backward": False,
+        "extra_build_options": in_parts(ROWS_HEADER.read_text()),
+    }
     wp.set_module_options(options, module=wp.get_module(name))
     return name
 

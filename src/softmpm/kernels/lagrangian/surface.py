@@ -19,6 +19,7 @@ from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.surface_contact import surface_contact
@@ -53,7 +54,7 @@ def surface(spec: Spec) -> SimpleNamespace:
     sums = surface_sums(dim, spec.dtype)
     Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
     Touched, touched_of, from_points = sums.Touched, sums.touched_of, sums.from_points
-    module = lagrangian_module(spec.module + ".lagrangian")
+    row, module = rows(dim, spec.dtype), lagrangian_module(spec.module + ".lagrangian")
 
     @wp.struct
     class Faces:
@@ -76,7 +77,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         out = Faces()
         for q in range(count):
             k = number[q]
-            wall = face(constants, inputs, world, k, x, anchor[world, q, p])
+            wall = face(constants, inputs, world, k, x, row(anchor, world, q)[p])
             out.n[q] = wall.n
             out.y[q] = wall.y
             out.depth[q] = wall.depth
@@ -111,20 +112,20 @@ def surface(spec: Spec) -> SimpleNamespace:
         """(K2) to (K4), (K6), (K7): impulse A J of each point."""
         now = state_of(at, s)
         then = state_of(at, s + 1)
-        u = at.u[now]
+        u = row(at.u, now, world)
         anchor = at.anchor[now]
-        middle = u[world, moving.middle]  # all of it loaded while the status is awaited
-        x = present(point, at_point(point, u, world))
-        v = at_point(point, at.free, world)
-        dv = at.D[world, p]
+        middle = u[moving.middle]  # all of it loaded while the status is awaited
+        x = present(point, at_point(point, u))
+        v = at_point(point, row(at.free, world))
+        dv = row(at.D, world)[p]
         per_force = at.rate[0] * point.newtons
         wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[now, world])
         after = vecs()
         pushed = vecs()
         for q in range(count):
-            after[q] = anchor[world, q, p]
+            after[q] = row(anchor, world, q)[p]
             if anew == 0:
-                pushed[q] = at.force[world, q, p]
+                pushed[q] = row(at.force, world, q)[p]
         total = vec()
         last = wp.max(s - 1, 0)
         deep = int(-1)
@@ -151,10 +152,10 @@ def surface(spec: Spec) -> SimpleNamespace:
                 v += dv * found.J
                 pushed[q] = pushed[q] + per_force * found.J
             for q in range(count):
-                at.force[world, q, p] = pushed[q]
+                row(at.force, world, q)[p] = pushed[q]
         for q in range(count):
-            at.anchor[then, world, q, p] = after[q]
-        at.impulse[world, p] = point.area * total
+            row(at.anchor, then, world, q)[p] = after[q]
+        row(at.impulse, world)[p] = point.area * total
         if deep >= 0:
             report(at.words, world, last, in_wall, deep * body.points.shape[0] + p)
 
@@ -173,16 +174,18 @@ def surface(spec: Spec) -> SimpleNamespace:
         now = state_of(at, s)
         then = state_of(at, s + 1)
         i = node.i
-        here = at.u[now, world, i]
-        low = at.low[world, 0, i]
-        new = at.free[world, i]  # all of it loaded while the status is awaited
-        m = at.mass[world, i]
-        old = at.v[now, world, i]
-        middle = at.u[now, world, moving.middle]
-        push = from_points(body, node, at.impulse, world)
+        u = row(at.u, now, world)
+        lows = row(at.low, world, 0)
+        here = u[i]
+        low = lows[i]
+        new = row(at.free, world)[i]  # all of it loaded while the status is awaited
+        m = row(at.mass, world)[i]
+        old = row(at.v, now, world)[i]
+        middle = u[moving.middle]
+        push = from_points(body, node, row(at.impulse, world))
         if running(at.words, world):
             if node.last > node.first - lane:
-                new += push / m
+                new += (real(1.0) / m) * push
             here = here - recentring(moving, middle)
             du = constants.dt * new + low
             low = lost(here, du)
@@ -190,9 +193,9 @@ def surface(spec: Spec) -> SimpleNamespace:
         else:
             new = old
         if lane == 0:
-            at.u[then, world, i] = here
-            at.low[world, 0, i] = low
-            at.v[then, world, i] = new
+            row(at.u, then, world)[i] = here
+            lows[i] = low
+            row(at.v, then, world)[i] = new
 
     @wp.kernel(module=module, enable_backward=False)
     def press(
@@ -231,7 +234,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         """Check a state that no contact is computed of: the final one of a chunk, or the initial one of a call."""
         world, p = wp.tid()
         point = point_of(body, p)
-        x = present(point, at_point(point, u, world)) + shift[world]
+        x = present(point, at_point(point, row(u, world))) + shift[world]
         for q in range(count):
             if depth(inputs, world, number[q], later, x) > point.deepest:
                 report(words, world, substep, in_wall, q * body.points.shape[0] + p)

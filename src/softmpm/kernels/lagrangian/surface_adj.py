@@ -18,6 +18,7 @@ from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics.grid import grid
@@ -46,7 +47,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     back, memory = nodes_adj(spec, wanted), chunk(dim, spec.dtype)
     before, adj_of, complete, moved_adj = back.before, back.adj_of, back.complete, back.moved_adj
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
-    module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
+    row, module = rows(dim, spec.dtype), lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.func
     def settle_adj_at(
@@ -62,23 +63,21 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         """(K5.adj): v* once more, v̄' with what u' gives to it, and v̄' / m. Nodes that no surface points act on are done here."""
         was = before(world, i, node, at, s)  # all of it loaded before anything is stored
-        after = at.v[s + 1, world, i]
+        after = row(at.v, s + 1, world)[i]
         free_v = vec()
         if wp.static(mirrored):
-            free_v = at.free[world, i]  # reflected already
+            free_v = row(at.free, world)[i]  # reflected already
         adj = complete(world, i, node, at, bar, s)
         adj.v += constants.dt * adj.u
         if node.touched == 1:
             if wp.static(not mirrored):
                 free_v = after_free(constants, inputs, world, was.x, was.w, node.m)
-            at.free[world, i] = free_v
-            each = vec()
-            if node.m > real(0.0):
-                each = adj.v / node.m
-            bar.u[world, i] = adj.u
-            bar.v[world, i] = adj.v
-            bar.shared[world, i] = each
-            bar.mass[world, i] = adj.m - wp.dot(after - free_v, each)
+            row(at.free, world)[i] = free_v
+            each = node.per_m * adj.v
+            row(bar.u, world)[i] = adj.u
+            row(bar.v, world)[i] = adj.v
+            row(bar.shared, world)[i] = each
+            row(bar.mass, world)[i] = adj.m - wp.dot(after - free_v, each)
         else:
             moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 
@@ -97,11 +96,10 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         anew: int,  # 1 if a control step begins
     ):
         """(K7.adj), and (K4.adj), (K3.adj), (K6.adj) from the last wall to the first."""
-        u = at.u[s]
         anchor = at.anchor[s]
-        x = present(point, at_point(point, u, world))  # all of it loaded before anything is stored
-        v = at_point(point, at.free, world)
-        dv = at.D[world, p]
+        x = present(point, at_point(point, row(at.u, s, world)))  # all of it loaded before anything is stored
+        v = at_point(point, row(at.free, world))
+        dv = row(at.D, world)[p]
         per_force = at.rate[0] * point.newtons
         wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[s, world])
         i = world * bar.held + p
@@ -110,13 +108,13 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         pushed = vecs()
         rubbed = reals()
         for q in range(count):
-            anchored[q] = anchor[world, q, p]
-            adj_anchor[q] = bar.anchor[world, q, p]
-            pushed[q] = bar.force[world, q, p]
+            anchored[q] = row(anchor, world, q)[p]
+            adj_anchor[q] = row(bar.anchor, world, q)[p]
+            pushed[q] = row(bar.force, world, q)[p]
             if wp.static(rough):
-                rubbed[q] = adj_inputs.friction[number[q], i]
-        adj_D = bar.D[world, p]
-        adj_J = point.area * at_point(point, bar.shared, world)
+                rubbed[q] = row(adj_inputs.friction, number[q])[i]
+        adj_D = row(bar.D, world)[p]
+        adj_J = point.area * at_point(point, row(bar.shared, world))
         reached = vecs()
         for q in range(count):
             reached[q] = v
@@ -165,14 +163,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             rubbed[q] += adj.friction
             after = here
         for q in range(count):
-            bar.anchor[world, q, p] = adj_anchor[q]
+            row(bar.anchor, world, q)[p] = adj_anchor[q]
             if anew == 1:  # the mean before is dropped
-                bar.force[world, q, p] = vec()
+                row(bar.force, world, q)[p] = vec()
             if wp.static(rough):
-                adj_inputs.friction[number[q], i] = rubbed[q]
-        bar.x[world, p] = back_x
-        bar.free[world, p] = back_v
-        bar.D[world, p] = adj_D
+                row(adj_inputs.friction, number[q])[i] = rubbed[q]
+        row(bar.x, world)[p] = back_x
+        row(bar.free, world)[p] = back_v
+        row(bar.D, world)[p] = adj_D
 
     @wp.func
     def spread_adj_at(
@@ -192,12 +190,12 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         i = entry.i
         was = before(world, i, node, at, s)  # all of it loaded before anything is stored
         adj = adj_of(world, i, bar)
-        adj.u += from_points(body, entry, bar.x, world)
-        adj.v += from_points(body, entry, bar.free, world)
+        adj.u += from_points(body, entry, row(bar.x, world))
+        adj.v += from_points(body, entry, row(bar.free, world))
         if lane == 0:
             if wp.static(constrained):
-                bar.u[world, i] = adj.u
-                bar.v[world, i] = adj.v
+                row(bar.u, world)[i] = adj.u
+                row(bar.v, world)[i] = adj.v
             else:
                 moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 

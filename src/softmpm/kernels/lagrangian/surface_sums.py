@@ -89,11 +89,11 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
         return out
 
     @wp.func
-    def at_point(point: Point, nodal: wp.array2d(dtype=vec), world: int) -> vec:
-        """Σ w a of a nodal field."""
+    def at_point(point: Point, nodal: wp.array(dtype=vec)) -> vec:
+        """Σ w a of a nodal field of a world."""
         total = vec()
         for n in range(count):
-            total += point.weights[n] * nodal[world, point.stencil[n]]
+            total += point.weights[n] * nodal[point.stencil[n]]
         return total
 
     @wp.func_native(TOGETHER.format(lanes=LANES[dim], dim=dim))
@@ -136,20 +136,20 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
         return out
 
     @wp.func
-    def partly(entries: Entries, values: wp.array2d(dtype=vec), world: int) -> vec:
+    def partly(entries: Entries, values: wp.array(dtype=vec)) -> vec:
         """Sum over a few points, whose values wait for memory together."""
         total = vec()
         for k in range(BATCH):
-            value = values[world, entries.members[k]]
+            value = values[entries.members[k]]
             total += wp.where(entries.shares[k] != real(0.0), entries.shares[k] * value, vec())
         return total
 
     @wp.func
-    def from_points(body: Surface, node: Touched, values: wp.array2d(dtype=vec), world: int) -> vec:
-        """Σ w a of a field of the surface points, at a node that they act on, in a fixed order."""
-        total = partly(node.entries, values, world)
+    def from_points(body: Surface, node: Touched, values: wp.array(dtype=vec)) -> vec:
+        """Σ w a of a field of the surface points of a world, at a node that they act on, in a fixed order."""
+        total = partly(node.entries, values)
         for m in range(node.first + BATCH * body.lanes, node.last, BATCH * body.lanes):
-            total += partly(entries_of(body, m, node.last), values, world)
+            total += partly(entries_of(body, m, node.last), values)
         return together(total)
 
     @wp.func

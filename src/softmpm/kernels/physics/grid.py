@@ -95,12 +95,11 @@ def grid(spec: Spec) -> SimpleNamespace:
         return v
 
     @wp.func
-    def increment(constants: Constants, inputs: GridInputs, world: int, impulse: vec, m: real) -> vec:
-        """Change of the velocity of a node by the impulse of its forces [N s] and by gravity."""
-        dv = vec()
-        if m > real(0.0):
-            dv = impulse / m
-            if wp.static(spec.gravity):
+    def increment(constants: Constants, inputs: GridInputs, world: int, impulse: vec, per_m: real) -> vec:
+        """Change of the velocity of a node by the impulse of its forces [N s] and by gravity, with 1/m, or 0 without mass."""
+        dv = per_m * impulse
+        if wp.static(spec.gravity):
+            if per_m > real(0.0):
                 dv += constants.dt * gravity(constants, inputs, world)
         return dv
 
@@ -250,11 +249,12 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         x: exact_vec,
         w: vec,
         m: real,
+        per_m: real,
         adj_velocity: vec,
         i: int,
         adj_inputs: GridInputsAdj,
     ) -> NodeAdj:
-        """As ``node_velocity_adj``, of ``after_free``: w = p/m + Δt g."""
+        """As ``node_velocity_adj``, of ``after_free``: w = p/m + Δt g, with 1/m, or 0 without mass."""
         adj = NodeAdj()
         if m > real(0.0):
             free = w
@@ -263,7 +263,7 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             back = after_all_walls_adj(constants, inputs, world, x, free, adj_velocity, i, adj_inputs)
             adj_v = back.v
             adj.x = back.x
-            adj.p = adj_v / m
+            adj.p = per_m * adj_v
             if wp.static(damped):
                 adj.p = decay(constants, inputs, world) * adj.p
             u = w

@@ -95,7 +95,7 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
             size = wp.length(T)
             if size > friction * P:
                 T = (friction * P / size) * T
-                out.anchor = x_t + dt * (v_t + D * T) + T / (k * dt)
+                out.anchor = x_t + dt * (v_t + D * T) + (real(1.0) / (k * dt)) * T
             out.J = P * n + T
         return out
 

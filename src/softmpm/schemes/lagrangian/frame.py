@@ -25,7 +25,8 @@ def quantum(model: Model) -> float:
 def frame_struct(model: Model) -> Any:
     """Struct of the rule by which u is kept small."""
     struct = frame(model.spec.dim, model.spec.dtype).Frame()
-    struct.middle, struct.quantum = model.rest_grid.middle, quantum(model)
+    q = quantum(model)
+    struct.middle, struct.quantum, struct.per_quantum = model.rest_grid.middle, q, 1.0 / q
     return struct
 
 
