@@ -26,6 +26,8 @@ class Cluster(NamedTuple):
     blocks: int
     groups: int
     """Groups of threads in a block; each has a brick."""
+    alone: bool = False
+    """Whether no thread has more than one brick, node, surface point and touched node: no code is needed to read others."""
 
     @property
     def group_threads(self) -> int:
@@ -55,12 +57,13 @@ class Cluster(NamedTuple):
 
     @property
     def name(self) -> str:
-        return f"{self.bricks.name}.c{self.blocks}x{self.groups}"
+        return f"{self.bricks.name}.c{self.blocks}x{self.groups}" + "a" * self.alone
 
 
 @kernel_factory
 def numbering(cluster: Cluster) -> SimpleNamespace:
-    blocks, serial = cluster.blocks, cluster.bricks.serial
+    blocks, serial, alone = cluster.blocks, cluster.bricks.serial, cluster.alone
+    bricks, threads = blocks * cluster.groups, blocks * cluster.threads
 
     @wp.func
     def number(block: int, thread: int) -> int:
@@ -78,7 +81,24 @@ def numbering(cluster: Cluster) -> SimpleNamespace:
         else:
             return (count + 31) / 32 * 32
 
-    return SimpleNamespace(number=number, rounded=rounded)
+    @wp.func
+    def following(i: int, count: int) -> int:
+        """The next node or point of the thread of number ``i``, or ``count``."""
+        if wp.static(alone):
+            return count
+        else:
+            return i + threads
+
+    @wp.func
+    def following_brick(brick: int, count: int) -> int:
+        if wp.static(alone):
+            return count
+        else:
+            return brick + bricks
+
+    return SimpleNamespace(
+        number=number, rounded=rounded, following=following, following_brick=following_brick
+    )
 
 
 @kernel_factory
@@ -99,12 +119,8 @@ def holdings(spec: Spec, cluster: Cluster) -> SimpleNamespace:
         cluster.lanes,
     )
     Point, point_of, Touched, touched_of = sums.Point, sums.point_of, sums.Touched, sums.touched_of
-    number, size, blocks, roomy = (
-        numbering(cluster).number,
-        cluster.group_threads,
-        cluster.blocks,
-        cluster.roomy,
-    )
+    number, size, blocks = numbering(cluster).number, cluster.group_threads, cluster.blocks
+    roomy, alone = cluster.roomy, cluster.alone
 
     class Held:
         number: int  # of the thread
@@ -143,8 +159,9 @@ def holdings(spec: Spec, cluster: Cluster) -> SimpleNamespace:
     @wp.func
     def seat_at(held: Held, inputs: ParticleInputs, inside: Rest, world: int, brick: int, lane: int) -> Seat:
         seat = held.seat
-        if brick > held.brick:
-            seat = seat_of(inside, inputs, world, brick, lane)
+        if wp.static(not alone):
+            if brick > held.brick:
+                seat = seat_of(inside, inputs, world, brick, lane)
         return seat
 
     @wp.func
@@ -152,16 +169,18 @@ def holdings(spec: Spec, cluster: Cluster) -> SimpleNamespace:
         held: Held, constants: Constants, inside: Rest, mass: wp.array2d(dtype=real), world: int, i: int
     ) -> Node:
         node = held.node
-        if i > held.number:
-            node = node_of(constants, inside, mass, world, i)
+        if wp.static(not alone):
+            if i > held.number:
+                node = node_of(constants, inside, mass, world, i)
         return node
 
     @wp.func
     def point_at(held: Held, body: Surface, p: int) -> Point:
         if wp.static(roomy):
             point = held.point
-            if p > held.number:
-                point = point_of(body, p)
+            if wp.static(not alone):
+                if p > held.number:
+                    point = point_of(body, p)
             return point
         else:
             return point_of(body, p)
@@ -170,8 +189,9 @@ def holdings(spec: Spec, cluster: Cluster) -> SimpleNamespace:
     def entry_at(held: Held, body: Surface, k: int, n: int) -> Touched:
         """Touched node ``n``, as the thread sees it that is number ``k`` of theirs."""
         entry = held.entry
-        if k > held.number:
-            entry = touched_of(body, n, k - n * lanes)
+        if wp.static(not alone):
+            if k > held.number:
+                entry = touched_of(body, n, k - n * lanes)
         return entry
 
     @wp.func
@@ -185,8 +205,9 @@ def holdings(spec: Spec, cluster: Cluster) -> SimpleNamespace:
         i: int,
     ) -> Node:
         node = held.touched
-        if k > held.number:
-            node = node_of(constants, inside, mass, world, i)
+        if wp.static(not alone):
+            if k > held.number:
+                node = node_of(constants, inside, mass, world, i)
         return node
 
     found = SimpleNamespace(held_by=held_by, seat_at=seat_at, node_at=node_at)

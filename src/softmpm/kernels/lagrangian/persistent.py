@@ -37,8 +37,8 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
     if contact:
         press_at, settle_at = surface(spec).press_at, surface(spec).settle_at
         point_at, entry_at = of_thread.point_at, of_thread.entry_at
-    size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    lanes, rounded = cluster.lanes, numbering(cluster).rounded
+    size, groups, lanes, number = cluster.group_threads, cluster.groups, cluster.lanes, numbering(cluster)
+    rounded, following, following_brick = number.rounded, number.following, number.following_brick
     module = brick_module(f"{spec.module}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -58,30 +58,37 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
         world, block, thread = wp.tid()
         lane = thread % size
         held = held_by(block, thread, constants, inputs, inside, body, at.mass, world)
-        own = held.number
         for s in range(first, last):
-            for brick in range(held.brick, inside.corners.shape[0], blocks * groups):
+            brick = held.brick
+            while brick < inside.corners.shape[0]:
                 seat = seat_at(held, inputs, inside, world, brick, lane)
                 if wp.static(lattice):
                     forces_at(world, brick, lane, seat, constants, inputs, inside, weights, at, s)
                 else:
                     forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
+                brick = following_brick(brick, inside.corners.shape[0])
             meet_cluster()
-            for i in range(own, inside.nodes.shape[0], blocks * threads):
+            i = held.number
+            while i < inside.nodes.shape[0]:
                 node = node_at(held, constants, inside, at.mass, world, i)
                 advance_at(world, i, node, constants, grid_inputs, moving, at, s)
+                i = following(i, inside.nodes.shape[0])
             meet_cluster()
             if wp.static(contact):
                 begins = wp.where(s == first, anew, 0)
-                for p in range(own, body.points.shape[0], blocks * threads):
+                p = held.number
+                while p < body.points.shape[0]:
                     point = point_at(held, body, p)
                     press_at(world, p, point, constants, grid_inputs, body, moving, at, s, begins)
+                    p = following(p, body.points.shape[0])
                 meet_cluster()
                 count = body.nodes.shape[0]
-                for k in range(own, rounded(count * lanes), blocks * threads):
+                k = held.number
+                while k < rounded(count * lanes):
                     n = wp.min(k / lanes, count - 1)
                     entry = entry_at(held, body, k, n)
                     settle_at(world, k - n * lanes, entry, constants, body, moving, at, s)
+                    k = following(k, rounded(count * lanes))
                 meet_cluster()
 
     return march
@@ -105,8 +112,8 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
         one = surface_adj(spec, wanted)
         settle_adj_at, press_adj_at, spread_adj_at = one.settle_adj_at, one.press_adj_at, one.spread_adj_at
         point_at, entry_at, touched_at = of_thread.point_at, of_thread.entry_at, of_thread.touched_at
-    size, groups, blocks, threads = cluster.group_threads, cluster.groups, cluster.blocks, cluster.threads
-    lanes, rounded = cluster.lanes, numbering(cluster).rounded
+    size, groups, lanes, number = cluster.group_threads, cluster.groups, cluster.lanes, numbering(cluster)
+    rounded, following, following_brick = number.rounded, number.following, number.following_brick
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -128,26 +135,30 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
         world, block, thread = wp.tid()
         lane = thread % size
         held = held_by(block, thread, constants, inputs, inside, body, at.mass, world)
-        own = held.number
         for back in range(last - first):
             s = last - 1 - back
-            for i in range(own, inside.nodes.shape[0], blocks * threads):
+            i = held.number
+            while i < inside.nodes.shape[0]:
                 node = node_at(held, constants, inside, at.mass, world, i)
                 if wp.static(contact):
                     settle_adj_at(world, i, node, constants, grid_inputs, at, bar, adj_grid_inputs, s)
                 else:
                     advance_adj_at(world, i, node, constants, grid_inputs, at, bar, adj_grid_inputs, s)
+                i = following(i, inside.nodes.shape[0])
             meet_cluster_adj()
             if wp.static(contact):
                 begins = wp.where(s == first, anew, 0)
-                for p in range(own, body.points.shape[0], blocks * threads):
+                p = held.number
+                while p < body.points.shape[0]:
                     point = point_at(held, body, p)
                     press_adj_at(
                         world, p, point, constants, grid_inputs, body, at, bar, adj_grid_inputs, s, begins
                     )
+                    p = following(p, body.points.shape[0])
                 meet_cluster_adj()
                 count = body.nodes.shape[0]
-                for k in range(own, rounded(count * lanes), blocks * threads):
+                k = held.number
+                while k < rounded(count * lanes):
                     n = wp.min(k / lanes, count - 1)
                     entry = entry_at(held, body, k, n)
                     node = touched_at(held, constants, inside, at.mass, world, k, entry.i)
@@ -155,8 +166,10 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     spread_adj_at(
                         world, turn, entry, node, constants, grid_inputs, body, at, bar, adj_grid_inputs, s
                     )
+                    k = following(k, rounded(count * lanes))
                 meet_cluster_adj()
-            for brick in range(held.brick, inside.corners.shape[0], blocks * groups):
+            brick = held.brick
+            while brick < inside.corners.shape[0]:
                 seat = seat_at(held, inputs, inside, world, brick, lane)
                 if wp.static(lattice):
                     forces_adj_at(
@@ -164,6 +177,7 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     )
                 else:
                     forces_adj_at(world, brick, lane, seat, constants, inputs, inside, at, bar, adj_inputs, s)
+                brick = following_brick(brick, inside.corners.shape[0])
             meet_cluster_adj()
 
     return march_adj

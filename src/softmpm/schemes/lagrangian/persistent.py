@@ -14,6 +14,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.schemes.lagrangian.bricks import lattice_struct
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
 from softmpm.schemes.launch import KernelLauncher
+from softmpm.surface_grid import SurfaceGrid
 
 BLOCKS = 16
 """Blocks of a cluster; a GPU of 132 multiprocessors has eight such clusters at a time."""
@@ -40,8 +41,16 @@ def _cluster_of(model: Model) -> Cluster | None:
     if groups > most or one.threads not in GROUP_THREADS:
         return None
     cluster = one._replace(groups=groups)
+    cluster = cluster._replace(alone=_most(model, cluster) <= cluster.blocks * cluster.threads)
     launchable = clusters_are_launchable(march(spec, cluster), model.wp_device, cluster.threads)
     return cluster if launchable else None
+
+
+def _most(model: Model, cluster: Cluster) -> int:
+    """Threads that are needed at once, for nodes, surface points or touched nodes."""
+    surface = model.surface
+    touched = len(surface.nodes) * cluster.lanes if isinstance(surface, SurfaceGrid) else 0
+    return max(model.rest_grid.count, model.anchor_shape[2], touched)
 
 
 def segments(chunk: Chunk) -> Iterator[tuple[int, int]]:
