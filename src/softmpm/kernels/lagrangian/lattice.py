@@ -9,7 +9,7 @@ from softmpm.kernels.lagrangian.bricks import Bricks, block_number, brick_module
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.layers import lattice_seats, layers
-from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
+from softmpm.kernels.lagrangian.particle_force import CHECKED, particle_forces, particle_forces_adj
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
 
@@ -29,7 +29,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     Constants, dim = t.Constants, spec.dim
     ParticleInputs, forced, given_to = input_types(spec).ParticleInputs, one.forced, one.given_to
-    check_now, memory = one.check_now, chunk(dim, spec.dtype)
+    check_now, sound, memory, mat = one.check_now, one.sound, chunk(dim, spec.dtype), t.mat
     Chunk, state_of = memory.Chunk, memory.state_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage_at, of_v.stage_at, sums(dim, spec.dtype, bricks, False).clear
@@ -71,19 +71,30 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                 place = places_of(inside, brick, slot)
             layer = slot / count
             A = block()
+            bad = bool(False)
             if corner >= 0:
                 H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)  # (Q1)
                 rate = block()
                 if wp.static(viscous):
                     rate = gradients_v(v, inside.window, world, brick, corner, layer, lattice)
                 for n in range(points):
-                    p = place[n]
-                    if p >= 0:
-                        Hn = taken(H, n)
-                        own = given_to(inputs, world, p)
-                        A = put(A, n, forced(own, Hn, taken(rate, n)))  # (Q2)
-                        check_now(constants, inputs, inside, at.words, world, p, s, Hn)  # last: nothing waits
+                    p = wp.max(place[n], 0)
+                    own = given_to(inputs, world, p)
+                    there = place[n] >= 0  # a branch on it would keep the particles from waiting together
+                    Hn = taken(H, n)
+                    A = put(A, n, wp.where(there, forced(own, Hn, taken(rate, n)), mat()))  # (Q2)
+                    if wp.static(serial):
+                        if there:
+                            check_now(constants, inputs, inside, at.words, world, p, s, Hn)
+                    else:
+                        bad = bad or (there and not sound(constants, Hn))
             add(A, at.partial, world, brick, corner, layer, lane, lattice)
+            if wp.static(not serial):  # here and with H once more, so that the particles do not wait for it
+                if corner >= 0 and (bad or s % CHECKED == 0):
+                    H = gradients_u(u, inside.window, world, brick, corner, layer, lattice)
+                    for n in range(points):
+                        if place[n] >= 0:
+                            check_now(constants, inputs, inside, at.words, world, place[n], s, taken(H, n))
 
     @wp.kernel(module=module, **bricks.layer_settings(resident(spec, bricks, WARPS)))
     def forces(

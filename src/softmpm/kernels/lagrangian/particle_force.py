@@ -70,13 +70,19 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         return -own.volume * P
 
     @wp.func
+    def sound(constants: Constants, H: mat) -> bool:
+        """True for a particle that ``check`` does not report. A comparison with NaN is false."""
+        j = volume_change(H)
+        return j > constants.collapse and j < real(largest)
+
+    @wp.func
     def check(
         constants: Constants, words: wp.array(dtype=wp.int64), world: int, p: int, substep: int, H: mat
     ):
-        """Report a particle that collapsed or is not finite. A comparison with NaN is false."""
-        j = volume_change(H)
-        if not (j > constants.collapse and j < real(largest)):
+        """Report a particle that collapsed or is not finite."""
+        if not sound(constants, H):
             kind = collapsed
+            j = volume_change(H)
             if not wp.isfinite(wp.ddot(H, H)) or not j < real(largest):
                 kind = not_finite
             report(words, world, substep, kind, p)
@@ -118,6 +124,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         given_to=given_to,
         piola=piola,
         forced=forced,
+        sound=sound,
         check=check,
         check_step=check_step,
         check_now=check_now,
