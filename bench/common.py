@@ -27,6 +27,7 @@ def cube(
     clamp=False,
     seed=0,
     domain=None,
+    on_knots=False,
     **scene_settings,
 ) -> softmpm.Scene:
     """An elastic cube with 2^dim particles per cell in the middle of the grid, particles in random order.
@@ -37,10 +38,11 @@ def cube(
         floor: Add a wall with friction at the lowest particles.
         clamp: Drive the lowest particles, which stand still unless a call gives their velocity.
         domain: Nodes along an axis of a larger grid, most of it empty.
+        on_knots: Shift the cube by half a cell, so that its faces lie on knots of the splines and its cells are full.
     """
     dx = 1.0 / nodes
     side = round(particles ** (1 / dim))
-    axis = (np.arange(side) - (side - 1) / 2) * dx / 2 + 0.5 * (domain or nodes) * dx
+    axis = (np.arange(side) - (side - 1) / 2) * dx / 2 + 0.5 * ((domain or nodes) + on_knots) * dx
     positions = np.stack(np.meshgrid(*[axis] * dim, indexing="ij"), -1).reshape(-1, dim)
     positions = np.random.default_rng(seed).permutation(positions)
     body = softmpm.Body(

@@ -5,9 +5,10 @@ warm-up, the two formulations in turn. ``further``: of one more substep in a cal
 without what a call costs in any case. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving formulation's
 figure over that of the reference formulation.
 
-``cube``: particles on a lattice, without walls, in one world or several. ``block`` has an outline; ``on a floor`` it also meets a wall
-with friction, at nodes in the moving and at surface points in the reference formulation, of which a row gives the times with the
-floor over those without. The last rows are of the moving formulation with contact at surface points, and over that at nodes.
+``cube``: particles on a lattice, without walls, in one world or several, with faces on knots of the splines. ``block`` has an
+outline; ``on a floor`` it also meets a wall with friction, at nodes in the moving and at surface points in the reference formulation,
+of which a row gives the times with the floor over those without. The last rows are of the moving formulation with contact at surface
+points, and over that at nodes.
 
 On a CPU the reference formulation runs with each number of threads; ``gain`` is its time with the first over that with this number,
 and ``cores`` the processor time of a call without gradient over its duration: below ``threads`` if other processes had a part of the
@@ -56,7 +57,7 @@ def block(dim: int, cells: int, floor: bool) -> softmpm.Scene:
 def cases(on_a_cpu: bool) -> Iterator[tuple[str, int, int, int, Callable[[], softmpm.Scene]]]:
     """Name, dimension, worlds, particles of a world, and the scene."""
     for dim, particles, nodes, worlds in ON_A_CPU if on_a_cpu else CASES:
-        yield "cube", dim, worlds, particles, lambda d=dim, p=particles, n=nodes: cube(d, p, n)
+        yield "cube", dim, worlds, particles, lambda d=dim, p=particles, n=nodes: cube(d, p, n, on_knots=True)
     for dim, cells in [(2, 32)] if on_a_cpu else [(2, 32), (3, 24)]:
         for name, floor in (("block", False), ("block on a floor", True)):
             yield name, dim, 1, (2 * cells) ** dim, lambda d=dim, c=cells, f=floor: block(d, c, f)

@@ -55,9 +55,9 @@ class RestGrid:
         # Cells, brick by brick, and particles, cell by cell
         cells, of = np.unique(brick.reshape(-1) * size.prod() + cell, return_inverse=True)
         of = of.reshape(-1)
-        brick_of_cell = cells // size.prod()
-        turn = cells % size.prod()
-        corner = np.stack(np.unravel_index(np.argsort(numbers, axis=None)[turn], bricks.cells), axis=-1)
+        brick_of_cell, cell = np.divmod(cells, size.prod())
+        corner = np.stack(np.unravel_index(np.argsort(numbers, axis=None)[cell], bricks.cells), axis=-1)
+        turn = packed(brick_of_cell, cell)
         corners = np.full((len(boxes), size.prod()), -1)
         corners[brick_of_cell, turn] = flat(corner, bricks.window)
         order = np.argsort(of, kind="stable")
@@ -159,6 +159,30 @@ def lattice_of(base: np.ndarray, fraction: np.ndarray) -> tuple[np.ndarray | Non
 
 SAME = 1e-11
 """Distance within which two places in a cell are the same [cells]: the rounding of positions."""
+
+
+def packed(brick: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Slot of each cell in its brick, so that as few warps as possible have cells: those of a warp of the full brick stay in one warp,
+    and share it with those of the next one if there is room.
+
+    Args:
+        brick: Number of the brick of each cell, in ascending order.
+        cell: Number in the full brick, in ascending order within a brick.
+    """
+    warps, whole = cell.max() // WARP + 1, cell // WARP
+    counts = np.bincount(brick * warps + whole, minlength=(brick.max() + 1) * warps).reshape(-1, warps)
+    starts = np.zeros_like(counts)
+    for w in range(1, warps):
+        end = starts[:, w - 1] + counts[:, w - 1]
+        room = -end % WARP
+        starts[:, w] = end + np.where(counts[:, w] > room, room, 0)
+    first = np.cumsum(counts) - counts.reshape(-1)
+    of = brick * warps + whole
+    return starts.reshape(-1)[of] + np.arange(len(cell)) - first[of]
+
+
+WARP = 32
+"""Threads of a warp."""
 
 
 def bases(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
