@@ -4,7 +4,7 @@ Each message names the rule, the value received and a remedy.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -101,11 +101,25 @@ def _check_surface(model: Sizes, surface: SurfaceState) -> None:
         check_tensor(model, f"state.surface.{name}", getattr(surface, name), shape)
 
 
+ALONE = 32_767
+"""Numbers of a tensor, at most, for which PyTorch uses the calling thread alone on a CPU."""
+
+
+def pieces(tensor: Tensor) -> Sequence[Tensor]:
+    """A tensor in pieces of which PyTorch takes each in the calling thread. After an operation with several threads these wait for the
+    next one in a loop, for milliseconds, on the cores that the threads of a simulation need."""
+    return tensor.reshape(-1).split(ALONE) if tensor.device.type == "cpu" else (tensor,)
+
+
+def _distance(ours: Tensor, theirs: Tensor) -> Tensor:
+    """Largest absolute difference."""
+    pairs = zip(pieces(ours), pieces(theirs), strict=True)
+    return torch.stack([(a - b).abs().max() for a, b in pairs]).max()
+
+
 def check_shown(state: State, shown: State) -> None:
     """The four tensors of a state with nodes are what its particles show of these. Reads back once: a GPU has to wait."""
-    apart = torch.stack(
-        [(ours - theirs).abs().max() for ours, theirs in zip(state[:4], shown[:4], strict=True)]
-    )
+    apart = torch.stack([_distance(*pair) for pair in zip(state[:4], shown[:4], strict=True)])
     for name, distance in zip(State._fields, apart.tolist(), strict=False):
         need(
             distance == 0.0,
@@ -219,7 +233,8 @@ def check_finite(state: State | None, activation: Tensor | None) -> None:
     if not given:
         return
     # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
-    for (name, value), total in zip(given, torch.stack([v.sum() for _, v in given]).tolist(), strict=True):
+    totals = [torch.stack([piece.sum() for piece in pieces(value)]).sum() for _, value in given]
+    for (name, value), total in zip(given, torch.stack(totals).tolist(), strict=True):
         if not math.isfinite(total):
             demand(name, value, torch.isfinite(value), "finite")
 

@@ -87,8 +87,8 @@ class SurfaceGrid(SurfacePoints):
 
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""
-        near = u[:, self.stencil.long()]
-        x = self.points.to(u.dtype) + torch.einsum("wpnd,pn->wpd", near, self.weights.to(u.dtype))
+        near = u.index_select(1, self.stencil.reshape(-1)).reshape(len(u), *self.stencil.shape, -1)
+        x = self.points.to(u.dtype) + (self.weights.to(u.dtype)[..., None] * near).sum(2)
         return x if shift is None else (x + shift[:, None]).to(u.dtype)
 
 

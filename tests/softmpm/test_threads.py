@@ -5,8 +5,10 @@ import time
 import pytest
 import torch
 from surface_scenes import made, slab
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import softmpm
+from softmpm.checks import ALONE
 from softmpm.schemes import program
 from softmpm.schemes.lagrangian.bricks import NODE_PART
 
@@ -114,3 +116,41 @@ def test_small_scenes_have_one_thread(threads):
     joined = threads(2)
     softmpm.simulate(small, small.rest(), None, small.params(), substeps=2)
     assert not joined
+
+
+class Watch(TorchDispatchMode):
+    """Collects the operations that PyTorch may give to several threads: those on many numbers, lookups, and products of matrices."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = set()
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        out = operation(*args, **(kwargs or {}))
+        sizes = [one.numel() for one in (*args, out) if isinstance(one, torch.Tensor)]
+        name = operation.name().split("::")[1].split(".")[0]
+        allocates = operation.is_view or name in ("empty", "empty_like", "empty_strided")
+        if not allocates and (max(sizes, default=0) > ALONE or name in ("index", "bmm", "mm")):
+            self.found.add(name)
+        return out
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_calls_leave_the_threads_of_pytorch_asleep(dim):
+    """These would wait for further work in a loop, for milliseconds, on the cores of the threads of the simulation. In 2D a call from
+    rest with contact; in 3D, with many numbers, one that goes on."""
+    rubber, up = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3), (0.0, 1.0) + (0.0,) * (dim - 2)
+    body = softmpm.Body(softmpm.box((0.25,) * dim, (0.75,) * dim, spacing=1 / 32), rubber)
+    walls = [softmpm.Wall(normal=up, offset=0.25)]
+    grid = softmpm.Grid(shape=(24,) * dim, spacing=1 / 16)
+    scene = softmpm.Scene(grid=grid, bodies=[body], walls=walls, dt=1e-4)
+    model = softmpm.build(scene, formulation="reference", device="cpu")
+    start, params = model.rest(), model.params()
+    if dim == 3:
+        assert model.particle_count * 9 > ALONE
+        start = softmpm.simulate(model, start, None, params, substeps=2)
+    young = params.young.clone().requires_grad_()
+    with Watch() as watch:
+        end = softmpm.simulate(model, start, None, params._replace(young=young), substeps=2)
+        torch.autograd.grad(end.nodes.u.sum(), young)
+    assert watch.found == set()

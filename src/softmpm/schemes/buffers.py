@@ -62,6 +62,13 @@ def clear(tensor: Tensor) -> None:
         tensor.zero_()
 
 
+def cleared(like: Tensor) -> Tensor:
+    """A tensor of zeros of the same shape, see :func:`clear`."""
+    made = torch.empty_like(like)
+    clear(made)
+    return made
+
+
 @dataclass
 class Motion:
     """State of all particles in the kernels' representation (kernels/structs.py); shapes (..., world, particle, dim[, dim])."""

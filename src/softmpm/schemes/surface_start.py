@@ -22,6 +22,6 @@ def with_surface(model: Model, start: State, values: Values) -> State:
         n = values["normal"][0][:, model.spec.surface_walls]  # at the beginning of the call
     else:
         n = points.normals.expand(model.worlds, -1, -1)
-    height = torch.einsum("wpd,wkd->wkp", x, n)
+    height = (x[:, None] * n[:, :, None]).sum(-1)
     anchor = (x[:, None] - height[..., None] * n[:, :, None]).to(model.dtype)
     return start._replace(surface=SurfaceState(anchor, torch.zeros_like(anchor)))

@@ -15,7 +15,7 @@ from softmpm.kernels.lagrangian.node_sums import node_sums
 from softmpm.kernels.lagrangian.projection import masses, projection
 from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.schemes.buffers import passing, view
+from softmpm.schemes.buffers import cleared, passing, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
@@ -133,12 +133,16 @@ class _Show(torch.autograd.Function):
         found = _show(model, u, v, shift)
         ctx.model = model
         ctx.save_for_backward(*found[2:])
+        ctx.set_materialize_grads(False)
         return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *adj):
-        return (None, *_show_adj(ctx.model, *ctx.saved_tensors, *adj), None)
+    def backward(ctx, *given):
+        C, F = ctx.saved_tensors
+        pairs = zip(given, (C[..., 0], C[..., 0], C, F), strict=True)
+        adj = [cleared(like) if one is None else one for one, like in pairs]
+        return (None, *_show_adj(ctx.model, C, F, *adj), None)
 
 
 @on_its_gpu
@@ -229,4 +233,4 @@ def _anchors(model: Model, u: Tensor, normals: Tensor | None) -> Tensor:
         n = surface.normals.expand(len(u), -1, -1).to(u.dtype)
     else:
         n = normals[:, model.spec.surface_walls].to(u.dtype)
-    return x[:, None] - torch.einsum("wpd,wkd->wkp", x, n)[..., None] * n[:, :, None]
+    return x[:, None] - (x[:, None] * n[:, :, None]).sum(-1, keepdim=True) * n[:, :, None]
