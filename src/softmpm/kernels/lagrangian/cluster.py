@@ -63,7 +63,6 @@ class Cluster(NamedTuple):
 @kernel_factory
 def numbering(cluster: Cluster) -> SimpleNamespace:
     blocks, serial, alone = cluster.blocks, cluster.bricks.serial, cluster.alone
-    bricks, threads = blocks * cluster.groups, blocks * cluster.threads
 
     @wp.func
     def number(block: int, thread: int) -> int:
@@ -82,23 +81,14 @@ def numbering(cluster: Cluster) -> SimpleNamespace:
             return (count + 31) / 32 * 32
 
     @wp.func
-    def following(i: int, count: int) -> int:
-        """The next node or point of the thread of number ``i``, or ``count``."""
+    def following(i: int, stride: int, count: int) -> int:
+        """What a thread has after its brick, node or point ``i``; ``count`` if it has no other."""
         if wp.static(alone):
             return count
         else:
-            return i + threads
+            return i + stride
 
-    @wp.func
-    def following_brick(brick: int, count: int) -> int:
-        if wp.static(alone):
-            return count
-        else:
-            return brick + bricks
-
-    return SimpleNamespace(
-        number=number, rounded=rounded, following=following, following_brick=following_brick
-    )
+    return SimpleNamespace(number=number, rounded=rounded, following=following)
 
 
 @kernel_factory

@@ -17,38 +17,13 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
+from softmpm.kernels.lagrangian.node_sums import gathering
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
-
-
-@kernel_factory
-def gathering(dim: int, dtype: str) -> SimpleNamespace:
-    vec, Rest, most = types(dim, dtype).vec, rest(dim, dtype).Rest, 2**dim
-    Entries = wp.types.vector(most, wp.int32)
-
-    @wp.func
-    def entries_of(inside: Rest, i: int) -> Entries:
-        """Where the partial sums for a node are, or -1."""
-        out = Entries()
-        for n in range(most):
-            out[n] = inside.shares[n, i]
-        return out
-
-    @wp.func
-    def gathered(partial: wp.array(dtype=vec), entries: Entries) -> vec:
-        """Sum of what the bricks around a node have for it, in a fixed order. Loads without branches wait for memory together."""
-        total = vec()
-        for n in range(most):
-            share = partial[wp.max(entries[n], 0)]
-            if entries[n] >= 0:
-                total += share
-        return total
-
-    return SimpleNamespace(Entries=Entries, entries_of=entries_of, gathered=gathered)
 
 
 @kernel_factory

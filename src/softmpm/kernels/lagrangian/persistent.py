@@ -38,7 +38,8 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
         press_at, settle_at = surface(spec).press_at, surface(spec).settle_at
         point_at, entry_at = of_thread.point_at, of_thread.entry_at
     size, groups, lanes, number = cluster.group_threads, cluster.groups, cluster.lanes, numbering(cluster)
-    rounded, following, following_brick = number.rounded, number.following, number.following_brick
+    rounded, following = number.rounded, number.following
+    all_groups, all_threads = cluster.blocks * groups, cluster.blocks * cluster.threads
     module = brick_module(f"{spec.module}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -66,13 +67,13 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
                     forces_at(world, brick, lane, seat, constants, inputs, inside, weights, at, s)
                 else:
                     forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
-                brick = following_brick(brick, inside.corners.shape[0])
+                brick = following(brick, all_groups, inside.corners.shape[0])
             meet_cluster()
             i = held.number
             while i < inside.nodes.shape[0]:
                 node = node_at(held, constants, inside, at.mass, world, i)
                 advance_at(world, i, node, constants, grid_inputs, moving, at, s)
-                i = following(i, inside.nodes.shape[0])
+                i = following(i, all_threads, inside.nodes.shape[0])
             meet_cluster()
             if wp.static(contact):
                 begins = wp.where(s == first, anew, 0)
@@ -80,7 +81,7 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
                 while p < body.points.shape[0]:
                     point = point_at(held, body, p)
                     press_at(world, p, point, constants, grid_inputs, body, moving, at, s, begins)
-                    p = following(p, body.points.shape[0])
+                    p = following(p, all_threads, body.points.shape[0])
                 meet_cluster()
                 count = body.nodes.shape[0]
                 k = held.number
@@ -88,7 +89,7 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
                     n = wp.min(k / lanes, count - 1)
                     entry = entry_at(held, body, k, n)
                     settle_at(world, k - n * lanes, entry, constants, body, moving, at, s)
-                    k = following(k, rounded(count * lanes))
+                    k = following(k, all_threads, rounded(count * lanes))
                 meet_cluster()
 
     return march
@@ -113,7 +114,8 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
         settle_adj_at, press_adj_at, spread_adj_at = one.settle_adj_at, one.press_adj_at, one.spread_adj_at
         point_at, entry_at, touched_at = of_thread.point_at, of_thread.entry_at, of_thread.touched_at
     size, groups, lanes, number = cluster.group_threads, cluster.groups, cluster.lanes, numbering(cluster)
-    rounded, following, following_brick = number.rounded, number.following, number.following_brick
+    rounded, following = number.rounded, number.following
+    all_groups, all_threads = cluster.blocks * groups, cluster.blocks * cluster.threads
     module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{cluster.name}", groups)
 
     @wp.kernel(module=module, **cluster.settings)
@@ -144,7 +146,7 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     settle_adj_at(world, i, node, constants, grid_inputs, at, bar, adj_grid_inputs, s)
                 else:
                     advance_adj_at(world, i, node, constants, grid_inputs, at, bar, adj_grid_inputs, s)
-                i = following(i, inside.nodes.shape[0])
+                i = following(i, all_threads, inside.nodes.shape[0])
             meet_cluster_adj()
             if wp.static(contact):
                 begins = wp.where(s == first, anew, 0)
@@ -154,7 +156,7 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     press_adj_at(
                         world, p, point, constants, grid_inputs, body, at, bar, adj_grid_inputs, s, begins
                     )
-                    p = following(p, body.points.shape[0])
+                    p = following(p, all_threads, body.points.shape[0])
                 meet_cluster_adj()
                 count = body.nodes.shape[0]
                 k = held.number
@@ -166,7 +168,7 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     spread_adj_at(
                         world, turn, entry, node, constants, grid_inputs, body, at, bar, adj_grid_inputs, s
                     )
-                    k = following(k, rounded(count * lanes))
+                    k = following(k, all_threads, rounded(count * lanes))
                 meet_cluster_adj()
             brick = held.brick
             while brick < inside.corners.shape[0]:
@@ -177,7 +179,7 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
                     )
                 else:
                     forces_adj_at(world, brick, lane, seat, constants, inputs, inside, at, bar, adj_inputs, s)
-                brick = following_brick(brick, inside.corners.shape[0])
+                brick = following(brick, all_groups, inside.corners.shape[0])
             meet_cluster_adj()
 
     return march_adj

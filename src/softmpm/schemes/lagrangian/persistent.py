@@ -41,13 +41,13 @@ def _cluster_of(model: Model) -> Cluster | None:
     if groups > most or one.threads not in GROUP_THREADS:
         return None
     cluster = one._replace(groups=groups)
-    cluster = cluster._replace(alone=_most(model, cluster) <= cluster.blocks * cluster.threads)
+    cluster = cluster._replace(alone=_threads_needed(model, cluster) <= cluster.blocks * cluster.threads)
     launchable = clusters_are_launchable(march(spec, cluster), model.wp_device, cluster.threads)
     return cluster if launchable else None
 
 
-def _most(model: Model, cluster: Cluster) -> int:
-    """Threads that are needed at once, for nodes, surface points or touched nodes."""
+def _threads_needed(model: Model, cluster: Cluster) -> int:
+    """Threads of a world if each has one node, surface point and touched node at most."""
     surface = model.surface
     touched = len(surface.nodes) * cluster.lanes if isinstance(surface, SurfaceGrid) else 0
     return max(model.rest_grid.count, model.anchor_shape[2], touched)
