@@ -87,7 +87,10 @@ class SurfaceGrid(SurfacePoints):
 
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""
-        near = u.index_select(1, self.stencil.reshape(-1)).reshape(len(u), *self.stencil.shape, -1)
+        if u.is_cuda:  # its adjoint adds in a fixed order, which that of index_select does not; on a CPU it would wake threads
+            near = u[:, self.stencil.long()]
+        else:
+            near = u.index_select(1, self.stencil.reshape(-1)).reshape(len(u), *self.stencil.shape, -1)
         x = self.points.to(u.dtype) + (self.weights.to(u.dtype)[..., None] * near).sum(2)
         return x if shift is None else (x + shift[:, None]).to(u.dtype)
 

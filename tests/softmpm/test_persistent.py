@@ -10,8 +10,10 @@ from softmpm.kernels.lagrangian.cluster import Cluster
 from softmpm.schemes.lagrangian import launches
 from softmpm.schemes.lagrangian.persistent import cluster_of
 
-NAMES = {"lattice": ("friction",), "particles": ("friction", "force")}
+NAMES = {"lattice": ("friction",), "particles": ("friction", "force"), "undamped": ("friction",)}
 """Inputs: with forces of their own, particles are taken one by one."""
+UNDAMPED = dict(damping=0.0, walls=[softmpm.Wall(normal=(0.1, 1.0), offset=0.36, friction=0.4)])
+"""With these a gradient stores some velocities only of nodes that surface points act on (kernels/lagrangian/record.py)."""
 
 
 @pytest.mark.parametrize("kind", NAMES)
@@ -23,10 +25,9 @@ def test_the_same_as_single_launches(kind, device, monkeypatch):
     body = softmpm.Body(softmpm.box((0.3, 0.3), (0.5, 0.5), spacing=0.05), made.bodies[0].material)
     on_cpu = torch.device(device).type == "cpu"
     for form in ("launches", "kernel", "kernel", *([] if on_cpu else ["loops"])):
-        model = build(
-            block(2, bodies=[body]), device=device, dtype=torch.float64, worlds=2, inputs=NAMES[kind]
-        )
-        assert model.rest_grid.bricks.lattice == (kind == "lattice")
+        scene = block(2, bodies=[body], **(UNDAMPED if kind == "undamped" else {}))
+        model = build(scene, device=device, dtype=torch.float64, worlds=2, inputs=NAMES[kind])
+        assert model.rest_grid.bricks.lattice == (kind != "particles")
         cluster = Cluster(model.rest_grid.bricks, 1, 1) if on_cpu else cluster_of(model)
         assert cluster is not None and cluster.alone != on_cpu
         if form != "kernel":

@@ -9,7 +9,9 @@ from helpers import assert_relative, busy_inputs, cotangent, dot
 from surface_scenes import block, build, compare
 
 import softmpm
-from softmpm.surface_grid import consistent
+from softmpm.kernels.lagrangian.record import stores_all
+from softmpm.schemes.lagrangian.footprint import recorded_nodes
+from softmpm.surface_grid import SurfaceGrid, consistent
 
 NAMES = ("gravity", "friction", "viscosity")
 
@@ -22,6 +24,16 @@ def test_the_end_and_all_gradients_are_those_of_the_reference(dim, width, device
         settings = dict(device=device, dtype=dtype, worlds=2, inputs=NAMES, contact_width=width)
         model = build(block(dim), **settings)
         compare(model, NAMES, limit)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_velocities_are_stored_where_points_act_only(dim, device):
+    """Without damping and other walls, of a gradient's velocities w the others are the new velocities, and are not stored."""
+    made = block(dim, damping=0.0, walls=block(dim).walls[:2])
+    model = build(made, device=device, dtype=torch.float64, worlds=2, inputs=("friction",))
+    assert isinstance(model.surface, SurfaceGrid) and not stores_all(model.spec)
+    assert 0 < recorded_nodes(model) == len(model.surface.nodes) < model.rest_grid.count
+    compare(model, ("friction",), 1e-10)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -15,7 +15,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
 
     class Chunk:
         """See :class:`softmpm.schemes.lagrangian.buffers.ChunkBuffers`. The first axis of u, v, anchor and shift counts states, that of
-        w substeps; without ``keep`` two states take turns, and w has one."""
+        w substeps (record.py); without ``keep`` two states take turns, and w has none."""
 
         length: int
         keep: int
@@ -65,12 +65,8 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
             return s % 2
 
     @wp.func
-    def stored_of(of: Chunk, s: int) -> int:
-        return of.keep * s
-
-    @wp.func
     def lost(a: vec, b: vec) -> vec:
         """What rounding keeps from a + b, where b is small."""
         return b - ((a + b) - a)
 
-    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, stored_of=stored_of, lost=lost)
+    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, lost=lost)

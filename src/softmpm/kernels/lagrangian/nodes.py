@@ -19,6 +19,7 @@ from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.node_sums import gathering
 from softmpm.kernels.lagrangian.portions import end_of, first_of
+from softmpm.kernels.lagrangian.record import record
 from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.physics import status
@@ -46,7 +47,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
-    Chunk, state_of, stored_of, lost = memory.Chunk, memory.state_of, memory.stored_of, memory.lost
+    Chunk, state_of, lost, store = memory.Chunk, memory.state_of, memory.lost, record(spec).store
     row, module = rows(spec.dim, spec.dtype), lagrangian_module(spec.module + ".lagrangian")
 
     @wp.struct
@@ -57,7 +58,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         m: real
         per_m: real  # 1/m, or 0
         entries: Entries
-        touched: int  # 1 if surface points act on it
+        touched: int  # its number among those that surface points act on, or -1
 
     @wp.func
     def node_of(constants: Constants, inside: Rest, mass: wp.array2d(dtype=real), world: int, i: int) -> Node:
@@ -66,6 +67,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         out.per_m = wp.where(out.m > real(0.0), real(1.0) / out.m, real(0.0))
         out.entries = entries_of(inside, i)
         out.rest = position(constants, inside.nodes[i])
+        out.touched = int(-1)
         if wp.static(surface):
             out.touched = inside.touched[i]
         return out
@@ -84,7 +86,6 @@ def nodes(spec: Spec) -> SimpleNamespace:
         """(Q3), (Q4). Where surface points act on a node, the velocity without contact goes to ``free``, and surface.py goes on."""
         now = state_of(at, s)
         then = state_of(at, s + 1)
-        stored = stored_of(at, s)
         u = row(at.u, now, world)
         lost_u = row(at.low, world, 0)
         lost_v = row(at.low, world, 1)
@@ -102,7 +103,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
             dv = increment(constants, inputs, world, constants.dt * f, node.per_m) + low_v
             low_v = lost(new, dv)
             w = new + dv
-            row(at.w, stored, world)[i] = w
+            store(at, world, i, node.touched, s, w)
             new = after_free(constants, inputs, world, x, w, node.m)  # (Q3)
             here = here - d
             du = constants.dt * new + low_u
@@ -114,7 +115,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         if wp.static(surface):
             row(at.free, world)[i] = new
         if wp.static(apart):
-            if node.touched == 0:
+            if node.touched < 0:
                 row(at.u, then, world)[i] = here
                 lost_u[i] = low_u
                 row(at.v, then, world)[i] = new
@@ -153,7 +154,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         chunk(spec.dim, spec.dtype),
         frame(spec.dim, spec.dtype).exact,
     )
-    Chunk, Adjoint = memory.Chunk, memory.Adjoint
+    Chunk, Adjoint, stored = memory.Chunk, memory.Adjoint, record(spec).stored
     row, module = rows(spec.dim, spec.dtype), lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
     @wp.struct
@@ -175,7 +176,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         out = Before()
         out.x = node.rest + at.shift[s, world] + exact(row(at.u, s, world)[i])
         out.v = row(at.v, s, world)[i]
-        out.w = row(at.w, s, world)[i]
+        out.w = stored(at, world, i, node.touched, s)
         return out
 
     @wp.func

@@ -39,7 +39,7 @@ def rest(dim: int, dtype: str) -> SimpleNamespace:
         places: wp.array2d(dtype=wp.int32)
         corners: wp.array2d(dtype=wp.int32)
         order: wp.array(dtype=wp.int32)
-        touched: wp.array(dtype=wp.int32)  # 1 for nodes that surface points act on
+        touched: wp.array(dtype=wp.int32)  # number of each node among those that surface points act on, or -1
         fraction: wp.array(dtype=t.vec)
 
     real, vec = t.real, t.vec

@@ -69,7 +69,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             free_v = row(at.free, world)[i]  # reflected already
         adj = complete(world, i, node, at, bar, s)
         adj.v += constants.dt * adj.u
-        if node.touched == 1:
+        if node.touched >= 0:
             if wp.static(not mirrored):
                 free_v = after_free(constants, inputs, world, was.x, was.w, node.m)
             row(at.free, world)[i] = free_v

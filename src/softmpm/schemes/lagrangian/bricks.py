@@ -25,9 +25,10 @@ def rest_struct(model: Model) -> Any:
         struct.nodes, struct.fraction = view(grid.nodes, t.ivec), view(grid.fraction, t.vec)
         for name in ("shares", "window", "rows", "places", "corners", "order"):
             setattr(struct, name, view(getattr(grid, name), wp.int32))
-        touched = torch.zeros(grid.count, dtype=torch.int32, device=model.device)
+        touched = torch.full((grid.count,), -1, dtype=torch.int32, device=model.device)
         if isinstance(model.surface, SurfaceGrid):
-            touched[model.surface.nodes.long()] = 1
+            nodes = model.surface.nodes
+            touched[nodes.long()] = torch.arange(len(nodes), dtype=torch.int32, device=model.device)
         struct.touched = view(touched, wp.int32)
         return struct
 

@@ -15,6 +15,7 @@ from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
+from softmpm.schemes.lagrangian.footprint import recorded_nodes
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
 from softmpm.schemes.lagrangian.kernels import define_adj
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
@@ -31,7 +32,7 @@ class ChunkBuffers:
         u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns.
         low: What rounding has kept from u and v of the latest state.
         force: Mean forces of the walls on the surface points in the present control step.
-        w: Velocities of the nodes after each substep if ``keep``, else one, without damping, walls and contact.
+        w: Velocities of the nodes after each substep, without damping, walls and contact, where ``keep`` needs them (record.py).
         mass: Masses of the nodes.
         partial: Sums of the bricks for the nodes of their windows.
         words: Status words, see errors.py; shape (world,).
@@ -45,10 +46,10 @@ class ChunkBuffers:
         self.model, self.chunk, self.keep = model, chunk, keep
         self.types, self.rest = types(model.spec.dim, model.spec.dtype), rest_struct(model)
         nodal = model.worlds, model.rest_grid.count, model.dim
-        stored, pushed = (chunk.length + 1, chunk.length) if keep else (2, 1)
+        stored, recorded = (chunk.length + 1, chunk.length) if keep else (2, 0)
         self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
         self.w, self.mass, self.low = (
-            self.tensor(pushed, *nodal),
+            self.tensor(recorded, model.worlds, recorded_nodes(model), model.dim),
             self.tensor(*nodal[:2]),
             self.tensor(nodal[0], 2, *nodal[1:]),
         )

@@ -4,8 +4,17 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
+from softmpm.kernels.lagrangian.record import stores_all
 from softmpm.planning.memory import Buffers, Plan, Sizes, input_bytes, sizes_of
 from softmpm.schemes.lagrangian.overlap import overlap_bytes
+from softmpm.surface_grid import SurfaceGrid
+
+
+def recorded_nodes(model) -> int:
+    """Number of nodes of which a gradient stores w (kernels/lagrangian/record.py)."""
+    if stores_all(model.spec):
+        return model.rest_grid.count
+    return len(model.surface.nodes) if isinstance(model.surface, SurfaceGrid) else 0
 
 
 class LagrangianFootprint:
@@ -20,15 +29,25 @@ class LagrangianFootprint:
         return model.rest_grid.count
 
     def sizes(self, model) -> Sizes:
-        field = model.worlds * model.rest_grid.count * model.dim * model.dtype.itemsize
-        anchors = math.prod(model.anchor_shape) * model.dtype.itemsize + 8 * model.worlds * model.dim
+        field, anchors = _field_bytes(model), _anchor_bytes(model)
+        recorded = model.worlds * recorded_nodes(model) * model.dim * model.dtype.itemsize
         held = math.prod(model.reaction_shape) * model.dtype.itemsize
-        return sizes_of(model, inside=3 * field + anchors, nodes=0, between=4 * field + 2 * anchors + held)
+        inside, between = 2 * field + recorded + anchors, 4 * field + 2 * anchors + held
+        return sizes_of(model, inside=inside, nodes=0, between=between)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
-        real, nodal = model.dtype.itemsize, model.sizes().inside
+        real, nodal = model.dtype.itemsize, 3 * _field_bytes(model) + _anchor_bytes(model)
         sums = model.worlds * model.rest_grid.window.numel() * model.dim * real
-        low = 2 * model.worlds * model.rest_grid.count * model.dim * real
-        forward = 2 * nodal + low + sums + input_bytes(model, 1) + overlap_bytes(model)
+        forward = 2 * nodal + 2 * _field_bytes(model) + sums + input_bytes(model, 1) + overlap_bytes(model)
         kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
         return Buffers(forward, kept, 2 * nodal + 2 * sums)
+
+
+def _field_bytes(model) -> int:
+    """Bytes of a vector at each node."""
+    return model.worlds * model.rest_grid.count * model.dim * model.dtype.itemsize
+
+
+def _anchor_bytes(model) -> int:
+    """Bytes of the anchors of the surface points and of the shifts."""
+    return math.prod(model.anchor_shape) * model.dtype.itemsize + 8 * model.worlds * model.dim

@@ -1,0 +1,45 @@
+"""Velocities w of the nodes without damping, walls and contact (nodes.py). A gradient stores them where they are not the new ones."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.lagrangian.chunk import chunk
+from softmpm.kernels.lagrangian.rows import rows
+from softmpm.kernels.structs import Spec, types
+
+
+def stores_all(spec: Spec) -> bool:
+    """Whether w is stored of all nodes, since something may act on each of them; else only of those that surface points act on."""
+    return spec.damping or spec.constrained or bool(spec.node_walls)
+
+
+@kernel_factory
+def record(spec: Spec) -> SimpleNamespace:
+    vec, Chunk = types(spec.dim, spec.dtype).vec, chunk(spec.dim, spec.dtype).Chunk
+    row, all_nodes, surface = rows(spec.dim, spec.dtype), stores_all(spec), bool(spec.surface_walls)
+
+    @wp.func
+    def store(at: Chunk, world: int, i: int, touched: int, s: int, w: vec):
+        """Store w of node ``i`` in substep ``s``; ``touched`` is its number among those that surface points act on, or -1."""
+        if wp.static(all_nodes or surface):
+            place = touched
+            if wp.static(all_nodes):
+                place = i
+            if at.keep == 1 and place >= 0:
+                row(at.w, s, world)[place] = w
+
+    @wp.func
+    def stored(at: Chunk, world: int, i: int, touched: int, s: int) -> vec:
+        """w of node ``i`` in substep ``s``."""
+        if wp.static(all_nodes):
+            return row(at.w, s, world)[i]
+        else:
+            w = row(at.v, s + 1, world)[i]
+            if wp.static(surface):
+                if touched >= 0:
+                    w = row(at.w, s, world)[touched]
+            return w
+
+    return SimpleNamespace(store=store, stored=stored)
