@@ -10,9 +10,9 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import passing, view
 from softmpm.schemes.capture import defer_status_check, is_capturing, keep_alive
-from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.failure_report import raise_failure
-from softmpm.schemes.launch import KernelLauncher
+from softmpm.schemes.launch import launcher
 from softmpm.state import GridField, State
 
 
@@ -38,7 +38,7 @@ def _units(model: Model, mass: Tensor, state: State) -> Tensor:
 
 def _sums(model: Model, state: State, words: Tensor) -> Tensor:
     """Momentum and mass of the nodes, (world, node, dim + 1)."""
-    launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    launch, kernels = launcher(model), raster(model.dim, model.spec.dtype)
     t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.particle_count)
     mass, status = passing(model.mass, t.real), passing(words, wp.int64)
     moving = _particles(model, *(tensor.contiguous() for tensor in (state.x, state.v, state.C)))
@@ -68,7 +68,7 @@ def rasterize_nodes(model: Model, state: State) -> GridField:
     grid = model.scene.grid.shape
     velocity = node.new_empty(model.worlds, model.dim, *grid).movedim(1, -1)  # in memory as in a picture
     field = GridField(node.new_empty(model.worlds, *grid), velocity)
-    launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    launch, kernels = launcher(model), raster(model.dim, model.spec.dtype)
     nodes = passing(node, types(model.dim, model.spec.dtype).node)
     launch(kernels.divide, (model.worlds, model.node_count), nodes, *_nodes(model, *field))
     return field
@@ -81,7 +81,7 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
     Raises:
         UnstableError: An adjoint is not finite.
     """
-    launch, kernels = KernelLauncher(model, stream_of(model.device)), raster(model.dim, model.spec.dtype)
+    launch, kernels = launcher(model), raster(model.dim, model.spec.dtype)
     t, lead = types(model.dim, model.spec.dtype), (model.worlds, model.node_count)
     adj_node = passing(field.mass.new_empty(*lead, model.dim + 1), t.node)
     launch(kernels.divide_adj, lead, *_nodes(model, *field, *adj), adj_node)

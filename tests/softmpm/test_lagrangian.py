@@ -181,9 +181,19 @@ def test_a_changed_state_is_not_ignored():
     """A state whose tensors differ from what its nodes show is refused; without nodes it runs."""
     model = build(busy_scene(2), dtype=torch.float64)
     state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=3)
-    changed = state._replace(v=state.v + 1.0)
-    with pytest.raises(ValueError, match="state.v was changed, but state.nodes was not"):
-        softmpm.simulate(model, changed, None, model.params(), substeps=1)
+    for name in "xvCF":
+        field = getattr(state, name).clone()
+        field[0, -1].view(-1)[-1] += 0.25
+        changed = state._replace(**{name: field})
+        with pytest.raises(ValueError, match=f"state.{name} was changed.*they differ by 0.25;"):
+            softmpm.simulate(model, changed, None, model.params(), substeps=1)
+    assert state.nodes is not None
+    u = state.nodes.u.clone()
+    u[0, 3, 0] = torch.nan
+    with pytest.raises(ValueError, match="they differ by inf"):
+        softmpm.simulate(
+            model, state._replace(nodes=state.nodes._replace(u=u)), None, model.params(), substeps=1
+        )
     softmpm.simulate(model, changed._replace(nodes=None), None, model.params(), substeps=1)
     moving = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64)
     with pytest.raises(ValueError, match="state.nodes must be None with formulation='moving'"):

@@ -14,9 +14,8 @@ from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import view
-from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import Values, elapsed, grid_struct
-from softmpm.schemes.launch import KernelLauncher
+from softmpm.schemes.launch import launcher
 from softmpm.schemes.penetration import deepest
 from softmpm.state import State, SurfaceState
 from softmpm.surface_points import CarriedPoints
@@ -178,5 +177,5 @@ def check_start(model: Model, start: State, values: Values, words: Tensor) -> No
     x = points_of(model).shown(start.detach()).contiguous()
     places = view(x, types(model.spec.dim, "float64").vec)
     arguments = (grid_struct(model, known), outline_struct(model), places, view(words, wp.int64))
-    launch, kernel = KernelLauncher(model, stream_of(model.device)), start_depth(model.spec)
+    launch, kernel = launcher(model), start_depth(model.spec)
     launch(kernel, tuple(x.shape[:2]), *arguments, block_dim=POINT_BLOCK)

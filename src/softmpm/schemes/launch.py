@@ -14,6 +14,7 @@ import warp as wp
 from softmpm.kernels.compile import launch, runs_in_order
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
+from softmpm.schemes.device import stream_of
 from softmpm.schemes.program import Program
 
 
@@ -53,6 +54,13 @@ class KernelLauncher:
         return made
 
 
+def launcher(model: Model) -> KernelLauncher:
+    """The launcher of single kernels on PyTorch's current stream, which remembers the launches of earlier calls."""
+    stream = stream_of(model.device)
+    key = launcher, None if stream is None else stream.cuda_stream
+    return model.workspace.get(key, lambda: KernelLauncher(model, stream))
+
+
 class LaunchTemplate:
     """A recorded launch, to be repeated on other inputs: the checks and look-ups of ``wp.launch`` take ten times as long as a launch.
 
@@ -60,7 +68,11 @@ class LaunchTemplate:
     """
 
     def __init__(self, made: Any):
-        self._made, self._kinds = made, [type(value) for value in made.params[1:]]
+        self._made, self._kinds = copy.copy(made), [type(value) for value in made.params[1:]]
+        self._made.params, self._made.fwd_args = (
+            made.params[:1],
+            (),
+        )  # else the first inputs would live as long
 
     def on(self, inputs: Sequence) -> wp.Launch:
         """The same launch on other inputs, which it keeps alive."""

@@ -13,9 +13,9 @@ from softmpm.kernels.lagrangian.driven import driven, driven_adj, spread
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.schemes.buffers import view
-from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.lagrangian.frame import frame_struct
-from softmpm.schemes.launch import KernelLauncher
+from softmpm.schemes.launch import launcher
 
 
 def drive(
@@ -85,6 +85,6 @@ def _multiplied(model: Model, matrix: Sparse, given: Tensor) -> Tensor:
     out = torch.empty(*given.shape[:2], matrix.rows, model.dim, dtype=model.dtype, device=model.device)
     parts = view(matrix.first, wp.int32), view(matrix.column, wp.int32), view(matrix.value, wp.float64)
     arrays = (view(one.contiguous().flatten(0, 1), t.vec) for one in (given, out))
-    launch = KernelLauncher(model, stream_of(model.device))
+    launch = launcher(model)
     launch(spread(model.spec.dim, model.spec.dtype), (lead, matrix.rows), *parts, *arrays)
     return out

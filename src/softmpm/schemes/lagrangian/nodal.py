@@ -3,6 +3,7 @@
 Equations: kernels/lagrangian/projection.py. Clamps and planes of symmetry then hold and reflect the nodes by (B1).
 """
 
+import math
 from typing import Any
 
 import torch
@@ -13,14 +14,15 @@ from torch.autograd.function import once_differentiable
 from softmpm.checks import check_reflected, check_shown
 from softmpm.kernels.lagrangian.node_sums import node_sums
 from softmpm.kernels.lagrangian.projection import masses, projection
+from softmpm.kernels.lagrangian.shown import shown as shown_by
 from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.schemes.buffers import cleared, passing, view
+from softmpm.schemes.buffers import cleared, passing
 from softmpm.schemes.capture import is_capturing
-from softmpm.schemes.device import on_its_gpu, stream_of
+from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
 from softmpm.schemes.lagrangian.frame import quantum, shift_of
-from softmpm.schemes.launch import KernelLauncher
+from softmpm.schemes.launch import KernelLauncher, launcher
 from softmpm.state import Nodal, State
 from softmpm.surface_grid import SurfaceGrid
 
@@ -38,10 +40,10 @@ def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
         mass: Mass of the particles in any unit, shape (world, particle).
         normals: Unit normals of all walls, shape (world, wall, dim); None takes the scene's.
     """
-    moved = state.x.double() - model.positions.double()
-    moved = moved if state.low is None else moved + (state.low.x.double() - model.rest_low.double())
+    rounded, exact = _rest_places(model)
+    moved = state.x - rounded if state.low is None else (state.x - exact) + state.low.x
     mean, step = moved.detach().mean(1), quantum(model)
-    shift = torch.where(mean.abs() > step, step * (mean / step).round(), 0.0)
+    shift = torch.zeros_like(mean) if math.isinf(step) else step * (mean / step).trunc()
     moved = (moved - shift[:, None]).to(model.dtype)
     placed = mass.index_select(1, model.rest_grid.order)
     found: Any = _Project.apply(model, moved, state.v, state.C, state.F, placed)
@@ -62,12 +64,24 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     if nodes is None:
         nodes = nodes_of(model, state, mass, normals)
     elif not is_capturing(model):
-        check_shown(state, particles_of(model, nodes.detach()))
+        check_shown(_apart(model, state, particles_of(model, nodes.detach())))
         if model.mirror is not None:
             check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
-    low = torch.stack([torch.zeros_like(nodes.u)] * 2, 1) if nodes.low is None else nodes.low
+    low = nodes.low
+    if low is None:
+        low = nodes.u.new_zeros(model.worlds, 2, *nodes.u.shape[1:])
     nodes = nodes._replace(shift=shift_of(model, nodes).detach(), low=low.detach())
     return with_reaction(model, nodes, nodes.reaction)
+
+
+def _rest_places(model: Model) -> tuple[Tensor, Tensor]:
+    """Places of the particles at rest in float64 [m], as the model's precision rounds them and with the remainders."""
+
+    def make() -> tuple[Tensor, Tensor]:
+        rounded = model.positions.double()
+        return rounded, rounded + model.rest_low.double()
+
+    return model.workspace.get(_rest_places, make)
 
 
 def with_reaction(model: Model, nodes: Nodal, reaction: Tensor | None = None) -> Nodal:
@@ -80,7 +94,7 @@ class _Arrays:
 
     def __init__(self, model: Model):
         self.model, self.types = model, types(model.spec.dim, model.spec.dtype)
-        self.rest, self.launch = rest_struct(model), KernelLauncher(model, stream_of(model.device))
+        self.rest, self.launch = rest_struct(model), launcher(model)
         self.kernels = projection(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
         self.sums = node_sums(model.spec.dim, model.spec.dtype)
         self._held: list[Tensor] = []  # until the launches
@@ -98,8 +112,8 @@ class _Arrays:
         shape = self.model.worlds, self.model.rest_grid.count, self.model.dim
         return [torch.empty(shape, dtype=self.model.dtype, device=self.model.device) for _ in range(2)]
 
-    def partials(self) -> list[wp.array]:
-        return [view(empty_partial(self.model), self.types.vec) for _ in range(2)]
+    def partials(self) -> list:
+        return self.views(*(empty_partial(self.model) for _ in range(2)))
 
     def views(self, *tensors: Tensor) -> list:
         """Scalars, vectors or matrices, by the number of axes."""
@@ -146,11 +160,21 @@ class _Show(torch.autograd.Function):
 
 
 @on_its_gpu
+def _apart(model: Model, ours: State, theirs: State) -> Tensor:
+    """Largest differences of x, v, C and F between two states, shape (4,)."""
+    one, found = _Arrays(model), torch.zeros(4, dtype=model.dtype, device=model.device)
+    lead, fields = (model.worlds, model.particle_count), one.views(*ours.detach()[:4], *theirs.detach()[:4])
+    kernel = shown_by(model.spec.dim, model.spec.dtype).apart
+    one.launch(kernel, lead, *fields, passing(found, one.types.real))
+    return found
+
+
+@on_its_gpu
 def _show(model: Model, u: Tensor, v: Tensor, shift: Tensor) -> tuple[Tensor, ...]:
     one = _Arrays(model)
     found = one.particles()
     exact = types(model.spec.dim, "float64").vec
-    given = view(model.positions, one.types.vec), view(shift, exact)
+    given = passing(model.positions, one.types.vec), passing(shift, exact)
     arguments = (model.constants, one.rest, *given, *one.views(u, v, *found))
     brick_launch(model, one.launch, one.kernels.show, *arguments)
     return tuple(found)

@@ -26,7 +26,7 @@ from softmpm.schemes.lagrangian.kernels import define
 from softmpm.schemes.lagrangian.launches import launch_chunk, launch_chunk_adj
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of, with_reaction
 from softmpm.schemes.lagrangian.surface import check_start
-from softmpm.schemes.launch import KernelLauncher, LaunchReplay
+from softmpm.schemes.launch import LaunchReplay, launcher
 from softmpm.state import Nodal, State
 
 
@@ -158,7 +158,7 @@ class Lagrangian:
         inputs = self._start_inputs.of(model.fixed | stiffest(model, values))
         arguments = (model.constants, inputs, rest_struct(model), 0, True, False, u, view(words, wp.int64))
         kernel = cells(model.spec, model.rest_grid.bricks).check_state
-        launch = KernelLauncher(model, stream_of(model.device))
+        launch = launcher(model)
         brick_launch(model, launch, kernel, *arguments)
         if model.surface is not None:
             known = model.fixed | values
