@@ -1,9 +1,14 @@
 """Short problems of bench/accuracy.py with limits; docs/accuracy.md has all of them."""
 
+import json
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 from bench.problems import contact, exact, statics, waves
+
+RESULTS = Path(__file__).parents[1] / "bench" / "results"
 
 
 def test_a_cantilever_bends_as_the_exact_beam():
@@ -59,3 +64,19 @@ def test_the_exact_answers():
     assert abs(small / (1e-3 * 0.8**4 / (8 * of.bending) + 1e-3 * 0.8**2 / (2 * of.shear)) - 1) < 1e-6
     light = exact.column([1.0], 1.0, 1e-6, 1.0, 1.0)[0]
     assert abs(light / (-1e-6 / 6) - 1) < 1e-5
+
+
+@pytest.mark.parametrize("formulation", ["reference", "moving"])
+def test_walks_are_those_of_the_present_robot(formulation, monkeypatch):
+    """Displacements of docs/gait.md on the coarsest grid, within 0.1 %: whoever changes the robot has to measure its walks again."""
+    monkeypatch.syspath_prepend(RESULTS.parent)
+    from bench import gait
+
+    rows = json.loads((RESULTS / "gait.walk.cpu.json").read_text())["rows"]
+    wanted = dict(gait="viscous", formulation=formulation)
+    (row,) = (
+        r for r in rows if r.items() >= wanted.items() and (round(r["η/μ ms"]), r["cells/m"]) == (1, 40)
+    )
+    activations, contact = np.array(gait.GAITS["viscous"]), {"reference": "surface", "moving": "nodes"}
+    found, _ = gait.walk(40, formulation, 1e-3, activations, "cpu", contact[formulation])
+    np.testing.assert_allclose(1e3 * found.mean(axis=0), [row["0.5 s mm"], row["1 s mm"]], rtol=1e-3)
