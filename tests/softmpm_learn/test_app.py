@@ -3,6 +3,8 @@
 import csv
 import logging
 import os
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -49,6 +51,27 @@ def composed(*overrides):
     app.register()
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         return compose("config", list(overrides))
+
+
+def commands_of(page: Path) -> list[list[str]]:
+    """Settings of each command of a page, of a list of values the first; without the commands for files of one's own."""
+    text = page.read_text().replace("\\\n", " ")
+    found = [shlex.split(line) for line in re.findall(r"python -m softmpm_learn ([^`\n]*)", text)]
+    found = [
+        words
+        for words in found
+        if not any(re.search(r"\.py$|^--|resume=|SETTINGS|train.log", w) for w in words)
+    ]
+    return [[re.sub(r"^([^=\[]*=[^,\[]*),.*", r"\1", w) for w in words if w != "-m"] for words in found]
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.stem
+)
+def test_the_commands_of_the_pages_are_accepted(page):
+    """Each setting exists, and has a value of its type."""
+    for words in commands_of(page):
+        to_run(composed(*words))
 
 
 def refusal(monkeypatch, capsys, *overrides) -> str:
