@@ -77,6 +77,6 @@ def test_walks_are_those_of_the_present_robot(formulation, monkeypatch):
     (row,) = (
         r for r in rows if r.items() >= wanted.items() and (round(r["η/μ ms"]), r["cells/m"]) == (1, 40)
     )
-    activations, contact = np.array(gait.GAITS["viscous"]), {"reference": "surface", "moving": "nodes"}
-    found, _ = gait.walk(40, formulation, 1e-3, activations, "cpu", contact[formulation])
+    activations, meets = np.array(gait.GAITS["viscous"]), {"reference": "surface", "moving": "nodes"}
+    found, _ = gait.walk(40, formulation, 1e-3, activations, "cpu", meets[formulation])
     np.testing.assert_allclose(1e3 * found.mean(axis=0), [row["0.5 s mm"], row["1 s mm"]], rtol=1e-3)

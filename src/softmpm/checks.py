@@ -118,8 +118,11 @@ def _total(tensor: Tensor) -> Tensor:
 
 
 def check_shown(apart: Tensor) -> None:
-    """The four tensors of a state with nodes are what its particles show of these, from which they differ by this, shape (4,). Reads
-    back once: a GPU has to wait."""
+    """The four tensors of a state are what its nodes show. Reads back once: a GPU has to wait.
+
+    Args:
+        apart: Largest differences of x, v, C and F, shape (4,).
+    """
     for name, distance in zip(State._fields, apart.tolist(), strict=False):
         need(
             distance == 0.0,

@@ -87,7 +87,7 @@ class SurfaceGrid(SurfacePoints):
 
     def places(self, u: Tensor, shift: Tensor | None = None) -> Tensor:
         """Places of the points [m], shape (world, point, dim), from displacements of the nodes and a shift of each world (K2)."""
-        if u.is_cuda:  # its adjoint adds in a fixed order, which that of index_select does not; on a CPU it would wake threads
+        if u.is_cuda:  # the adjoint of indexing sums in a fixed order, that of index_select does not; on a CPU indexing wakes threads
             near = u[:, self.stencil.long()]
         else:
             near = u.index_select(1, self.stencil.reshape(-1)).reshape(len(u), *self.stencil.shape, -1)

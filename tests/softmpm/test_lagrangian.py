@@ -158,6 +158,22 @@ def test_affine_states_are_projected_exactly(device):
         torch.testing.assert_close(got, want, rtol=1e-11, atol=1e-11, msg=name)
 
 
+def test_states_far_from_rest_are_projected_without_loss():
+    """In float32 a rest state has no displacement at all, with and without remainders of rounding; others have them, and a shift."""
+    model = build(busy_scene(3))
+    rest, mass, quantum = model.rest(), model.mass.expand(1, -1), 0.125
+    assert rest.low is not None and rest.low.x.any()
+    for state in (rest, rest._replace(low=None)):
+        nodes = nodes_of(model, state, mass)
+        assert not nodes.u.any() and not nodes.shift.any()
+    moved = nodes_of(model, rest._replace(low=rest.low._replace(x=rest.low.x + 1e-6)), mass)
+    torch.testing.assert_close(moved.u, torch.full_like(moved.u, 1e-6), rtol=1e-3, atol=0.0)
+    far = nodes_of(model, rest._replace(x=rest.x + 7.3 * quantum, low=None), mass)
+    assert far.u.mean(1).abs().max() <= quantum
+    way = far.shift + far.u.double()
+    torch.testing.assert_close(way, torch.full_like(way, 7.3 * quantum), rtol=1e-6, atol=0.0)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_particles_in_the_middle_of_cells(dim, device):
     """One particle in the middle of each cell, where the last spline along each axis is zero: a free fall by the discrete law."""
@@ -179,11 +195,11 @@ def test_particles_in_the_middle_of_cells(dim, device):
 
 def test_a_changed_state_is_not_ignored():
     """A state whose tensors differ from what its nodes show is refused; without nodes it runs."""
-    model = build(busy_scene(2), dtype=torch.float64)
+    model = build(busy_scene(2), dtype=torch.float64, worlds=2)
     state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=3)
     for name in "xvCF":
         field = getattr(state, name).clone()
-        field[0, -1].view(-1)[-1] += 0.25
+        field[-1, -1].view(-1)[-1] += 0.25
         changed = state._replace(**{name: field})
         with pytest.raises(ValueError, match=f"state.{name} was changed.*they differ by 0.25;"):
             softmpm.simulate(model, changed, None, model.params(), substeps=1)
@@ -195,7 +211,7 @@ def test_a_changed_state_is_not_ignored():
             model, state._replace(nodes=state.nodes._replace(u=u)), None, model.params(), substeps=1
         )
     softmpm.simulate(model, changed._replace(nodes=None), None, model.params(), substeps=1)
-    moving = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64)
+    moving = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64, worlds=2)
     with pytest.raises(ValueError, match="state.nodes must be None with formulation='moving'"):
         softmpm.simulate(moving, state, None, moving.params(), substeps=1)
 

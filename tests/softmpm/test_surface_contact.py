@@ -10,6 +10,8 @@ from surface_scenes import block, build, compare
 
 import softmpm
 from softmpm.kernels.lagrangian.record import stores_all
+from softmpm.planning.chunks import Chunk
+from softmpm.schemes.lagrangian.buffers import ChunkBuffers
 from softmpm.schemes.lagrangian.footprint import recorded_nodes
 from softmpm.surface_grid import SurfaceGrid, consistent
 
@@ -28,12 +30,52 @@ def test_the_end_and_all_gradients_are_those_of_the_reference(dim, width, device
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_velocities_are_stored_where_points_act_only(dim, device):
-    """Without damping and other walls, of a gradient's velocities w the others are the new velocities, and are not stored."""
+    """Without damping and other walls, w is stored only at nodes on which surface points act; gradients are those of the reference."""
     made = block(dim, damping=0.0, walls=block(dim).walls[:2])
     model = build(made, device=device, dtype=torch.float64, worlds=2, inputs=("friction",))
     assert isinstance(model.surface, SurfaceGrid) and not stores_all(model.spec)
     assert 0 < recorded_nodes(model) == len(model.surface.nodes) < model.rest_grid.count
     compare(model, ("friction",), 1e-10)
+
+
+STORED = {
+    "damping": (dict(walls=[]), {}),
+    "damping of a body that meets walls": (dict(walls=block(2).walls[:2]), {}),
+    "walls at nodes": (dict(damping=0.0), dict(contact="nodes")),
+}
+"""What may act on any node, one at a time: changes of the block, and settings of its model."""
+
+
+@pytest.mark.parametrize("what", STORED)
+def test_velocities_are_stored_where_anything_acts(what, device):
+    """At all nodes; gradients are those of the reference. Of walls at nodes only friction tells w from the new velocity."""
+    changes, settings = STORED[what]
+    names = ("friction",) if changes.get("walls") != [] else ("gravity",)
+    model = build(block(2, **changes), device=device, dtype=torch.float64, worlds=2, inputs=names, **settings)
+    assert recorded_nodes(model) == model.rest_grid.count
+    compare(model, names, 1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.7])
+def test_the_plan_counts_what_is_stored(damping):
+    """Bytes of a stored substep, from buffers of several."""
+    made = block(3, damping=damping, walls=block(3).walls[:2])
+    model, sizes = build(made), []
+    for length in (3, 5):
+        one = ChunkBuffers(model, Chunk(0, length, length), keep=True)
+        sizes.append(sum(t.nbytes for t in (one.u, one.v, one.w, one.anchor, one.shift)))
+    assert (sizes[1] - sizes[0]) / 2 == model.sizes().inside
+
+
+def test_gradients_through_surface_points_have_the_same_bits(device):
+    """To the particles of a state without nodes, from which the anchors follow: three runs, float32."""
+    model, found = build(block(3), device=device), []
+    for _ in range(3):
+        start = model.rest()
+        start.x.requires_grad_()
+        end = softmpm.simulate(model, start, None, model.params(), substeps=4)
+        found.append(torch.autograd.grad(end.x.square().sum() + end.v.sum(), start.x)[0])
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
 @pytest.mark.parametrize("dim", [2, 3])

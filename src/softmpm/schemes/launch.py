@@ -55,7 +55,7 @@ class KernelLauncher:
 
 
 def launcher(model: Model) -> KernelLauncher:
-    """The launcher of single kernels on PyTorch's current stream, which remembers the launches of earlier calls."""
+    """The model's launcher of single kernels on PyTorch's current stream; it repeats the launches recorded in earlier calls."""
     stream = stream_of(model.device)
     key = launcher, None if stream is None else stream.cuda_stream
     return model.workspace.get(key, lambda: KernelLauncher(model, stream))
@@ -69,10 +69,9 @@ class LaunchTemplate:
 
     def __init__(self, made: Any):
         self._made, self._kinds = copy.copy(made), [type(value) for value in made.params[1:]]
-        self._made.params, self._made.fwd_args = (
-            made.params[:1],
-            (),
-        )  # else the first inputs would live as long
+        # The first inputs must not live as long as the template:
+        self._made.params = made.params[:1]
+        self._made.fwd_args = ()
 
     def on(self, inputs: Sequence) -> wp.Launch:
         """The same launch on other inputs, which it keeps alive."""

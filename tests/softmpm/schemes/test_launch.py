@@ -1,5 +1,7 @@
 """Repeated launches: each works on its own inputs, as if it were launched alone."""
 
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from helpers import busy_scene
 import softmpm
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.launch import KernelLauncher
+from softmpm.schemes.launch import KernelLauncher, launcher
 from softmpm.schemes.program import Program
 
 
@@ -57,3 +59,18 @@ def test_a_repeated_launch_refuses_inputs_of_another_type():
     launch(combine, 5, offsets, 1, 0.5, True, out)
     with pytest.raises(AssertionError, match="a repeated launch got"):
         launch(combine, 5, out, 1, 0.5, True, out)
+
+
+def test_the_launcher_keeps_no_arrays_alive():
+    """One launcher of a model; what it remembers of a launch does not refer to the first inputs."""
+    model = softmpm.build(busy_scene(2), device="cpu")
+    assert launcher(model) is launcher(model)
+
+    def call() -> weakref.ref:
+        offsets, out = Offsets(), view(torch.zeros(5), wp.float32)
+        offsets.each, offsets.shift = view(torch.ones(5), wp.float32), wp.vec2(0.0, 2.0)
+        launcher(model)(combine, 5, offsets, 2, 0.5, True, out)
+        assert out.numpy().tolist() == 5 * [4.0]
+        return weakref.ref(out)
+
+    assert call()() is None and call()() is None

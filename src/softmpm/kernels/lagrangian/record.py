@@ -1,4 +1,7 @@
-"""Velocities w of the nodes without damping, walls and contact (nodes.py). A gradient stores them where they are not the new ones."""
+"""Storage of w, the nodal velocity before damping, walls and contact (nodes.py).
+
+Where none of these acts, w is the new velocity and is not stored.
+"""
 
 from types import SimpleNamespace
 
@@ -11,7 +14,7 @@ from softmpm.kernels.structs import Spec, types
 
 
 def stores_all(spec: Spec) -> bool:
-    """Whether w is stored of all nodes, since something may act on each of them; else only of those that surface points act on."""
+    """True if w is stored at all nodes, because damping, walls or constraints may act on any of them."""
     return spec.damping or spec.constrained or bool(spec.node_walls)
 
 

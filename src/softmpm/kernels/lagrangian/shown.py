@@ -13,11 +13,11 @@ from softmpm.kernels.structs import types
 def shown(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat
-    module = lagrangian_module(f"softmpm.d{dim}.{dtype}.node_sums")
+    module = lagrangian_module(f"softmpm.d{dim}.{dtype}.shown")
 
     @wp.func
-    def note(found: wp.array(dtype=real), k: int, difference: real):
-        """Raise the largest difference of field ``k``; that of a NaN is infinite."""
+    def accumulate_max(found: wp.array(dtype=real), k: int, difference: real):
+        """Update the largest difference of field ``k``; a NaN counts as infinite."""
         size = wp.abs(difference)
         if size > real(0.0):
             wp.atomic_max(found, k, size)
@@ -40,10 +40,10 @@ def shown(dim: int, dtype: str) -> SimpleNamespace:
         """Largest difference of each of the four fields, over all worlds."""
         world, p = wp.tid()
         for i in range(dim):
-            note(found, 0, x[world, p][i] - shown_x[world, p][i])
-            note(found, 1, v[world, p][i] - shown_v[world, p][i])
+            accumulate_max(found, 0, x[world, p][i] - shown_x[world, p][i])
+            accumulate_max(found, 1, v[world, p][i] - shown_v[world, p][i])
             for j in range(dim):
-                note(found, 2, C[world, p][i, j] - shown_C[world, p][i, j])
-                note(found, 3, F[world, p][i, j] - shown_F[world, p][i, j])
+                accumulate_max(found, 2, C[world, p][i, j] - shown_C[world, p][i, j])
+                accumulate_max(found, 3, F[world, p][i, j] - shown_F[world, p][i, j])
 
     return SimpleNamespace(apart=apart)

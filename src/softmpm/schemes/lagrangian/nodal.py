@@ -3,7 +3,6 @@
 Equations: kernels/lagrangian/projection.py. Clamps and planes of symmetry then hold and reflect the nodes by (B1).
 """
 
-import math
 from typing import Any
 
 import torch
@@ -40,10 +39,10 @@ def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
         mass: Mass of the particles in any unit, shape (world, particle).
         normals: Unit normals of all walls, shape (world, wall, dim); None takes the scene's.
     """
-    rounded, exact = _rest_places(model)
-    moved = state.x - rounded if state.low is None else (state.x - exact) + state.low.x
+    moved = state.x - _rest_places(model, state.low is not None)
+    moved = moved if state.low is None else moved + state.low.x
     mean, step = moved.detach().mean(1), quantum(model)
-    shift = torch.zeros_like(mean) if math.isinf(step) else step * (mean / step).trunc()
+    shift = torch.where(mean.abs() > step, step * (mean / step).round(), 0.0)
     moved = (moved - shift[:, None]).to(model.dtype)
     placed = mass.index_select(1, model.rest_grid.order)
     found: Any = _Project.apply(model, moved, state.v, state.C, state.F, placed)
@@ -74,14 +73,14 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     return with_reaction(model, nodes, nodes.reaction)
 
 
-def _rest_places(model: Model) -> tuple[Tensor, Tensor]:
-    """Places of the particles at rest in float64 [m], as the model's precision rounds them and with the remainders."""
+def _rest_places(model: Model, exact: bool) -> Tensor:
+    """Places of the particles at rest in float64 [m], exact or as the model's precision rounds them."""
 
-    def make() -> tuple[Tensor, Tensor]:
+    def make() -> Tensor:
         rounded = model.positions.double()
-        return rounded, rounded + model.rest_low.double()
+        return rounded + model.rest_low.double() if exact else rounded
 
-    return model.workspace.get(_rest_places, make)
+    return model.workspace.get((_rest_places, exact), make)
 
 
 def with_reaction(model: Model, nodes: Nodal, reaction: Tensor | None = None) -> Nodal:
@@ -165,6 +164,7 @@ def _apart(model: Model, ours: State, theirs: State) -> Tensor:
     one, found = _Arrays(model), torch.zeros(4, dtype=model.dtype, device=model.device)
     lead, fields = (model.worlds, model.particle_count), one.views(*ours.detach()[:4], *theirs.detach()[:4])
     kernel = shown_by(model.spec.dim, model.spec.dtype).apart
+    # Not in parts, whose threads would share the result:
     one.launch(kernel, lead, *fields, passing(found, one.types.real))
     return found
 
