@@ -4,7 +4,7 @@ Each message names the rule, the value received and a remedy.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -105,16 +105,11 @@ ALONE = 32_767
 """Numbers of a tensor, at most, for which PyTorch uses the calling thread alone on a CPU."""
 
 
-def pieces(tensor: Tensor) -> Sequence[Tensor]:
-    """A tensor in pieces of which PyTorch takes each in the calling thread. After an operation with several threads these wait for the
-    next one in a loop, for milliseconds, on the cores that the threads of a simulation need."""
-    return tensor.reshape(-1).split(ALONE) if tensor.device.type == "cpu" else (tensor,)
-
-
 def _total(tensor: Tensor) -> Tensor:
-    """Sum of a tensor."""
-    sums = [piece.sum() for piece in pieces(tensor)]
-    return sums[0] if len(sums) == 1 else torch.stack(sums).sum()
+    """Sum of a tensor, on a CPU in parts that PyTorch adds up in the calling thread (docs/decisions/0011-cpu-threads.md)."""
+    if tensor.device.type != "cpu" or tensor.numel() <= ALONE:
+        return tensor.sum()
+    return torch.stack([part.sum() for part in tensor.reshape(-1).split(ALONE)]).sum()
 
 
 def check_shown(apart: Tensor) -> None:

@@ -10,6 +10,7 @@ from surface_scenes import by_reference, compare
 
 import softmpm
 from softmpm.kernels.lagrangian import bricks
+from softmpm.schemes.lagrangian.frame import quantum
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
@@ -161,17 +162,17 @@ def test_affine_states_are_projected_exactly(device):
 def test_states_far_from_rest_are_projected_without_loss():
     """In float32 a rest state has no displacement at all, with and without remainders of rounding; others have them, and a shift."""
     model = build(busy_scene(3))
-    rest, mass, quantum = model.rest(), model.mass.expand(1, -1), 0.125
+    rest, mass, way = model.rest(), model.mass.expand(1, -1), 7.3 * quantum(model)
     assert rest.low is not None and rest.low.x.any()
     for state in (rest, rest._replace(low=None)):
         nodes = nodes_of(model, state, mass)
         assert not nodes.u.any() and not nodes.shift.any()
     moved = nodes_of(model, rest._replace(low=rest.low._replace(x=rest.low.x + 1e-6)), mass)
     torch.testing.assert_close(moved.u, torch.full_like(moved.u, 1e-6), rtol=1e-3, atol=0.0)
-    far = nodes_of(model, rest._replace(x=rest.x + 7.3 * quantum, low=None), mass)
-    assert far.u.mean(1).abs().max() <= quantum
-    way = far.shift + far.u.double()
-    torch.testing.assert_close(way, torch.full_like(way, 7.3 * quantum), rtol=1e-6, atol=0.0)
+    far = nodes_of(model, rest._replace(x=rest.x + way, low=None), mass)
+    assert far.u.mean(1).abs().max() <= quantum(model)
+    moved = far.shift + far.u.double()
+    torch.testing.assert_close(moved, torch.full_like(moved, way), rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -12,7 +12,7 @@ import softmpm
 from softmpm.kernels.lagrangian.record import stores_all
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.lagrangian.buffers import ChunkBuffers
-from softmpm.schemes.lagrangian.footprint import recorded_nodes
+from softmpm.schemes.lagrangian.footprint import stored_nodes
 from softmpm.surface_grid import SurfaceGrid, consistent
 
 NAMES = ("gravity", "friction", "viscosity")
@@ -34,7 +34,7 @@ def test_velocities_are_stored_where_points_act_only(dim, device):
     made = block(dim, damping=0.0, walls=block(dim).walls[:2])
     model = build(made, device=device, dtype=torch.float64, worlds=2, inputs=("friction",))
     assert isinstance(model.surface, SurfaceGrid) and not stores_all(model.spec)
-    assert 0 < recorded_nodes(model) == len(model.surface.nodes) < model.rest_grid.count
+    assert 0 < stored_nodes(model) == len(model.surface.nodes) < model.rest_grid.count
     compare(model, ("friction",), 1e-10)
 
 
@@ -52,7 +52,7 @@ def test_velocities_are_stored_where_anything_acts(what, device):
     changes, settings = STORED[what]
     names = ("friction",) if changes.get("walls") != [] else ("gravity",)
     model = build(block(2, **changes), device=device, dtype=torch.float64, worlds=2, inputs=names, **settings)
-    assert recorded_nodes(model) == model.rest_grid.count
+    assert stored_nodes(model) == model.rest_grid.count
     compare(model, names, 1e-9)
 
 

@@ -15,7 +15,7 @@ from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
-from softmpm.schemes.lagrangian.footprint import recorded_nodes
+from softmpm.schemes.lagrangian.footprint import stored_nodes
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
 from softmpm.schemes.lagrangian.kernels import define_adj
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
@@ -46,10 +46,10 @@ class ChunkBuffers:
         self.model, self.chunk, self.keep = model, chunk, keep
         self.types, self.rest = types(model.spec.dim, model.spec.dtype), rest_struct(model)
         nodal = model.worlds, model.rest_grid.count, model.dim
-        stored, recorded = (chunk.length + 1, chunk.length) if keep else (2, 0)
+        stored, substeps = (chunk.length + 1, chunk.length) if keep else (2, 0)
         self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
         self.w, self.mass, self.low = (
-            self.tensor(recorded, model.worlds, recorded_nodes(model), model.dim),
+            self.tensor(substeps, model.worlds, stored_nodes(model), model.dim),
             self.tensor(*nodal[:2]),
             self.tensor(nodal[0], 2, *nodal[1:]),
         )

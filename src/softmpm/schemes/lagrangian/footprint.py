@@ -10,7 +10,7 @@ from softmpm.schemes.lagrangian.overlap import overlap_bytes
 from softmpm.surface_grid import SurfaceGrid
 
 
-def recorded_nodes(model) -> int:
+def stored_nodes(model) -> int:
     """Number of nodes of which a gradient stores w (kernels/lagrangian/record.py)."""
     if stores_all(model.spec):
         return model.rest_grid.count
@@ -30,9 +30,9 @@ class LagrangianFootprint:
 
     def sizes(self, model) -> Sizes:
         field, anchors = _field_bytes(model), _anchor_bytes(model)
-        recorded = model.worlds * recorded_nodes(model) * model.dim * model.dtype.itemsize
+        w = model.worlds * stored_nodes(model) * model.dim * model.dtype.itemsize
         held = math.prod(model.reaction_shape) * model.dtype.itemsize
-        inside, between = 2 * field + recorded + anchors, 4 * field + 2 * anchors + held
+        inside, between = 2 * field + w + anchors, 4 * field + 2 * anchors + held
         return sizes_of(model, inside=inside, nodes=0, between=between)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
