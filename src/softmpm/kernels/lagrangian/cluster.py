@@ -47,7 +47,7 @@ class Cluster(NamedTuple):
     @property
     def lanes(self) -> int:
         """Threads of a node that surface points act on."""
-        return 1 if self.bricks.serial else LANES[self.bricks.dim]
+        return 1 if self.bricks.serial else LANES
 
     @property
     def settings(self) -> dict:

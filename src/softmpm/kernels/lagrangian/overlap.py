@@ -143,7 +143,10 @@ def overlap(dim: int, dtype: str) -> SimpleNamespace:
         if not ran(words, world, substep) or not wp.isfinite(wp.dot(here, here)):
             return
         cell = cell_of(bodies, here - vec(bodies.reach))
-        for n in range(cells):
+        all_cells = int(
+            cells
+        )  # a variable: unrolled, with the loops over nodes inside, it took 20 s to compile
+        for n in range(all_cells):
             bucket = find(table, world, cell + corner(n))
             q = int(-1)
             if bucket >= 0:

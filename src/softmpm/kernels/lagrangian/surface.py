@@ -91,9 +91,9 @@ def surface(spec: Spec) -> SimpleNamespace:
         world, p = wp.tid()
         total = real(0.0)
         for n in range(r.count):
-            i = body.stencil[p, n]
-            if body.weights[p, n] != real(0.0):
-                total += wp.abs(body.weights[p, n]) * body.loads[i] / mass[world, i]
+            i = body.stencil[n, p]
+            if body.weights[n, p] != real(0.0):
+                total += wp.abs(body.weights[n, p]) * body.loads[i] / mass[world, i]
         D[world, p] = total
 
     @wp.func

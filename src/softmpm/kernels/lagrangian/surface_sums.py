@@ -15,7 +15,7 @@ from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
 
-LANES = {2: 8, 3: 32}
+LANES = 8
 """Threads of a node on a GPU; the CPU has one."""
 BATCH = 2
 """Entries that a thread reads at once."""
@@ -45,7 +45,9 @@ def surface_type(dim: int, dtype: str):
         deepest: wp.array(dtype=t.real)
         stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
         loads: wp.array(dtype=t.real)
-        stencil: wp.array2d(dtype=wp.int32)
+        stencil: wp.array2d(
+            dtype=wp.int32
+        )  # (node, point): threads that are neighbours read neighbouring numbers
         weights: wp.array2d(dtype=t.real)
         nodes: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
@@ -79,8 +81,8 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
     def point_of(body: Surface, p: int) -> Point:
         out = Point()
         for n in range(count):
-            out.stencil[n] = body.stencil[p, n]
-            out.weights[n] = body.weights[p, n]
+            out.stencil[n] = body.stencil[n, p]
+            out.weights[n] = body.weights[n, p]
         out.rest = body.points[p]
         out.area = body.areas[p]
         out.newtons = body.newtons[p]
@@ -96,7 +98,7 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
             total += point.weights[n] * nodal[point.stencil[n]]
         return total
 
-    @wp.func_native(TOGETHER.format(lanes=LANES[dim], dim=dim))
+    @wp.func_native(TOGETHER.format(lanes=LANES, dim=dim))
     def together(value: vec) -> vec:
         """Sum over the threads of a node, for all of them."""
 

@@ -40,14 +40,16 @@ def _surface_struct(model: Model):
         free = points.carried(~model.driven_grid.held)
         areas, limit = areas * free, torch.where(free, limit, torch.inf)
     struct.areas = view(areas.to(model.dtype), t.real)
-    for name in ("loads", "weights", "shares"):
+    for name in ("loads", "shares"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
+    struct.stencil = view(points.stencil.T.contiguous(), wp.int32)
+    struct.weights = view(points.weights.T.to(model.dtype).contiguous(), t.real)
     struct.width = model.contact_width * model.scene.grid.spacing
-    struct.lanes = LANES[model.dim] if model.device.type == "cuda" else 1
+    struct.lanes = LANES if model.device.type == "cuda" else 1
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
     struct.newtons = view(areas.to(model.dtype) * model.mass_unit, t.real)
     struct.deepest = view(limit.to(model.dtype), t.real)
-    for name in ("stencil", "nodes", "first", "members"):
+    for name in ("nodes", "first", "members"):
         setattr(struct, name, view(getattr(points, name), wp.int32))
     return struct
 
