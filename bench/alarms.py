@@ -56,7 +56,7 @@ def variants(scene: softmpm.Scene, device: torch.device, scheme: str) -> dict[st
     }
 
     class Unchecked(type(models["none"].spec)):
-        module = models["none"].spec.module + ".unchecked"
+        """Another specification to the caches of kernels."""
 
     models["none"].spec = Unchecked(**dataclasses.asdict(models["none"].spec))
     unchecked(models["none"])

@@ -1,8 +1,6 @@
 """A model compiles, stores and passes what its scene requires, and says so."""
 
 import copy
-import dataclasses
-import itertools
 import logging
 import os
 import pickle
@@ -19,10 +17,12 @@ from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradien
 
 import softmpm
 from softmpm import autograd
-from softmpm.inputs import groups
-from softmpm.kernels.structs import RequestedGrads, adj_module, input_types
+from softmpm.kernels.fast.g2p2g import fused
+from softmpm.kernels.fast.g2p2g_adj import fused_adj
+from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.plain.transfer import transfer
+from softmpm.kernels.structs import RequestedGrads, input_types
 from softmpm.planning.chunks import Horizon
-from softmpm.scene.scene import CONTACTS, MIRRORS
 from softmpm.schemes.buffers import passing
 from softmpm.schemes.inputs import Accumulators
 from softmpm.schemes.plain.substep import Substep
@@ -83,10 +83,10 @@ def test_what_a_scene_lacks_is_not_compiled(tmp_path):
 
 def _source(model, folder) -> str:
     """C++ that Warp generates for the kernels of a forward substep."""
-    Substep(model)  # defines them
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*-march=native")  # the binary is not kept
-        wp.compile_aot_module(model.spec.module, device="cpu", module_dir=folder)
+        for kernel in (transfer(model.spec).p2g, grid(model.spec).grid_velocity, transfer(model.spec).g2p):
+            wp.compile_aot_module(kernel.module, device="cpu", module_dir=folder)
     return "".join(path.read_text() for path in folder.rglob("*.cpp"))
 
 
@@ -123,23 +123,16 @@ def test_a_substep_is_three_launches_forward_and_five_backward(monkeypatch):
 
 
 def test_modules_are_shared_by_scenes_alike_and_compiled_once():
-    """Two scenes that differ in numbers only have the same kernels."""
+    """Two scenes that differ in numbers only have the same kernels, and others those that are alike; each is a module of its own."""
     a = softmpm.build(busy_scene(2, seed=0), device="cpu").spec
     b = softmpm.build(busy_scene(2, seed=5, dt=2e-3), device="cpu").spec
-    assert a == b and a.module == b.module
-    wanted = RequestedGrads(("material",))
-    assert adj_module(a, wanted) != adj_module(a, RequestedGrads())
-
-
-def test_modules_of_many_walls_have_names_short_enough_for_files():
-    """With everything a scene can have, 64 walls of changing kinds among it; Warp adds numbers of its own."""
-    kinds = itertools.islice(itertools.cycle(kind for kind in CONTACTS if kind not in MIRRORS), 64)
-    walls = [softmpm.Wall(normal=(0, 1), offset=0.3, contact=kind) for kind in kinds]
-    spec = softmpm.build(busy_scene(2, walls=walls), device="cpu", deterministic=True).spec
-    name = adj_module(spec, RequestedGrads(groups(spec))) + ".fused.few"
-    assert len(f"wp_{name}_1234567_p1234567_t123456789012345") <= 255
-    fewer = dataclasses.replace(spec, contacts=spec.contacts[1:])
-    assert spec.module != fewer.module
+    assert a == b and fused(a) is fused(b)
+    passive = fused(softmpm.build(plain_scene(), device="cpu").spec)
+    assert passive.clear is fused(a).clear and passive.g2p2g[False] is not fused(a).g2p2g[False]
+    kernels = [fused(a).clear, fused(a).grid_velocity, fused(a).p2g_first, *fused(a).g2p2g.values()]
+    assert all(list(kernel.module.kernels.values()) == [kernel] for kernel in kernels)
+    less, more = (fused_adj(a, RequestedGrads(wanted)) for wanted in ((), ("material",)))
+    assert less.g2p2g_adj[False] is not more.g2p2g_adj[False]
 
 
 def test_describe_says_what_was_compiled_and_left_out():

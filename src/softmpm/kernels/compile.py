@@ -1,24 +1,34 @@
 """Thread-safe kernel definition and loading: Warp's module registry is not thread-safe (undocumented), so one lock serialises both.
 
-Modules are compiled one after another. In a trial with a thread for each (Warp 1.19) the modules of a chunk and of its adjoint took
-1.5 and 0.8 s instead of 1.3 and 0.9 s for an H100, and 3.1 and 2.1 s instead of 2.1 and 2.4 s for a CPU of two cores.
+Each kernel has a module of its own (:func:`kernel`), so that only what is launched is compiled, once for each number of threads in a
+block; kernels of two scenes with the same code share one. Such a module takes a tenth of a second besides its code. For a GPU several
+are compiled at the same time (:func:`compile_together`).
 
-Modules of :func:`in_order` have Warp's deterministic mode: on a GPU ``wp.atomic_add`` writes a record (node, thread, term) instead of
-adding, and after the kernel Warp sorts the records and adds up those of each node in the order of the threads, as the CPU does.
+Kernels of :func:`kernel_in_order` have Warp's deterministic mode: on a GPU ``wp.atomic_add`` writes a record (node, thread, term)
+instead of adding, and after the kernel Warp sorts the records and adds up those of each node in the order of the threads, as the CPU
+does.
 """
 
 import functools
+import os
 import threading
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import warp as wp
 
 T = TypeVar("T")
 
+THREADS = 256
+"""Threads of a block, where a launch does not say otherwise."""
+AT_ONCE = 4
+"""Modules that are compiled at the same time, at most; 8 and 16 took no less time on 16 cores (H200, Warp 1.19)."""
+
 _lock = threading.RLock()
-_loaded: set[tuple] = set()
-_in_order: set[str] = set()
+_launched: set[tuple] = set()
+_compiled: set[tuple] = set()
+_in_order: set[wp.Kernel] = set()
 
 
 def kernel_factory(define: Callable[..., T]) -> Callable[..., T]:
@@ -33,35 +43,73 @@ def kernel_factory(define: Callable[..., T]) -> Callable[..., T]:
     return found
 
 
-def in_order(module: str, records: int) -> str:
-    """Name of a module of its own, beside ``module``, for kernels whose sums of floating-point numbers are taken in a fixed order.
+def kernel(options: Mapping[str, Any] | None = None, **settings) -> Callable[[Callable], wp.Kernel]:
+    """Decorator of a kernel without a generated adjoint, in a module of its own.
+
+    Args:
+        options: Of the module, as in ``wp.set_module_options``.
+        settings: Others of ``wp.kernel``.
+    """
+    return wp.kernel(module="unique", module_options=dict(options or {}), enable_backward=False, **settings)
+
+
+def kernel_in_order(records: int) -> Callable[[Callable], wp.Kernel]:
+    """As :func:`kernel`, for one whose sums of floating-point numbers are taken in a fixed order.
 
     Args:
         records: Terms that one thread adds to an array, at most; Warp counts them only where it unrolls the loop.
     """
-    name = f"{module}.in_order"
     options = {"deterministic": wp.DeterministicMode.GPU_TO_GPU, "deterministic_max_records": records}
-    wp.set_module_options(options, module=wp.get_module(name))
-    _in_order.add(name)
-    return name
+
+    def define(function: Callable) -> wp.Kernel:
+        made = kernel(options)(function)
+        _in_order.add(made)
+        return made
+
+    return define
 
 
 def runs_in_order(kernel: wp.Kernel) -> bool:
-    """True for a kernel of a module of :func:`in_order`."""
-    return kernel.module.name in _in_order
+    """True for a kernel of :func:`kernel_in_order`."""
+    return kernel in _in_order
 
 
 def launch(kernel, dim, inputs: Sequence, device: wp.Device, **settings):
     """``wp.launch``, never recorded on a tape. The first launch of a kernel on a device, which loads its module, holds the lock."""
     if device.is_cuda and runs_in_order(kernel):
         return _launch_in_order(kernel, dim, inputs, **settings)
-    key = kernel, device.alias, settings.get("block_dim")
-    if key in _loaded:
+    key = kernel, device.alias, settings.get("block_dim", THREADS)
+    if key in _launched:
         return wp.launch(kernel, dim, inputs, device=device, record_tape=False, **settings)
     with _lock:
         launched = wp.launch(kernel, dim, inputs, device=device, record_tape=False, **settings)
-        _loaded.add(key)
+        _launched.add(key)
         return launched
+
+
+def compile_together(kernels: Iterable[tuple[wp.Kernel, int]], device: wp.Device) -> None:
+    """Compile kernels that will be launched in blocks of so many threads, several at a time.
+
+    Only for a GPU: on a CPU each thread would prepare Warp's headers anew, which takes as long as several modules (Warp 1.19).
+    """
+    if not device.is_cuda:
+        return
+    with _lock:
+        wanted = [(kernel, device.alias, threads) for kernel, threads in kernels]
+        missing = [one for one in wanted if one not in _launched | _compiled]
+        list(_compilers().map(_compile, missing))  # raises what a thread raised
+        _compiled.update(missing)
+
+
+def _compile(one: tuple[wp.Kernel, str, int]) -> None:
+    kernel, device, threads = one
+    wp.force_load(device, [kernel.module], block_dim=threads, max_workers=0)
+
+
+@functools.cache
+def _compilers() -> ThreadPoolExecutor:
+    """Threads that compile; they remain, since each prepares Warp's headers once, which takes as long as a kernel or two."""
+    return ThreadPoolExecutor(min(os.cpu_count() or 1, AT_ONCE), "softmpm-compiler")
 
 
 def clusters_are_launchable(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> bool:
@@ -73,7 +121,7 @@ def clusters_are_launchable(kernel: wp.Kernel, device: wp.Device, block_dim: int
 
 
 def _launch_in_order(kernel, dim, inputs: Sequence, stream: wp.Stream, **settings):
-    """Launch a kernel of a module of :func:`in_order`.
+    """Launch a kernel of :func:`kernel_in_order`.
 
     Warp allocates and sorts the records on its current stream of the device, which all threads share: it is made that of the launch,
     and the lock keeps other threads away from it. Warp also reads the number of records back, which no capture allows.

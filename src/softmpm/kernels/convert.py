@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.structs import types
 
@@ -19,7 +19,6 @@ def conversion(dim: int, dtype: str) -> SimpleNamespace:
     real, vec, mat, ivec, Constants, Motion = t.real, t.vec, t.mat, t.ivec, t.Constants, t.Motion
     report = status.report(dim, dtype).report
     bad_start, rounds = int(Kind.START), dtype == "float32"
-    module = f"softmpm.conversion.d{dim}.{dtype}"
 
     @wp.struct
     class Entered:
@@ -78,7 +77,7 @@ def conversion(dim: int, dtype: str) -> SimpleNamespace:
                 out.low_f[axis, other] = real(full - wp.float64(real(full)))
         return out
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def enter(
         # Parameters:
         constants: Constants,
@@ -107,7 +106,7 @@ def conversion(dim: int, dtype: str) -> SimpleNamespace:
         if not at.valid:
             report(words, world, 0, bad_start, p)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def leave(
         # Parameters:
         constants: Constants,

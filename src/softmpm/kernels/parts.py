@@ -8,7 +8,7 @@ from pathlib import Path
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 
 HEADER = Path(__file__).with_name("parts.h").read_text()
 COUNT_BYTES = 64
@@ -35,8 +35,6 @@ def may_be_divided(kernel: wp.Kernel) -> bool:
 @kernel_factory
 def runner() -> wp.Kernel:
     """Kernel that takes part in the launches from ``first`` to ``last`` of a program."""
-    module = "softmpm.parts"
-    wp.set_module_options({"extra_build_options": in_parts()}, module=wp.get_module(module))
 
     @wp.func_native(
         "softmpm::run_parts(reinterpret_cast<const softmpm::Row*>(program), reinterpret_cast<softmpm::Count*>(counts), "
@@ -52,7 +50,7 @@ def runner() -> wp.Kernel:
         last: int,
     ): ...
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel({"extra_build_options": in_parts()})
     def run(
         program: wp.int64,  # address of one row for each launch
         counts: wp.int64,  # address of the counters, zero at the start

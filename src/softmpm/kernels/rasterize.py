@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import in_order, kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory, kernel_in_order
 from softmpm.kernels.convert import conversion
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.spline import spline
@@ -27,7 +27,6 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
     pack, momentum, report = s.pack, s.momentum, status.report(dim, dtype).report
     bad_start = int(Kind.START)
-    module = f"softmpm.raster.d{dim}.{dtype}"
 
     @wp.func
     def placed(constants: Constants, x: vec, v: vec, C: mat) -> Entered:
@@ -65,7 +64,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
                 share * pack(speed + affine * (position(o) - at.fx), real(1.0)),
             )
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def splat_fixed(
         # Parameters:
         constants: Constants,
@@ -102,7 +101,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
                 wp.atomic_add(node, world, i, axis, wp.int64(whole))
             wp.atomic_add(node, world, i, dim, wp.int64(wp.rint(wp.float64(share) / unit[world, 1])))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def splat_adj(
         # Parameters:
         constants: Constants,
@@ -141,7 +140,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         adj_v[world, p] = m * sum_v
         adj_C[world, p] = (m * constants.spacing) * sum_C
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def divide(
         # In:
         node: wp.array2d(dtype=node_vec),
@@ -155,7 +154,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         for axis in range(dim):
             velocity[world, i, axis] = wp.where(m > real(0.0), node[world, i][axis] / m, real(0.0))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def divide_adj(
         # In:
         mass: wp.array2d(dtype=real),
@@ -176,8 +175,8 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         adj_node[world, i] = pack(adj_p, adj_m)
 
     return SimpleNamespace(
-        splat=wp.kernel(splat, module=module, enable_backward=False),
-        splat_in_order=wp.kernel(splat, module=in_order(module, s.count), enable_backward=False),
+        splat=kernel()(splat),
+        splat_in_order=kernel_in_order(s.count)(splat),
         splat_fixed=splat_fixed,
         splat_adj=splat_adj,
         divide=divide,

@@ -1,6 +1,5 @@
 """Specification of the kernels of a scene, and the Warp structs that follow from it."""
 
-import hashlib
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -11,14 +10,6 @@ from softmpm.inputs import Input, differentiable, present
 from softmpm.kernels.compile import kernel_factory
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
-
-
-def short(name: str, most: int) -> str:
-    """A name of at most so many letters, told by a digest beyond: that of a module becomes that of a file."""
-    if len(name) <= most:
-        return name
-    digest = hashlib.sha256(name.encode()).hexdigest()[:12]
-    return f"{name[: most - len(digest) - 1]}.{digest}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,27 +54,6 @@ class Spec:
     def constrained(self) -> bool:
         """Whether some nodes of the reference formulation are held or mirrored after the walls acted on them."""
         return bool(self.mirrors) or self.driven_nodes
-
-    @property
-    def module(self) -> str:
-        """Name of the Warp module that holds every kernel of this specialisation."""
-        names = (
-            "friction",
-            "gravity",
-            "damping",
-            "viscosity",
-            "driven",
-            "driven_nodes",
-            "deterministic",
-            "surface",
-        )
-        features = [name for name in names if getattr(self, name)]
-        actuators = [f"{name}s" for name in self.actuators if name != "muscle"]
-        muscles = [f"muscles{self.muscle_slots}"] if self.muscle_slots else []
-        walls = ["walls_" + "_".join(self.contacts)] if self.contacts else []
-        given = ["given_" + "_".join(self.given)] if self.given else []
-        parts = [f"d{self.dim}", self.dtype, *self.laws, *muscles, *actuators, *walls, *features, *given]
-        return short(".".join(["softmpm", *parts]), 120)
 
 
 @dataclass(frozen=True)
@@ -247,9 +217,10 @@ def input_types(spec: Spec) -> SimpleNamespace:
         array = wp.array(dtype=element_type(spec, one), ndim=AXES[one.per] - one.shared(spec))
         kind = constant_type(spec, one) if one.constant(spec) else array
         fields["grid" if one.stage == "grid" else "particle"][one.name] = kind
+    module = f"softmpm.types.{spec}"
     return SimpleNamespace(
-        ParticleInputs=_struct("ParticleInputs", spec.module, fields["particle"]),
-        GridInputs=_struct("GridInputs", spec.module, fields["grid"]),
+        ParticleInputs=_struct("ParticleInputs", module, fields["particle"]),
+        GridInputs=_struct("GridInputs", module, fields["grid"]),
     )
 
 
@@ -263,13 +234,8 @@ def input_adj_types(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             dtype = t.vec if one.kind == "vector" else t.real
             array = wp.array(dtype=dtype, ndim=ACCUMULATOR_AXES[one.per])
             fields["grid" if one.stage == "grid" else "particle"][one.name] = array
-    module = adj_module(spec, wanted)
+    module = f"softmpm.types.{spec}.{wanted}"
     return SimpleNamespace(
         ParticleInputsAdj=_struct("ParticleInputsAdj", module, fields["particle"]),
         GridInputsAdj=_struct("GridInputsAdj", module, fields["grid"]),
     )
-
-
-def adj_module(spec: Spec, wanted: RequestedGrads) -> str:
-    """Name of the Warp module that holds the adjoint kernels."""
-    return ".".join([spec.module, "adj", short(".".join(wanted.groups), 40)]).rstrip(".")

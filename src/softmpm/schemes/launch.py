@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from softmpm.kernels.compile import launch, runs_in_order
+from softmpm.kernels.compile import THREADS, compile_together, launch, runs_in_order
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
 from softmpm.schemes.device import stream_of
@@ -25,7 +25,7 @@ class KernelLauncher:
         self.device, self.stream, self.collected = model.wp_device, stream, collected
         self._templates: dict[tuple, LaunchTemplate] = {}
 
-    def __call__(self, kernel, dim, *inputs, block_dim: int = 256, part: int | None = None) -> None:
+    def __call__(self, kernel, dim, *inputs, block_dim: int = THREADS, part: int | None = None) -> None:
         """Launch a kernel.
 
         Args:
@@ -121,6 +121,16 @@ class RebindableLaunch:
             self._launch.launch(stream)
 
 
+class KernelList:
+    """Takes the place of a launcher and lists the kernels, with the threads of a block, instead of launching them."""
+
+    def __init__(self):
+        self.found: dict[tuple[wp.Kernel, int], None] = {}
+
+    def __call__(self, kernel, dim, *inputs, block_dim: int = THREADS, part: int | None = None) -> None:
+        self.found[kernel, block_dim] = None
+
+
 class LaunchReplay:
     """Captures ``launches(launcher)`` on first use, as a CUDA graph or, on the CPU, as a program, and replays it.
 
@@ -135,7 +145,7 @@ class LaunchReplay:
         self._graph: wp.Graph | None = None
         self._program: Program | None = None
 
-    def run(self, stream: wp.Stream | None, launches: Callable[[KernelLauncher], None]) -> None:
+    def run(self, stream: wp.Stream | None, launches: Callable[[Any], None]) -> None:
         if stream is None:
             self._run_program(launches)
         elif is_capturing(self.model):
@@ -148,18 +158,21 @@ class LaunchReplay:
             else:
                 wp.capture_launch(self._graph, stream=stream)
 
-    def _run_program(self, launches: Callable[[KernelLauncher], None]) -> None:
+    def _run_program(self, launches: Callable[[Any], None]) -> None:
         if self._program is None:
             collected = []
             launches(KernelLauncher(self.model, None, collected))
             self._program = Program(collected)
         self._program.run()
 
-    def _capture(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
+    def _capture(self, launches: Callable[[Any], None]) -> wp.Graph | None:
         """The captured graph; None if another thread is capturing: waiting for it could deadlock."""
         with exclusive_capture(wait=False) as acquired:
             if not acquired:
                 return None
+            kernels = KernelList()
+            launches(kernels)
+            compile_together(kernels.found, self.model.wp_device)
             stream = _capture_stream(self.model.device)
             with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
                 launches(KernelLauncher(self.model, stream))

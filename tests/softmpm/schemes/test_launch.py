@@ -7,11 +7,14 @@ import pytest
 import torch
 import warp as wp
 from helpers import busy_scene
+from surface_scenes import block
 
 import softmpm
+from softmpm.kernels import compile as compiling
+from softmpm.schemes import fast, lagrangian
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.launch import KernelLauncher, launcher
+from softmpm.schemes.launch import KernelLauncher, KernelList, LaunchReplay, launcher
 from softmpm.schemes.program import Program
 
 
@@ -74,3 +77,71 @@ def test_the_launcher_keeps_no_arrays_alive():
         return weakref.ref(out)
 
     assert call()() is None and call()() is None
+
+
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_kernels_are_known_before_the_first_is_launched(dim, formulation, monkeypatch):
+    """Those of a chunk by its list, the others of a call and its gradient by that of the scheme, but for the smallest."""
+    launched, in_chunks, run = set(), set(), LaunchReplay.run
+
+    def listed(self, stream, launches):
+        found = KernelList()
+        launches(found)
+        in_chunks.update(found.found)
+        run(self, stream, launches)
+
+    monkeypatch.setattr(compiling, "_launched", launched)
+    monkeypatch.setattr(LaunchReplay, "run", listed)
+    alarms = softmpm.Alarms(depth=None)
+    model = softmpm.build(block(dim), device="cpu", formulation=formulation, alarms=alarms)
+    start = model.rest()
+    start.x.requires_grad_()
+    end = softmpm.simulate(model, start, None, model.params(), substeps=3)
+    end.x.sum().backward()
+    used = {(kernel, threads) for kernel, _, threads in launched}
+    assert in_chunks and {kernel for kernel, _ in in_chunks} <= {kernel for kernel, _ in used}
+    of_scheme = {"moving": fast, "reference": lagrangian}[formulation].kernels.first_kernels(model)
+    known = {kernel for kernel, _ in [*in_chunks, *of_scheme]}
+    missing = {kernel.key.split("__")[-1] for kernel, _ in used if kernel not in known}
+    assert missing <= {"sort", "sort_adj", "run"}  # the last one runs programs on a CPU
+
+
+@pytest.mark.gpu
+def test_kernels_are_compiled_together_before_their_launch():
+    """For the number of threads that is asked for; a kernel whose code is wrong raises as its launch would."""
+    device, out = wp.get_device("cuda"), torch.zeros(3, device="cuda")
+
+    def made(value: float):
+        @compiling.kernel()
+        def fill(out: wp.array(dtype=wp.float32)):
+            out[wp.tid()] = wp.static(value)
+
+        return fill
+
+    kernels = [made(value) for value in (1.5, 2.5)]
+    compiling.compile_together([(kernel, 64) for kernel in kernels], device)
+    assert all(list(kernel.module.execs) == [(device.context, 64)] for kernel in kernels)
+    for kernel, value in zip(kernels, (1.5, 2.5), strict=True):
+        compiling.launch(
+            kernel, 3, [view(out, wp.float32)], device, block_dim=64, stream=stream_of(out.device)
+        )
+        assert out.tolist() == 3 * [value] and len(kernel.module.execs) == 1
+
+    @compiling.kernel()
+    def wrong(out: wp.array(dtype=wp.float32)):
+        out[wp.tid()] = unknown  # noqa: F821
+
+    with pytest.raises(Exception, match="unknown"):
+        compiling.compile_together([(wrong, 64)], device)
+
+
+def test_the_cpu_compiles_what_it_launches():
+    """Nothing before, since each thread would prepare the headers of Warp anew."""
+
+    @compiling.kernel()
+    def idle(out: wp.array(dtype=wp.float32)):
+        out[wp.tid()] = 7.0
+
+    compiling.compile_together([(idle, 64)], wp.get_device("cpu"))
+    assert not idle.module.execs

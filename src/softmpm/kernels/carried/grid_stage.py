@@ -7,23 +7,22 @@
               points: the part of L̄ in their adjoints (K9.adj), L of the substep before, its stored impulses into that other V (K10)
     g2p2g_adj, press_adj
 
-Sums of two successive substeps have two buffers: one is added to while the other is cleared. The kernels have modules of their own,
-since a GPU compiles a module for each number of threads in a block.
+Sums of two successive substeps have two buffers: one is added to while the other is cleared.
 """
 
 from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.carried.point import module_of, outline_type, surface_point
+from softmpm.kernels.carried.point import outline_type, surface_point
 from softmpm.kernels.carried.surface import surface
 from softmpm.kernels.carried.surface_adj import loads_adj
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import native
+from softmpm.kernels.fast.native import NATIVE, native
 from softmpm.kernels.physics.grid import grid, grid_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -38,13 +37,13 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 
-    @wp.kernel(module=module_of(spec.module + ".surface.grid", packed=True), enable_backward=False)
+    @kernel(NATIVE)
     def clear(one: wp.array2d(dtype=real), other: wp.array2d(dtype=real)):
         world, i = wp.tid()
         one[world, i] = real(0.0)
         other[world, i] = real(0.0)
 
-    @wp.kernel(module=module_of(spec.module + ".surface.grid", packed=True), enable_backward=False)
+    @kernel(NATIVE)
     def grid_and_loads(
         # Parameters:
         constants: Constants,
@@ -104,9 +103,7 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 
-    @wp.kernel(
-        module=module_of(adj_module(spec, wanted) + ".surface.grid", packed=True), enable_backward=False
-    )
+    @kernel(NATIVE)
     def grid_and_loads_adj(
         # Parameters:
         constants: Constants,

@@ -16,7 +16,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import WARP, native, native_module
+from softmpm.kernels.fast.native import NATIVE, WARP, native
 from softmpm.kernels.physics.lanes import lane_sum
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.structs import types
@@ -40,9 +40,9 @@ def outline_type(dim: int, dtype: str):
     return wp.struct(Outline, module=f"softmpm.types.d{dim}.{dtype}.outline")
 
 
-def module_of(name: str, packed: bool) -> str:
-    """Name of a Warp module, whose options are set as native functions need them if it is for packed particles."""
-    return native_module(name + ".packed") if packed else name
+def options_of(packed: bool) -> dict:
+    """Compile options of a kernel, as native functions need them if it is for packed particles."""
+    return NATIVE if packed else {}
 
 
 @kernel_factory

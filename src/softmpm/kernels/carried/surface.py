@@ -16,8 +16,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.carried.point import module_of, outline_type, surface_point
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.carried.point import options_of, outline_type, surface_point
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
@@ -47,7 +47,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     running, report = reports.running, reports.report
     count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
     vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
-    in_wall, module = int(Kind.IN_WALL), module_of(spec.module + ".surface", packed)
+    in_wall = int(Kind.IN_WALL)
 
     @wp.struct
     class Faces:
@@ -127,7 +127,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
             if m > real(0.0):
                 wp.atomic_add(velocity, world, i, (share(at, n) / m) * impulse)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(options_of(packed))
     def add_loads(
         # Parameters:
         constants: Constants,
@@ -143,7 +143,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
         add_load(window, outline, at, world, p, lane, load)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(options_of(packed))
     def press(
         # Parameters:
         constants: Constants,
@@ -228,7 +228,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
             if alive and deep >= 0:
                 report(words, world, wp.max(substep - 1, 0), in_wall, deep * owner.shape[1] + p)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(options_of(packed))
     def check_end(
         # Parameters:
         constants: Constants,
@@ -272,7 +272,7 @@ def start_depth(spec: Spec) -> wp.Kernel:
     walls = spec.surface_walls
     count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)
 
-    @wp.kernel(module=module_of(spec.module + ".surface.start", packed=False), enable_backward=False)
+    @kernel()
     def check_start(
         # Parameters:
         inputs: GridInputs,

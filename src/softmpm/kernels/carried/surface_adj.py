@@ -14,14 +14,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.carried.point import module_of, outline_type, surface_point
+from softmpm.kernels.carried.point import options_of, outline_type, surface_point
 from softmpm.kernels.carried.surface import surface
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -82,9 +82,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     faces_of, face_adj = one.faces_of, wall_face_adj(spec, wanted)
     offset, node_index, size, vecs = s.offset, s.node_index, s.count, one.vecs
     add_load_adj, count = loads_adj(dim, spec.dtype, packed), len(spec.surface_walls)
-    module = module_of(adj_module(spec, wanted) + ".surface", packed)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(options_of(packed))
     def press_adj(
         # Parameters:
         constants: Constants,
@@ -221,7 +220,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
                 wp.atomic_add(gained, world, i, pack(b * back_v, adj_m))
         add_place_adj(constants, outline, back_place, back_x, world, p, owner[world, p], lane, adj)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(options_of(packed))
     def add_loads_adj(
         # Parameters:
         constants: Constants,

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import native, native_module
+from softmpm.kernels.fast.native import NATIVE, native
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.alarms import alarm
 from softmpm.kernels.structs import Spec, input_types, types
@@ -23,9 +23,8 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
     step_is_stable, near, row_fx, row_H = one.step_is_stable, one.near, t.row_fx, t.row_h
     ran, report = status.report(spec.dim, spec.dtype).ran, status.report(spec.dim, spec.dtype).report
     torn, step = int(Kind.TORN), int(Kind.STEP)
-    module = native_module(spec.module + ".alarms.fused")
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def check(
         # Parameters:
         constants: Constants,
@@ -56,7 +55,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
                 if not near(constants, unpack_base(now.base[j]) - base, load_vec(now.rows, j, row_fx) - fx):
                     report(words, world, substep, torn, order[i])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def permute_neighbours(
         # In:
         order: wp.array2d(dtype=wp.int32),

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import native, native_module
+from softmpm.kernels.fast.native import NATIVE, native
 from softmpm.kernels.structs import types
 
 
@@ -96,7 +96,7 @@ def fixed(dim: int) -> SimpleNamespace:
         leave(sums, i, sum)
         return sum
 
-    @wp.kernel(module=native_module(f"softmpm.fixed.d{dim}"), enable_backward=False, grid_stride=False)
+    @kernel(NATIVE, grid_stride=False)
     def push(
         # Parameters:
         window: Window,

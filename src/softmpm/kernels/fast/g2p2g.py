@@ -19,10 +19,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import BLOCK, native, native_module
+from softmpm.kernels.fast.native import BLOCK, NATIVE, native
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.particle import particle
@@ -50,7 +50,6 @@ def fused(spec: Spec) -> SimpleNamespace:
     take = fixed(dim).take if exact else load_node
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
     report = status.report(spec.dim, spec.dtype).report
-    module = native_module(spec.module + ".fused")
 
     @wp.func
     def centre(fx: vec) -> vec:
@@ -65,12 +64,12 @@ def fused(spec: Spec) -> SimpleNamespace:
         """Position of node ``i`` of all allocated nodes [m]."""
         return position(constants, coordinates(i - world * window.count, window.shape) + window.origin[world])
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @kernel(NATIVE, grid_stride=False)
     def clear(node: wp.array(dtype=node_vec)):
         """Clear the first M, and V before the first substep."""
         store_node(node, wp.tid(), node_vec())
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @kernel(NATIVE, grid_stride=False)
     def grid_velocity(
         # Parameters:
         constants: Constants,
@@ -125,6 +124,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         store_mat(then.rows, i, row_H, load_mat(now.rows, i, row_H))
         store_mat(then.rows, i, row_C, load_mat(now.rows, i, row_C))
 
+    @kernel(NATIVE, grid_stride=False)
     def p2g_first(
         # Parameters:
         constants: Constants,
@@ -226,20 +226,15 @@ def fused(spec: Spec) -> SimpleNamespace:
                 words, window, place, count, total, order, substep + 1, first, g, b, A, m, node
             )  # (T1)
 
-    def by_number(kernel, bounds_of_few=None) -> dict[bool, wp.Kernel]:
-        """Two variants of a kernel, for many particles and for few: the latter has registers to wait for all loads at once."""
-        few = native_module(spec.module + ".fused.few")
-        options = dict(enable_backward=False, grid_stride=False)
-        return {
-            False: wp.kernel(**options, module=module)(kernel),
-            True: wp.kernel(**options, module=few, launch_bounds=bounds_of_few)(kernel),
-        }
+    def compiled(**bounds) -> wp.Kernel:
+        """``g2p2g`` for many particles, or with bounds for few: it has registers then to wait for all loads at once."""
+        return kernel(NATIVE, grid_stride=False, **bounds)(g2p2g)
 
     return SimpleNamespace(
         clear=clear,
         grid_velocity=grid_velocity,
-        p2g_first=by_number(p2g_first),
-        g2p2g=by_number(g2p2g, (BLOCK, 3)),
+        p2g_first=p2g_first,
+        g2p2g={False: compiled(), True: compiled(launch_bounds=(BLOCK, 3))},
         centre=centre,
         place_of=place_of,
     )

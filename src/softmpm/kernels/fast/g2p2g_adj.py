@@ -15,16 +15,16 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.gather_adj import stencil_adj
-from softmpm.kernels.fast.native import BLOCK, native, native_module
+from softmpm.kernels.fast.native import BLOCK, NATIVE, native
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
 from softmpm.kernels.physics.particle import particle, particle_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -52,9 +52,8 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     exact, give = spec.deterministic, fixed(dim).give
     take, leave = (fixed(dim).take, fixed(dim).leave) if exact else (load_node, store_node)
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
-    module = native_module(adj_module(spec, wanted) + ".fused")
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @kernel(NATIVE, grid_stride=False)
     def grid_velocity_adj(
         # Parameters:
         constants: Constants,
@@ -186,10 +185,8 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
     def compiled(few: bool) -> wp.Kernel:
         """``g2p2g_adj`` for few particles or for many, as in g2p2g.py; registers are limited so that ``blocks`` blocks fit."""
-        name, blocks = (".few", 2) if few else ("", 3)
-        where = native_module(adj_module(spec, wanted) + ".fused" + name)
-        options = dict(module=where, enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, blocks))
-        return wp.kernel(**options)(g2p2g_adj)
+        blocks = 2 if few else 3
+        return kernel(NATIVE, grid_stride=False, launch_bounds=(BLOCK, blocks))(g2p2g_adj)
 
     return SimpleNamespace(
         grid_velocity_adj=grid_velocity_adj, g2p2g_adj={few: compiled(few) for few in (False, True)}

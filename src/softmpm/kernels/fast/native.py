@@ -11,7 +11,13 @@ import warp as wp
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.structs import types
 
-HEADERS = [Path(__file__).with_name(name) for name in ("scatter.h", "fixed_point.h")]
+SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("scatter.h", "fixed_point.h"))
+NATIVE = {
+    "extra_build_options": wp.ModuleBuildOptions(extra_cuda_preamble=SOURCE, extra_cpu_preamble=SOURCE),
+    "cuda_output": "cubin",
+}
+"""Compile options of kernels with native functions. Machine code is compiled for each GPU ("cubin"): PTX would be that of the oldest
+GPU in the machine, without 16-byte reductions."""
 WARP = 32
 """Threads per warp, and particles per block of packed rows."""
 BLOCK = 128
@@ -23,18 +29,6 @@ FEW, VERY_FEW = 20_000, 10_000
 def padded(particles: int) -> int:
     """Number of places of the packed particles: their count rounded up to whole warps."""
     return -(-particles // WARP) * WARP
-
-
-def native_module(name: str) -> str:
-    """Set the compile options of the Warp module of this name, as native functions need them; returns the name.
-
-    Machine code is compiled for each GPU ("cubin"): PTX would be that of the oldest GPU in the machine, without 16-byte reductions.
-    """
-    source = "".join(header.read_text() for header in HEADERS)
-    build = wp.ModuleBuildOptions(extra_cuda_preamble=source, extra_cpu_preamble=source)
-    options = {"extra_build_options": build, "cuda_output": "cubin", "enable_backward": False}
-    wp.set_module_options(options, module=wp.get_module(name))
-    return name
 
 
 @kernel_factory

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.convert import conversion
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import native, native_module
+from softmpm.kernels.fast.native import NATIVE, native
 from softmpm.kernels.fast.sorting import sorting
 from softmpm.kernels.physics import status
 from softmpm.kernels.structs import types
@@ -28,9 +28,8 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     pack_base, unpack_base, report = s.pack_base, s.unpack_base, status.report(dim, dtype).report
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     kept_inside, bad_start = sorting(dim, dtype).kept_inside, int(Kind.START)
-    module = native_module(f"softmpm.packing.d{dim}.{dtype}")
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def enter(
         # Parameters:
         constants: Constants,
@@ -62,7 +61,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         store_mat(packed.rows, i, row_H, at.H)
         store_mat(packed.rows, i, row_C, C[world, p])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def leave(
         # Parameters:
         constants: Constants,
@@ -97,7 +96,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
             spread_vec(low_x, row, out.low_x, i, total)
             spread_mat(low_F, row, out.low_f, i, total)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def positions(
         # Parameters:
         constants: Constants,
@@ -116,7 +115,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         )
         x[world, order[world, place]] = at.x
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def enter_adj(
         # Parameters:
         constants: Constants,
@@ -138,7 +137,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
         store_mat(adj, i, row_H, adj_F[world, p])
         store_mat(adj, i, row_C, adj_C[world, p])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def leave_adj(
         # Parameters:
         constants: Constants,

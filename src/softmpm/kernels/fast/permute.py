@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 
 DTYPES: dict[str, Any] = {"float32": wp.float32, "float64": wp.float64, "int32": wp.int32}
 
@@ -15,7 +15,7 @@ def permute(dtype: str) -> SimpleNamespace:
     """Kernels on arrays (quantity, world, particle, component); ``order`` contains the particle at each place."""
     kind = DTYPES[dtype]
 
-    @wp.kernel(module=f"softmpm.permute.{dtype}", enable_backward=False)
+    @kernel()
     def sort(
         # Parameters:
         order: wp.array2d(dtype=wp.int32),
@@ -27,7 +27,7 @@ def permute(dtype: str) -> SimpleNamespace:
         quantity, world, place, component = wp.tid()
         placed[quantity, world, place, component] = given[quantity, world, order[world, place], component]
 
-    @wp.kernel(module=f"softmpm.permute.{dtype}", enable_backward=False)
+    @kernel()
     def sort_adj(
         # Parameters:
         order: wp.array2d(dtype=wp.int32),

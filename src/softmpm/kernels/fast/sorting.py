@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import WARP, native, native_module
+from softmpm.kernels.fast.native import NATIVE, WARP, native
 from softmpm.kernels.physics import status
 from softmpm.kernels.structs import types
 
@@ -25,7 +25,6 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
     Constants, Packed, Window = t.Constants, t.Packed, t.Window
     copy_rows, pack_base, unpack_base = n.copy_rows, s.pack_base, s.unpack_base
     report, left_window = status.report(dim, dtype).report, int(Kind.LEFT_WINDOW)
-    module = native_module(f"softmpm.sorting.d{dim}.{dtype}")
 
     @wp.func
     def kept_inside(words: wp.array(dtype=wp.int64), window: Window, world: int, p: int, base: ivec) -> ivec:
@@ -38,7 +37,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
                 report(words, world, 0, left_window, p)
         return inside
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def locate(
         # Parameters:
         constants: Constants,
@@ -77,7 +76,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
                 wp.atomic_max(high, world, axis, base[axis])
         key[world, p] = 2 * cell + half
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def centre_window(
         # Parameters:
         constants: Constants,
@@ -92,7 +91,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         middle = (low[world, axis] + high[world, axis] + 3 - shape[axis]) / 2
         origin[world, axis] = wp.clamp(middle, 0, constants.shape[axis] - shape[axis])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def survey(
         # Parameters:
         constants: Constants,
@@ -120,7 +119,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
             if room < 2 and first + window.shape[axis] < constants.shape[axis]:
                 found[1] = wp.int64(1)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def invert(
         # In:
         order: wp.array2d(dtype=wp.int32),
@@ -130,7 +129,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         world, place = wp.tid()
         places[world, order[world, place]] = place
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def move(
         # Parameters:
         window: Window,
@@ -152,7 +151,7 @@ def sorting(dim: int, dtype: str) -> SimpleNamespace:
         packed.base[i] = pack_base(kept_inside(words, window, world, p, unpack_base(base[j])))
         copy_rows(rows, j, packed.rows, i)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def move_adj(
         # Parameters:
         order: wp.array2d(dtype=wp.int32),

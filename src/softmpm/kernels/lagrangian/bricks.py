@@ -119,12 +119,12 @@ class Bricks(NamedTuple):
     @property
     def settings(self) -> dict:
         """Of kernels that have bricks."""
-        return dict(enable_backward=False, grid_stride=False, launch_bounds=(self.threads, self.blocks))
+        return dict(grid_stride=False, launch_bounds=(self.threads, self.blocks))
 
     def layer_settings(self, warps: int = 0) -> dict:
         """Of kernels that have bricks of a lattice, with so many warps in a multiprocessor at least."""
         bounds = (self.layer_threads, max(self.blocks, warps // -(-self.layer_threads // 32)))
-        return dict(enable_backward=False, grid_stride=False, launch_bounds=bounds)
+        return dict(grid_stride=False, launch_bounds=bounds)
 
 
 FEW = {2: 50_000, 3: 20_000}
@@ -152,25 +152,20 @@ def bricks_for(dim: int, particles: int, device: torch.device, dtype: torch.dtyp
     return Bricks(cells, places if lattice else 8 if few else 4, lattice)
 
 
-def brick_module(name: str, groups: int = 1) -> str:
-    """Set the compile options of the Warp module of this name, as native functions need them; returns the name.
+def brick_options(groups: int = 1) -> dict:
+    """Compile options of kernels of bricks, as native functions need them.
 
     Args:
         groups: Bricks that a block of threads has at a time.
     """
-    options = {
-        "extra_build_options": in_parts(
-            f"#define SOFTMPM_GROUPS {groups}\n" * (groups > 1)
-            + ROWS_HEADER.read_text()
-            + HEADER.read_text(),
-            FOURS_HEADER.read_text(),
-        ),
+    source = (
+        f"#define SOFTMPM_GROUPS {groups}\n" * (groups > 1) + ROWS_HEADER.read_text() + HEADER.read_text()
+    )
+    return {
+        "extra_build_options": in_parts(source, FOURS_HEADER.read_text()),
         "max_unroll": UNROLLED,
         "cuda_output": "cubin",
-        "enable_backward": False,
     }
-    wp.set_module_options(options, module=wp.get_module(name))
-    return name
 
 
 @kernel_factory

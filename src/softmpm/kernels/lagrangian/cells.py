@@ -12,15 +12,15 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
+from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.lagrangian.bricks import Bricks, brick_options, meet
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.pair_sums import pair_sums
 from softmpm.kernels.lagrangian.particle_force import particle_forces, particle_forces_adj
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.lagrangian.seats import seats
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -39,7 +39,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     of_f = sums(dim, spec.dtype, bricks, loaded)
     line, clear, add, write, place_of = of_f.line, of_f.clear, of_f.add, of_f.write, of_f.place_of
     count, turns, threads, serial = bricks.cell_count, bricks.turns, bricks.threads, bricks.serial
-    module = brick_module(f"{spec.module}.lagrangian.{bricks.name}")
+    options = brick_options()
 
     @wp.func
     def forces_at(
@@ -89,7 +89,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                 total = add(total, at.partial, world, brick, slot, corner, fx, A, b)
         write(total, at.partial, corner, world, brick, lane)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def forces(
         constants: Constants,
         inputs: ParticleInputs,
@@ -101,7 +101,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         seat = seat_of(inside, inputs, world, brick, lane)
         forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def check_state(
         # Parameters:
         constants: Constants,
@@ -167,7 +167,7 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
     count, turns, threads, settings = bricks.cell_count, bricks.turns, bricks.threads, bricks.settings
     serial, memory = bricks.serial, chunk(dim, spec.dtype)
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
-    module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}")
+    options = brick_options()
 
     @wp.func
     def forces_adj_at(
@@ -231,7 +231,7 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
         else:
             write(total, bar.partial_u, corner, world, brick, lane)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def forces_adj(
         constants: Constants,
         inputs: ParticleInputs,

@@ -52,7 +52,7 @@ class Cluster(NamedTuple):
     @property
     def settings(self) -> dict:
         """Of the kernels."""
-        bounds = dict(enable_backward=False, grid_stride=False, launch_bounds=(self.threads, 1))
+        bounds = dict(grid_stride=False, launch_bounds=(self.threads, 1))
         return bounds if self.bricks.serial else bounds | dict(cluster_dim=self.blocks)
 
     @property

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.frame import frame
-from softmpm.kernels.lagrangian.rest import lagrangian_module
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN
 from softmpm.kernels.physics import status
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -23,7 +23,7 @@ def driven(spec: Spec) -> SimpleNamespace:
     vec, Constants, Frame, recentring = t.vec, t.Constants, f.Frame, f.recentring
     running = status.report(spec.dim, spec.dtype).running
 
-    @wp.kernel(module=lagrangian_module(spec.module + ".lagrangian"), enable_backward=False)
+    @kernel(LAGRANGIAN)
     def drive(
         # Parameters:
         constants: Constants,
@@ -53,7 +53,7 @@ def driven_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, GridInputsAdj = types(spec.dim, spec.dtype), input_adj_types(spec, wanted).GridInputsAdj
     real, vec = t.real, t.vec
 
-    @wp.kernel(module=lagrangian_module(adj_module(spec, wanted) + ".lagrangian"), enable_backward=False)
+    @kernel(LAGRANGIAN)
     def drive_adj(
         # Parameters:
         nodes: wp.array(dtype=wp.int32),
@@ -81,7 +81,7 @@ def driven_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 def spread(dim: int, dtype: str) -> wp.Kernel:
     vec, exact_vec, exact = types(dim, dtype).vec, types(dim, "float64").vec, frame(dim, dtype).exact
 
-    @wp.kernel(module=lagrangian_module(f"softmpm.d{dim}.{dtype}.spread"), enable_backward=False)
+    @kernel(LAGRANGIAN)
     def spread(
         # Parameters:
         first: wp.array(dtype=wp.int32),

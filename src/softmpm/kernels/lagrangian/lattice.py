@@ -4,14 +4,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, block_number, brick_module, meet, thread_number
+from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.lagrangian.bricks import Bricks, block_number, brick_options, meet, thread_number
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.layers import lattice_seats, layers
 from softmpm.kernels.lagrangian.particle_force import CHECKED, particle_forces, particle_forces_adj
 from softmpm.kernels.lagrangian.rest import rest
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 WARPS, WARPS_ADJ = 20, 16
 """Warps of a multiprocessor, forward and adjoint, at which the threads of small layers hardly spill registers."""
@@ -39,7 +39,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
     gradients_u, gradients_v = one_layer.gradients[0], one_layer.gradients[1]
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
-    module = brick_module(f"{spec.module}.lagrangian.{bricks.name}.layers")
+    options = brick_options()
 
     @wp.func
     def forces_at(
@@ -96,7 +96,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         if place[n] >= 0:
                             check_now(constants, inputs, inside, at.words, world, place[n], s, taken(H, n))
 
-    @wp.kernel(module=module, **bricks.layer_settings(resident(spec, bricks, WARPS)))
+    @kernel(options, **bricks.layer_settings(resident(spec, bricks, WARPS)))
     def forces(
         constants: Constants,
         inputs: ParticleInputs,
@@ -140,7 +140,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
     memory = chunk(dim, spec.dtype)
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
-    module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{bricks.name}.layers")
+    options = brick_options()
 
     @wp.func
     def forces_adj_at(
@@ -198,7 +198,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
             if wp.static(viscous):
                 add(B, bar.partial_v, world, brick, corner, layer, lane, lattice)
 
-    @wp.kernel(module=module, **bricks.layer_settings(resident(spec, bricks, WARPS_ADJ)))
+    @kernel(options, **bricks.layer_settings(resident(spec, bricks, WARPS_ADJ)))
     def forces_adj(
         constants: Constants,
         inputs: ParticleInputs,

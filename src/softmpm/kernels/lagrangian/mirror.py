@@ -12,13 +12,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.nodes import nodes
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_types, types
 
 
 @kernel_factory
@@ -37,7 +37,6 @@ def mirror(spec: Spec) -> SimpleNamespace:
     t, Mirror = types(spec.dim, spec.dtype), mirror_type(spec.dim, spec.dtype)
     real, vec, Constants = t.real, t.vec, t.Constants
     running = status.report(spec.dim, spec.dtype).running
-    module = lagrangian_module(spec.module + ".lagrangian")
 
     @wp.func
     def total_mass(groups: Mirror, mass: wp.array2d(dtype=real), world: int, g: int) -> real:
@@ -66,7 +65,7 @@ def mirror(spec: Spec) -> SimpleNamespace:
                 w += (mass[world, i] / total) * wp.cw_mul(groups.signs[i], nodal[world, i])
         return w
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def reflect(
         # Parameters:
         constants: Constants,
@@ -111,9 +110,8 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     GridInputs, after_free = input_types(spec).GridInputs, grid(spec).after_free
     node_of, exact = nodes(spec).node_of, frame(spec.dim, spec.dtype).exact
     total_mass, mean = one.total_mass, one.mean
-    module = lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def free_again(
         # Parameters:
         constants: Constants,
@@ -132,7 +130,7 @@ def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         here = node.rest + exact(u[world, i])  # such worlds have no shift
         v[world, i] = after_free(constants, inputs, world, here, w[world, i], node.m)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def reflect_adj(
         # Parameters:
         groups: Mirror,

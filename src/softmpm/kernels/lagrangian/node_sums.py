@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.portions import end_of, first_of
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.structs import types
 
@@ -43,16 +43,16 @@ def gathering(dim: int, dtype: str) -> SimpleNamespace:
 def node_sums(dim: int, dtype: str) -> SimpleNamespace:
     t, Rest, one = types(dim, dtype), rest(dim, dtype).Rest, gathering(dim, dtype)
     real, vec, entries_of, gathered = t.real, t.vec, one.entries_of, one.gathered
-    row, module = rows(dim, dtype), lagrangian_module(f"softmpm.d{dim}.{dtype}.node_sums")
+    row = rows(dim, dtype)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def mass(inside: Rest, partial: wp.array2d(dtype=vec), out: wp.array2d(dtype=real)):
         """(Q2)"""
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             out[world, i] = gathered(row(partial, world), entries_of(inside, i))[0]
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def fields(
         inside: Rest,
         partial_u: wp.array2d(dtype=vec),
@@ -67,7 +67,7 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
             u[world, i] = gathered(row(partial_u, world), entries)
             v[world, i] = gathered(row(partial_v, world), entries)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def means(
         inside: Rest,
         mass: wp.array2d(dtype=real),
@@ -88,7 +88,7 @@ def node_sums(dim: int, dtype: str) -> SimpleNamespace:
                 u[world, i] = vec()
                 v[world, i] = vec()
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def means_adj(
         mass: wp.array2d(dtype=real),
         u: wp.array2d(dtype=vec),

@@ -14,17 +14,17 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.node_sums import gathering
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.record import record
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -48,7 +48,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
     Chunk, state_of, lost, store = memory.Chunk, memory.state_of, memory.lost, record(spec).store
-    row, module = rows(spec.dim, spec.dtype), lagrangian_module(spec.module + ".lagrangian")
+    row = rows(spec.dim, spec.dtype)
 
     @wp.struct
     class Node:
@@ -124,7 +124,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
             lost_u[i] = low_u
             row(at.v, then, world)[i] = new
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def advance(
         constants: Constants,
         inputs: GridInputs,
@@ -155,7 +155,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         frame(spec.dim, spec.dtype).exact,
     )
     Chunk, Adjoint, stored = memory.Chunk, memory.Adjoint, record(spec).stored
-    row, module = rows(spec.dim, spec.dtype), lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
+    row = rows(spec.dim, spec.dtype)
 
     @wp.struct
     class Before:
@@ -242,7 +242,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj.v += constants.dt * adj.u
         moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def advance_adj(
         constants: Constants,
         inputs: GridInputs,
@@ -257,7 +257,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             node = node_of(constants, inside, at.mass, world, i)
             advance_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def gather_adj(inside: Rest, bar: Adjoint):
         """Add what the forces of a substep give to its displacements and velocities (Q1.adj)."""
         world, k = wp.tid()

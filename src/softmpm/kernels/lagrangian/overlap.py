@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.cell_table import cell_table
-from softmpm.kernels.lagrangian.rest import lagrangian_module
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.spline import spline
@@ -54,7 +54,6 @@ def overlap(dim: int, dtype: str) -> SimpleNamespace:
     table_of = cell_table(dim)
     Table, reset, find = table_of.Table, table_of.clear, table_of.find
     enter, farthest = table_of.enter, table_of.farthest
-    module = lagrangian_module(f"softmpm.overlap.d{dim}.{dtype}")
 
     @wp.func
     def node_of(bodies: Volumes, p: int, o: ivec) -> int:
@@ -86,12 +85,12 @@ def overlap(dim: int, dtype: str) -> SimpleNamespace:
             o[axis] = (n >> axis) & 1
         return o
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def clear(table: Table):
         world, bucket = wp.tid()
         reset(table, world, bucket)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def sort(
         # Parameters:
         bodies: Volumes,
@@ -124,7 +123,7 @@ def overlap(dim: int, dtype: str) -> SimpleNamespace:
         F = deformation(bodies, u, rate, world, q)
         return wp.determinant(F) != real(0.0) and wp.max(wp.abs(wp.inverse(F) * d)) <= bodies.half[q]
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def compare(
         # Parameters:
         bodies: Volumes,

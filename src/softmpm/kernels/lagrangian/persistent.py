@@ -7,8 +7,8 @@ rounding, see docs/decisions/0010-reference-formulation.md. On the CPU, for test
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import brick_module, meet_cluster, meet_cluster_adj
+from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.lagrangian.bricks import brick_options, meet_cluster, meet_cluster_adj
 from softmpm.kernels.lagrangian.cells import cells, cells_adj
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.cluster import Cluster, holdings, numbering
@@ -20,7 +20,7 @@ from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_adj import surface_adj
 from softmpm.kernels.lagrangian.surface_sums import surface_type
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -40,9 +40,9 @@ def march(spec: Spec, cluster: Cluster) -> wp.Kernel:
     size, groups, lanes, number = cluster.group_threads, cluster.groups, cluster.lanes, numbering(cluster)
     rounded, following = number.rounded, number.following
     all_groups, all_threads = cluster.blocks * groups, cluster.blocks * cluster.threads
-    module = brick_module(f"{spec.module}.lagrangian.{cluster.name}", groups)
+    options = brick_options(groups)
 
-    @wp.kernel(module=module, **cluster.settings)
+    @kernel(options, **cluster.settings)
     def march(
         constants: Constants,
         inputs: ParticleInputs,
@@ -116,9 +116,9 @@ def march_adj(spec: Spec, wanted: RequestedGrads, cluster: Cluster) -> wp.Kernel
     size, groups, lanes, number = cluster.group_threads, cluster.groups, cluster.lanes, numbering(cluster)
     rounded, following = number.rounded, number.following
     all_groups, all_threads = cluster.blocks * groups, cluster.blocks * cluster.threads
-    module = brick_module(f"{adj_module(spec, wanted)}.lagrangian.{cluster.name}", groups)
+    options = brick_options(groups)
 
-    @wp.kernel(module=module, **cluster.settings)
+    @kernel(options, **cluster.settings)
     def march_adj(
         constants: Constants,
         inputs: ParticleInputs,

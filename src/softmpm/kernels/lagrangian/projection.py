@@ -17,8 +17,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.bricks import Bricks, brick_module, meet
+from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.lagrangian.bricks import Bricks, brick_options, meet
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.interpolation import field, sums
 from softmpm.kernels.lagrangian.rest import rest
@@ -35,9 +35,9 @@ def masses(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     across, along, count = bricks.window[-2], bricks.window[-1], 3**dim
     cells, turns, threads, place_of = bricks.cell_count, bricks.turns, bricks.threads, total_of.place_of
     weights, weight, offset, settings = s.weights, s.weight, s.offset, bricks.settings
-    module = brick_module(f"softmpm.d{dim}.{dtype}.lagrangian.{bricks.name}")
+    options = brick_options()
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def bricks_of_masses(inside: Rest, mass: wp.array2d(dtype=real), partial: wp.array2d(dtype=vec)):
         """Sums of (Q2), along the first axis."""
         world, brick, lane = wp.tid()
@@ -56,7 +56,7 @@ def masses(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                 total = add(total, partial, world, brick, slot, corner, fx, mat(), b)
         write(total, partial, inside.corners[brick, lane % cells], world, brick, lane)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def masses_adj(inside: Rest, adj_nodes: wp.array2d(dtype=real), adj_mass: wp.array2d(dtype=real)):
         """(Q2.adj): adds Σ N m̄_i to those of the particles."""
         world, brick, lane = wp.tid()
@@ -90,7 +90,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     exact_vec, exact = types(dim, "float64").vec, frame(dim, dtype).exact
     cells, turns, threads, place_of = bricks.cell_count, bricks.turns, bricks.threads, total_of.place_of
     line, clear, add, write = total_of.line, total_of.clear, total_of.add, total_of.write
-    module = brick_module(f"softmpm.d{dim}.{dtype}.projection.{bricks.name}")
+    options = brick_options()
     store = f"softmpm::scatter_rows<{{}}, {threads}>(&out.data->{{}}, row, lane, &value.{{}});"
 
     @wp.func_native(store.format(dim, "c[0]", "c[0]"))
@@ -99,7 +99,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
     @wp.func_native(store.format(dim * dim, "data[0][0]", "data[0][0]"))
     def store_mat(out: wp.array2d(dtype=mat), row: int, lane: int, value: mat): ...
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def show(
         # Parameters:
         constants: Constants,
@@ -144,7 +144,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                 store_mat(C, row_of_p, lane, affine)
                 store_mat(F, row_of_p, lane, here)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def show_adj(
         # Parameters:
         constants: Constants,
@@ -189,7 +189,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         write(total_u, partial_u, inside.corners[brick, lane % cells], world, brick, lane)
         write(total_v, partial_v, inside.corners[brick, lane % cells], world, brick, lane)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def project(
         # Parameters:
         constants: Constants,
@@ -233,7 +233,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         write(total_u, partial_u, inside.corners[brick, lane % cells], world, brick, lane)
         write(total_v, partial_v, inside.corners[brick, lane % cells], world, brick, lane)
 
-    @wp.kernel(module=module, **settings)
+    @kernel(options, **settings)
     def project_adj(
         # Parameters:
         constants: Constants,

@@ -14,15 +14,8 @@ UNROLLED = 27
 """Loops over the nodes of a cell are unrolled, so that their sums stay in registers."""
 
 
-def lagrangian_module(name: str) -> str:
-    """Set the compile options of the Warp module of this name; returns the name."""
-    options = {
-        "max_unroll": UNROLLED,
-        "enable_backward": False,
-        "extra_build_options": in_parts(ROWS_HEADER.read_text()),
-    }
-    wp.set_module_options(options, module=wp.get_module(name))
-    return name
+LAGRANGIAN = {"max_unroll": UNROLLED, "extra_build_options": in_parts(ROWS_HEADER.read_text())}
+"""Compile options of kernels with rows of arrays, which a CPU may launch in parts."""
 
 
 @kernel_factory

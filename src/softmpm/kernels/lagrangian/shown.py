@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
-from softmpm.kernels.lagrangian.rest import lagrangian_module
+from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN
 from softmpm.kernels.structs import types
 
 
@@ -13,7 +13,6 @@ from softmpm.kernels.structs import types
 def shown(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat = t.real, t.vec, t.mat
-    module = lagrangian_module(f"softmpm.d{dim}.{dtype}.shown")
 
     @wp.func
     def accumulate_max(found: wp.array(dtype=real), k: int, difference: real):
@@ -24,7 +23,7 @@ def shown(dim: int, dtype: str) -> SimpleNamespace:
         elif wp.isnan(size):
             wp.atomic_max(found, k, real(wp.inf))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def apart(
         x: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),

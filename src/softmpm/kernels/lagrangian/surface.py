@@ -14,11 +14,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.portions import end_of, first_of
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics import status
@@ -54,7 +54,7 @@ def surface(spec: Spec) -> SimpleNamespace:
     sums = surface_sums(dim, spec.dtype)
     Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
     Touched, touched_of, from_points = sums.Touched, sums.touched_of, sums.from_points
-    row, module = rows(dim, spec.dtype), lagrangian_module(spec.module + ".lagrangian")
+    row = rows(dim, spec.dtype)
 
     @wp.struct
     class Faces:
@@ -85,7 +85,7 @@ def surface(spec: Spec) -> SimpleNamespace:
             out.friction[q] = friction_of(inputs, world, k)
         return out
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def delassus(body: Surface, mass: wp.array2d(dtype=real), D: wp.array2d(dtype=real)):
         """(K1)"""
         world, p = wp.tid()
@@ -197,7 +197,7 @@ def surface(spec: Spec) -> SimpleNamespace:
             lows[i] = low
             row(at.v, then, world)[i] = new
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def press(
         constants: Constants,
         inputs: GridInputs,
@@ -211,13 +211,13 @@ def surface(spec: Spec) -> SimpleNamespace:
         for p in range(first_of(k), end_of(k, body.points.shape[0])):
             press_at(world, p, point_of(body, p), constants, inputs, body, moving, at, s, anew)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def settle(constants: Constants, body: Surface, moving: Frame, at: Chunk, s: int):
         world, k, lane = wp.tid()
         for n in range(first_of(k), end_of(k, body.nodes.shape[0])):
             settle_at(world, lane, touched_of(body, n, lane), constants, body, moving, at, s)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def check_depth(
         # Parameters:
         constants: Constants,

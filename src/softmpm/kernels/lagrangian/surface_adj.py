@@ -13,18 +13,18 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.portions import end_of, first_of
-from softmpm.kernels.lagrangian.rest import lagrangian_module, rest
+from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.physics.wall_face import wall_face_adj
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -47,7 +47,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     back, memory = nodes_adj(spec, wanted), chunk(dim, spec.dtype)
     before, adj_of, complete, moved_adj = back.before, back.adj_of, back.complete, back.moved_adj
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
-    row, module = rows(dim, spec.dtype), lagrangian_module(adj_module(spec, wanted) + ".lagrangian")
+    row = rows(dim, spec.dtype)
 
     @wp.func
     def settle_adj_at(
@@ -199,7 +199,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             else:
                 moved_adj(world, i, node, was, adj, constants, inputs, bar, adj_inputs)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def settle_adj(
         constants: Constants,
         inputs: GridInputs,
@@ -214,7 +214,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             node = node_of(constants, inside, at.mass, world, i)
             settle_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def press_adj(
         constants: Constants,
         inputs: GridInputs,
@@ -229,7 +229,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         for p in range(first_of(k), end_of(k, body.points.shape[0])):
             press_adj_at(world, p, point_of(body, p), constants, inputs, body, at, bar, adj_inputs, s, anew)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def spread_adj(
         constants: Constants,
         inputs: GridInputs,
@@ -246,7 +246,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             node = node_of(constants, inside, at.mass, world, entry.i)
             spread_adj_at(world, lane, entry, node, constants, inputs, body, at, bar, adj_inputs, s)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(LAGRANGIAN)
     def delassus_adj(
         body: Surface,
         mass: wp.array2d(dtype=real),

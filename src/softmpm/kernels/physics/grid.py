@@ -12,10 +12,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.physics.contact import meet_adj_type, wall, wall_adj
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
@@ -116,7 +116,7 @@ def grid(spec: Spec) -> SimpleNamespace:
             v = after_all_walls(constants, inputs, world, x, free)
         return v
 
-    @wp.kernel(module=spec.module, enable_backward=False)
+    @kernel()
     def grid_velocity(
         # Parameters:
         constants: Constants,
@@ -276,7 +276,7 @@ def grid_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 adj_inputs.gravity[i] = adj_inputs.gravity[i] + (m * constants.dt) * adj.p
         return adj
 
-    @wp.kernel(module=adj_module(spec, wanted) + ".grid", enable_backward=False)
+    @kernel()
     def grid_velocity_adj(
         # Parameters:
         constants: Constants,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.structs import Spec, types
 
 COLLECTORS = 8_192
@@ -23,7 +23,7 @@ def collect_slots(spec: Spec):
     """Kernel that adds the adjoint of every particle and slot to that of its actuator, and clears it."""
     t = types(spec.dim, spec.dtype)
 
-    @wp.kernel(module=spec.module + ".slots", enable_backward=False)
+    @kernel()
     def collect(
         # In:
         muscle: wp.array3d(dtype=wp.int32),
@@ -59,9 +59,8 @@ PARTS = 256
 def collect_slots_in_order(spec: Spec) -> SimpleNamespace:
     """As :func:`collect_slots`, in an order that is always the same: ``parts`` of each actuator, then their ``total``."""
     t = types(spec.dim, spec.dtype)
-    module = spec.module + ".slots"
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def parts(
         # In:
         muscle: wp.array3d(dtype=wp.int32),
@@ -79,7 +78,7 @@ def collect_slots_in_order(spec: Spec) -> SimpleNamespace:
                     adj_slot[world, p, slot] = t.real(0.0)
         part[world, k, n] = total
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel()
     def total(
         # In:
         part: wp.array3d(dtype=t.real),

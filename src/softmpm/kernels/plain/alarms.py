@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.alarms import alarm
 from softmpm.kernels.physics.kinematics import kinematics
@@ -30,7 +30,7 @@ def state_alarms(spec: Spec):
                 return False
         return True
 
-    @wp.kernel(module=spec.module + ".alarms", enable_backward=False)
+    @kernel()
     def check(
         # Parameters:
         constants: Constants,

@@ -23,11 +23,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.errors import Kind
-from softmpm.kernels.compile import in_order, kernel_factory
+from softmpm.kernels.compile import kernel, kernel_factory, kernel_in_order
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.particle import particle, particle_adj
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.structs import RequestedGrads, Spec, adj_module, input_adj_types, input_types, types
+from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 def transfer(spec: Spec, ordered: bool = False) -> SimpleNamespace:
@@ -51,9 +51,9 @@ def _p2g(spec: Spec, ordered: bool):
     )
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
     rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
-    pack, module = s.pack, in_order(spec.module, s.count) if ordered else spec.module
+    pack, define = s.pack, kernel_in_order(s.count) if ordered else kernel()
 
-    @wp.kernel(module=module, enable_backward=False)
+    @define
     def p2g(
         # Parameters:
         constants: Constants,
@@ -93,7 +93,7 @@ def _g2p(spec: Spec):
     running, rounds = status.report(spec.dim, spec.dtype).running, spec.dtype == "float32"
     report_invalid = status.check(spec).report_invalid
 
-    @wp.kernel(module=spec.module, enable_backward=False)
+    @kernel()
     def g2p(
         # Parameters:
         constants: Constants,
@@ -157,7 +157,7 @@ def _p2g_adj(spec: Spec, wanted: RequestedGrads):
     momentum_adj = particle_adj(spec, wanted).momentum_adj
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
 
-    @wp.kernel(module=adj_module(spec, wanted), enable_backward=False)
+    @kernel()
     def p2g_adj(
         # Parameters:
         constants: Constants,
@@ -224,10 +224,10 @@ def _g2p_adj(spec: Spec, wanted: RequestedGrads, ordered: bool):
     )
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
-    ParticleAdj, moved_adj, module = one.ParticleAdj, one.moved_adj, adj_module(spec, wanted)
-    module = in_order(module, s.count) if ordered else module
+    ParticleAdj, moved_adj = one.ParticleAdj, one.moved_adj
+    define = kernel_in_order(s.count) if ordered else kernel()
 
-    @wp.kernel(module=module, enable_backward=False)
+    @define
     def g2p_adj(
         # Parameters:
         constants: Constants,

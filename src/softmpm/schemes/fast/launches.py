@@ -43,7 +43,7 @@ def _p2g_first(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     sizes = (size.per_warp, model.particle_count, size.particles, buffers.order_flat)
     state = (buffers.packed[0], buffers.words_array)
     inputs = buffers.inputs.particle_struct(0, 0)
-    kernel = fused(model.spec).p2g_first[size.few]
+    kernel = fused(model.spec).p2g_first
     arguments = (model.constants, inputs, buffers.window, *sizes, *state, sink)
     launch(kernel, size.threads, *arguments, block_dim=size.block)
     if exact is not None:

@@ -7,6 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from softmpm.kernels.compile import compile_together
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
@@ -19,6 +20,7 @@ from softmpm.schemes.failure_report import began_outside, outgrown
 from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
 from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
 from softmpm.schemes.fast.footprint import FastFootprint
+from softmpm.schemes.fast.kernels import first_kernels
 from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacker
 from softmpm.schemes.graph_cache import GraphCache, Lease
@@ -103,6 +105,7 @@ class Fast:
 
     def __init__(self, model: Model):
         self.model = model
+        compile_together(first_kernels(model), model.wp_device)
         self._pool: LayoutGraphs | None = None
         self._unpacker = Unpacker(model)
         self._start_check: StartCheck | None = None

@@ -17,7 +17,6 @@ from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
 from softmpm.schemes.lagrangian.footprint import stored_nodes
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
-from softmpm.schemes.lagrangian.kernels import define_adj
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
 from softmpm.schemes.lagrangian.overlap import OverlapCheck
 from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
@@ -146,7 +145,6 @@ class SharedAdjoint:
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
         self.model, self.wanted = buffers.model, wanted
-        define_adj(self.model.spec, wanted)
         self.u, self.v, self.anchor, self.force = (
             torch.empty_like(one) for one in (buffers.u[0], buffers.v[0], buffers.anchor[0], buffers.force)
         )

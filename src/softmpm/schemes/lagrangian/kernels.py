@@ -1,28 +1,30 @@
-"""Definition of all kernels of a Warp module before it is first loaded, so that it is compiled once."""
+"""Kernels of a call and its gradient besides those of the chunks, compiled together before the first of them is launched."""
 
-from softmpm.kernels.lagrangian.driven import driven, driven_adj
-from softmpm.kernels.lagrangian.mirror import mirror, mirror_adj
-from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
-from softmpm.kernels.lagrangian.surface import surface
-from softmpm.kernels.lagrangian.surface_adj import surface_adj
-from softmpm.kernels.structs import RequestedGrads, Spec
+import warp as wp
 
-
-def define(spec: Spec) -> None:
-    """Define the kernels of nodes and surface points."""
-    for made, present in ((nodes, True), *zip((surface, mirror, driven), _features(spec), strict=True)):
-        if present:
-            made(spec)
+from softmpm.kernels.compile import compile_together
+from softmpm.kernels.lagrangian.cells import cells
+from softmpm.kernels.lagrangian.node_sums import node_sums
+from softmpm.kernels.lagrangian.projection import masses, projection
+from softmpm.model import Model
+from softmpm.schemes.lagrangian.bricks import NODE_BLOCK
 
 
-def define_adj(spec: Spec, wanted: RequestedGrads) -> None:
-    """Define their adjoints."""
-    factories = (surface_adj, mirror_adj, driven_adj)
-    for made, present in ((nodes_adj, True), *zip(factories, _features(spec), strict=True)):
-        if present:
-            made(spec, wanted)
+def compile_first(model: Model) -> None:
+    """Compile them, unless this thread has done it for this model."""
+
+    def compiled() -> bool:
+        compile_together(first_kernels(model), model.wp_device)
+        return True
+
+    model.workspace.get(compile_first, compiled)
 
 
-def _features(spec: Spec) -> tuple[bool, bool, bool]:
-    """True for contact at surface points, for clamps and symmetries, and for driven particles, if the scene has them."""
-    return bool(spec.surface_walls), bool(spec.mirrors), spec.driven_nodes
+def first_kernels(model: Model) -> list[tuple[wp.Kernel, int]]:
+    """The kernels, with the threads of a block."""
+    spec, bricks = model.spec, model.rest_grid.bricks
+    of_bricks = projection(spec.dim, spec.dtype, bricks), masses(spec.dim, spec.dtype, bricks)
+    kernels = [(kernel, bricks.threads) for made in of_bricks for kernel in vars(made).values()]
+    kernels += [(kernel, NODE_BLOCK) for kernel in vars(node_sums(spec.dim, spec.dtype)).values()]
+    kernels.append((cells(spec, bricks).check_state, bricks.threads))
+    return kernels

@@ -21,6 +21,7 @@ from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
 from softmpm.schemes.lagrangian.frame import quantum, shift_of
+from softmpm.schemes.lagrangian.kernels import compile_first
 from softmpm.schemes.launch import KernelLauncher, launcher
 from softmpm.state import Nodal, State
 from softmpm.surface_grid import SurfaceGrid
@@ -92,6 +93,7 @@ class _Arrays:
     """Warp arrays on tensors, and launches, of one model."""
 
     def __init__(self, model: Model):
+        compile_first(model)
         self.model, self.types = model, types(model.spec.dim, model.spec.dtype)
         self.rest, self.launch = rest_struct(model), launcher(model)
         self.kernels = projection(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)

@@ -15,7 +15,6 @@ from softmpm.schemes.device import stream_of
 from softmpm.schemes.inputs import InputsAdj, Values, particle_struct
 from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
 from softmpm.schemes.lagrangian.buffers import SharedAdjoint
-from softmpm.schemes.lagrangian.kernels import define
 from softmpm.schemes.lagrangian.scheme import ChunkGraph, ChunkGraphAdj
 from softmpm.schemes.launch import KernelLauncher
 from softmpm.state import Nodal
@@ -37,7 +36,6 @@ class NodalStep:
     def __init__(self, model: Model):
         self.model, self.last = model, 0
         self.stream = stream_of(model.device)
-        define(model.spec)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
         self._graph: ChunkGraph | None = None
         self._adjoints: dict[RequestedGrads, ChunkGraphAdj] = {}

@@ -22,7 +22,6 @@ from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers, SharedAdjoint
 from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
 from softmpm.schemes.lagrangian.frame import shift_of
-from softmpm.schemes.lagrangian.kernels import define
 from softmpm.schemes.lagrangian.launches import launch_chunk, launch_chunk_adj
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of, with_reaction
 from softmpm.schemes.lagrangian.surface import check_start
@@ -144,7 +143,6 @@ class Lagrangian:
     def __init__(self, model: Model):
         self.model, self._pool = model, LagrangianGraphs(model)
         self._start_inputs = ReusedParticleStruct(model)
-        define(model.spec)
 
     def run(
         self, chunk: Chunk, start: Nodal, values: Values, keep: bool, frozen: Tensor | None = None

@@ -47,9 +47,8 @@ def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
     return fused(spec).g2p2g[few]
 
 
-def compiled(kernel) -> tuple[str, cubin.Kernel]:
-    """PTX of this kernel, and what its binary says about it; from Warp's cache if nothing has changed."""
-    threads = WARP if kernel.module.name.endswith(".few") else BLOCK
+def compiled(kernel, threads: int = BLOCK) -> tuple[str, cubin.Kernel]:
+    """PTX of this kernel for blocks of so many threads, and what its binary says about it; from Warp's cache if nothing has changed."""
     wp.set_module_options({"block_dim": threads}, module=kernel.module)
     (ptx,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
     (binary,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=False)
@@ -68,7 +67,7 @@ def test_machine_code(dim, law, which, bare, few):
 
     Numbers that are added to singly are a particle's own: the gradients of both moduli and of the stress of two actuators.
     """
-    code, facts = compiled(kernel(dim, law, which, bare, few))
+    code, facts = compiled(kernel(dim, law, which, bare, few), WARP if few else BLOCK)
     print(f"\n{dim}D {law} {which}: {facts}")
     assert len(re.findall(r"\bred\.global\.add\.v4\.f32", code)) > 0
     own = 4 if which == "adjoint" and not bare else 0

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from softmpm.kernels.compile import kernel
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.gather_adj import stencil_adj
-from softmpm.kernels.fast.native import BLOCK, WARP, native, native_module
+from softmpm.kernels.fast.native import BLOCK, NATIVE, WARP, native
 from softmpm.kernels.structs import BASE_BITS, packed_rows, types
 
 COUNT = 41  # particles: one full block of packed rows, and part of another
@@ -28,9 +29,8 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
     pack_base, unpack_base = s.pack_base, s.unpack_base
     load_node, store_node, aligned, head = n.load_node, n.store_node, s.aligned, s.head
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
-    module = native_module(f"test_stencil.d{dim}.{dtype}")
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def sums(
         node: wp.array(dtype=node_vec),
         first: wp.array(dtype=int),
@@ -44,7 +44,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         value[i] = found.value
         outer[i] = found.outer
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def sums_adj(
         node: wp.array(dtype=node_vec),
         first: wp.array(dtype=int),
@@ -68,7 +68,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         alone = slope_adj(node, first[i], shape, g[i], b[i], A[i], mu[i])
         slope_alone[i] = alone.slope
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    @kernel(NATIVE, grid_stride=False)
     def spread(
         node: wp.array(dtype=node_vec),
         shape: ivec,
@@ -85,13 +85,13 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         at = wp.where(i < count, first[p], -1)
         scatter(node, shape, at, g[p], b[p], A[p], m[p])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def bases(base: wp.array(dtype=ivec), packed: wp.array(dtype=int), back: wp.array(dtype=ivec)):
         i = wp.tid()
         packed[i] = pack_base(base[i])
         back[i] = unpack_base(packed[i])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def nodes(
         origin: ivec,
         shape: ivec,
@@ -107,7 +107,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         full = load_node(node, index[i])
         store_node(copy, index[i], aligned(head(full), full[dim]))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def store(
         row_v: int, row_m: int, v: wp.array(dtype=vec), m: wp.array(dtype=mat), packed: wp.array(dtype=real)
     ):
@@ -115,7 +115,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         store_vec(packed, i, row_v, v[i])
         store_mat(packed, i, row_m, m[i])
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel(NATIVE)
     def load(
         row_v: int, row_m: int, packed: wp.array(dtype=real), v: wp.array(dtype=vec), m: wp.array(dtype=mat)
     ):

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softmpm.kernels.fast.native import HEADERS, WARP
+from softmpm.kernels.fast import native
+from softmpm.kernels.fast.native import WARP
 
 HERE = Path(__file__).parent
 
@@ -20,7 +21,7 @@ def warp(tmp_path_factory):
     if shutil.which("g++") is None:
         pytest.skip("no C++ compiler here (g++)")
     library = tmp_path_factory.mktemp("warp") / "warp.so"
-    flags = ["-std=c++20", "-O1", "-pthread", "-shared", "-fPIC", f"-I{HEADERS[0].parent}"]
+    flags = ["-std=c++20", "-O1", "-pthread", "-shared", "-fPIC", f"-I{Path(native.__file__).parent}"]
     built = subprocess.run(["g++", *flags, HERE / "warp.cpp", "-o", library], capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
     return ctypes.CDLL(str(library))
