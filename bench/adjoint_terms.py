@@ -99,7 +99,7 @@ def terms_of(path: Path, file: str) -> list[Term]:
     source = path.read_text()
     found: dict[tuple[int, int], Term] = {}
     for function in _adjoints(ast.parse(source), False):
-        for node in _terms(function) if "@wp." in source else _stored_on_the_host(function):
+        for node in _terms(function) if _in_kernels(source) else _stored_on_the_host(function):
             start, end = _span(source, node)
             term = Term(file, function.name, node.lineno, source[start:end], start, end)
             found.setdefault((start, end), term)
@@ -115,7 +115,7 @@ def with_factors(source: str, terms: list[Term], first: int) -> str:
         openings[term.start] += f"factor({k}, "
         closings[term.end] += 1
     parts = [openings[i] + letter + ")" * closings[i + 1] for i, letter in enumerate(source)]
-    return (IN_KERNELS if "@wp." in source else ON_HOST) + "".join(parts)
+    return (IN_KERNELS if _in_kernels(source) else ON_HOST) + "".join(parts)
 
 
 def _adjoints(node: ast.AST, inside: bool) -> Iterator[ast.FunctionDef]:
@@ -273,3 +273,8 @@ def _called(call: ast.Call) -> str:
 
 def _leaves(target: ast.expr) -> Iterator[ast.Name]:
     yield from (n for n in ast.walk(target) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store))
+
+
+def _in_kernels(source: str) -> bool:
+    """True if the functions of a file are those of kernels."""
+    return "@wp." in source or "@kernel(" in source
