@@ -25,7 +25,7 @@ from softmpm.kernels.structs import types
 
 
 def unchecked(model: softmpm.Model):
-    """Compile the kernels of a model with checks that always succeed, under a specification that differs only in its name."""
+    """Compile the kernels of a model with checks that always succeed, under a specification that differs only in its class."""
     spec = model.spec
     t = types(spec.dim, spec.dtype)
     ivec, vec, mat, Constants = t.ivec, t.vec, t.mat, t.Constants

@@ -1,8 +1,8 @@
 """Seconds until the first gradient of a scene: `python bench/compiling.py [--json bench/results/compiling.json]`
 
 A call of 20 substeps and its gradient, in a program of its own: with an empty cache of kernels, which compiles them, and again with a
-full one. ``compiled`` counts their modules. The cache of the CUDA compiler is off. Without the start of the program, the import of
-softmpm and the building of the model.
+full one. ``compiled`` counts the modules. The cache of the CUDA compiler is off. The import of softmpm and the building of the model
+are not counted.
 """
 
 import json

@@ -1,8 +1,8 @@
-"""Thread-safe kernel definition and loading: Warp's module registry is not thread-safe (undocumented), so one lock serialises both.
+"""Thread-safe kernel definition and loading: Warp's registry of kernels is not thread-safe (undocumented), so one lock serialises both.
+While it is held, a few threads may load modules at the same time, as Warp's own ``force_load`` does.
 
-Each kernel has a module of its own (:func:`kernel`), so that only what is launched is compiled, once for each number of threads in a
-block; kernels of two scenes with the same code share one. Such a module takes a tenth of a second besides its code. For a GPU several
-are compiled at the same time (:func:`compile_together`).
+Each kernel has a module of its own (:func:`kernel`): what is not needed is not compiled, nothing is compiled twice, and kernels of two
+scenes with the same code share a module. A module takes 0.1 s to compile in addition to its code.
 
 Kernels of :func:`kernel_in_order` have Warp's deterministic mode: on a GPU ``wp.atomic_add`` writes a record (node, thread, term)
 instead of adding, and after the kernel Warp sorts the records and adds up those of each node in the order of the threads, as the CPU
@@ -13,12 +13,14 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 import warp as wp
 
 T = TypeVar("T")
+Compiled = tuple[wp.Kernel, str, int]
+"""A kernel, the alias of a device, and the threads of a block."""
 
 THREADS = 256
 """Threads of a block, where a launch does not say otherwise."""
@@ -26,8 +28,8 @@ AT_ONCE = 4
 """Modules that are compiled at the same time, at most; 8 and 16 took no less time on 16 cores (H200, Warp 1.19)."""
 
 _lock = threading.RLock()
-_launched: set[tuple] = set()
-_compiled: set[tuple] = set()
+_launched: set[Compiled] = set()
+_compiled: set[Compiled] = set()
 _in_order: set[wp.Kernel] = set()
 
 
@@ -46,9 +48,12 @@ def kernel_factory(define: Callable[..., T]) -> Callable[..., T]:
 def kernel(options: Mapping[str, Any] | None = None, **settings) -> Callable[[Callable], wp.Kernel]:
     """Decorator of a kernel without a generated adjoint, in a module of its own.
 
+    Kernels with the same code and options are one kernel. Warp compares the numbers of their closures in single precision, or as 32-bit
+    integers.
+
     Args:
-        options: Of the module, as in ``wp.set_module_options``.
-        settings: Others of ``wp.kernel``.
+        options: Compile options, as in ``wp.set_module_options``.
+        settings: Further arguments of ``wp.kernel``.
     """
     return wp.kernel(module="unique", module_options=dict(options or {}), enable_backward=False, **settings)
 
@@ -82,34 +87,54 @@ def launch(kernel, dim, inputs: Sequence, device: wp.Device, **settings):
     if key in _launched:
         return wp.launch(kernel, dim, inputs, device=device, record_tape=False, **settings)
     with _lock:
+        _compile_at_once([key])
         launched = wp.launch(kernel, dim, inputs, device=device, record_tape=False, **settings)
         _launched.add(key)
         return launched
 
 
 def compile_together(kernels: Iterable[tuple[wp.Kernel, int]], device: wp.Device) -> None:
-    """Compile kernels that will be launched in blocks of so many threads, several at a time.
-
-    Only for a GPU: on a CPU each thread would prepare Warp's headers anew, which takes as long as several modules (Warp 1.19).
-    """
-    if not device.is_cuda:
-        return
+    """Compile kernels that will be launched in blocks of so many threads, several at a time."""
     with _lock:
-        wanted = [(kernel, device.alias, threads) for kernel, threads in kernels]
-        missing = [one for one in wanted if one not in _launched | _compiled]
-        list(_compilers().map(_compile, missing))  # raises what a thread raised
-        _compiled.update(missing)
+        _compile_at_once([(kernel, device.alias, threads) for kernel, threads in kernels])
 
 
-def _compile(one: tuple[wp.Kernel, str, int]) -> None:
+def _compile_at_once(wanted: Sequence[Compiled]) -> None:
+    """Compile what has not been compiled, in the threads for it. After a failure none of them is at work."""
+    tasks = [_compiling(one) for one in wanted if one not in _compiled]
+    try:
+        for task in tasks:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        wait(tasks)
+
+
+def _compiling(one: Compiled) -> Future:
+    try:
+        return _compilers().submit(_compile, one)
+    except RuntimeError:  # the main thread has ended, and pools take no more work
+        task = Future()
+        _compile(one)
+        task.set_result(None)
+        return task
+
+
+def _compile(one: Compiled) -> None:
     kernel, device, threads = one
     wp.force_load(device, [kernel.module], block_dim=threads, max_workers=0)
+    _compiled.add(one)
 
 
 @functools.cache
 def _compilers() -> ThreadPoolExecutor:
-    """Threads that compile; they remain, since each prepares Warp's headers once, which takes as long as a kernel or two."""
+    """Threads that compile. They remain, since each prepares Warp's headers first: 1.5 s on a CPU, less for a GPU."""
     return ThreadPoolExecutor(min(os.cpu_count() or 1, AT_ONCE), "softmpm-compiler")
+
+
+if hasattr(os, "register_at_fork"):  # a child has none of these threads
+    os.register_at_fork(after_in_child=_compilers.cache_clear)
 
 
 def clusters_are_launchable(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> bool:

@@ -16,10 +16,10 @@ COUNT_BYTES = 64
 
 
 def in_parts(source: str = "", before: str = "") -> wp.ModuleBuildOptions:
-    """Build options of modules whose kernels of two or three dimensions may be launched in parts.
+    """Build options of kernels of two or three dimensions that may be launched in parts.
 
     Args:
-        source: Native code of the module on every device.
+        source: Native code on every device.
         before: Further code on the CPU, before the other.
     """
     on_cpu = HEADER + before + source

@@ -152,6 +152,7 @@ class LaunchReplay:
             launches(KernelLauncher(self.model, stream))
         else:
             if self._graph is None:
+                self._compile(launches)
                 self._graph = self._capture(launches)
             if self._graph is None:
                 launches(KernelLauncher(self.model, stream))
@@ -160,19 +161,22 @@ class LaunchReplay:
 
     def _run_program(self, launches: Callable[[Any], None]) -> None:
         if self._program is None:
+            self._compile(launches)
             collected = []
             launches(KernelLauncher(self.model, None, collected))
             self._program = Program(collected)
         self._program.run()
+
+    def _compile(self, launches: Callable[[Any], None]) -> None:
+        kernels = KernelList()
+        launches(kernels)
+        compile_together(kernels.found, self.model.wp_device)
 
     def _capture(self, launches: Callable[[Any], None]) -> wp.Graph | None:
         """The captured graph; None if another thread is capturing: waiting for it could deadlock."""
         with exclusive_capture(wait=False) as acquired:
             if not acquired:
                 return None
-            kernels = KernelList()
-            launches(kernels)
-            compile_together(kernels.found, self.model.wp_device)
             stream = _capture_stream(self.model.device)
             with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
                 launches(KernelLauncher(self.model, stream))

@@ -1,5 +1,9 @@
 """Repeated launches: each works on its own inputs, as if it were launched alone."""
 
+import pathlib
+import subprocess
+import sys
+import tempfile
 import weakref
 
 import numpy as np
@@ -11,10 +15,11 @@ from surface_scenes import block
 
 import softmpm
 from softmpm.kernels import compile as compiling
-from softmpm.schemes import fast, lagrangian
+from softmpm.kernels.fast.packing import packing
+from softmpm.kernels.fast.sorting import sorting
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.launch import KernelLauncher, KernelList, LaunchReplay, launcher
+from softmpm.schemes.launch import KernelLauncher, launcher
 from softmpm.schemes.program import Program
 
 
@@ -81,30 +86,35 @@ def test_the_launcher_keeps_no_arrays_alive():
 
 @pytest.mark.parametrize("formulation", ["moving", "reference"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_kernels_are_known_before_the_first_is_launched(dim, formulation, monkeypatch):
-    """Those of a chunk by its list, the others of a call and its gradient by that of the scheme, but for the smallest."""
-    launched, in_chunks, run = set(), set(), LaunchReplay.run
+def test_kernels_are_compiled_together_before_they_are_launched(dim, formulation, monkeypatch):
+    """All but the smallest, for the threads of a block with which they are launched, and no others."""
+    batches, launched, at_once = [], set(), compiling._compile_at_once
 
-    def listed(self, stream, launches):
-        found = KernelList()
-        launches(found)
-        in_chunks.update(found.found)
-        run(self, stream, launches)
+    def listed(wanted):
+        batches.append([one for one in wanted if not any(one in batch for batch in batches)])
+        at_once(wanted)
 
     monkeypatch.setattr(compiling, "_launched", launched)
-    monkeypatch.setattr(LaunchReplay, "run", listed)
-    alarms = softmpm.Alarms(depth=None)
-    model = softmpm.build(block(dim), device="cpu", formulation=formulation, alarms=alarms)
+    monkeypatch.setattr(compiling, "_compile_at_once", listed)
+    model = softmpm.build(block(dim), device="cpu", formulation=formulation)
     start = model.rest()
+    start.x.add_(0.5 * model.scene.grid.spacing)  # off the walls
     start.x.requires_grad_()
     end = softmpm.simulate(model, start, None, model.params(), substeps=3)
     end.x.sum().backward()
-    used = {(kernel, threads) for kernel, _, threads in launched}
-    assert in_chunks and {kernel for kernel, _ in in_chunks} <= {kernel for kernel, _ in used}
-    of_scheme = {"moving": fast, "reference": lagrangian}[formulation].kernels.first_kernels(model)
-    known = {kernel for kernel, _ in [*in_chunks, *of_scheme]}
-    missing = {kernel.key.split("__")[-1] for kernel, _ in used if kernel not in known}
-    assert missing <= {"sort", "sort_adj", "run"}  # the last one runs programs on a CPU
+    single = {batch[0][0].key.split("__")[-1] for batch in batches if len(batch) == 1}
+    together = {one for batch in batches if len(batch) > 1 for one in batch}
+    assert single <= {"sort", "sort_adj", "collect", "run"}  # the last one runs programs on a CPU
+    assert together and together <= launched | unused(model)
+
+
+def unused(model) -> set:
+    """Kernels of the lists that this call does not need: it begins with particles, and ends after one chunk."""
+    dim, dtype, lists = model.spec.dim, model.spec.dtype, []
+    if model.formulation == "moving":
+        lists += [sorting(dim, dtype).centre_window, sorting(dim, dtype).move, sorting(dim, dtype).move_adj]
+        lists += [packing(dim, dtype).positions, packing(dim, dtype).leave_adj]
+    return {(kernel, "cpu", compiling.THREADS) for kernel in lists}
 
 
 @pytest.mark.gpu
@@ -136,12 +146,63 @@ def test_kernels_are_compiled_together_before_their_launch():
         compiling.compile_together([(wrong, 64)], device)
 
 
-def test_the_cpu_compiles_what_it_launches():
-    """Nothing before, since each thread would prepare the headers of Warp anew."""
+def filling(value: float, **settings) -> wp.Kernel:
+    @compiling.kernel(**settings)
+    def fill(out: wp.array(dtype=wp.float32)):
+        out[wp.tid()] = wp.static(value)
 
-    @compiling.kernel()
-    def idle(out: wp.array(dtype=wp.float32)):
-        out[wp.tid()] = 7.0
+    return fill
 
-    compiling.compile_together([(idle, 64)], wp.get_device("cpu"))
-    assert not idle.module.execs
+
+def test_kernels_are_one_if_their_code_and_options_are():
+    """Whatever factory made them: a number of the closure, a compile option or a bound of the launch makes another one."""
+    fill = filling(3.5)
+    assert filling(3.5) is fill
+    others = [filling(4.5), filling(3.5, options={"max_unroll": 3}), filling(3.5, launch_bounds=64)]
+    assert len({fill, *others}) == 4 == len({one.module for one in (fill, *others)})
+
+
+def test_after_a_failure_to_compile_no_thread_is_at_work(monkeypatch):
+    """The others are compiled or not begun, and a later call compiles them."""
+    kernels = [(filling(20.5 + k), "cpu", 64) for k in range(12)]
+    compiled, done, working = compiling._compile, [], []
+
+    def failing(one):
+        working.append(one)
+        try:
+            if one == kernels[0]:
+                raise RuntimeError("no compiler")
+            compiled(one)
+            done.append(one)
+        finally:
+            working.remove(one)
+
+    monkeypatch.setattr(compiling, "_compile", failing)
+    with pytest.raises(RuntimeError, match="no compiler"):
+        compiling.compile_together([(kernel, 64) for kernel, *_ in kernels], wp.get_device("cpu"))
+    assert not working and set(done) == {one for one in kernels if one in compiling._compiled}
+    monkeypatch.undo()
+    compiling.compile_together([(kernel, 64) for kernel, *_ in kernels], wp.get_device("cpu"))
+    assert set(kernels) <= compiling._compiled
+
+
+def test_a_kernel_is_compiled_after_the_end_of_the_main_thread():
+    """Thread pools take no more work then."""
+    code = (
+        "import threading, time, warp as wp\n"
+        "from softmpm.kernels.compile import kernel, launch\n"
+        "@kernel()\n"
+        "def late(out: wp.array(dtype=wp.float32)):\n"
+        "    out[wp.tid()] = 2.5\n"
+        "def work():\n"
+        "    threading.main_thread().join()\n"
+        "    out = wp.zeros(2, dtype=wp.float32, device='cpu')\n"
+        "    launch(late, 2, [out], wp.get_device('cpu'))\n"
+        "    print(out.numpy().tolist())\n"
+        "wp.init()\n"
+        "threading.Thread(target=work).start()\n"
+    )
+    path = pathlib.Path(tempfile.mkdtemp()) / "late.py"
+    path.write_text(code)
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True)
+    assert done.returncode == 0 and "[2.5, 2.5]" in done.stdout, done.stderr

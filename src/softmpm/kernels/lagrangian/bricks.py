@@ -112,11 +112,6 @@ class Bricks(NamedTuple):
         return max(given * self.slots, 3 * fields * self.nodes * self.dim)
 
     @property
-    def name(self) -> str:
-        kind = "l" if self.lattice else "p"
-        return "x".join(map(str, self.cells)) + f".{kind}{self.parts}.{self.blocks}" + "s" * self.serial
-
-    @property
     def settings(self) -> dict:
         """Of kernels that have bricks."""
         return dict(grid_stride=False, launch_bounds=(self.threads, self.blocks))

@@ -55,10 +55,6 @@ class Cluster(NamedTuple):
         bounds = dict(grid_stride=False, launch_bounds=(self.threads, 1))
         return bounds if self.bricks.serial else bounds | dict(cluster_dim=self.blocks)
 
-    @property
-    def name(self) -> str:
-        return f"{self.bricks.name}.c{self.blocks}x{self.groups}" + "a" * self.alone
-
 
 @kernel_factory
 def numbering(cluster: Cluster) -> SimpleNamespace:

@@ -18,7 +18,7 @@ from softmpm.kernels.lagrangian.nodes import nodes
 from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
-from softmpm.kernels.structs import RequestedGrads, Spec, input_types, types
+from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
@@ -104,7 +104,7 @@ def mirror(spec: Spec) -> SimpleNamespace:
 
 
 @kernel_factory
-def mirror_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
+def mirror_adj(spec: Spec) -> SimpleNamespace:
     t, one, Mirror = types(spec.dim, spec.dtype), mirror(spec), mirror_type(spec.dim, spec.dtype)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, rest(spec.dim, spec.dtype).Rest
     GridInputs, after_free = input_types(spec).GridInputs, grid(spec).after_free

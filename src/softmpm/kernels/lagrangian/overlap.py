@@ -142,9 +142,8 @@ def overlap(dim: int, dtype: str) -> SimpleNamespace:
         if not ran(words, world, substep) or not wp.isfinite(wp.dot(here, here)):
             return
         cell = cell_of(bodies, here - vec(bodies.reach))
-        all_cells = int(
-            cells
-        )  # a variable: unrolled, with the loops over nodes inside, it took 20 s to compile
+        # A variable, so that the loop is not unrolled: with those over the nodes inside it took 20 s to compile.
+        all_cells = int(cells)
         for n in range(all_cells):
             bucket = find(table, world, cell + corner(n))
             q = int(-1)

@@ -16,7 +16,7 @@ ROWS_HEADER = Path(__file__).with_name("rows.h")
 
 @kernel_factory
 def rows(dim: int, dtype: str) -> wp.Function:
-    """``row(values, i, ...)`` of an array of numbers or vectors whose last axis is contiguous; only modules of :mod:`rest` have it."""
+    """``row(values, i, ...)`` of an array of numbers or vectors whose last axis is contiguous; kernels need ``ROWS_HEADER`` for it."""
     real, vec = types(dim, dtype).real, types(dim, dtype).vec
 
     @wp.func_native("return softmpm::row(values, i);")

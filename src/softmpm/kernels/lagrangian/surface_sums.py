@@ -45,9 +45,8 @@ def surface_type(dim: int, dtype: str):
         deepest: wp.array(dtype=t.real)
         stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
         loads: wp.array(dtype=t.real)
-        stencil: wp.array2d(
-            dtype=wp.int32
-        )  # (node, point): threads that are neighbours read neighbouring numbers
+        # (node, point), so that neighbouring threads read neighbouring numbers:
+        stencil: wp.array2d(dtype=wp.int32)
         weights: wp.array2d(dtype=t.real)
         nodes: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)

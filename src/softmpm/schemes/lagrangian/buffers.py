@@ -191,7 +191,7 @@ class ChunkAdjoint:
             self.adj_placed_mass = view(self.found.tensors["mass"], forward.types.real)
         self.contact = self.reflection = None
         if forward.reflection is not None:
-            given = shared.wanted, forward.words_array, shared.mass_array
+            given = forward.words_array, shared.mass_array
             self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
             self.contact = SurfaceContactAdj(forward.contact, shared.wanted)

@@ -8,7 +8,7 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.kernels.lagrangian.mirror import mirror, mirror_adj, mirror_type
-from softmpm.kernels.structs import RequestedGrads, types
+from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import clear, view
@@ -87,13 +87,12 @@ class ReflectionAdj:
         self,
         forward: Reflection,
         contact: SurfaceContact | None,
-        wanted: RequestedGrads,
         words: wp.array,
         adj_mass: wp.array,
     ):
         self.forward, self.contact = forward, contact
         self._words, self._adj_mass = words, adj_mass
-        self._kernels = mirror_adj(forward.model.spec, wanted)
+        self._kernels = mirror_adj(forward.model.spec)
         self._free, self._scratch = forward.vectors(), forward.vectors()
         self.reaction = torch.empty_like(forward.reaction)
         self._reaction = view(self.reaction, types(forward.model.spec.dim, forward.model.spec.dtype).vec)

@@ -93,7 +93,6 @@ class _Arrays:
     """Warp arrays on tensors, and launches, of one model."""
 
     def __init__(self, model: Model):
-        compile_first(model)
         self.model, self.types = model, types(model.spec.dim, model.spec.dtype)
         self.rest, self.launch = rest_struct(model), launcher(model)
         self.kernels = projection(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
@@ -173,6 +172,7 @@ def _apart(model: Model, ours: State, theirs: State) -> Tensor:
 
 @on_its_gpu
 def _show(model: Model, u: Tensor, v: Tensor, shift: Tensor) -> tuple[Tensor, ...]:
+    compile_first(model)
     one = _Arrays(model)
     found = one.particles()
     exact = types(model.spec.dim, "float64").vec
@@ -184,6 +184,7 @@ def _show(model: Model, u: Tensor, v: Tensor, shift: Tensor) -> tuple[Tensor, ..
 
 @on_its_gpu
 def _show_adj(model: Model, C: Tensor, F: Tensor, *adj: Tensor) -> list[Tensor]:
+    compile_first(model, adjoint=True)
     one = _Arrays(model)
     partials, found = one.partials(), one.nodal()
     brick_launch(
@@ -211,6 +212,7 @@ class _Project(torch.autograd.Function):
 
 @on_its_gpu
 def _project(model: Model, moved: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor) -> list[Tensor]:
+    compile_first(model)
     one = _Arrays(model)
     partials, found, node_mass = one.partials(), one.nodal(), one.node_masses(mass)
     given = one.views(mass, moved, v, C, F)
@@ -235,6 +237,7 @@ def _project_adj(
     adj_u: Tensor,
     adj_v: Tensor,
 ) -> list[Tensor]:
+    compile_first(model, adjoint=True)
     one = _Arrays(model)
     each, adj_node_mass = [adj_u.clone(), adj_v.clone()], torch.empty_like(node_mass)
     arguments = one.views(node_mass, nodal_u, nodal_v, *each, adj_node_mass)

@@ -40,9 +40,7 @@ class Substep:
         self.model, self.stream = model, stream_of(model.device)
         self.types = types(model.spec.dim, model.spec.dtype)
         self.ordered = model.deterministic and model.device.type == "cuda"  # the CPU adds in one order anyway
-        # All of a module before it is first loaded: it is compiled once.
         self.transfer = transfer(model.spec, self.ordered)
-        grid(model.spec)
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
