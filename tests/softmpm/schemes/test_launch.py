@@ -1,9 +1,7 @@
 """Repeated launches: each works on its own inputs, as if it were launched alone."""
 
-import pathlib
 import subprocess
 import sys
-import tempfile
 import weakref
 
 import numpy as np
@@ -186,23 +184,42 @@ def test_after_a_failure_to_compile_no_thread_is_at_work(monkeypatch):
     assert set(kernels) <= compiling._compiled
 
 
-def test_a_kernel_is_compiled_after_the_end_of_the_main_thread():
-    """Thread pools take no more work then."""
-    code = (
-        "import threading, time, warp as wp\n"
-        "from softmpm.kernels.compile import kernel, launch\n"
-        "@kernel()\n"
-        "def late(out: wp.array(dtype=wp.float32)):\n"
-        "    out[wp.tid()] = 2.5\n"
-        "def work():\n"
-        "    threading.main_thread().join()\n"
-        "    out = wp.zeros(2, dtype=wp.float32, device='cpu')\n"
-        "    launch(late, 2, [out], wp.get_device('cpu'))\n"
-        "    print(out.numpy().tolist())\n"
-        "wp.init()\n"
-        "threading.Thread(target=work).start()\n"
-    )
-    path = pathlib.Path(tempfile.mkdtemp()) / "late.py"
-    path.write_text(code)
-    done = subprocess.run([sys.executable, path], capture_output=True, text=True)
-    assert done.returncode == 0 and "[2.5, 2.5]" in done.stdout, done.stderr
+LATE = """
+import os, threading, warp as wp
+from softmpm.kernels.compile import kernel, launch
+
+def made(value):
+    @kernel()
+    def late(out: wp.array(dtype=wp.float32)):
+        out[wp.tid()] = wp.static(value)
+
+    return late
+
+def filled(value):
+    out = wp.zeros(2, dtype=wp.float32, device="cpu")
+    launch(made(value), 2, [out], wp.get_device("cpu"))
+    return out.numpy().tolist() == 2 * [value]
+
+def after_the_main_thread():
+    threading.main_thread().join()
+    print("filled" if filled(3.75) else "not filled")
+
+wp.init()
+assert filled(2.75)
+"""
+THREAD = "threading.Thread(target=after_the_main_thread).start()"
+FORK = """
+child = os.fork()
+if child == 0:
+    os._exit(0 if filled(4.75) else 1)
+print("filled" if os.waitpid(child, 0)[1] == 0 else "not filled")
+"""
+
+
+@pytest.mark.parametrize("way", [THREAD, FORK], ids=["after the main thread", "after a fork"])
+def test_kernels_are_compiled_where_there_are_no_threads_for_it(way, tmp_path):
+    """Thread pools take no more work once the main thread has ended, and a child has none of the threads of its parent."""
+    path = tmp_path / "late.py"
+    path.write_text(LATE + way)
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0 and done.stdout.splitlines()[-1] == "filled", done.stderr
