@@ -1,8 +1,8 @@
 """Thread-safe kernel definition and loading: Warp's registry of kernels is not thread-safe (undocumented), so one lock serialises both.
 While it is held, a few threads may load modules at the same time, as Warp's own ``force_load`` does.
 
-Each kernel has a module of its own (:func:`kernel`): what is not needed is not compiled, nothing is compiled twice, and kernels of two
-scenes with the same code share a module. A module takes 0.1 s to compile in addition to its code.
+Each kernel has a module of its own (:func:`kernel`), which Warp compiles once for each number of threads in a block; kernels of two
+scenes with the same code share one. A module takes 0.1 s to compile in addition to its code.
 
 Kernels of :func:`kernel_in_order` have Warp's deterministic mode: on a GPU ``wp.atomic_add`` writes a record (node, thread, term)
 instead of adding, and after the kernel Warp sorts the records and adds up those of each node in the order of the threads, as the CPU
@@ -130,7 +130,8 @@ def _compile(one: Compiled) -> None:
 @functools.cache
 def _compilers() -> ThreadPoolExecutor:
     """Threads that compile. They remain, since each prepares Warp's headers first: 1.5 s on a CPU, less for a GPU."""
-    return ThreadPoolExecutor(min(os.cpu_count() or 1, AT_ONCE), "softmpm-compiler")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(min(cores, AT_ONCE), "softmpm-compiler")
 
 
 if hasattr(os, "register_at_fork"):  # a child has none of these threads

@@ -121,10 +121,11 @@ class RebindableLaunch:
             self._launch.launch(stream)
 
 
-class KernelList:
-    """Takes the place of a launcher and lists the kernels, with the threads of a block, instead of launching them."""
+class KernelList(KernelLauncher):
+    """Lists the kernels, with the threads of a block, instead of launching them."""
 
-    def __init__(self):
+    def __init__(self, model: Model):
+        super().__init__(model, None)
         self.found: dict[tuple[wp.Kernel, int], None] = {}
 
     def __call__(self, kernel, dim, *inputs, block_dim: int = THREADS, part: int | None = None) -> None:
@@ -145,7 +146,7 @@ class LaunchReplay:
         self._graph: wp.Graph | None = None
         self._program: Program | None = None
 
-    def run(self, stream: wp.Stream | None, launches: Callable[[Any], None]) -> None:
+    def run(self, stream: wp.Stream | None, launches: Callable[[KernelLauncher], None]) -> None:
         if stream is None:
             self._run_program(launches)
         elif is_capturing(self.model):
@@ -159,7 +160,7 @@ class LaunchReplay:
             else:
                 wp.capture_launch(self._graph, stream=stream)
 
-    def _run_program(self, launches: Callable[[Any], None]) -> None:
+    def _run_program(self, launches: Callable[[KernelLauncher], None]) -> None:
         if self._program is None:
             self._compile(launches)
             collected = []
@@ -167,12 +168,12 @@ class LaunchReplay:
             self._program = Program(collected)
         self._program.run()
 
-    def _compile(self, launches: Callable[[Any], None]) -> None:
-        kernels = KernelList()
+    def _compile(self, launches: Callable[[KernelLauncher], None]) -> None:
+        kernels = KernelList(self.model)
         launches(kernels)
         compile_together(kernels.found, self.model.wp_device)
 
-    def _capture(self, launches: Callable[[Any], None]) -> wp.Graph | None:
+    def _capture(self, launches: Callable[[KernelLauncher], None]) -> wp.Graph | None:
         """The captured graph; None if another thread is capturing: waiting for it could deadlock."""
         with exclusive_capture(wait=False) as acquired:
             if not acquired:

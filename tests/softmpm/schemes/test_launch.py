@@ -116,18 +116,10 @@ def unused(model) -> set:
 
 
 @pytest.mark.gpu
-def test_kernels_are_compiled_together_before_their_launch():
-    """For the number of threads that is asked for; a kernel whose code is wrong raises as its launch would."""
+def test_kernels_are_compiled_for_the_threads_of_a_block():
+    """Before they are launched; a kernel whose code is wrong raises as its launch would."""
     device, out = wp.get_device("cuda"), torch.zeros(3, device="cuda")
-
-    def made(value: float):
-        @compiling.kernel()
-        def fill(out: wp.array(dtype=wp.float32)):
-            out[wp.tid()] = wp.static(value)
-
-        return fill
-
-    kernels = [made(value) for value in (1.5, 2.5)]
+    kernels = [filling(value) for value in (1.5, 2.5)]
     compiling.compile_together([(kernel, 64) for kernel in kernels], device)
     assert all(list(kernel.module.execs) == [(device.context, 64)] for kernel in kernels)
     for kernel, value in zip(kernels, (1.5, 2.5), strict=True):
