@@ -592,15 +592,15 @@ def assert_same_failure(one, other, built) -> None:
     healthy = [world for world in range(built.worlds) if world != other.world]
     for name in "xvCF":
         got, want = getattr(one.state, name), getattr(other.state, name)
-        assert_relative(got[healthy], want[healthy], 2e-6, name)
+        assert_relative(got[healthy], want[healthy], 1e-13, name)
         at = other.world, other.particle
         if (
             name == "C"
         ):  # a difference of velocities over a cell: their rounding, not its own size, is the measure
             rounding = other.state.v[at].norm() / built.scene.grid.spacing
-            assert (got[at] - want[at]).norm() <= 5e-7 * rounding
+            assert (got[at] - want[at]).norm() <= 1e-14 * rounding
         else:
-            assert_relative(got[at], want[at], 2e-6, f"{name} of the particle")
+            assert_relative(got[at], want[at], 1e-13, f"{name} of the particle")
 
 
 def test_a_failure_is_that_of_the_plain_scheme(short_chunks, device):
@@ -611,7 +611,7 @@ def test_a_failure_is_that_of_the_plain_scheme(short_chunks, device):
 
     errors = []
     for scheme in ("fast", "plain"):
-        built = model(device=device, scheme=scheme, worlds=3)
+        built = model(device=device, dtype=torch.float64, scheme=scheme, worlds=3)
         errors.append(failure(built, v=kick))
     assert errors[1].kind == "left_grid" and errors[1].world == 1 and errors[1].substep > SHORT
     assert_same_failure(*errors, built)
