@@ -141,8 +141,9 @@ def test_walkers_learn_with_contact_that_converges():
     for conf in (ElephantConf, BipedConf):
         task = make_task(conf())
         material = task.scene.bodies[0].material
-        assert material.viscosity == pytest.approx(1e-3 * material.young / (2 * (1 + material.poisson)))
+        assert material.viscosity == pytest.approx(2e-3 * material.young / (2 * (1 + material.poisson)))
         assert task.build == surface and conf(contact="nodes").build == nodes
+        assert conf(formulation="reference").build == surface | {"formulation": "reference"}
         assert conf(contact_width=0.0).build == surface | {"contact_width": 0.0}
     task = make_task(ArmConf())
     assert task.build == nodes and task.scene.bodies[0].material.viscosity == 0.0

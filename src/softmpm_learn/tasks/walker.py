@@ -38,7 +38,7 @@ them (:class:`softmpm.Alarms`)."""
 class WalkerConf(TaskConf):
     """Settings that robots on legs have besides, and their own defaults: contact that converges (docs/gait.md)."""
 
-    retardation: float = 1e-3
+    retardation: float = 2e-3
     """Retardation time η/μ of the material [s], instead of ``viscosity``; without it soles flutter. Good value in the reference
     formulation: 4e-3."""
     strength: float = 6e3
@@ -79,11 +79,10 @@ class WalkerConf(TaskConf):
 
     @property
     def alarms(self) -> softmpm.Alarms:
-        """On the moving grid without the alarm on the step: single particles in the inner corners of the hips are beyond the limit of a
+        """On the surface without the alarm on the step: single particles in the inner corners of the hips are beyond the limit of a
         lone one, which falls with up to the fourth power of the stretch, and their neighbours are not (docs/gait.md)."""
         alarms = super().alarms
-        carried = self.on_surface and self.formulation == "moving"
-        return dataclasses.replace(alarms, step=None) if carried else alarms
+        return dataclasses.replace(alarms, step=None) if self.on_surface else alarms
 
 
 def walking(conf: WalkerConf, scene: softmpm.Scene, rest: np.ndarray, torso: np.ndarray) -> Objective:
