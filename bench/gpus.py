@@ -67,9 +67,8 @@ def run(words: list[str], processes: int) -> list[list[float]]:
 def seconds(path: Path) -> list[float]:
     """Of each iteration of a seed; those of one process have the same."""
     with open(path, newline="") as file:
-        return [
-            sum(float(row[name]) for name in ("episode", "learn", "save")) for row in csv.DictReader(file)
-        ]
+        rows = list(csv.DictReader(file))
+    return [sum(float(row[name]) for name in ("episode", "evaluate", "learn", "save")) for row in rows]
 
 
 if __name__ == "__main__":

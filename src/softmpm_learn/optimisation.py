@@ -71,10 +71,11 @@ def optimise(
             failed = {0: error}
         if not failed:
             found = {k: row | {"retries": retries[k]} for k, row in rows.items() if isinstance(row, dict)}
-            update(runs, found)
+            with clock(seconds, "evaluate"):
+                update(runs, found)
             return found, episode.observations
         ends = any(k not in runs.active for k in failed)
-        with runs.group.fail_together():
+        with clock(seconds, "save"), runs.group.fail_together():
             save_before(runs, loggers, {k: s for k, s in streams.items() if ends or k in failed})
         for k, error in failed.items():
             go_back(runs, k, error, retries.get(k, 0))
@@ -246,7 +247,9 @@ def _losses(runs: Runs, episode: Episode, k: int) -> dict[str, Tensor]:
 
 @contextlib.contextmanager
 def clock(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Measure the time that the block takes [s]."""
+    """Add the time that the block takes [s], also if it fails."""
     begin = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - begin
+    try:
+        yield
+    finally:
+        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - begin

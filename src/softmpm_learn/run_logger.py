@@ -24,9 +24,10 @@ from softmpm_learn.runs import Runs
 
 logger = logging.getLogger("softmpm_learn")
 
-TIMING = ["episode", "learn", "save"]
-"""Columns of timing.csv [s]: ``episode`` is simulation, gradient and its mean over the processes, ``learn`` keeps pictures as well,
-``save`` is that of the iteration before.
+TIMING = ["episode", "evaluate", "learn", "save", "draw"]
+"""Columns of timing.csv [s]: ``episode`` is simulation, gradient and its mean over the processes, also of attempts that failed;
+``evaluate`` has the step along the gradient as well, and ``learn`` keeps pictures; ``save`` and ``draw``, checkpoints and recorded
+episodes with their pictures, are those of the iteration before.
 """
 
 

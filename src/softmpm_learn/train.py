@@ -176,10 +176,11 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
         _end_iteration(work, ended)
         if progress and group.first and rows:
             progress(ended)
-        for k in ended if work.loggers else ():  # a run that failed may have frames, but of no iteration
-            if work.loggers[k].frames:
-                work.loggers[k].flush()
-                work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
+        with clock(seconds, "draw"):
+            for k in ended if work.loggers else ():  # a run that failed may have frames, but of no iteration
+                if work.loggers[k].frames:
+                    work.loggers[k].flush()
+                    work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     _save_all(work)
     ends = evaluate_ends(runs)
     _save_all(work)  # with what became of the best
@@ -203,6 +204,7 @@ def _end_iteration(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) 
     loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
     with group.fail_together():
         at_once(lambda k: loggers[k].add(*ended[k], work.seconds), loggers)
+    work.seconds |= dict.fromkeys(TIMING, 0.0)
     for k in ended:
         runs.all[k].iteration += 1
     _save(work, [k for k, one in loggers.items() if one.is_due])

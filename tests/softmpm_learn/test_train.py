@@ -83,8 +83,8 @@ def test_every_iteration_is_a_row(unbroken, settings):
     assert all(abs(float(r["loss"])) < 1 for r in found)
     assert float(found[-1]["best"]) == min(float(r["loss"]) for r in found)
     header, *times = (unbroken / "timing.csv").read_text().splitlines()
-    assert header == "iteration,episode,learn,save" and len(times) == 5
-    assert all(float(line.split(",")[2]) > 0 for line in times)  # pictures are kept in every iteration
+    assert header == "iteration,episode,evaluate,learn,save,draw" and len(times) == 5
+    assert all(float(line.split(",")[3]) > 0 for line in times)  # pictures are kept in every iteration
 
 
 def test_equal_seeds_give_equal_runs(task, model, settings, unbroken, tmp_path):
