@@ -50,7 +50,7 @@ class Evaluation:
 def evaluate(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
     """Evaluate policy and design of some runs as they are, by their numbers; what would be the best so far also from further starts."""
     found, further = simulate(runs, of, runs.evaluator.starts), runs.evaluator.further
-    best = [k for k, one in found.items() if runs.all[k].would_be_best(one.loss, one.lasts)]
+    best = [k for k, one in found.items() if runs.all[k].motions.would_be_best(one.loss, one.lasts)]
     again = simulate(runs, best, further) if best and further else {}
     return found | {k: found[k].worse(one) for k, one in again.items()}
 
@@ -62,7 +62,7 @@ def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
     :data:`ROUNDS` evaluations, the last of which is accepted in any case. If no motion is left that is worth going on with, the run
     keeps its best.
     """
-    first, before = dict[int, Evaluation](), {k: runs.all[k].candidates for k in of}
+    first, before = dict[int, Evaluation](), {k: runs.all[k].motions.all for k in of}
     found, left = dict[int, Evaluation](), ROUNDS
     while of:
         left -= 1
@@ -72,9 +72,9 @@ def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
         first, found = again | first, found | again
         tried = [k for k in of if left and runs.all[k].settles and not _repeats(runs.all[k], again[k])]
         of = [k for k in tried if runs.all[k].is_at_work]
-    for k, candidates in before.items():
-        if candidates and not runs.all[k].is_at_work:
-            runs.all[k].rank(candidates)
+    for k, motions in before.items():
+        if motions and not runs.all[k].is_at_work:
+            runs.all[k].motions.rank(motions)
             runs.all[k].load_policy(runs.all[k].best)
             found[k] = first[k]
     return found

@@ -3,15 +3,20 @@
 Its three refinements, early stopping, replay and target network, each have a switch in :class:`LearningConf`.
 """
 
+import dataclasses
+from pathlib import Path
+
 import torch
 from torch import Tensor, nn
 
+from softmpm import Model
 from softmpm_learn.autoencoder import FAINT, QUIET, Autoencoder
 from softmpm_learn.learning_phase import learn_together
 from softmpm_learn.lockstep import LockStep
+from softmpm_learn.observe import Latent
 from softmpm_learn.replay import Replay
 from softmpm_learn.seeding import stream
-from softmpm_learn.settings import LearningConf
+from softmpm_learn.settings import LearningConf, Settings
 from softmpm_learn.target import TargetNetwork
 
 
@@ -92,3 +97,29 @@ class Learner:
         self.phases = content["phases"]
         for name, generator in self.streams.items():
             generator.set_state(content["streams"][name])
+
+
+def make_learner(
+    settings: Settings, observer: Latent, control_steps: int, model: Model, folder: Path
+) -> Learner:
+    """Learner of an observer's autoencoder, which it moves to the model's device; an observer that is not trained gets no epochs.
+
+    Args:
+        control_steps: Of an episode.
+        folder: Of the replay buffer.
+    """
+    conf, worlds, autoencoder = settings.learning, settings.train.worlds, observer.encoder
+    assert isinstance(autoencoder, Autoencoder)
+    if not observer.trained:
+        conf = dataclasses.replace(conf, epochs=0)
+    frames = -(-control_steps // conf.frame_every)
+    replay = Replay(
+        folder,
+        (frames, observer.picture.channels, *observer.picture.shape),
+        simulations=conf.simulations if conf.replay else conf.every * worlds,
+        megabytes=conf.megabytes,
+        validation=conf.validation,
+        worlds=worlds,
+        device=model.device,
+    )
+    return Learner(conf, autoencoder.to(model.device, model.dtype), replay, settings.train.seed)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,18 +11,17 @@ from torch import Tensor, nn
 
 from softmpm import Model
 from softmpm_learn import settling
-from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.design import Design
 from softmpm_learn.distributed import Group
 from softmpm_learn.fallback import Fallback
 from softmpm_learn.goals import Goals
 from softmpm_learn.identity import identity, identity_of_settings
-from softmpm_learn.learner import Learner
+from softmpm_learn.learner import Learner, make_learner
+from softmpm_learn.motions import Motions
 from softmpm_learn.observe import Latent, Observer, make_observer
 from softmpm_learn.optimizers import make_optimizer
 from softmpm_learn.policy import make_policy
-from softmpm_learn.replay import Replay
-from softmpm_learn.restart import Restart, is_worth
+from softmpm_learn.restart import Restart
 from softmpm_learn.seeding import seeded, stream_seed
 from softmpm_learn.settings import Settings
 from softmpm_learn.settling import Settling
@@ -34,12 +32,6 @@ if TYPE_CHECKING:
 
 OLDER = {"optimizer.settle": 0.0}
 """Settings of checkpoints that do not name them, where these are not the defaults."""
-
-
-OTHERS = 6
-"""Motions that are kept besides the best."""
-REPEATED = 0.8
-"""A best repeats itself if a further evaluation makes at least this share of its progress."""
 
 
 class SettingsError(ValueError):
@@ -58,8 +50,7 @@ class Run:
         learner: The learning phase, None unless the observer has an encoder.
         goals: Those of its simulations.
         safe: Values of policy and design in the last simulation that did not fail.
-        best: The loss of the best motion so far, that of its evaluation if there are any, whether it lasts, and what gave it.
-        others: The next best, at most :data:`OTHERS`, the better first.
+        motions: The best ones so far.
         end: The iterations after which the best was evaluated for the end of the run, and its loss then; None: it was not.
         fallback: Decides when the run goes back to its best.
         restart: Decides when it begins anew.
@@ -86,8 +77,7 @@ class Run:
             )
         settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
-        self.iteration, self.best = 0, {"loss": math.inf, "lasts": False, "iteration": -1}
-        self.others: list[dict] = []
+        self.iteration, self.motions = 0, Motions(settings.optimizer)
         self.end: tuple[int, float] | None = None
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = Goals(task, model, settings.train, self.worlds)
@@ -111,31 +101,12 @@ class Run:
         return Design(self.settings.design, self.model, self.task.regions)
 
     def _make_observer(self, out: Path) -> Observer:
-        seed, task = self.settings.train.seed, self.task
-        with seeded(stream_seed(seed, "autoencoder")):
+        task = self.task
+        with seeded(stream_seed(self.settings.train.seed, "autoencoder")):
             observer = make_observer(self.settings.observer, self.model, task)
         if not isinstance(observer, Latent):
             return observer.to(self.model.device, self.model.dtype)
-        learning = self.settings.learning
-        if not observer.trained:
-            learning = dataclasses.replace(learning, epochs=0)
-        since_last = learning.every * self.settings.train.worlds
-        replay = Replay(
-            out / "replay",
-            (
-                -(-task.control_steps // learning.frame_every),
-                observer.picture.channels,
-                *observer.picture.shape,
-            ),
-            simulations=learning.simulations if learning.replay else since_last,
-            megabytes=learning.megabytes,
-            validation=learning.validation,
-            worlds=self.settings.train.worlds,
-            device=self.model.device,
-        )
-        autoencoder = observer.encoder
-        assert isinstance(autoencoder, Autoencoder)
-        self.learner = Learner(learning, autoencoder.to(self.model.device, self.model.dtype), replay, seed)
+        self.learner = make_learner(self.settings, observer, task.control_steps, self.model, out / "replay")
         observer.encoder = self.learner.encoder
         return observer
 
@@ -171,61 +142,23 @@ class Run:
     def _settling_iterations(self) -> int:
         return settling.iterations(self.settings.train.iterations, self.settings.optimizer.settle)
 
-    def would_be_best(self, loss: float, lasts: bool) -> bool:
-        """True of a motion that is better than the best so far: one that lasts is better than one that does not, and of two others that
-        of the lower loss.
-
-        Args:
-            loss: nan or infinite of a motion that is not known.
-            lasts: See :mod:`softmpm_learn.lasting`; of no account where the motion is not worth going on with.
-        """
-        return math.isfinite(loss) and _rank(self._counted(loss, lasts)) < _rank(self.best)
-
-    def _counted(self, loss: float, lasts: bool) -> dict:
-        """What a motion counts by; one that is not worth going on with does not last."""
-        return {"loss": loss, "lasts": lasts and self._is_worth(loss)}
-
-    def _is_worth(self, loss: float) -> bool:
-        return math.isfinite(loss) and is_worth(loss, self.settings.optimizer)
+    @property
+    def best(self) -> dict:
+        """The best motion, see :class:`softmpm_learn.motions.Motions`."""
+        return self.motions.best
 
     @property
     def is_at_work(self) -> bool:
         """True if the best is worth going on with."""
-        return self.best["iteration"] >= 0 and self._is_worth(self.best["loss"])
+        return self.motions.are_worth
 
     def keep(self, loss: float, lasts: bool) -> None:
-        """Keep policy and design as they are if they are the best so far, see :meth:`would_be_best`, or among the next best."""
-        now = self._counted(loss, lasts) | {"iteration": self.iteration}
-        full = len(self.others) == OTHERS
-        if math.isfinite(loss) and not (full and _rank(now) >= _rank(self.others[-1])):
-            self.rank([*self.candidates, now | self.policy_snapshot()])
-
-    @property
-    def candidates(self) -> list[dict]:
-        """The best motion and the next best."""
-        return [self.best] * (self.best["iteration"] >= 0) + self.others
-
-    def rank(self, candidates: list[dict]) -> None:
-        """Keep the best of some motions, and the next best."""
-        self.best, *others = sorted(candidates, key=_rank)
-        self.others = others[:OTHERS]
+        """Keep policy and design as they are if they are the best so far, or among the next best; see :meth:`Motions.would_be_best`."""
+        self.motions.keep(loss, lasts, self.iteration, self.policy_snapshot)
 
     def recount(self, loss: float, lasts: bool) -> bool:
-        """Count a further evaluation of the best: True if it repeats itself, by :data:`REPEATED` of its progress, and lasts again if it
-        did, or if it is not worth going on with anyway.
-
-        A best that does not is worth the worse of both, and the best is then the best of it and of the others.
-
-        Args:
-            loss: Infinite where it failed.
-        """
-        best = self.best
-        known = math.isfinite(loss) and not self.fallback.is_below(loss, best["loss"], REPEATED)
-        if (known and lasts >= best["lasts"]) or not self.is_at_work:
-            return True
-        worse = self._counted(max(loss, best["loss"]), best["lasts"] and lasts)
-        self.rank([best | worse, *self.others])
-        return False
+        """Count a further evaluation of the best: True if it repeats itself, see :meth:`Motions.recount`."""
+        return self.motions.recount(loss, lasts, self.fallback)
 
     def step(self) -> None:
         """Take a step along the gradient, the next one with lower rates."""
@@ -307,8 +240,8 @@ class Run:
             "goals": self.goals.stream.get_state(),
             "learner": None if self.learner is None else self.learner.state_dict(),
             "safe": self.safe,
-            "best": self.best,
-            "others": self.others,
+            "best": self.motions.best,
+            "others": self.motions.others,
             "end": self.end,
             "fallback": dataclasses.asdict(self.fallback),
             "restart": dataclasses.asdict(self.restart),
@@ -336,9 +269,9 @@ class Run:
         if self.learner is not None:
             self.learner.load_state_dict(content["learner"])
         self.safe = [tensor.to(self.model.device) for tensor in content["safe"]]
-        self.iteration, best = content["iteration"], content["best"]
-        self.best = {"lasts": best["iteration"] >= 0} | best  # others were not known
-        self.others, self.end = list(content.get("others", [])), content.get("end")
+        self.iteration, best, self.end = content["iteration"], content["best"], content.get("end")
+        self.motions.best = {"lasts": best["iteration"] >= 0} | best  # others were not known
+        self.motions.others = list(content.get("others", []))
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
         self.settling = Settling(**content.get("settling", {}))
@@ -362,7 +295,7 @@ class Run:
                 f"the iteration is {self.iteration!r}, that of the best loss {self.best['iteration']!r}"
             )
         now = self.policy_snapshot()
-        for one in self.candidates:
+        for one in self.motions.all:
             self.load_policy(one)  # compares the shapes
         self.load_policy(now)
 
@@ -370,11 +303,6 @@ class Run:
     def about(self) -> str:
         """Identity of the run, which a resumed run must share, as JSON; its tensors are read once."""
         return json.dumps(identity(self.task, self.model, self.settings), sort_keys=True)
-
-
-def _rank(motion: dict) -> tuple[bool, float]:
-    """Lower of a better motion, see :meth:`Run.would_be_best`."""
-    return not motion["lasts"], motion["loss"]
 
 
 def _moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> list[Tensor]:

@@ -200,7 +200,7 @@ def test_the_worst_start_counts(task, model, settings, tmp_path, judge, known, c
     four if it would be the best by the first two."""
     judge[0].extend([k != failing] for k in range(4))
     runs = runs_of(task, model, settings, tmp_path)
-    runs.all[0].best |= {"loss": known, "lasts": not math.isfinite(known) and known < 0}
+    runs.all[0].motions.best |= {"loss": known, "lasts": not math.isfinite(known) and known < 0}
     losses, found = losses_of(runs), evaluate(runs, [0])[0]
     assert found.loss == pytest.approx(max(losses[:count]), rel=1e-6) and found.lasts == (failing >= count)
     assert len(judge[1]) == count and min(map(abs, np.diff(sorted(losses)))) > 1e-5
@@ -232,10 +232,10 @@ def test_further_starts_are_a_run_s_own(task, settings, tmp_path, judge):
     model = softmpm.build(task.scene, device="cpu", worlds=2)
     judge[0].extend([[True, True], [True, True], [False, False], [True, True]])
     runs = runs_of(task, model, settings, tmp_path, count=2)
-    runs.all[1].best |= {"loss": -math.inf, "lasts": True}
+    runs.all[1].motions.best |= {"loss": -math.inf, "lasts": True}
     losses, found = losses_of(runs), evaluate(runs, [0, 1])
     assert found[0].loss == pytest.approx(max(losses), rel=1e-5) and not found[0].lasts and found[1].lasts
-    runs.all[0].best |= {"loss": -math.inf, "lasts": True}
+    runs.all[0].motions.best |= {"loss": -math.inf, "lasts": True}
     judge[0].extend([[True, True]] * 2)
     assert evaluate(runs, [0, 1])[1] == found[1]
 

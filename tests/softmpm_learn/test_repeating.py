@@ -11,8 +11,9 @@ import softmpm
 from softmpm_learn import checkpoint, evaluation
 from softmpm_learn.evaluation import ROUNDS, Evaluation, evaluate_best
 from softmpm_learn.lasting import AGAIN, FURTHER, STARTS, Lasting
+from softmpm_learn.motions import OTHERS
 from softmpm_learn.objective import Progress, Tilt
-from softmpm_learn.run import OTHERS, Run
+from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.train import train
 
@@ -48,8 +49,8 @@ def test_a_best_that_does_not_repeat_itself(run, again, repeats, left):
     """It counts by the worse value among the others, and one that fails comes last."""
     first = run.best["loss"]
     assert run.recount(*again) is repeats
-    assert [one["iteration"] for one in (run.best, *run.others)] == left
-    values = {one["iteration"]: (one["loss"], one["lasts"]) for one in (run.best, *run.others)}
+    assert [one["iteration"] for one in run.motions.all] == left
+    values = {one["iteration"]: (one["loss"], one["lasts"]) for one in run.motions.all}
     assert values[3] == ((first, True) if repeats else again)
     assert all((weights == left[0]).all() for weights in run.best["policy"].values())
 
@@ -66,7 +67,7 @@ def test_a_best_that_is_not_worth_it_need_not_repeat_itself(task, model, setting
     run.keep(-1.4, False)
     run.keep(-1.5, True)
     assert not run.recount(-0.1, True) and run.is_at_work
-    assert [(one["loss"], one["lasts"]) for one in run.candidates] == [
+    assert [(one["loss"], one["lasts"]) for one in run.motions.all] == [
         (-1.4, False),
         (-0.1, False),
         (0.1, False),
@@ -84,18 +85,18 @@ def test_the_next_best_are_kept(run):
     found = {4: -1.2, 5: -0.3, 6: -1.6, 7: math.nan, 8: -1.2, 9: INF}
     for run.iteration, loss in found.items():
         run.keep(loss, True)
-    assert [one["iteration"] for one in (run.best, *run.others)] == [6, 3, 4, 8, 2, 5, 1] and OTHERS == 6
-    assert all((weights == 3).all() for weights in run.others[0]["policy"].values())
+    assert [one["iteration"] for one in run.motions.all] == [6, 3, 4, 8, 2, 5, 1] and OTHERS == 6
+    assert all((weights == 3).all() for weights in run.motions.others[0]["policy"].values())
 
 
 def test_a_checkpoint_has_the_next_best(run, task, model, settings, tmp_path):
     """One from before has none, and one with weights of another shape is not this run's."""
     other = Run(task, model, settings, tmp_path / "other")
     other.load_state_dict(run.state_dict())
-    assert [one["iteration"] for one in other.others] == [2, 1, 0]
+    assert [one["iteration"] for one in other.motions.others] == [2, 1, 0]
     before = {name: value for name, value in run.state_dict().items() if name != "others"}
     other.load_state_dict(before)
-    assert other.others == [] and other.best["iteration"] == 3
+    assert other.motions.others == [] and other.best["iteration"] == 3
     policy = {name: weights[..., :-1] for name, weights in run.best["policy"].items()}
     with pytest.raises(RuntimeError, match="size mismatch"):
         other.load_state_dict(before | {"others": [run.best | {"policy": policy}]})
@@ -133,11 +134,11 @@ def test_where_all_fail_the_best_is_kept(run, scripted, others, caplog):
     """There is nothing to go back to; its further evaluation says that it failed."""
     caplog.set_level("INFO", "softmpm_learn")
     answers, asked = scripted
-    run.others = run.others if others else []
-    before, tried = run.candidates, [3.0, 2.0, 1.0, 0.0] if others else [3.0]
+    run.motions.others = run.motions.others if others else []
+    before, tried = run.motions.all, [3.0, 2.0, 1.0, 0.0] if others else [3.0]
     answers[0] = [(INF, False)] * 4
     assert evaluate_best(Runs([run]), [0]) == {0: Evaluation(INF, False)}
-    assert [one[0] for one in asked] == tried and run.candidates == before
+    assert [one[0] for one in asked] == tried and run.motions.all == before
     assert next(run.policy.parameters()).flatten()[0] == 3.0
     assert caplog.messages[-1].endswith("no other is better.") and len(caplog.messages) == len(tried)
 
@@ -152,7 +153,7 @@ def test_a_run_that_does_not_settle_keeps_its_best(run, scripted):
 
 def test_there_is_an_end_to_it(run, scripted):
     """The last evaluation stands and belongs to the best, whose value is the one before."""
-    run.others, (answers, asked) = [], scripted
+    run.motions.others, (answers, asked) = [], scripted
     values = [0.5 - 2 * 0.7**k for k in range(1, 20)]
     answers[0] = [(value, True) for value in values]
     assert evaluate_best(Runs([run]), [0]) == {0: Evaluation(values[ROUNDS - 1], True)}

@@ -102,9 +102,9 @@ def test_a_stopped_run_begins_anew_as_well(task, model, restarting, tmp_path):
 def test_a_run_does_not_go_back_to_what_is_not_worth_it(task, model, settings, tmp_path):
     """It begins anew instead, with the count of the times that it went back as it was."""
     run = Run(task, model, with_optimizer(settings, restart_above=-1.0), tmp_path)
-    run.best = {"loss": -0.5, "iteration": 3, **run.policy_snapshot()}
+    run.motions.best = {"loss": -0.5, "iteration": 3, **run.policy_snapshot()}
     assert run.fall_back() == "beginning anew with other first weights"
     assert (run.restart.count, run.fallback.count) == (1, 0)
-    run.best = {"loss": -1.5, "iteration": 4, **run.policy_snapshot()}
+    run.motions.best = {"loss": -1.5, "iteration": 4, **run.policy_snapshot()}
     assert run.fall_back() == "going back to iteration 4"
     assert (run.restart.count, run.fallback.count) == (1, 1)

@@ -136,7 +136,7 @@ def test_a_run_that_settles_does_not_begin_anew(task, model, conf, tmp_path):
     """Although no loss of an episode since its last beginning is low enough: it has a best, that of an evaluation."""
     for settles, anew in ((True, 0), (False, 1)):
         run = Run(task, model, changed(conf, optimizer=dict(restart_above=-1.0)), tmp_path)
-        run.best = {"loss": -1.5, "iteration": 2, **run.policy_snapshot()}
+        run.motions.best = {"loss": -1.5, "iteration": 2, **run.policy_snapshot()}
         run.iteration, run.restart.iterations, run.settling.active = 6, 99, settles
         assert optimisation.step(run, 0.0, math.nan) == {"fallbacks": 0, "restarts": anew}
 

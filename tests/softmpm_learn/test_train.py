@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 import gc
 import itertools
@@ -5,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import time
 import weakref
 from pathlib import Path
 
@@ -17,7 +19,7 @@ import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
 from softmpm_learn.objective import Effort, Objective, Progress
-from softmpm_learn.optimisation import TrainingError
+from softmpm_learn.optimisation import TrainingError, clock
 from softmpm_learn.pictures import design
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -85,6 +87,16 @@ def test_every_iteration_is_a_row(unbroken, settings):
     header, *times = (unbroken / "timing.csv").read_text().splitlines()
     assert header == "iteration,episode,evaluate,learn,save,draw" and len(times) == 5
     assert all(float(line.split(",")[3]) > 0 for line in times)  # pictures are kept in every iteration
+
+
+def test_times_are_summed():
+    """Those of one iteration, over attempts of which some fail."""
+    seconds: dict[str, float] = {}
+    for _ in range(2):
+        with contextlib.suppress(ValueError), clock(seconds, "episode"):
+            time.sleep(0.01)
+            raise ValueError
+    assert seconds["episode"] >= 0.02
 
 
 def test_equal_seeds_give_equal_runs(task, model, settings, unbroken, tmp_path):
