@@ -40,7 +40,7 @@ def seconds(task: Task, settings: Settings, device: torch.device, out: Path) -> 
     model = softmpm.build(task.scene, device=device, **built, **task.build)
     plans = [Plan(settings=one, out=out / str(one.train.seed)) for one in conf]
     train_side_by_side(task, model, plans)
-    times = columns(plans[0].out / "timing.csv", ["episode", "evaluate", "learn", "save"])
+    times = columns(plans[0].out / "timing.csv", ["episode", "learn", "save"])
     epochs = sum(sum(columns(plan.out / "metrics.csv", ["epochs"])["epochs"]) for plan in plans)
     return {
         "whole s": sum(map(sum, times.values())),

@@ -102,11 +102,12 @@ class Learner:
 def make_learner(
     settings: Settings, observer: Latent, control_steps: int, model: Model, folder: Path
 ) -> Learner:
-    """Learner of an observer's autoencoder, which it moves to the model's device; an observer that is not trained gets no epochs.
+    """Make the learner of an observer's autoencoder, moved to device and precision of the model. Without ``observer.trained`` its
+    learning phases have no epochs.
 
     Args:
-        control_steps: Of an episode.
-        folder: Of the replay buffer.
+        control_steps: Decisions in an episode.
+        folder: Where the replay buffer lies.
     """
     conf, worlds, autoencoder = settings.learning, settings.train.worlds, observer.encoder
     assert isinstance(autoencoder, Autoencoder)

@@ -1,4 +1,4 @@
-"""The best motions of a run: which of two is better, and what becomes of a best that does not repeat itself."""
+"""Ranking of the best motions of a run, and replacement of a best that does not repeat itself."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,11 +16,11 @@ REPEATED = 0.8
 class Motions:
     """The best motions of a run so far.
 
-    A motion is a dict of its ``loss``, that of its evaluation if there are any, of ``lasts``, of its ``iteration``, and of the copies
-    of what gave it (:meth:`softmpm_learn.run.Run.policy_snapshot`).
+    A motion is a dict: ``loss`` (of its evaluation if there are any), ``lasts``, ``iteration``, and copies of policy, design and what
+    belongs to them (:meth:`softmpm_learn.run.Run.policy_snapshot`).
 
     Attributes:
-        best: Before there is any, of iteration −1 and of an infinite loss.
+        best: The best motion; iteration −1 and an infinite loss until there is one.
         others: The next best, at most :data:`OTHERS`, the better first.
     """
 
@@ -35,7 +35,7 @@ class Motions:
         return [self.best] * (self.best["iteration"] >= 0) + self.others
 
     @property
-    def are_worth(self) -> bool:
+    def best_is_worth_it(self) -> bool:
         """True if the best is worth going on with."""
         return self.best["iteration"] >= 0 and self._is_worth(self.best["loss"])
 
@@ -50,7 +50,11 @@ class Motions:
         return math.isfinite(loss) and _rank(self._counted(loss, lasts)) < _rank(self.best)
 
     def keep(self, loss: float, lasts: bool, iteration: int, snapshot: Callable[[], dict]) -> None:
-        """Keep a motion if it is the best so far, or among the next best; ``snapshot`` gives the copies of what gave it."""
+        """Keep a motion if it is the best so far, or among the next best.
+
+        Args:
+            snapshot: Makes the copies; called only for a motion that is kept.
+        """
         now = self._counted(loss, lasts) | {"iteration": iteration}
         full = len(self.others) == OTHERS
         if math.isfinite(loss) and not (full and _rank(now) >= _rank(self.others[-1])):
@@ -73,7 +77,7 @@ class Motions:
         """
         best = self.best
         known = math.isfinite(loss) and not fallback.is_below(loss, best["loss"], REPEATED)
-        if (known and lasts >= best["lasts"]) or not self.are_worth:
+        if (known and lasts >= best["lasts"]) or not self.best_is_worth_it:
             return True
         worse = self._counted(max(loss, best["loss"]), best["lasts"] and lasts)
         self.rank([best | worse, *self.others])
@@ -88,5 +92,5 @@ class Motions:
 
 
 def _rank(motion: dict) -> tuple[bool, float]:
-    """Lower of a better motion, see :meth:`Motions.would_be_best`."""
+    """Sort key, lower for the better motion, see :meth:`Motions.would_be_best`."""
     return not motion["lasts"], motion["loss"]

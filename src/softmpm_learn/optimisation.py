@@ -247,7 +247,7 @@ def _losses(runs: Runs, episode: Episode, k: int) -> dict[str, Tensor]:
 
 @contextlib.contextmanager
 def clock(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add the time that the block takes [s], also if it fails."""
+    """Add the time that the block takes [s] to ``seconds[name]``, also if it raises an error."""
     begin = time.perf_counter()
     try:
         yield

@@ -150,14 +150,15 @@ class Run:
     @property
     def is_at_work(self) -> bool:
         """True if the best is worth going on with."""
-        return self.motions.are_worth
+        return self.motions.best_is_worth_it
 
     def keep(self, loss: float, lasts: bool) -> None:
-        """Keep policy and design as they are if they are the best so far, or among the next best; see :meth:`Motions.would_be_best`."""
+        """Keep policy and design as they are if they are the best so far, or among the next best; see :mod:`softmpm_learn.motions`."""
         self.motions.keep(loss, lasts, self.iteration, self.policy_snapshot)
 
     def recount(self, loss: float, lasts: bool) -> bool:
-        """Count a further evaluation of the best: True if it repeats itself, see :meth:`Motions.recount`."""
+        """Count a further evaluation of the best: True if it repeats itself, see
+        :meth:`softmpm_learn.motions.Motions.recount`."""
         return self.motions.recount(loss, lasts, self.fallback)
 
     def step(self) -> None:

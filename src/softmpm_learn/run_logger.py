@@ -25,9 +25,15 @@ from softmpm_learn.runs import Runs
 logger = logging.getLogger("softmpm_learn")
 
 TIMING = ["episode", "evaluate", "learn", "save", "draw"]
-"""Columns of timing.csv [s]: ``episode`` is simulation, gradient and its mean over the processes, also of attempts that failed;
-``evaluate`` has the step along the gradient as well, and ``learn`` keeps pictures; ``save`` and ``draw``, checkpoints and recorded
-episodes with their pictures, are those of the iteration before.
+"""Columns of timing.csv [s]:
+
+- ``episode``: simulation, gradient and its mean over the processes, also of attempts that failed, with their recording;
+- ``evaluate``: evaluations, and the step along the gradient;
+- ``learn``: learning phases, and adding observations to the replay buffer;
+- ``save``: checkpoints, that of the iteration before and those before a run goes back;
+- ``draw``: pictures of the iteration before.
+
+What follows the last iteration is in no row.
 """
 
 

@@ -199,7 +199,7 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
 
 
 def _end_iteration(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) -> None:
-    """End an iteration of some runs: rows of the tables, then the checkpoints that are due."""
+    """End an iteration of some runs: rows of the tables, new sums of the times, then the checkpoints that are due."""
     runs, group = work.runs, work.runs.group
     loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
     with group.fail_together():

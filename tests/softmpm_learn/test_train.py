@@ -89,14 +89,24 @@ def test_every_iteration_is_a_row(unbroken, settings):
     assert all(float(line.split(",")[3]) > 0 for line in times)  # pictures are kept in every iteration
 
 
-def test_times_are_summed():
-    """Those of one iteration, over attempts of which some fail."""
-    seconds: dict[str, float] = {}
-    for _ in range(2):
+def test_times_are_summed(monkeypatch):
+    """The clock adds the time of every block, also of one that raises an error."""
+    ticks, seconds = itertools.count(1.0, 0.5), {}
+    monkeypatch.setattr(time, "perf_counter", lambda: next(ticks))
+    for error in (ValueError, None):
         with contextlib.suppress(ValueError), clock(seconds, "episode"):
-            time.sleep(0.01)
-            raise ValueError
-    assert seconds["episode"] >= 0.02
+            if error:
+                raise error
+    assert seconds == {"episode": 1.0}
+
+
+def test_times_are_those_of_an_iteration(task, model, settings, tmp_path):
+    """All rows together take no longer than the training: no time is in two of them."""
+    begin = time.perf_counter()
+    train.train(task, model, settings, tmp_path)
+    whole = time.perf_counter() - begin
+    _, *times = (tmp_path / "timing.csv").read_text().splitlines()
+    assert 0 < sum(float(cell) for line in times for cell in line.split(",")[1:]) < whole
 
 
 def test_equal_seeds_give_equal_runs(task, model, settings, unbroken, tmp_path):

@@ -80,7 +80,8 @@ class WalkerConf(TaskConf):
     @property
     def alarms(self) -> softmpm.Alarms:
         """On the surface without the alarm on the step: single particles in the inner corners of the hips are beyond the limit of a
-        lone one, which falls with up to the fourth power of the stretch, and their neighbours are not (docs/gait.md)."""
+        lone one, which falls under stretch, in the reference formulation under compression, and their neighbours are not. These
+        simulations are stable (docs/gait.md)."""
         alarms = super().alarms
         return dataclasses.replace(alarms, step=None) if self.on_surface else alarms
 

@@ -582,28 +582,34 @@ def failure(built, seed=1, **changes) -> softmpm.UnstableError:
     return caught.value
 
 
+ALIKE = {torch.float32: 2e-6, torch.float64: 1e-14}
+"""Limits of differences by their rounding; on a GPU the order of sums made up to 5e-7 in single precision (80 runs, H200)."""
+
+
 def assert_same_failure(one, other, built) -> None:
     """Kind, place and time are equal; worlds that did not fail end alike, and so does the particle that did.
 
     The others of its world stop in that substep, before or after it: they run at the same time.
     """
+    limit = ALIKE[built.dtype]
     for name in ("kind", "world", "particle", "substep"):
         assert getattr(one, name) == getattr(other, name), name
     healthy = [world for world in range(built.worlds) if world != other.world]
     for name in "xvCF":
         got, want = getattr(one.state, name), getattr(other.state, name)
-        assert_relative(got[healthy], want[healthy], 1e-13, name)
+        assert_relative(got[healthy], want[healthy], limit, name)
         at = other.world, other.particle
         if (
             name == "C"
         ):  # a difference of velocities over a cell: their rounding, not its own size, is the measure
             rounding = other.state.v[at].norm() / built.scene.grid.spacing
-            assert (got[at] - want[at]).norm() <= 1e-14 * rounding
+            assert (got[at] - want[at]).norm() <= limit * rounding
         else:
-            assert_relative(got[at], want[at], 1e-13, f"{name} of the particle")
+            assert_relative(got[at], want[at], limit, f"{name} of the particle")
 
 
-def test_a_failure_is_that_of_the_plain_scheme(short_chunks, device):
+@pytest.mark.parametrize("dtype", list(ALIKE))
+def test_a_failure_is_that_of_the_plain_scheme(dtype, short_chunks, device):
     """In the second chunk, a world that moves off leaves the grid; the two others stay and go on."""
 
     def kick(v):
@@ -611,7 +617,7 @@ def test_a_failure_is_that_of_the_plain_scheme(short_chunks, device):
 
     errors = []
     for scheme in ("fast", "plain"):
-        built = model(device=device, dtype=torch.float64, scheme=scheme, worlds=3)
+        built = model(device=device, dtype=dtype, scheme=scheme, worlds=3)
         errors.append(failure(built, v=kick))
     assert errors[1].kind == "left_grid" and errors[1].world == 1 and errors[1].substep > SHORT
     assert_same_failure(*errors, built)
