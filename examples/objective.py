@@ -13,7 +13,7 @@ from torch import Tensor
 
 import softmpm
 from softmpm_learn.objective import Objective, Path, Term
-from softmpm_learn.settings import DesignConf, ObserverConf, PolicyConf, Settings, TrainConf
+from softmpm_learn.settings import DesignConf, ObserverConf, Settings, TrainConf
 from softmpm_learn.tasks import BipedConf, biped
 from softmpm_learn.train import train
 
@@ -35,9 +35,8 @@ bounce = Bounce(weight=0.5, particles=task.regions["body"])
 task = dataclasses.replace(task, objective=Objective(*task.objective.terms, bounce))
 settings = Settings(
     observer=ObserverConf(name="centroids"),
-    policy=PolicyConf(name="linear"),
     design=DesignConf(enabled=False),
-    train=TrainConf(iterations=3 if quick else 30, record_every=1, examine=False, endurance=1),
+    train=TrainConf(iterations=3 if quick else 40, record_every=1, examine=False, endurance=1),
 )
 model = softmpm.build(task.scene, calls=task.control_steps, **task.build)
 out = File("objective_run")
