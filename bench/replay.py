@@ -1,16 +1,18 @@
 """Truth of a learned gait: `python bench/replay.py FOLDER … [--device cpu] [--json FILE]`; FOLDER is that of a run of a walker
 
-The activations of the best episode are replayed on other grids, with nodes or the surface on the floor: displacement of the centre of
-mass at the end [mm], mean and standard deviation over four positions of the grid, each a quarter of a cell further, but for those that
-``stopped``. All rows of a run have the same material; a designed one is that of the nearest particle.
+The activations of the best episode are replayed on other grids, with nodes or the surface on the floor, and in the formulations that
+are named, where limbs may pass through each other in the reference formulation: displacement of the centre of mass at the end [mm],
+mean and standard deviation over four positions of the grid, each a quarter of a cell further, but for those that ``stopped``. All
+rows of a run have the same material; a designed one is that of the nearest particle.
 
-``later`` is the displacement from T to 3T over twice that until T, T the length of the episode: the policy goes on, in closed loop and
-on a longer track. A leap has 0, a walk that is under way from the start 1. ``stretch`` is the largest of a particle, ``dt / limit`` the
-ratio of dt and the stable step of such a particle if it were alone on the grid and its muscles fully active.
+``later`` is the displacement from T to 3T over twice that until T, T the length of the episode: the policy goes on, in closed loop. A
+leap has 0, a walk that is under way from the start 1. ``stretch`` is the largest of a particle, ``dt / limit`` the ratio of dt and
+the stable step of such a particle if it were alone on the grid and its muscles fully active.
 """
 
 import argparse
 import dataclasses
+import itertools
 import math
 import tempfile
 from pathlib import Path
@@ -28,27 +30,13 @@ from softmpm_learn.design import declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
 from softmpm_learn.experiment import make_model
-from softmpm_learn.observe import Observer
 from softmpm_learn.run import Run
 from softmpm_learn.saved import load
 from softmpm_learn.tasks import Resolution, Task, make_task
+from softmpm_learn.tasks.task import FORMULATIONS
 
 LONGER = 3
 """Length of the continued walk over that of an episode."""
-
-
-class Onlooker(Observer):
-    """An observer of a run that sees the robot on the track of the run, wherever it is."""
-
-    def __init__(self, run: Run):
-        super().__init__()
-        self.run, self.size = run, run.observer.size
-
-    def observe(self, model, state):
-        return self.run.observer.observe(self.run.model, state)
-
-    def encode(self, observation):
-        return self.run.observer.encode(observation)
 
 
 def learned(folder: Path, device: torch.device, out: Path) -> tuple[RunConf, Run]:
@@ -65,14 +53,15 @@ def learned(folder: Path, device: torch.device, out: Path) -> tuple[RunConf, Run
 def played(run: Run, task: Task, model: softmpm.Model) -> tuple[torch.Tensor, list[float]]:
     """Activations of the policy, (step, world, muscle), and displacement at the beginning of each step and at the end [m]."""
     frames, (params, inputs) = [], run.design()
-    run_episode(task, model, Onlooker(run), run.policy, params, inputs=inputs, on_frame=frames.append)
+    run_episode(task, model, run.observer, run.policy, params, inputs=inputs, on_frame=frames.append)
     way = [travelled(model, params, frame.state) for frame in frames]
     return torch.stack([frame.activation for frame in frames[:-1]]), way
 
 
 def lasting(run: Run) -> float:
     """Speed from T to ``LONGER`` T over that until T, NaN where the simulation stopped."""
-    task, steps = longer(run.task), run.task.control_steps
+    steps = run.task.control_steps
+    task = dataclasses.replace(run.task, control_steps=LONGER * steps)
     try:
         _, way = played(run, task, built(task, run))
     except softmpm.UnstableError as error:
@@ -84,17 +73,6 @@ def lasting(run: Run) -> float:
 def travelled(model: softmpm.Model, params: softmpm.Params, state: softmpm.State) -> float:
     mass = params.density * model.volume
     return (mass @ (state.x[0, :, 0] - model.positions[:, 0]) / mass.sum()).item()
-
-
-def longer(task: Task) -> Task:
-    """The task with ``LONGER`` times the length of the track and of the episode."""
-    scene = task.scene
-    (nodes, high), far = scene.grid.shape, scene.walls[-1]
-    more = (LONGER - 1) * nodes
-    wall = dataclasses.replace(far, offset=far.offset - more * scene.grid.spacing)
-    grid = dataclasses.replace(scene.grid, shape=(nodes + more, high))
-    scene = dataclasses.replace(scene, grid=grid, walls=[*scene.walls[:-1], wall])
-    return dataclasses.replace(task, scene=scene, control_steps=LONGER * task.control_steps)
 
 
 def built(task: Task, run: Run, shift: float = 0.0) -> softmpm.Model:
@@ -153,20 +131,31 @@ def replays(
     out: Path,
     finest: Resolution,
     safeties: list[float],
+    formulations: list[str],
 ) -> None:
     conf, run = learned(folder, device, out)
     activation, way = played(run, run.task, built(run.task, run))
     later, own, coarsest = lasting(run), conf.task, conf.task.resolution
     cases: list[dict] = [{"safety": safety} for safety in safeties]
-    for contact in [own.contact] if own.on_surface else ["nodes", "surface"]:
+    contacts = [own.contact] if own.on_surface else ["nodes", "surface"]
+    finer = [r for r in Resolution if coarsest.value <= r.value <= finest.value]
+    for formulation, contact, resolution in itertools.product(
+        formulations or [own.formulation], contacts, finer
+    ):
         width = own.contact_width if contact == own.contact else None
-        for resolution in (r for r in Resolution if coarsest.value <= r.value <= finest.value):
-            cases.append({"contact": contact, "contact_width": width, "resolution": resolution})
+        case = {"contact": contact, "contact_width": width, "resolution": resolution}
+        cases.append(
+            case | {"formulation": formulation, "overlap": formulation == "reference" or own.overlap}
+        )
     for case in cases:
         changed = dataclasses.replace(own, **case)
         found, stretch, ratio = replayed(run, make_task(changed), activation)
         row = {"run": folder.name, "η/μ ms": 1e3 * own.retardation, "contact": changed.build["contact"]}
-        row |= {"cells/m": changed.resolution.value, "safety": changed.safety}
+        row |= {
+            "formulation": changed.formulation,
+            "cells/m": changed.resolution.value,
+            "safety": changed.safety,
+        }
         going = 1e3 * found[~np.isnan(found)]
         row |= {"learned mm": 1e3 * way[-1], "stopped": len(found) - len(going)}
         several = len(going) > 1
@@ -182,6 +171,9 @@ def main():
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--finest", choices=[r.name for r in Resolution], default="standard")
     parser.add_argument("--safety", type=float, nargs="*", default=[], help="also with these values of it")
+    parser.add_argument(
+        "--formulations", choices=FORMULATIONS, nargs="*", default=[], help="default: that of the run"
+    )
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--json", type=Path, default=None, help="also write the table to this file")
     args = parser.parse_args()
@@ -189,7 +181,7 @@ def main():
     table = Table("Best episode of a run on other grids", device, args.json)
     for folder in args.folders:
         with tempfile.TemporaryDirectory() as out:
-            replays(table, folder, device, Path(out), Resolution[args.finest], args.safety)
+            replays(table, folder, device, Path(out), Resolution[args.finest], args.safety, args.formulations)
 
 
 if __name__ == "__main__":

@@ -603,7 +603,7 @@ def assert_same_failure(one, other, built) -> None:
             name == "C"
         ):  # a difference of velocities over a cell: their rounding, not its own size, is the measure
             rounding = other.state.v[at].norm() / built.scene.grid.spacing
-            assert (got[at] - want[at]).norm() <= limit * rounding
+            assert (got[at] - want[at]).norm() <= 0.5 * limit * rounding
         else:
             assert_relative(got[at], want[at], limit, f"{name} of the particle")
 
