@@ -5,7 +5,7 @@ from comparison import WALKS, Row
 from lasting import Count, both, compare, lasting, lucky, print_change, print_examined, walking
 from settling import table
 
-FOLDERS = {"farthest": "settled/", "lasting": "lasting/", "repeats itself": ""}
+FOLDERS = {"farthest": "settled/", "lasting": "lasting/", "repeats itself": "repeating/"}
 """Where the comparison is whose best motions are chosen in this way."""
 ROBOTS = "biped", "elephant"
 LENGTHS = {"biped": 0.3, "elephant": 0.44}

@@ -31,7 +31,7 @@ def print_changes(robot: str) -> None:
     name, arm = f"comparison.{robot}.h200.csv", robot == "arm"
     now, before = (
         {(r["observer"], r["clock"], r["design"], r["seed"]): float(r["best"]) for r in table(folder + name)}
-        for folder in ("" if arm else "settled/", "before_settling/")
+        for folder in ("settled/", "before_settling/")
     )
     changes: dict[str, list[float]] = {}
     for key, value in now.items():
