@@ -31,6 +31,7 @@ def build(
     inputs: Iterable[str] = (),
     deterministic: bool = False,
     calls: int = 1,
+    threads: int | None = None,
     alarms: Alarms | None = None,
 ) -> Model:
     """Make a scene ready to run.
@@ -56,6 +57,8 @@ def build(
             and ``step`` much slower: float32 and the fast scheme are best. The CPU adds in one order anyway. See docs/conventions.md.
         calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
             budget. If there are more, they keep more.
+        threads: CPU threads that share a simulation; None takes those of PyTorch (``torch.get_num_threads()``) at each call. Results
+            have the same bits with any number of them. It has no effect on a GPU.
         alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
 
     Returns:
@@ -70,6 +73,8 @@ def build(
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
     check_whole("worlds", worlds)
     check_whole("calls", calls)
+    if threads is not None:
+        check_whole("threads", threads)
     if memory_budget is not None:
         if isinstance(memory_budget, float) and memory_budget.is_integer():
             memory_budget = int(memory_budget)
@@ -126,6 +131,7 @@ def build(
         worlds=int(worlds),
         memory_budget=memory_budget,
         calls=int(calls),
+        threads=None if threads is None else int(threads),
     )
 
 

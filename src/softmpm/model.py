@@ -36,6 +36,7 @@ class Model:
         device, dtype: Where it runs and in which precision.
         worlds, particle_count, muscle_count, wall_count, driven_count, dim: Sizes.
         calls: How many calls of ``simulate`` share the memory budget.
+        threads: CPU threads that share a simulation; None: those of PyTorch.
         alarms: Limits beyond which a simulation is stopped.
         neighbours: Neighbours at rest of each particle, -1 for none, shape (particle, at most dim).
         positions: Rest positions X [m], shape (particle, dim); ``exact_positions`` are the scene's, a NumPy array.
@@ -83,9 +84,11 @@ class Model:
         worlds: int,
         memory_budget: int | None,
         calls: int,
+        threads: int | None,
     ):
         self.scene, self.device, self.dtype, self.worlds = scene, device, dtype, worlds
         self.memory_budget, self.calls, self.alarms = memory_budget, calls, alarms
+        self.threads = threads
         self.dim = scene.grid.dim
         sizes = [len(body.particles) for body in scene.bodies]
         self.particle_count = sum(sizes)
@@ -112,7 +115,10 @@ class Model:
                 SurfaceGrid(scene, self.rest_grid, device) if reference else CarriedPoints(scene, device)
             )
         self.contact_width, precision = contact_width, str(dtype).removeprefix("torch.")
-        self.spec = specification(scene, precision, slots.shape[1], given, fixed_point, surface, formulation)
+        slabs = scheme == "fast" and device.type == "cpu" and not fixed_point
+        self.spec = specification(
+            scene, precision, slots.shape[1], given, fixed_point, slabs, surface, formulation
+        )
         self.mirror = MirrorGrid(scene, self.rest_grid, device) if self.spec.mirrors else None
         self.driven_grid = (
             DrivenGrid(scene, self.rest_grid, self.mirror, device) if self.spec.driven_nodes else None

@@ -33,6 +33,7 @@ def specification(
     slots: int,
     given: tuple[str, ...],
     fixed_point: bool,
+    slabs: bool,
     surface: bool,
     formulation: str,
 ) -> Spec:
@@ -42,6 +43,7 @@ def specification(
         slots: Actuators that overlap on one particle, at most.
         given: Inputs that calls may give.
         fixed_point: Whether sums are in fixed point.
+        slabs: Whether sums over particles are taken by slabs of nodes.
         surface: Whether separating walls act on surface points.
     """
 
@@ -66,6 +68,7 @@ def specification(
         driven_nodes=len(scene.driven) > 0 and formulation == "reference",
         given=given,
         deterministic=fixed_point,
+        slabs=slabs,
         surface=surface,
         mirrors=tuple(k for k, wall in enumerate(scene.walls) if wall.contact in MIRRORS),
     )

@@ -38,8 +38,8 @@ class DeviceConf:
     """auto takes a CUDA GPU if there is one; cpu; cuda."""
     dtype: str = "float32"
     """Precision of the simulation: float32 or float64."""
-    threads: int = 1
-    """CPU threads of PyTorch; the same number gives the same run to the last bit."""
+    threads: int | None = None
+    """CPU threads of the simulation, which change no bit of a run; null for one on each core, or OMP_NUM_THREADS. PyTorch has one."""
     memory: float | None = None
     """Most memory that one simulation may keep for its gradient, in each process [MB]; null for a sensible choice."""
     deterministic: bool = False
@@ -50,8 +50,8 @@ class DeviceConf:
         for name, value, known in (("name", self.name, DEVICES), ("dtype", self.dtype, DTYPES)):
             if value not in known:
                 raise ValueError(f"device.{name} must be one of {', '.join(known)}; got {value!r}.")
-        if self.threads < 1:
-            raise ValueError(f"device.threads must be at least 1, got {self.threads}.")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"device.threads must be at least 1 or null, got {self.threads}.")
         if self.memory is not None and not self.memory > 0:
             raise ValueError(f"device.memory must be > 0 MB or null, got {self.memory}.")
 

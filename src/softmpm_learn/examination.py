@@ -167,6 +167,7 @@ def rubbed(task: Task, factor: float) -> Task:
 def built(task: Task, run: Run, worlds: int = 1) -> Model:
     """Model of a task on the device of a run, with the inputs that its design gives."""
     settings = task.build | {"inputs": declared_inputs(run.settings.design), "worlds": worlds}
+    settings |= {"threads": run.model.threads}
     return softmpm.build(task.scene, device=run.model.device, dtype=run.model.dtype, **settings)
 
 

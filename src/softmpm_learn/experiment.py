@@ -27,6 +27,8 @@ from softmpm_learn.tasks import Task, TaskConf, make_task
 from softmpm_learn.train import Plan, Result, train_side_by_side
 
 logger = logging.getLogger("softmpm_learn")
+THREADS = torch.get_num_threads()
+"""Those that PyTorch begins with: one on each core, or as many as OMP_NUM_THREADS says."""
 
 
 def run_experiment(
@@ -69,7 +71,7 @@ def run_side_by_side(
             f"jobs side by side need train.seeds ≥ {group.size}, so that each process has some of them; got {conf.train.seeds}."
         )
     wp.config.log_level = wp.LOG_ERROR
-    torch.set_num_threads(conf.device.threads)
+    torch.set_num_threads(1)  # several add up in another order
     need_determinism(conf.device.deterministic)
     with group.fail_together():
         shares = [seeds.share(own, place, group) for own, place in jobs]
@@ -167,6 +169,7 @@ def make_model(task: Task, conf: RunConf, group: Group, runs: int | None = None)
         memory_budget=None if memory is None else round(1e6 * memory),
         inputs=declared_inputs(conf.design),
         calls=task.control_steps,
+        threads=conf.device.threads or THREADS,
         deterministic=conf.device.deterministic,
         **task.build,
     )

@@ -165,6 +165,7 @@ def test_build_refuses_what_cannot_work():
         (dict(device="mps"), "device must be .* got 'mps'"),
         (dict(dtype=torch.float16), "float16"),
         (dict(worlds=0), "worlds must be .* got 0"),
+        (dict(threads=0), "threads must be .* got 0"),
         (dict(memory_budget=-1), "memory_budget"),
     ):
         with pytest.raises((ValueError, RuntimeError), match=message):

@@ -42,7 +42,7 @@ def metrics(folder) -> list[dict[str, str]]:
 )
 def test_a_run_is_whole(task, formulation, tmp_path):
     """Finite gradients of policy and design in every iteration; the folder has the recording, the pictures and a configuration that
-    gives the same model; a run of one iteration continued by a second equals one of two."""
+    gives the same model; a run of one iteration continued by a second, with two threads, equals one of two."""
     chosen = (task, f"task.formulation={formulation}")
     experiment.run_experiment(conf_of(*chosen), tmp_path / "whole")
     found = metrics(tmp_path / "whole")
@@ -57,7 +57,7 @@ def test_a_run_is_whole(task, formulation, tmp_path):
     assert len(frames["x"]) == 3 and np.abs(frames["x"][-1] - frames["x"][0]).max() > 1e-6
     assert load(tmp_path / "whole").task == conf_of(*chosen).task
 
-    parts = (*chosen, "train.pictures=false")
+    parts = (*chosen, "train.pictures=false", "device.threads=2")
     experiment.run_experiment(conf_of(*parts, "train.iterations=1"), tmp_path / "parts")
     experiment.run_experiment(conf_of(*parts), tmp_path / "parts")
     assert metrics(tmp_path / "parts") == found

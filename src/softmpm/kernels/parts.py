@@ -1,7 +1,7 @@
 """Launches on the CPU in parts, which threads run at the same time.
 
-A program is a list of launches. Threads take the parts of a launch from a counter and begin the next launch when all of them are done.
-A thread may come late or not at all: the others do its work.
+A program is a list of launches. Threads take the parts of a launch from counters, and begin the next launch when all of them are done
+or, if it may run beside this one, before. A thread may come late or not at all: the others do its work.
 """
 
 from pathlib import Path
@@ -10,13 +10,15 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel, kernel_factory
 
-HEADER = Path(__file__).with_name("parts.h").read_text()
 COUNT_BYTES = 64
 """Bytes of the counters of a launch: a cache line."""
+SECTIONS = 8
+"""Sections of the parts of a launch, each with a counter."""
+HEADER = f"#define SOFTMPM_SECTIONS {SECTIONS}\n" + Path(__file__).with_name("parts.h").read_text()
 
 
 def in_parts(source: str = "", before: str = "") -> wp.ModuleBuildOptions:
-    """Build options of kernels of two or three dimensions that may be launched in parts.
+    """Build options of kernels of up to three dimensions that may be launched in parts.
 
     Args:
         source: Native code on every device.
@@ -38,7 +40,7 @@ def runner() -> wp.Kernel:
 
     @wp.func_native(
         "softmpm::run_parts(reinterpret_cast<const softmpm::Row*>(program), reinterpret_cast<softmpm::Count*>(counts), "
-        "reinterpret_cast<wp::int32*>(stop), reinterpret_cast<softmpm::GiveWay>(give_way), helper, first, last);"
+        "reinterpret_cast<wp::int32*>(stop), reinterpret_cast<softmpm::GiveWay>(give_way), helper, section, first, last);"
     )
     def run_parts(
         program: wp.int64,
@@ -46,6 +48,7 @@ def runner() -> wp.Kernel:
         stop: wp.int64,
         give_way: wp.int64,
         helper: bool,
+        section: int,
         first: int,
         last: int,
     ): ...
@@ -57,9 +60,10 @@ def runner() -> wp.Kernel:
         stop: wp.int64,
         give_way: wp.int64,  # address of a function that lets other threads run
         helper: bool,
+        section: int,  # where this thread begins
         first: int,
         last: int,
     ):
-        run_parts(program, counts, stop, give_way, helper, first, last)
+        run_parts(program, counts, stop, give_way, helper, section, first, last)
 
     return run

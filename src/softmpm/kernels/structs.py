@@ -31,6 +31,7 @@ class Spec:
     driven_nodes: bool = False  # nodes that driven particles hold, in the reference formulation
     given: tuple[str, ...] = ()  # fields of softmpm.Inputs that calls give
     deterministic: bool = False  # sums over particles in fixed point
+    slabs: bool = False  # sums over particles by slabs of nodes, for the threads of a CPU
     surface: bool = False  # separating walls act on surface points, not on nodes
     mirrors: tuple[int, ...] = ()  # numbers of the walls that reflect the motion of the nodes at rest
 

@@ -22,6 +22,8 @@ from softmpm.surface_points import CarriedPoints
 
 POINT_BLOCK = 64
 """Threads per block: two warps, so that few points are spread over many multiprocessors and many fill one."""
+POINT_PART = 32
+"""Points of a part of a launch on the CPU."""
 
 
 class Nodes(NamedTuple):
@@ -149,8 +151,18 @@ class SurfaceContact:
         about = (self.rate_array, self.chunk.anew(s), self.owner_array, now, self.anchors[self.stored(s)])
         force, anchor = (self.force_array, self.anchors[self.stored(s + 1)]) if out is None else out
         states = (words, force, anchor, self.impulses[s % len(self.impulses)], nodes.velocity)
-        arguments = (*about, nodes.node, nodes.free, nodes.load, *states)
-        launch(self.kernels.press, self.threads, *parameters, *arguments, block_dim=POINT_BLOCK)
+        arguments = (*parameters, *about, nodes.node, nodes.free, nodes.load, *states)
+        if self.packed and self.model.spec.slabs:
+            launch(self.kernels.press, self.threads, *arguments, block_dim=POINT_BLOCK, part=POINT_PART)
+            self.push(s, now, nodes.node, nodes.velocity, launch)
+        else:
+            launch(self.kernels.press, self.threads, *arguments, block_dim=POINT_BLOCK)
+
+    def push(self, s: int, now: Any, node: wp.array, velocity: wp.array, launch: Callable[..., None]) -> None:
+        """Add the impulses of substep ``s`` to the velocity of the nodes."""
+        about = (self.model.constants, self.window, self.outline, self.owner_array, now)
+        arguments = (*about, self.impulses[s % len(self.impulses)], node, velocity)
+        launch(self.kernels.push_all, self.threads, *arguments, block_dim=POINT_BLOCK)
 
     def check_end(self, inputs: Any, now: Any, words: wp.array, launch: Callable[..., None]) -> None:
         """Check the depth of the points in the final state ``now``, with the inputs of the last substep."""

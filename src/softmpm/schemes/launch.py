@@ -15,7 +15,7 @@ from softmpm.kernels.compile import THREADS, compile_together, launch, runs_in_o
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
 from softmpm.schemes.device import stream_of
-from softmpm.schemes.program import Program
+from softmpm.schemes.program import Divided, Program
 
 
 class KernelLauncher:
@@ -23,24 +23,35 @@ class KernelLauncher:
 
     def __init__(self, model: Model, stream: wp.Stream | None, collected: list | None = None):
         self.device, self.stream, self.collected = model.wp_device, stream, collected
+        self._threads = model.threads
         self._templates: dict[tuple, LaunchTemplate] = {}
 
-    def __call__(self, kernel, dim, *inputs, block_dim: int = THREADS, part: int | None = None) -> None:
+    def __call__(
+        self,
+        kernel,
+        dim,
+        *inputs,
+        block_dim: int = THREADS,
+        part: int | None = None,
+        beside: bool = False,
+    ) -> None:
         """Launch a kernel.
 
         Args:
             part: Threads in each of the parts into which a CPU divides the launch; None if it must not be divided. The module of the
                 kernel needs the build options :func:`softmpm.kernels.parts.in_parts`.
+            beside: A CPU may begin it before the launch before it is done.
         """
-        divided = self.collected is None and self.device.is_cpu and part is not None and math.prod(dim) > part
+        size = dim if isinstance(dim, int) else math.prod(dim)
+        divided = self.collected is None and self.device.is_cpu and part is not None and size > part
         if self.device.is_cuda and runs_in_order(kernel):
             launch(kernel, dim, inputs, self.device, stream=self.stream, block_dim=block_dim)
             return
         made = self._recorded(kernel, dim, inputs, block_dim)
         if self.collected is not None:
-            self.collected.append((made, part))
+            self.collected.append(Divided(made, part, beside))
         elif divided:
-            Program([(made, part)]).run()
+            Program([Divided(made, part, beside)]).run(self._threads)
         else:
             made.launch(self.stream)
 
@@ -128,7 +139,7 @@ class KernelList(KernelLauncher):
         super().__init__(model, None)
         self.found: dict[tuple[wp.Kernel, int], None] = {}
 
-    def __call__(self, kernel, dim, *inputs, block_dim: int = THREADS, part: int | None = None) -> None:
+    def __call__(self, kernel, dim, *inputs, block_dim: int = THREADS, **division) -> None:
         self.found[kernel, block_dim] = None
 
 
@@ -166,7 +177,7 @@ class LaunchReplay:
             collected = []
             launches(KernelLauncher(self.model, None, collected))
             self._program = Program(collected)
-        self._program.run()
+        self._program.run(self.model.threads)
 
     def _compile(self, launches: Callable[[KernelLauncher], None]) -> None:
         kernels = KernelList(self.model)

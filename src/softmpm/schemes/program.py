@@ -1,4 +1,4 @@
-"""Lists of launches on the CPU, run without Python in between by as many threads as PyTorch uses.
+"""Lists of launches on the CPU, run without Python in between by several threads.
 
 A launch is divided into parts of a fixed size, which do not depend on the number of threads; nor do results.
 """
@@ -9,13 +9,13 @@ import functools
 import math
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
 
 from softmpm.kernels.compile import launch
-from softmpm.kernels.parts import COUNT_BYTES, may_be_divided, runner
+from softmpm.kernels.parts import COUNT_BYTES, SECTIONS, may_be_divided, runner
 
 MOST_PARTS = 256
 """Parts of a launch at most: threads take them one by one from a counter that they share."""
@@ -30,7 +30,9 @@ INTERRUPTIBLE = 64
 class _Row(ctypes.Structure):
     """A launch of a program, see kernels/parts.h."""
 
-    _fields_ = [(name, ctypes.c_int64) for name in ("kernel", "arguments", "bounds", "bytes", "parts")]
+    _fields_ = [
+        (name, ctypes.c_int64) for name in ("kernel", "arguments", "bounds", "bytes", "parts", "joint")
+    ]
 
 
 class _RunArguments(ctypes.Structure):
@@ -39,46 +41,61 @@ class _RunArguments(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("program", "counts", "stop", "give_way")),
         ("helper", ctypes.c_bool),
+        ("section", ctypes.c_int32),
         ("first", ctypes.c_int32),
         ("last", ctypes.c_int32),
     ]
 
 
+class Divided(NamedTuple):
+    """A recorded launch, and how threads share it."""
+
+    launch: Any
+    """``wp.Launch``"""
+    part: int | None = None
+    """Threads of Warp in one part; None if it must not be divided."""
+    beside: bool = False
+    """True if it may begin before the launch before it is done."""
+
+
 class Program:
-    """Recorded launches in their order.
+    """Recorded launches in their order."""
 
-    Args:
-        launches: ``wp.Launch`` each, with the threads of Warp in one part of it; None if it must not be divided.
-    """
-
-    def __init__(self, launches: Sequence[tuple[Any, int | None]]):
-        self._launches = [made for made, _ in launches]  # with what they refer to
+    def __init__(self, launches: Sequence[Divided]):
+        self._launches = [one.launch for one in launches]  # with what they refer to
         self._arguments = [_arguments(made) for made in self._launches]
-        self._bounds = [_parts(made.bounds, size) for made, size in launches]
+        self._bounds = [_parts(one.launch.bounds, one.part) for one in launches]
         divided = {
             made.kernel for made, bounds in zip(self._launches, self._bounds, strict=True) if len(bounds) > 1
         }
         assert all(map(may_be_divided, divided)), "the modules of divided kernels need in_parts()"
-        self._rows = (_Row * len(launches))(*map(_row, self._launches, self._arguments, self._bounds))
+        joint = [*(one.beside for one in launches[1:]), False]
+        self._rows = (_Row * len(launches))(*map(_row, self._launches, self._arguments, self._bounds, joint))
         self._counts = (ctypes.c_char * (COUNT_BYTES * len(launches)))()
         self._stop = ctypes.c_int32()
         addresses = [ctypes.addressof(one) for one in (self._rows, self._counts, self._stop)]
-        self._whole = _RunArguments(*addresses, _giving_way(), True, 0, len(launches))
-        self._some = _RunArguments(*addresses, _giving_way(), False, 0, 0)
+        self._of_helper = [
+            _RunArguments(*addresses, _giving_way(), True, k, 0, len(launches)) for k in range(SECTIONS)
+        ]
+        self._of_caller = _RunArguments(*addresses, _giving_way(), False, 0, 0, 0)
         parts = [len(bounds) for bounds in self._bounds]
         self._helpers = min(max(parts) // PARTS_PER_THREAD, 1 + sum(parts) // PARTS_PER_START) - 1
 
-    def run(self) -> None:
-        """Run all launches; returns when they are done, and after an interrupt when no thread is at work any more."""
+    def run(self, threads: int | None) -> None:
+        """Run all launches with at most so many threads, None for those of PyTorch. Returns when they are done, and after an interrupt
+        when no thread is at work any more."""
+        threads = torch.get_num_threads() if threads is None else threads
         ctypes.memset(self._counts, 0, ctypes.sizeof(self._counts))
         self._stop.value = 0
         helpers = []
         try:
-            for _ in range(min(self._helpers, torch.get_num_threads() - 1)):
-                helpers.append(_pool().submit(_take_part, self._whole))
+            threads = min(1 + self._helpers, threads)
+            for k in range(1, threads):
+                helpers.append(_pool().submit(_take_part, self._of_helper[k * SECTIONS // threads]))
             for first in range(0, len(self._launches), INTERRUPTIBLE):
-                self._some.first, self._some.last = first, min(first + INTERRUPTIBLE, len(self._launches))
-                _take_part(self._some)
+                some = self._of_caller
+                some.first, some.last = first, min(first + INTERRUPTIBLE, len(self._launches))
+                _take_part(some)
         finally:
             self._stop.value = 1
             for helper in helpers:
@@ -94,7 +111,7 @@ def _take_part(arguments: _RunArguments) -> None:
 @functools.lru_cache(maxsize=None)
 def _runner() -> Any:
     """Recorded launch of the kernel that runs a program; its arguments are not used."""
-    return launch(runner(), 1, (0, 0, 0, 0, True, 0, 0), device=wp.get_device("cpu"), record_cmd=True)
+    return launch(runner(), 1, (0, 0, 0, 0, True, 0, 0, 0), device=wp.get_device("cpu"), record_cmd=True)
 
 
 def _arguments(made: Any) -> ctypes.Structure:
@@ -110,8 +127,8 @@ def _structure(*kinds: type) -> type[ctypes.Structure]:
 
 
 def _parts(bounds: Any, size: int | None) -> Any:
-    """Bounds of the parts of a launch, see kernels/parts.h."""
-    size = bounds.size if size is None else max(size, math.ceil(bounds.size / MOST_PARTS))
+    """Bounds of the parts of a launch, of ``size`` threads each or a multiple of it, see kernels/parts.h."""
+    size = bounds.size if size is None else size * math.ceil(bounds.size / (size * MOST_PARTS))
     return _divided(type(bounds), tuple(bounds.shape), size)
 
 
@@ -124,9 +141,9 @@ def _divided(kind: Any, shape: tuple[int, ...], size: int) -> Any:
     return found
 
 
-def _row(made: Any, arguments: ctypes.Structure, bounds: Any) -> tuple[int, ...]:
+def _row(made: Any, arguments: ctypes.Structure, bounds: Any, joint: bool) -> tuple[int, ...]:
     addresses = _address(made.hooks.forward), ctypes.addressof(arguments), ctypes.addressof(bounds)
-    return *addresses, ctypes.sizeof(bounds[0]), len(bounds)
+    return *addresses, ctypes.sizeof(bounds[0]), len(bounds), joint
 
 
 def _address(function: Any) -> int:

@@ -51,7 +51,7 @@ def test_launches_of_one_kernel_keep_their_own_inputs(device, collected):
         outputs.append(out)
         given.append(each)
     if launches:
-        Program(launches).run()
+        Program(launches).run(None)
     for (whole, real, flag, shift), each, out in zip(CASES, given, outputs, strict=True):
         want = (1.0 if flag else -1.0) * (each.cpu().numpy() + np.float32(shift[1] + whole * real))
         np.testing.assert_allclose(out.cpu().numpy(), want, rtol=1e-6)

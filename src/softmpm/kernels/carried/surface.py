@@ -44,10 +44,10 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     block = surface_contact(dim, spec.dtype)
     touch, Touch = block.touch, block.Touch
     reports, walls = status.report(dim, spec.dtype), spec.surface_walls
-    running, report = reports.running, reports.report
+    was_running, report = reports.was_running, reports.report
     count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
     vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
-    in_wall = int(Kind.IN_WALL)
+    in_wall, apart = int(Kind.IN_WALL), packed and spec.slabs
 
     @wp.struct
     class Faces:
@@ -168,10 +168,11 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         new_anchor: wp.array3d(dtype=vec),
         impulse: wp.array2d(dtype=vec),  # A J of all walls
         # Out, added into:
-        velocity: wp.array2d(dtype=vec),  # v'
+        velocity: wp.array2d(dtype=vec),  # v', or left to ``push_all``
     ):
         world, p, lane = wp.tid()
-        alive = running(words, world)
+        last = wp.max(substep - 1, 0)  # in which the state came about
+        alive = was_running(words, world, last, in_wall)
         before = vecs()
         pushed = vecs()
         for q in range(count):
@@ -215,8 +216,9 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         pushing = vec()
         if alive:
             pushing = area * total
-            if wp.dot(total, total) > real(0.0):
-                push(window, at, pushing, world, lane, outline.lanes, node, velocity)
+            if wp.static(not apart):
+                if wp.dot(total, total) > real(0.0):
+                    push(window, at, pushing, world, lane, outline.lanes, node, velocity)
         if lane == 0:
             impulse[world, p] = pushing
             for q in range(count):
@@ -226,7 +228,28 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
                 else:
                     new_anchor[world, q, p] = before[q]
             if alive and deep >= 0:
-                report(words, world, wp.max(substep - 1, 0), in_wall, deep * owner.shape[1] + p)
+                report(words, world, last, in_wall, deep * owner.shape[1] + p)
+
+    @kernel(options_of(packed))
+    def push_all(
+        # Parameters:
+        constants: Constants,
+        window: Window,
+        outline: Outline,
+        owner: wp.array2d(dtype=wp.int32),
+        # In:
+        now: Particles,
+        impulse: wp.array2d(dtype=vec),
+        node: wp.array2d(dtype=node_vec),
+        # Out, added into:
+        velocity: wp.array2d(dtype=vec),  # v'
+    ):
+        """(K10) where ``press`` leaves it out: on the CPU, whose threads must not add to the same node."""
+        world, p, lane = wp.tid()
+        J = impulse[world, p]
+        if wp.dot(J, J) > real(0.0):
+            at = point_of(constants, window, outline, now, world, p, owner[world, p])
+            push(window, at, J, world, lane, outline.lanes, node, velocity)
 
     @kernel(options_of(packed))
     def check_end(
@@ -253,6 +276,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     return SimpleNamespace(
         add_loads=add_loads,
         press=press,
+        push_all=push_all,
         check_end=check_end,
         add_load=add_load,
         faces_of=faces_of,

@@ -9,7 +9,8 @@ A substep is two launches. With M the momentum and mass of the nodes, and V thei
 A node without mass retains its previous V. The only particles that read it have zero weight there, or too little to give it mass; V is
 initialised to zero, so that they read a finite number.
 
-A deterministic model accumulates in an additional launch, ``push`` of fixed_point.py, between p2g_first or g2p2g and grid.
+Where particles do not add to the nodes themselves, a launch between p2g_first or g2p2g and grid adds up their contributions: in a
+deterministic model ``push`` of fixed_point.py, on a CPU ``collect`` of slabs.py.
 
 All functions of a single particle or node are shared with the plain scheme: kernels/physics. Adjoint: g2p2g_adj.py.
 """
@@ -23,6 +24,7 @@ from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import BLOCK, NATIVE, native
+from softmpm.kernels.fast.slabs import slabs
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.physics.particle import particle
@@ -44,11 +46,14 @@ def fused(spec: Spec) -> SimpleNamespace:
     rotation, moved = one.rotation, one.moved
     linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum
     node_velocity, position = grid(spec).node_velocity, grid(spec).position
-    running, report_invalid = status.report(spec.dim, spec.dtype).running, status.check(spec).report_invalid
+    ran, report_invalid = status.report(spec.dim, spec.dtype).ran, status.check(spec).report_invalid
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     exact, give, not_finite = spec.deterministic, fixed(dim).give, int(Kind.NOT_FINITE)
     take = fixed(dim).take if exact else load_node
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
+    by_slabs, give_to_slabs = spec.slabs, slabs(dim, spec.dtype).give
+    if by_slabs:
+        Shares = slabs(dim, spec.dtype).Shares
     report = status.report(spec.dim, spec.dtype).report
 
     @wp.func
@@ -100,6 +105,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         total: int,
         order: wp.array(dtype=wp.int32),
         substep: int,
+        plane: int,
         first: int,
         g: vec,
         b: vec,
@@ -107,11 +113,14 @@ def fused(spec: Spec) -> SimpleNamespace:
         m: real,
         node: Shares,
     ):
-        """Add (T1) of one particle to its nodes, the first of which is ``first``. All lanes of a warp must call this together."""
+        """Add (T1) of one particle to its nodes, the first of which is ``first``, at ``plane`` along the first axis of the window. All
+        lanes of a warp must call this together."""
         if wp.static(exact):
             if not give(node, place, count, total, b, A):
                 report(words, place / count, substep, not_finite, order[place])
-        else:
+        if wp.static(by_slabs):
+            give_to_slabs(node, place, plane, b, A)
+        if wp.static(not (exact or by_slabs)):
             scatter(node, window.shape, first, g, b, A, m)
 
     @wp.func
@@ -153,12 +162,13 @@ def fused(spec: Spec) -> SimpleNamespace:
         m = inputs.mass[world, p]
         A = affine_momentum(constants, inputs, world, p, C, H, rotation(inputs, world, p, H))
         b = linear_momentum(constants, inputs, world, p, v) - A * g
-        first = world * window.count + first_node(
-            unpack_base(start.base[i]), window.origin[world], window.shape
-        )
+        base = unpack_base(start.base[i])
+        origin = window.origin[world]
+        first = world * window.count + first_node(base, origin, window.shape)
         if place == total:
             first = -1
-        scatter_momentum(words, window, place, count, total, order, 0, first, g, b, A, m, node)
+        plane = base[0] - origin[0]
+        scatter_momentum(words, window, place, count, total, order, 0, plane, first, g, b, A, m, node)
 
     def g2p2g(
         # Parameters:
@@ -185,7 +195,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
-        alive = running(words, world)
+        alive = ran(words, world, substep)
         origin = window.origin[world]
         held = world * window.count  # nodes of the worlds before
         old = Particle()
@@ -222,8 +232,9 @@ def fused(spec: Spec) -> SimpleNamespace:
             else:
                 copy_unchanged(i, now, then)
         if not last:
+            plane = base[0] - origin[0]
             scatter_momentum(
-                words, window, place, count, total, order, substep + 1, first, g, b, A, m, node
+                words, window, place, count, total, order, substep + 1, plane, first, g, b, A, m, node
             )  # (T1)
 
     def compiled(**bounds) -> wp.Kernel:

@@ -7,7 +7,7 @@ From the last substep to the first, with M the momentum and mass of the nodes, V
 
 Nodes without mass retain their V and their V̄, as in g2p2g.py.
 
-A deterministic model accumulates in an additional launch, ``push`` of fixed_point.py, between the two.
+An additional launch between g2p2g_adj and grid_adj adds up the contributions in a deterministic model and on a CPU, as in g2p2g.py.
 """
 
 from types import SimpleNamespace
@@ -21,6 +21,7 @@ from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.gather_adj import stencil_adj
 from softmpm.kernels.fast.native import BLOCK, NATIVE, native
+from softmpm.kernels.fast.slabs import slabs
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid, grid_adj
 from softmpm.kernels.physics.particle import particle, particle_adj
@@ -52,6 +53,9 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     exact, give = spec.deterministic, fixed(dim).give
     take, leave = (fixed(dim).take, fixed(dim).leave) if exact else (load_node, store_node)
     Sums, Shares = (fixed(dim).Sums, fixed(dim).Shares) if exact else 2 * (wp.array(dtype=node_vec),)
+    by_slabs, give_to_slabs = spec.slabs, slabs(dim, spec.dtype).give
+    if by_slabs:
+        Shares = slabs(dim, spec.dtype).Shares
 
     @kernel(NATIVE, grid_stride=False)
     def grid_velocity_adj(
@@ -116,6 +120,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         i = particle_of(wp.tid(), per_warp, total)
         first = int(-1)
+        plane = int(0)
         g = vec()
         b = vec()
         B = mat()
@@ -163,7 +168,9 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 store_vec(adj_now, i, row_v, adj.v)
                 store_mat(adj_now, i, row_C, adj.C)
             else:
-                first = held + first_node(unpack_base(before.base[i]), origin, window.shape)
+                base = unpack_base(before.base[i])
+                first = held + first_node(base, origin, window.shape)
+                plane = base[0] - origin[0]
                 g = centre(old_fx)
                 adj = moved_adj(
                     constants, inputs, world, p, load_mat(before.rows, i, row_H), C, adj, adj_inputs
@@ -180,7 +187,9 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if not start:
             if wp.static(exact):
                 give(adj_velocity, i, count, total, b, B)
-            else:
+            if wp.static(by_slabs):
+                give_to_slabs(adj_velocity, i, plane, b, B)
+            if wp.static(not (exact or by_slabs)):
                 scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
 
     def compiled(few: bool) -> wp.Kernel:

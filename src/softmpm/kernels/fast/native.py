@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.parts import in_parts
 from softmpm.kernels.structs import types
 
 SOURCE = "".join(Path(__file__).with_name(name).read_text() for name in ("scatter.h", "fixed_point.h"))
 NATIVE = {
-    "extra_build_options": wp.ModuleBuildOptions(extra_cuda_preamble=SOURCE, extra_cpu_preamble=SOURCE),
+    "extra_build_options": in_parts(SOURCE),
     "cuda_output": "cubin",
 }
 """Compile options of kernels with native functions. Machine code is compiled for each GPU ("cubin"): PTX would be that of the oldest
@@ -38,6 +39,21 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func_native(f"softmpm::scatter<{dim}>(node.data, shape, first, g, b, A, m);")
     def scatter(node: wp.array(dtype=node_vec), shape: ivec, first: int, g: vec, b: vec, A: mat, m: real): ...
+
+    @wp.func_native(
+        f"softmpm::add_each(reinterpret_cast<{t.c_name}*>(node.data), shape, first, g, b, A, m, begin, end);"
+    )
+    def scatter_planes(
+        node: wp.array(dtype=node_vec),
+        shape: ivec,
+        first: int,
+        g: vec,
+        b: vec,
+        A: mat,
+        m: real,
+        begin: int,
+        end: int,
+    ): ...
 
     @wp.func_native("return softmpm::load_node(node.data, i);")
     def load_node(node: wp.array(dtype=node_vec), i: int) -> node_vec: ...
@@ -73,6 +89,7 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
 
     return SimpleNamespace(
         scatter=scatter,
+        scatter_planes=scatter_planes,
         load_node=load_node,
         store_node=store_node,
         load_vec=load_vec,

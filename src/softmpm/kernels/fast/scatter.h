@@ -17,6 +17,10 @@ constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 // Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed_point.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
 
+#if !defined(__CUDA_ARCH__)
+#pragma clang fp contract(fast) // as on a GPU
+#endif
+
 // g^2, rounded so that the weights made of it are exact and add up to one, see spline.py.
 template <typename T> CUDA_CALLABLE inline T square(T g) { return (g * g + T(0.5)) - T(0.5); }
 
@@ -31,12 +35,15 @@ template <typename T> CUDA_CALLABLE inline void weights(T g, T* w)
 
 #if defined(__CUDA_ARCH__)
 
-template <typename T> struct Node {
-    T x, y, z, m;
+template <typename T> struct Four {
+    T x, y, z, w;
+    CUDA_CALLABLE inline Four operator+(const Four& o) const { return { x + o.x, y + o.y, z + o.z, w + o.w }; }
+    CUDA_CALLABLE inline Four operator-(const Four& o) const { return { x - o.x, y - o.y, z - o.z, w - o.w }; }
+    CUDA_CALLABLE inline Four operator*(T f) const { return { x * f, y * f, z * f, w * f }; }
 };
 
-template <typename T> CUDA_CALLABLE inline Node<T> load(const T* p) { return { p[0], p[1], p[2], p[3] }; }
-template <> CUDA_CALLABLE inline Node<float> load(const float* p)
+template <typename T> CUDA_CALLABLE inline Four<T> load(const T* p) { return { p[0], p[1], p[2], p[3] }; }
+template <> CUDA_CALLABLE inline Four<float> load(const float* p)
 {
     float4 v = __ldg(reinterpret_cast<const float4*>(p));
     return { v.x, v.y, v.z, v.w };
@@ -256,63 +263,68 @@ CUDA_CALLABLE inline void add_warp(
 
 #else
 
-template <typename T> struct Node {
-    T x, y, z, m;
-};
-template <typename T> inline Node<T> load(const T* p) { return { p[0], p[1], p[2], p[3] }; }
-template <typename T> inline void add(T* p, T x, T y, T z, T m)
+template <typename T> using Four __attribute__((ext_vector_type(4))) = T;
+template <typename T> inline Four<T> load(const T* p)
 {
-    p[0] += x;
-    p[1] += y;
-    p[2] += z;
-    p[3] += m;
+    Four<T> value;
+    __builtin_memcpy(&value, p, sizeof(value));
+    return value;
+}
+template <typename T> inline void add(T* p, Four<T> term)
+{
+    term += load(p);
+    __builtin_memcpy(p, &term, sizeof(term));
 }
 
 #endif
 
-// (A1) node by node: on the CPU, and in double precision.
+template <class Sink, typename T> CUDA_CALLABLE inline void add(Sink at, Four<T> term) { add(at, term.x, term.y, term.z, term.w); }
+
+// (A1) node by node: on the CPU, and in double precision. Of the three planes of nodes along the first axis those from ``begin`` to ``end``.
 template <class Sink, typename T>
 CUDA_CALLABLE inline void add_each(
     Sink node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, T>& g, const wp::vec_t<3, T>& b,
-    const wp::mat_t<3, 3, T>& A, T m)
+    const wp::mat_t<3, 3, T>& A, T m, int begin = 0, int end = 3)
 {
     if (first < 0)
         return;
     T w[3][3];
     for (int a = 0; a < 3; ++a)
         weights(g[a], w[a]);
-    for (int i = 0; i < 3; ++i)
+    Four<T> middle = { b[0], b[1], b[2], m }, along[3];
+    for (int a = 0; a < 3; ++a)
+        along[a] = { A.data[0][a], A.data[1][a], A.data[2][a], T(0) };
+    for (int i = begin; i < end; ++i)
         for (int j = 0; j < 3; ++j) {
-            T wij = w[0][i] * w[1][j], x[3];
-            for (int a = 0; a < 3; ++a)
-                x[a] = b[a] + A.data[a][0] * T(i - 1) + A.data[a][1] * T(j - 1) - A.data[a][2];
+            T wij = w[0][i] * w[1][j];
+            Four<T> value = (middle + along[0] * T(i - 1) + along[1] * T(j - 1)) * wij, more = along[2] * wij;
             auto at = cell(node, first + (i * shape[1] + j) * shape[2]);
-            for (int k = 0; k < 3; ++k) {
-                T share = wij * w[2][k];
-                add(at + 4 * k, share * x[0], share * x[1], share * x[2], share * m);
-                for (int a = 0; a < 3; ++a)
-                    x[a] += A.data[a][2];
-            }
+            add(at, (value - more) * w[2][0]);
+            add(at + 4, value * w[2][1]);
+            add(at + 8, (value + more) * w[2][2]);
         }
 }
 
 template <class Sink, typename T>
 CUDA_CALLABLE inline void add_each(
     Sink node, const wp::vec_t<2, int>& shape, int first, const wp::vec_t<2, T>& g, const wp::vec_t<2, T>& b,
-    const wp::mat_t<2, 2, T>& A, T m)
+    const wp::mat_t<2, 2, T>& A, T m, int begin = 0, int end = 3)
 {
     if (first < 0)
         return;
     T w[2][3];
     for (int a = 0; a < 2; ++a)
         weights(g[a], w[a]);
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) {
-            T share = w[0][i] * w[1][j], x = T(i - 1), y = T(j - 1);
-            auto at = cell(node, first + i * shape[1] + j);
-            add(at, share * (b[0] + A.data[0][0] * x + A.data[0][1] * y),
-                share * (b[1] + A.data[1][0] * x + A.data[1][1] * y), share * m, T(0));
-        }
+    Four<T> middle = { b[0], b[1], m, T(0) }, along[2];
+    for (int a = 0; a < 2; ++a)
+        along[a] = { A.data[0][a], A.data[1][a], T(0), T(0) };
+    for (int i = begin; i < end; ++i) {
+        Four<T> value = (middle + along[0] * T(i - 1)) * w[0][i], more = along[1] * w[0][i];
+        auto at = cell(node, first + i * shape[1]);
+        add(at, (value - more) * w[1][0]);
+        add(at + 4, value * w[1][1]);
+        add(at + 8, (value + more) * w[1][2]);
+    }
 }
 
 // The whole warp must come here together; lanes without a particle have first = -1 and come after all others.
@@ -332,8 +344,8 @@ CUDA_CALLABLE inline void scatter(
 
 template <typename T> CUDA_CALLABLE inline wp::vec_t<4, T> load_node(const wp::vec_t<4, T>* node, int i)
 {
-    Node<T> n = load(reinterpret_cast<const T*>(node + i));
-    return wp::vec_t<4, T>(n.x, n.y, n.z, n.m);
+    Four<T> n = load(reinterpret_cast<const T*>(node + i));
+    return wp::vec_t<4, T>(n.x, n.y, n.z, n.w);
 }
 
 template <typename T> CUDA_CALLABLE inline void store_node(wp::vec_t<4, T>* node, int i, const wp::vec_t<4, T>& v)

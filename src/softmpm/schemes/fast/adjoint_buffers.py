@@ -9,9 +9,8 @@ from softmpm.kernels.structs import RequestedGrads
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.carried_adj import SurfaceContactAdj
-from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
+from softmpm.schemes.fast.chunk_buffers import ChunkBuffers, sums_over
 from softmpm.schemes.fast.contact_views import packed_nodes, vectors
-from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
 from softmpm.schemes.fast.sorted_state import SortedAdj
 from softmpm.schemes.inputs import Accumulators, InputsAdj
 from softmpm.schemes.launch import RebindableLaunch
@@ -29,7 +28,7 @@ class SharedAdjoint:
         contact: Adjoint of contact at surface points, or None.
         gained: What contact adds to the adjoints of velocities and masses.
         adj_loads: Adjoint of the loads, of two successive substeps.
-        exact: Fixed-point sums of a deterministic model.
+        sums: How the particles add to the adjoints of the nodes.
     """
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
@@ -55,9 +54,7 @@ class SharedAdjoint:
             self.velocity_vectors = [vectors(model, velocity) for velocity in self.velocity]
             self.node_vectors = [vectors(model, nodes) for nodes in self.nodes]
             self.adj_load_arrays = [view(load, t.real) for load in self.adj_loads]
-        self.exact = None
-        if model.spec.deterministic:
-            self.exact = FixedPointAccumulator(model, self.adj_array, self.node_arrays)
+        self.sums = sums_over(model, lambda: self.adj, self.node_arrays)
 
     def velocity_at(self, s: int) -> wp.array:
         """Nodal velocities of substep ``s``."""
@@ -97,8 +94,7 @@ class ChunkAdjoint:
     def load(self, stream: wp.Stream | None, adj_end: State | SortedAdj) -> None:
         """Copy the adjoint of the final state into the buffers, in the order of the chunk, and clear all sums."""
         self.found.clear()
-        if self.shared.exact is not None:
-            self.shared.exact.begin(None)
+        self.shared.sums.begin(None)
         self.forward.reset_status()
         if self.shared.contact is not None and adj_end.surface is not None:
             self.shared.contact.load(adj_end.surface)

@@ -4,6 +4,8 @@ A captured graph refers to addresses, so whatever changes between calls is copie
 the inputs (sorted_inputs.py) and the initial state.
 """
 
+from collections.abc import Callable, Sequence
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -19,14 +21,24 @@ from softmpm.schemes.buffers import passing, placeholder, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.carried import Nodes, SurfaceContact
 from softmpm.schemes.fast.contact_views import packed_nodes, vectors
-from softmpm.schemes.fast.fixed_point import FixedPointAccumulator
+from softmpm.schemes.fast.fixed_point import FixedPointSums
 from softmpm.schemes.fast.launch_size import LaunchSize
 from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedState
+from softmpm.schemes.fast.sums import NodeSums, SlabSums
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.launch import RebindableLaunch
 from softmpm.schemes.sorted_inputs import SortedInputs
 from softmpm.state import State
+
+
+def sums_over(
+    model: Model, rows: Callable[[], Tensor], nodes: Sequence[wp.array]
+) -> NodeSums | FixedPointSums:
+    """How the particles of a model add to nodes; ``rows`` gives memory for what they contribute, packed as they are."""
+    if model.spec.deterministic:
+        return FixedPointSums(model, view(rows(), wp.float32), nodes)
+    return SlabSums(model, rows(), nodes) if model.spec.slabs else NodeSums(nodes)
 
 
 class ChunkBuffers:
@@ -44,7 +56,7 @@ class ChunkBuffers:
         velocity: Nodal velocities of the present substep; with contact at surface points those before contact as well.
         contact: Contact at surface points, or None.
         loads: Sums of its areas on the nodes, of two successive substeps.
-        exact: Fixed-point sums of a deterministic model.
+        sums: How the particles add to the nodes.
     """
 
     def __init__(self, model: Model, layout: ParticleLayout, chunk: Chunk, keep: bool):
@@ -72,10 +84,7 @@ class ChunkBuffers:
         self.velocity = tensor(1 if model.surface is None else 2, self.held, 4)
         self.nothing = view(tensor(0, 4), t.aligned)
         self._view()
-        self.exact = None
-        if model.spec.deterministic:
-            sums = view(tensor(places * t.rows), t.real)
-            self.exact = FixedPointAccumulator(model, sums, self.node_arrays)
+        self.sums = sums_over(model, lambda: tensor(places * t.rows), self.node_arrays)
         self.contact = None
         if model.surface is not None:
             self.contact = SurfaceContact(model, self.window, chunk, keep, packed=True)
@@ -129,11 +138,9 @@ class ChunkBuffers:
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        sums = () if self.exact is None else (self.exact.fixed, self.rows[0])
         points = 0 if self.contact is None else self.contact.bytes
-        return points + sum(
-            tensor.nbytes for tensor in (self.base, self.rows, self.nodes, self.velocity, *sums)
-        )
+        tensors = (self.base, self.rows, self.nodes, self.velocity)
+        return points + self.sums.bytes + sum(tensor.nbytes for tensor in tensors)
 
     def packed_at(self, s: int):
         """Packed state before substep ``s``."""
@@ -182,8 +189,7 @@ class ChunkBuffers:
         self.load_state(stream, start)
         if self.contact is not None and start.surface is not None:
             self.contact.load(chunk, start.surface)
-        if self.exact is not None:
-            self.exact.begin(values["mass"])
+        self.sums.begin(values["mass"])
 
     def load_state(self, stream: wp.Stream | None, start: State | SortedState) -> None:
         """Copy the initial state into the buffers, permuted into the present order."""

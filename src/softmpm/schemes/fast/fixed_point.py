@@ -12,7 +12,7 @@ from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.launch import KernelLauncher
 
 
-class FixedPointAccumulator:
+class FixedPointSums:
     """Double-buffered fixed-point P2G sums; even and odd substeps have separate scale factors.
 
     Args:
@@ -22,7 +22,7 @@ class FixedPointAccumulator:
 
     def __init__(self, model: Model, rows: wp.array, nodes: Sequence[wp.array]):
         f, device = fixed(model.dim), model.device
-        self.model, self.rows = model, rows
+        self.model = model
         self.fixed = torch.empty(len(nodes[0]), 4, dtype=torch.int64, device=device)
         self.largest = torch.zeros(2, model.worlds, 2, dtype=torch.float32, device=device)
         self._none = view(self.largest.new_empty(0, 0), wp.float32)
@@ -39,6 +39,7 @@ class FixedPointAccumulator:
             sums.largest, sums.other_largest = largest[k % 2], largest[(k + 1) % 2]
             sums.node = nodes[k % len(nodes)]
             self._sums.append(sums)
+        self.bytes = self.fixed.nbytes + 4 * len(rows)
 
     def begin(self, mass: Tensor | None) -> None:
         """Prepare sum 0 with the masses (world, particle) that enter the sums, or None."""
@@ -47,17 +48,22 @@ class FixedPointAccumulator:
         if mass is not None:
             self.largest[..., 1] = mass.amax(1)
 
-    def shares(self, k: int):
+    def sink(self, k: int):
         """Destination of the particles' contributions to sum ``k``."""
         return self._shares[k % 2]
 
-    def sums(self, k: int):
+    def source(self, k: int):
         """Struct of sum ``k`` for the kernels that read it."""
         return self._sums[k % len(self._sums)]
 
-    def accumulate(self, buffers, k: int, states, mass: wp.array | None, launch: KernelLauncher) -> None:
+    def cleared(self, k: int) -> None:
+        """None: reading a sum clears it."""
+
+    def accumulate(
+        self, buffers, k: int, states, mass: wp.array | None, launch: KernelLauncher, beside: bool = False
+    ) -> None:
         """Accumulate the contributions of the particles of ``states`` in sum ``k``."""
         mass = self._none if mass is None else mass
         size = buffers.size
-        arguments = (buffers.window, size.particles, states, self.shares(k), mass, self.sums(k))
+        arguments = (buffers.window, size.particles, states, self.sink(k), mass, self.source(k))
         launch(fixed(self.model.dim).push, size.threads, *arguments, block_dim=size.block)

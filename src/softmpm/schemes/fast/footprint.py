@@ -52,9 +52,10 @@ class FastFootprint:
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         sizes = model.sizes()
         material = input_bytes(model, 1)
-        fixed_point = 2 * sizes.nodes + sizes.inside if model.spec.deterministic else 0
+        fixed_point, slabs = model.spec.deterministic, model.spec.slabs
+        apart = (fixed_point or slabs) * sizes.inside + fixed_point * 2 * sizes.nodes
         second = 0 if model.surface is None else 3 * sizes.nodes // 2  # velocities before contact, and loads
-        graph = material + sizes.nodes + fixed_point + second
+        graph = material + sizes.nodes + apart + second
         small = graph + sizes.inside + 2 * sizes.nodes
         forward = small * _at_once(horizon, sizes.longest)
         passed = 2 * sizes.inside  # adjoints in the order of the previous chunk, and their copy

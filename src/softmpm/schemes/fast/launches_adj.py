@@ -7,7 +7,7 @@ from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK
 from softmpm.schemes.fast.adjoint_buffers import ChunkAdjoint
-from softmpm.schemes.fast.launches import point_threads
+from softmpm.schemes.fast.launches import NODE_PART, PARTICLE_PART, add_loads, point_threads
 from softmpm.schemes.launch import KernelLauncher
 
 
@@ -16,7 +16,7 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     forward, shared, chunk = adjoint.forward, adjoint.shared, adjoint.forward.chunk
     contact = forward.contact is not None
     for nodes in [*shared.velocity_arrays, *([shared.gained_array] if contact else [])]:
-        launch(fused(adjoint.model.spec).clear, forward.held, nodes, block_dim=BLOCK)
+        launch(fused(adjoint.model.spec).clear, forward.held, nodes, block_dim=BLOCK, part=NODE_PART)
     if contact:
         for loads in (forward.load_arrays, shared.adj_load_arrays):
             launch(contact_stage(adjoint.model.spec).clear, forward.loads.shape[1:], *loads, block_dim=BLOCK)
@@ -34,10 +34,10 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
 
 def _grid(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     """Adjoint of the grid stage of substep ``s``, and the nodal velocities of substep ``s - 1`` once more."""
-    forward, shared, (here, before) = adjoint.forward, adjoint.shared, _adj_nodes(adjoint, s)
+    forward, shared, sums = adjoint.forward, adjoint.shared, adjoint.shared.sums
     model, nodes, nothing = forward.model, forward.node_arrays, forward.nothing
-    if shared.exact is not None:
-        here, before = shared.exact.sums(s), nothing
+    here, before = sums.source(s), sums.cleared(s - 1)
+    before = nothing if before is None else before
     last, first = s == forward.chunk.length, s == 0
     now, then = nothing if last else nodes[s], nothing if first else nodes[s - 1]
     kernel = fused_adj(model.spec, adjoint.wanted).grid_velocity_adj
@@ -51,7 +51,7 @@ def _grid(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
         )
         grids = (now, then, here, shared.velocity_at(s - 1), before)
         arguments = (model.constants, inputs, forward.window, *grids, adj_inputs)
-        launch(kernel, forward.held, *arguments, block_dim=BLOCK)
+        launch(kernel, forward.held, *arguments, block_dim=BLOCK, part=NODE_PART)
 
 
 def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
@@ -70,6 +70,10 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
     about = forward.masses(earlier), contact.impulses[earlier]
     loads, adj_loads = forward.load_arrays, shared.adj_load_arrays
     point, threads = point_threads(forward)
+    beside = model.spec.slabs and not last
+    if beside:  # beside the nodes; the loads of the substep before follow beside the particles
+        of_loads = forward.packed[s], adj_loads[s % 2], shared.adj_array
+        shared.contact.add_loads_adj(contact, *of_loads, launch)
     for k, now, then in stages:
         inputs = forward.inputs.grid_struct(k)
         parameters = (model.constants, inputs, forward.window, contact.outline, point, contact.owner_array)
@@ -80,7 +84,11 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
             adjoint.found.grid_struct(forward.chunk.row(k)),
             contact_stage_adj(model.spec, adjoint.wanted),
         )
-        launch(kernel, threads, *parameters, *states, *out, *sums, adj_inputs, block_dim=BLOCK)
+        arguments = (*parameters, *states, *out, *sums, adj_inputs)
+        launch(kernel, threads, *arguments, block_dim=BLOCK, part=NODE_PART, beside=beside)
+        beside = False
+    if model.spec.slabs and not first:
+        contact.push(s - 1, forward.packed[s - 1], forward.masses(s - 1), pushed, launch)
 
 
 def _contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
@@ -102,9 +110,8 @@ def _adj_nodes(adjoint: ChunkAdjoint, s: int) -> tuple[wp.array, wp.array]:
 
 def _particles(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     """Adjoint of P2G of substep ``s``, then that of G2P of the previous substep."""
-    forward, shared, (here, before) = adjoint.forward, adjoint.shared, _adj_nodes(adjoint, s)
-    model, chunk, size, exact = forward.model, forward.chunk, forward.size, shared.exact
-    sink = before if exact is None else exact.shares(s - 1)
+    forward, shared, (here, _) = adjoint.forward, adjoint.shared, _adj_nodes(adjoint, s)
+    model, chunk, size, sums = forward.model, forward.chunk, forward.size, shared.sums
     first, last = s == 0, s == chunk.length
     rows = [chunk.row(min(max(k, 0), chunk.length - 1)) for k in (s, s - 1)]
     inputs = forward.inputs.particle_struct(s, s - 1)
@@ -112,8 +119,10 @@ def _particles(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     sizes = (size.per_warp_adj, model.particle_count, size.particles, forward.order_flat)
     states = (forward.packed[max(s - 1, 0)], forward.packed[s])
     grids = (shared.velocity_at(s - 1), here, shared.adj_array)
-    out = (forward.words_array, adjoint.found.particle_struct(*rows), sink)
+    out = (forward.words_array, adjoint.found.particle_struct(*rows), sums.sink(s - 1))
     kernel = fused_adj(model.spec, adjoint.wanted).g2p2g_adj[size.few]
-    launch(kernel, size.threads_adj, *parameters, *sizes, *states, *grids, *out, block_dim=size.block)
-    if exact is not None and not first:
-        exact.accumulate(forward, s - 1, states[0], None, launch)
+    arguments = (*parameters, *sizes, *states, *grids, *out)
+    beside = not first and add_loads(forward, s - 1, states[0], launch)
+    launch(kernel, size.threads_adj, *arguments, block_dim=size.block, part=PARTICLE_PART, beside=beside)
+    if not first:
+        sums.accumulate(forward, s - 1, states[0], None, launch)
