@@ -10,8 +10,9 @@ outline; ``on a floor`` it also meets a wall with friction, at nodes in the movi
 of which a row gives the times with the floor over those without. The last rows are of the moving formulation with contact at surface
 points, and over that at nodes.
 
-On a CPU both run with each number of threads; ``gain`` is the time with the first over that with this number, and ``cores`` the
-processor time of a call without gradient over its duration: below ``threads`` if other processes had a part of the cores.
+On a CPU the reference formulation runs with each number of threads; ``gain`` is its time with the first over that with this number,
+and ``cores`` the processor time of a call without gradient over its duration: below ``threads`` if other processes had a part of the
+cores.
 """
 
 import time
@@ -99,38 +100,35 @@ def main():
     args = arguments(__doc__, threads=True)
     device = torch.device(args.device)
     table, before = Table("Two formulations [us/substep], float32", device, args.json), (1.0,) * len(FIGURES)
-    kinds = {"moving": ("moving", "nodes"), "reference": ("reference", "auto")}
-    on_a_floor = kinds | {"moving, surface": ("moving", "surface")}
+    runs = [("moving", args.threads[0]), *(("reference", count) for count in args.threads)]
     for name, dim, worlds, particles, scene in cases(device.type == "cpu"):
         if particles * worlds > (args.largest or particles * worlds):
             continue
-        case = {"scene": name, "dim": dim, "worlds": worlds, "particles": particles}
-        substeps, first = substeps_of(particles * worlds, device)["kept"], args.threads[0]
-        found: dict[tuple[str, int], tuple[float, ...]] = {}
+        case, found = {"scene": name, "dim": dim, "worlds": worlds, "particles": particles}, []
+        substeps = substeps_of(particles * worlds, device)["kept"]
 
         def add(kind: str, threads: int, values: tuple[float, ...], cores: float = 0.0, case=case) -> None:
             row = case | {"formulation": kind, "threads": threads}
             table.add(row | dict(zip(FIGURES, values, strict=True)) | {"cores": cores})
 
-        floor = name == "block on a floor"
-        for threads in args.threads:
+        for formulation, threads in runs:
             torch.set_num_threads(threads)
-            for kind, (formulation, contact) in (on_a_floor if floor else kinds).items():
-                found[kind, threads], cores = figures(scene(), formulation, worlds, substeps, args, contact)
-                add(kind, threads, found[kind, threads], cores)
-                if threads != first:
-                    add(f"gain, {kind}", threads, quotients(found[kind, first], found[kind, threads]))
-                if device.type == "cuda":
-                    torch.cuda.empty_cache()
-        add("ratio", first, quotients(found["moving", first], found["reference", first]))
-        if floor:
-            add("with over without", first, quotients(found["reference", first], before))
-            add(
-                "surface over nodes",
-                first,
-                quotients(found["moving, surface", first], found["moving", first]),
-            )
-        before = found["reference", first]
+            contact = "nodes" if formulation == "moving" else "auto"
+            values, cores = figures(scene(), formulation, worlds, substeps, args, contact)
+            found.append(values)
+            add(formulation, threads, values, cores)
+            if device.type == "cuda":
+                torch.cuda.empty_cache()
+        add("ratio", runs[1][1], quotients(found[0], found[1]))
+        for (_, threads), values in zip(runs[2:], found[2:], strict=True):
+            add("gain", threads, quotients(found[1], values))
+        if name == "block on a floor":
+            add("with over without", runs[1][1], quotients(found[1], before))
+            torch.set_num_threads(args.threads[0])
+            values, cores = figures(scene(), "moving", worlds, substeps, args, "surface")
+            add("moving, surface", args.threads[0], values, cores)
+            add("surface over nodes", args.threads[0], quotients(values, found[0]))
+        before = found[1]
 
 
 def quotients(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:

@@ -279,6 +279,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         push_all=push_all,
         check_end=check_end,
         add_load=add_load,
+        apart=apart,
         faces_of=faces_of,
         meet=meet,
         push=push,

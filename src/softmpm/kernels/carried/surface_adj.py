@@ -56,7 +56,9 @@ def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
         found = PlaceAdj()
         for n in range(lane, size, outline.lanes):
             i = node_index(at.base, offset(n), window.shape)
-            found = with_share_adj(found, at, n, wp.sign(share(at, n)) * area * adj_load[world, i])
+            a = adj_load[world, i]
+            if a != real(0.0):  # only at nodes near a wall
+                found = with_share_adj(found, at, n, wp.sign(share(at, n)) * area * a)
         add_place_adj(constants, outline, found, vec(), world, p, owner, lane, adj)
 
     return add_load_adj
@@ -82,6 +84,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     faces_of, face_adj = one.faces_of, wall_face_adj(spec, wanted)
     offset, node_index, size, vecs = s.offset, s.node_index, s.count, one.vecs
     add_load_adj, count = loads_adj(dim, spec.dtype, packed), len(spec.surface_walls)
+    apart = one.apart
 
     @kernel(options_of(packed))
     def press_adj(
@@ -120,6 +123,12 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
             adj_pushed[q] = adj_force[world, q, p]
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
         wall = faces_of(constants, inputs, world, at.x, before)
+        if wp.static(apart):
+            if wall.near == 0 and wp.ddot(adj_after, adj_after) == real(0.0):  # as most are
+                if anew == 1:
+                    for q in range(count):
+                        adj_force[world, q, p] = vec()
+                return
         stiffness = outline.stiffness[p]
         area = outline.areas[p]
         per_force = rate[0] * outline.newtons[p]
