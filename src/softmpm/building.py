@@ -58,7 +58,7 @@ def build(
         calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
             budget. If there are more, they keep more.
         threads: CPU threads that share a simulation; None takes those of PyTorch (``torch.get_num_threads()``) at each call. Results
-            have the same bits with any number of them. It has no effect on a GPU.
+            have the same bits with any number of them. It has no effect on a GPU, nor in the plain scheme, which has one.
         alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
 
     Returns:

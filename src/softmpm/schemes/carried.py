@@ -145,10 +145,20 @@ class SurfaceContact:
         words: wp.array,
         launch: Callable[..., None],
         out: tuple[wp.array, wp.array] | None = None,
+        before: wp.array | None = None,
     ) -> None:
-        """Add what the walls give to the velocity of the nodes; ``out`` receives forces and anchors instead of the state."""
+        """Add what the walls give to the velocity of the nodes. ``out`` receives forces and anchors instead of the state; ``before``
+        has the words before this launch, if they are kept."""
         parameters = (self.model.constants, inputs, self.window, self.outline, self.width, s)
-        about = (self.rate_array, self.chunk.anew(s), self.owner_array, now, self.anchors[self.stored(s)])
+        before = words if before is None else before
+        about = (
+            self.rate_array,
+            self.chunk.anew(s),
+            self.owner_array,
+            before,
+            now,
+            self.anchors[self.stored(s)],
+        )
         force, anchor = (self.force_array, self.anchors[self.stored(s + 1)]) if out is None else out
         states = (words, force, anchor, self.impulses[s % len(self.impulses)], nodes.velocity)
         arguments = (*parameters, *about, nodes.node, nodes.free, nodes.load, *states)

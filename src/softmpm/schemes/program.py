@@ -71,9 +71,10 @@ class Program:
         assert all(map(may_be_divided, divided)), "the modules of divided kernels need in_parts()"
         joint = [*(one.beside for one in launches[1:]), False]
         self._rows = (_Row * len(launches))(*map(_row, self._launches, self._arguments, self._bounds, joint))
-        self._counts = (ctypes.c_char * (COUNT_BYTES * len(launches)))()
+        self._counts = (ctypes.c_char * (COUNT_BYTES * (len(launches) + 1)))()
         self._stop = ctypes.c_int32()
-        addresses = [ctypes.addressof(one) for one in (self._rows, self._counts, self._stop)]
+        aligned = -(-ctypes.addressof(self._counts) // COUNT_BYTES) * COUNT_BYTES
+        addresses = [ctypes.addressof(self._rows), aligned, ctypes.addressof(self._stop)]
         self._of_helper = [
             _RunArguments(*addresses, _giving_way(), True, k, 0, len(launches)) for k in range(SECTIONS)
         ]

@@ -7,7 +7,8 @@
               points: the part of L̄ in their adjoints (K9.adj), L of the substep before, its stored impulses into that other V (K10)
     g2p2g_adj, press_adj
 
-Sums of two successive substeps have two buffers: one is added to while the other is cleared.
+Sums of two successive substeps have two buffers: one is added to while the other is cleared. On a CPU these launches have no threads of
+points, whose parts are launches of their own: ``add_loads``, ``add_loads_adj`` and ``push_all``.
 """
 
 from types import SimpleNamespace

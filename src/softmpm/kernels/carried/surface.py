@@ -5,10 +5,10 @@
     f_s += A_s J / T, the mean force of a wall on a point in a control step of T                     (K7)
     v'_i = v*_i + (1/m_i) Σ W_si A_s J                                                               (K10)
 
-``add_loads`` is L, ``press`` the rest. A point further than a cell from all walls reads no nodes there. Otherwise its lanes
-(physics/lanes.py) share its nodes, and the first lane writes what is the point's own. Nodes are those of a window, the whole grid in
-the plain scheme; their arrays may have strides, since the fast scheme has several quantities in one. v* and v' are two arrays: points
-read the one while others add to the other. The adjoint is in surface_adj.py.
+``add_loads`` is L, ``press`` the rest; on a CPU (K10) is left to ``push_all``. A point further than a cell from all walls reads no
+nodes there. Otherwise its lanes (physics/lanes.py) share its nodes, and the first lane writes what is the point's own. Nodes are
+those of a window, the whole grid in the plain scheme; their arrays may have strides, since the fast scheme has several quantities
+in one. v* and v' are two arrays: points read the one while others add to the other. The adjoint is in surface_adj.py.
 """
 
 from types import SimpleNamespace
@@ -44,7 +44,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     block = surface_contact(dim, spec.dtype)
     touch, Touch = block.touch, block.Touch
     reports, walls = status.report(dim, spec.dtype), spec.surface_walls
-    was_running, report = reports.was_running, reports.report
+    running, report = reports.running, reports.report
     count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
     vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
     in_wall, apart = int(Kind.IN_WALL), packed and spec.slabs
@@ -156,6 +156,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         anew: int,  # 1 at the beginning of a control step
         owner: wp.array2d(dtype=wp.int32),
         # In:
+        words_before: wp.array(dtype=wp.int64),  # this launch, or the words themselves
         now: Particles,
         anchor: wp.array3d(dtype=vec),
         node: wp.array2d(dtype=node_vec),
@@ -171,8 +172,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         velocity: wp.array2d(dtype=vec),  # v', or left to ``push_all``
     ):
         world, p, lane = wp.tid()
-        last = wp.max(substep - 1, 0)  # in which the state came about
-        alive = was_running(words, world, last, in_wall)
+        alive = running(words_before, world)
         before = vecs()
         pushed = vecs()
         for q in range(count):
@@ -228,7 +228,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
                 else:
                     new_anchor[world, q, p] = before[q]
             if alive and deep >= 0:
-                report(words, world, last, in_wall, deep * owner.shape[1] + p)
+                report(words, world, wp.max(substep - 1, 0), in_wall, deep * owner.shape[1] + p)
 
     @kernel(options_of(packed))
     def push_all(

@@ -124,7 +124,11 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
         wall = faces_of(constants, inputs, world, at.x, before)
         if wp.static(apart):
-            if wall.near == 0 and wp.ddot(adj_after, adj_after) == real(0.0):  # as most are
+            idle = wall.near == 0  # as most points are
+            for q in range(count):
+                for axis in range(dim):
+                    idle = idle and adj_after[q, axis] == real(0.0)
+            if idle:
                 if anew == 1:
                     for q in range(count):
                         adj_force[world, q, p] = vec()

@@ -46,7 +46,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     rotation, moved = one.rotation, one.moved
     linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum
     node_velocity, position = grid(spec).node_velocity, grid(spec).position
-    ran, report_invalid = status.report(spec.dim, spec.dtype).ran, status.check(spec).report_invalid
+    running, report_invalid = status.report(spec.dim, spec.dtype).running, status.check(spec).report_invalid
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c
     exact, give, not_finite = spec.deterministic, fixed(dim).give, int(Kind.NOT_FINITE)
     take = fixed(dim).take if exact else load_node
@@ -73,6 +73,12 @@ def fused(spec: Spec) -> SimpleNamespace:
     def clear(node: wp.array(dtype=node_vec)):
         """Clear the first M, and V before the first substep."""
         store_node(node, wp.tid(), node_vec())
+
+    @kernel(NATIVE, grid_stride=False)
+    def remember(words: wp.array(dtype=wp.int64), before: wp.array(dtype=wp.int64)):
+        """Copy the words: which particle a thread takes first must not decide what another one sees of its world."""
+        world = wp.tid()
+        before[world] = words[world]
 
     @kernel(NATIVE, grid_stride=False)
     def grid_velocity(
@@ -182,6 +188,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         total: int,
         order: wp.array(dtype=wp.int32),
         # In:
+        before: wp.array(dtype=wp.int64),  # the words before this launch, or the words themselves
         velocity: wp.array(dtype=node_vec),
         now: Packed,
         # Out:
@@ -195,7 +202,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
-        alive = ran(words, world, substep)
+        alive = running(before, world)
         origin = window.origin[world]
         held = world * window.count  # nodes of the worlds before
         old = Particle()
@@ -243,6 +250,7 @@ def fused(spec: Spec) -> SimpleNamespace:
 
     return SimpleNamespace(
         clear=clear,
+        remember=remember,
         grid_velocity=grid_velocity,
         p2g_first=p2g_first,
         g2p2g={False: compiled(), True: compiled(launch_bounds=(BLOCK, 3))},

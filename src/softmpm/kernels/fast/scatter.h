@@ -17,8 +17,9 @@ constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 // Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed_point.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
 
+// In the code that follows, that of the kernels included, a product and a sum are rounded once, as on a GPU.
 #if !defined(__CUDA_ARCH__)
-#pragma clang fp contract(fast) // as on a GPU
+#pragma clang fp contract(fast)
 #endif
 
 // g^2, rounded so that the weights made of it are exact and add up to one, see spline.py.
@@ -281,6 +282,7 @@ template <typename T> inline void add(T* p, Four<T> term)
 template <class Sink, typename T> CUDA_CALLABLE inline void add(Sink at, Four<T> term) { add(at, term.x, term.y, term.z, term.w); }
 
 // (A1) node by node: on the CPU, and in double precision. Of the three planes of nodes along the first axis those from ``begin`` to ``end``.
+// The weights are multiplied first: where b + A o was multiplied by one after the other, a turning body gained more spin by rounding.
 template <class Sink, typename T>
 CUDA_CALLABLE inline void add_each(
     Sink node, const wp::vec_t<3, int>& shape, int first, const wp::vec_t<3, T>& g, const wp::vec_t<3, T>& b,
@@ -297,11 +299,11 @@ CUDA_CALLABLE inline void add_each(
     for (int i = begin; i < end; ++i)
         for (int j = 0; j < 3; ++j) {
             T wij = w[0][i] * w[1][j];
-            Four<T> value = (middle + along[0] * T(i - 1) + along[1] * T(j - 1)) * wij, more = along[2] * wij;
+            Four<T> row = middle + along[0] * T(i - 1) + along[1] * T(j - 1);
             auto at = cell(node, first + (i * shape[1] + j) * shape[2]);
-            add(at, (value - more) * w[2][0]);
-            add(at + 4, value * w[2][1]);
-            add(at + 8, (value + more) * w[2][2]);
+            add(at, (row - along[2]) * (wij * w[2][0]));
+            add(at + 4, row * (wij * w[2][1]));
+            add(at + 8, (row + along[2]) * (wij * w[2][2]));
         }
 }
 
@@ -319,11 +321,11 @@ CUDA_CALLABLE inline void add_each(
     for (int a = 0; a < 2; ++a)
         along[a] = { A.data[0][a], A.data[1][a], T(0), T(0) };
     for (int i = begin; i < end; ++i) {
-        Four<T> value = (middle + along[0] * T(i - 1)) * w[0][i], more = along[1] * w[0][i];
+        Four<T> row = middle + along[0] * T(i - 1);
         auto at = cell(node, first + i * shape[1]);
-        add(at, (value - more) * w[1][0]);
-        add(at + 4, value * w[1][1]);
-        add(at + 8, (value + more) * w[1][2]);
+        add(at, (row - along[1]) * (w[0][i] * w[1][0]));
+        add(at + 4, row * (w[0][i] * w[1][1]));
+        add(at + 8, (row + along[1]) * (w[0][i] * w[1][2]));
     }
 }
 

@@ -33,9 +33,8 @@ def slabs(dim: int, dtype: str) -> SimpleNamespace:
     @wp.struct
     class Shares:
         rows: wp.array(dtype=real)  # packed particles: b in the rows of v, A in those of C
-        ends: wp.array(
-            dtype=wp.int32
-        )  # least and greatest place of a block's stencils along the first axis, a line each
+        # Least and greatest place of a block's stencils along the first axis, of each block in a line of its own:
+        ends: wp.array(dtype=wp.int32)
 
     @wp.func
     def give(to: Shares, i: int, plane: int, b: vec, A: mat):

@@ -32,9 +32,7 @@ from softmpm.schemes.sorted_inputs import SortedInputs
 from softmpm.state import State
 
 
-def sums_over(
-    model: Model, rows: Callable[[], Tensor], nodes: Sequence[wp.array]
-) -> NodeSums | FixedPointSums:
+def sums_over(model: Model, rows: Callable[[], Tensor], nodes: Sequence[wp.array]) -> NodeSums:
     """How the particles of a model add to nodes; ``rows`` gives memory for what they contribute, packed as they are."""
     if model.spec.deterministic:
         return FixedPointSums(model, view(rows(), wp.float32), nodes)
@@ -50,6 +48,7 @@ class ChunkBuffers:
     Attributes:
         order, origin: Particle at each place, and first node of the window, of the initial state that was loaded last.
         words: Status words, as in :class:`softmpm.schemes.fast.scheme.FastRun`.
+        words_before: On a CPU those before a launch that may change them, else the words themselves.
         inputs: Inputs in this order.
         base, rows: Packed states, one or, if ``keep``, one more than substeps; the last one is the final state.
         nodes: Mass and momentum of the window's nodes, two or, if ``keep``, one for each substep.
@@ -75,6 +74,7 @@ class ChunkBuffers:
         self.words = tensor(model.worlds + 2, dtype=torch.int64)
         self._no_status = torch.full_like(self.words, NEVER)
         self._no_status[-2:].zero_()
+        self.words_before = torch.empty_like(self.words[:-2]) if model.spec.slabs else self.words
         self._version = -1  # of the layout that order and origin were copied from
         self.inputs = SortedInputs(model, chunk, self.order)
         self.base = tensor(stored, places, dtype=torch.int32)
@@ -108,7 +108,7 @@ class ChunkBuffers:
         self.velocity_array = self.velocity_arrays[0]
         self.order_array = view(self.order, wp.int32)
         self.order_flat = view(self.order.view(-1), wp.int32)
-        self.words_array = view(self.words, wp.int64)
+        self.words_array, self.before_array = view(self.words, wp.int64), view(self.words_before, wp.int64)
         self.survey_array = view(self.words[-2:], wp.int64)
         self.mass = view(self.inputs.values["mass"], t.real)
 

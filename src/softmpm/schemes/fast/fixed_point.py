@@ -9,10 +9,11 @@ from torch import Tensor
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.model import Model
 from softmpm.schemes.buffers import clear, view
+from softmpm.schemes.fast.sums import NodeSums
 from softmpm.schemes.launch import KernelLauncher
 
 
-class FixedPointSums:
+class FixedPointSums(NodeSums):
     """Double-buffered fixed-point P2G sums; even and odd substeps have separate scale factors.
 
     Args:
@@ -21,6 +22,7 @@ class FixedPointSums:
     """
 
     def __init__(self, model: Model, rows: wp.array, nodes: Sequence[wp.array]):
+        super().__init__(nodes)
         f, device = fixed(model.dim), model.device
         self.model = model
         self.fixed = torch.empty(len(nodes[0]), 4, dtype=torch.int64, device=device)

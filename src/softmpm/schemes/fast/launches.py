@@ -18,6 +18,11 @@ PARTICLE_PART, NODE_PART = WARP, 256
 """Particles and nodes of a part of a launch on the CPU. Particles are whole blocks of packed rows: no two threads write to one."""
 
 
+def particle_part(buffers: ChunkBuffers) -> int | None:
+    """Particles of a part; None in a deterministic model, whose particles all raise one number."""
+    return PARTICLE_PART if buffers.model.spec.slabs else None
+
+
 def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     """Advance the first packed state by all substeps of the chunk, then check the last one."""
     spec = buffers.model.spec
@@ -49,7 +54,7 @@ def _p2g_first(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
     inputs = buffers.inputs.particle_struct(0, 0)
     kernel = fused(model.spec).p2g_first
     arguments = (model.constants, inputs, buffers.window, *sizes, *state, sums.sink(0))
-    launch(kernel, size.threads, *arguments, block_dim=size.block, part=PARTICLE_PART)
+    launch(kernel, size.threads, *arguments, block_dim=size.block, part=particle_part(buffers))
     _accumulate(buffers, 0, buffers.packed[0], launch)
 
 
@@ -76,6 +81,14 @@ def _grid(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     arguments = (model.constants, inputs, buffers.window, buffers.sums.source(s), buffers.velocity_array)
     kernel, then = fused(model.spec).grid_velocity, _cleared(buffers, s)
     launch(kernel, buffers.held, *arguments, then, block_dim=BLOCK, part=NODE_PART)
+    _remember(buffers, launch)
+
+
+def _remember(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
+    """On a CPU, keep the status words for the next launch, beside the one before."""
+    if buffers.model.spec.slabs:
+        arguments = (buffers.model.worlds, buffers.words_array, buffers.before_array)
+        launch(fused(buffers.model.spec).remember, *arguments, beside=True)
 
 
 def _cleared(buffers: ChunkBuffers, s: int) -> wp.array:
@@ -94,8 +107,10 @@ def _contact(buffers: ChunkBuffers, contact: SurfaceContact, s: int, launch: Ker
     out = (free, velocity, then, loads[(s + 1) % 2], loads[s % 2])
     kernel = contact_stage(model.spec).grid_and_loads
     launch(kernel, threads, *parameters, packed, now, *out, block_dim=BLOCK, part=NODE_PART)
+    _remember(buffers, launch)
     nodes = buffers.contact_nodes(s, *buffers.velocity_vectors)
-    contact.press(s, inputs, packed, nodes, buffers.words_array, launch)
+    contact.press(s, inputs, packed, nodes, buffers.words_array, launch, before=buffers.before_array)
+    _remember(buffers, launch)
 
 
 def point_threads(buffers: ChunkBuffers) -> tuple[int, int]:
@@ -121,9 +136,9 @@ def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
         size.per_warp,
     )
     sizes = (model.particle_count, size.particles, buffers.order_flat)
-    arguments = (*parameters, *sizes, buffers.velocity_array, now, buffers.words_array, then)
-    kernel, shares = fused(model.spec).g2p2g[size.few], sums.sink(s + 1)
-    launch(kernel, size.threads, *arguments, shares, block_dim=size.block, part=PARTICLE_PART)
+    arguments = (*sizes, buffers.before_array, buffers.velocity_array, now, buffers.words_array, then)
+    kernel, part = fused(model.spec).g2p2g[size.few], particle_part(buffers)
+    launch(kernel, size.threads, *parameters, *arguments, sums.sink(s + 1), block_dim=size.block, part=part)
     if not last:
         _accumulate(buffers, s + 1, then, launch)
 

@@ -7,7 +7,7 @@ from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
 from softmpm.kernels.fast.native import BLOCK
 from softmpm.schemes.fast.adjoint_buffers import ChunkAdjoint
-from softmpm.schemes.fast.launches import NODE_PART, PARTICLE_PART, add_loads, point_threads
+from softmpm.schemes.fast.launches import NODE_PART, add_loads, particle_part, point_threads
 from softmpm.schemes.launch import KernelLauncher
 
 
@@ -79,12 +79,12 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
         parameters = (model.constants, inputs, forward.window, contact.outline, point, contact.owner_array)
         states = (now, then, *about, forward.packed[s], forward.packed[earlier], adj_loads[s % 2])
         out = (here, shared.gained_array, free, before, cleared, loads[s % 2], adj_loads[(s + 1) % 2])
-        sums = (velocity, pushed, loads[(s + 1) % 2], shared.adj_array)
+        added = (velocity, pushed, loads[(s + 1) % 2], shared.adj_array)
         adj_inputs, kernel = (
             adjoint.found.grid_struct(forward.chunk.row(k)),
             contact_stage_adj(model.spec, adjoint.wanted),
         )
-        arguments = (*parameters, *states, *out, *sums, adj_inputs)
+        arguments = (*parameters, *states, *out, *added, adj_inputs)
         launch(kernel, threads, *arguments, block_dim=BLOCK, part=NODE_PART, beside=beside)
         beside = False
     if model.spec.slabs and not first:
@@ -122,7 +122,9 @@ def _particles(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     out = (forward.words_array, adjoint.found.particle_struct(*rows), sums.sink(s - 1))
     kernel = fused_adj(model.spec, adjoint.wanted).g2p2g_adj[size.few]
     arguments = (*parameters, *sizes, *states, *grids, *out)
-    beside = not first and add_loads(forward, s - 1, states[0], launch)
-    launch(kernel, size.threads_adj, *arguments, block_dim=size.block, part=PARTICLE_PART, beside=beside)
+    beside, part = False, particle_part(forward)
+    if not first:
+        beside = add_loads(forward, s - 1, states[0], launch)
+    launch(kernel, size.threads_adj, *arguments, block_dim=size.block, part=part, beside=beside)
     if not first:
         sums.accumulate(forward, s - 1, states[0], None, launch)
