@@ -17,11 +17,6 @@ constexpr int LANES = 32;  // particles of a block of packed rows, and of a warp
 // Where the four numbers of a node stand. A sum goes to plain nodes or, with overloads of cell and add, to those of fixed_point.h.
 template <typename T> CUDA_CALLABLE inline T* cell(T* node, int i) { return node + 4 * (long long)i; }
 
-// In the code that follows, that of the kernels included, a product and a sum are rounded once, as on a GPU.
-#if !defined(__CUDA_ARCH__)
-#pragma clang fp contract(fast)
-#endif
-
 // g^2, rounded so that the weights made of it are exact and add up to one, see spline.py.
 template <typename T> CUDA_CALLABLE inline T square(T g) { return (g * g + T(0.5)) - T(0.5); }
 
