@@ -20,7 +20,6 @@ from softmpm_learn.tasks import BipedConf, ElephantConf, make_task
 
 SUBSTEPS = 460
 """Of a round, at least; those of ten decisions of a robot."""
-QUARTILES = 4
 
 
 def of_robot(conf) -> tuple[softmpm.Scene, int, dict]:
@@ -71,7 +70,7 @@ def main():
             ][1:]
             for k, threads in enumerate(args.threads):
                 gains = [one[0][0] / one[k][0] for one in rounds]
-                low, gain, high = statistics.quantiles(gains, n=QUARTILES) if k else (1.0,) * 3
+                low, gain, high = statistics.quantiles(gains, n=4) if k else (1.0,) * 3
                 row = {"scene": name, "formulation": formulation, "particles": models[0].particle_count}
                 row |= {"threads": threads, "us": 1e6 * statistics.median(one[k][0] for one in rounds)}
                 row["us"] /= SUBSTEPS // substeps * substeps

@@ -51,7 +51,7 @@ class KernelLauncher:
         if self.collected is not None:
             self.collected.append(Divided(made, part, beside))
         elif divided:
-            Program([Divided(made, part, beside)]).run(self._threads)
+            Program([Divided(made, part)]).run(self._threads)
         else:
             made.launch(self.stream)
 

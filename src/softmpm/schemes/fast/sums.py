@@ -60,12 +60,12 @@ class SlabSums(NodeSums):
     def __init__(self, model: Model, rows: Tensor, nodes: Sequence[wp.array]):
         super().__init__(nodes)
         self.model = model
-        self._kernels, real = slabs(model.dim, model.spec.dtype), rows.dtype
+        self._kernels, real = slabs(model.dim, model.spec.dtype), wp.dtype_from_torch(rows.dtype)
         places = model.worlds * model.particle_count
         ends = torch.empty(LINE * -(-places // WARP), dtype=torch.int32, device=model.device)
         self._shares = self._kernels.Shares()
-        self._shares.rows, self._shares.ends = view(rows, wp.dtype_from_torch(real)), view(ends, wp.int32)
-        self._none = view(rows.new_empty(0, 0), wp.dtype_from_torch(real))
+        self._shares.rows, self._shares.ends = view(rows, real), view(ends, wp.int32)
+        self._none = view(rows.new_empty(0, 0), real)
         self.bytes = rows.nbytes + ends.nbytes
 
     def sink(self, k: int) -> Any:
