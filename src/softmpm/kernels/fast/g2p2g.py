@@ -188,7 +188,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         total: int,
         order: wp.array(dtype=wp.int32),
         # In:
-        before: wp.array(dtype=wp.int64),  # the words before this launch, or the words themselves
+        before: wp.array(dtype=wp.int64),  # the words before this launch, of a model with slabs
         velocity: wp.array(dtype=node_vec),
         now: Packed,
         # Out:
@@ -202,7 +202,9 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
-        alive = running(before, world)
+        alive = running(words, world)
+        if wp.static(by_slabs):
+            alive = running(before, world)
         origin = window.origin[world]
         held = world * window.count  # nodes of the worlds before
         old = Particle()
