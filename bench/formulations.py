@@ -1,9 +1,9 @@
 """Both formulations on one body: `python bench/formulations.py [--device cpu --threads 1 2] [--json FILE]`
 
 Microseconds of a substep in calls without gradient, in calls that store their states, and of the backward pass; medians after a
-warm-up, the two formulations in turn. ``further``: of one more substep in a call without gradient,
-without what a call costs in any case. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving formulation's
-figure over that of the reference formulation.
+warm-up, the two formulations in turn. ``further``: of one more substep in a call without gradient, without what a call costs in any
+case; the median over pairs of a long and a short call. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving
+formulation's figure over that of the reference formulation.
 
 ``cube``: particles on a lattice, without walls, in one world or several, with faces on knots of the splines. ``block`` has an
 outline; ``on a floor`` it also meets a wall with friction, at nodes in the moving and at surface points in the reference formulation,
@@ -15,6 +15,7 @@ and ``cores`` the processor time of a call without gradient over its duration: b
 cores.
 """
 
+import statistics
 import time
 from collections.abc import Callable, Iterator
 
@@ -38,6 +39,9 @@ FIGURES = "forward", "further", "stored", "backward", "kept"
 SHORTER = 5
 """Quotient of the lengths of two calls, whose difference is the cost of a further substep. The shorter one is added for it: in a longer
 one the cube might fall off the grid."""
+
+PAIRS = 4
+"""Pairs of a long and a short call for each repeat: the difference of two calls scatters more than a call."""
 
 
 def block(dim: int, cells: int, floor: bool) -> softmpm.Scene:
@@ -63,18 +67,29 @@ def cases(on_a_cpu: bool) -> Iterator[tuple[str, int, int, int, Callable[[], sof
             yield name, dim, 1, (2 * cells) ** dim, lambda d=dim, c=cells, f=floor: block(d, c, f)
 
 
-def forward(model: softmpm.Model, substeps: int, repeats: int) -> tuple[float, float]:
-    """Median microseconds of a substep without gradient, and the cores that were used."""
-    start, params, times = model.rest(), model.params(), []
-    for _ in range(repeats + 1):
-        sync(model.device)
-        begin, used = time.perf_counter(), time.process_time()
-        with torch.no_grad():
-            softmpm.simulate(model, start, None, params, substeps=substeps)
-        sync(model.device)
-        times.append((time.perf_counter() - begin, time.process_time() - used))
-    median, used = sorted(times[1:])[repeats // 2]
-    return median / substeps * 1e6, used / median
+def call(
+    model: softmpm.Model, start: softmpm.State, params: softmpm.Params, substeps: int
+) -> tuple[float, float]:
+    """Microseconds of a call without gradient, and the cores that it used."""
+    sync(model.device)
+    begin, used = time.perf_counter(), time.process_time()
+    with torch.no_grad():
+        softmpm.simulate(model, start, None, params, substeps=substeps)
+    sync(model.device)
+    seconds = time.perf_counter() - begin
+    return 1e6 * seconds, (time.process_time() - used) / seconds
+
+
+def forward(model: softmpm.Model, substeps: int, repeats: int) -> tuple[float, float, float]:
+    """Median microseconds of a substep in a call without gradient and of a further one, and the cores that were used."""
+    start, params, few = model.rest(), model.params(), substeps // SHORTER
+    pairs = [
+        [call(model, start, params, count) for count in (substeps, few)] for _ in range(PAIRS * repeats + 1)
+    ]
+    long, short = zip(*pairs[1:], strict=True)
+    whole, cores = sorted(long)[len(long) // 2]
+    further = statistics.median(a - b for (a, _), (b, _) in zip(long, short, strict=True)) / (substeps - few)
+    return whole / substeps, further, cores
 
 
 def figures(
@@ -90,9 +105,7 @@ def figures(
         memory_budget=2**62,
     )
     ahead, back = measure(model, substeps, args.repeats)
-    sizes, (alone, cores) = model.sizes(), forward(model, substeps, args.repeats)
-    few = substeps // SHORTER
-    further = (substeps * alone - few * forward(model, few, args.repeats)[0]) / (substeps - few)
+    sizes, (alone, further, cores) = model.sizes(), forward(model, substeps, args.repeats)
     return (alone, further, ahead, back, sizes.inside + sizes.nodes), cores
 
 
