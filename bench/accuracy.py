@@ -35,6 +35,8 @@ def measured() -> Iterator[tuple[dict, dict]]:
             yield named("beam in 3D, 0.2 L", kind, size), statics.beam(kind, *size, sinks=0.2, dim=3)
         for size in ((2, 2), (4, 2), (2, 3), (4, 3)):
             yield named("twisted bar in 3D", kind, size), statics.twisted(kind, *size)
+        for size in ((2, 2), (4, 2), (2, 3), (4, 3)):
+            yield named("the same, sides on nodes", kind, size), statics.twisted(kind, *size, beyond=0.0)
     for kind in KINDS:
         for cells in (8, 16, 32):
             yield named("column under its weight", kind, (cells, 2)), statics.column(kind, cells, 2)

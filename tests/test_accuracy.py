@@ -24,6 +24,12 @@ def test_a_cantilever_of_two_cells_bends_in_3d():
     assert abs(statics.beam("reference", 2, 3, sinks=0.2, dim=3)["error %"]) <= 2.0
 
 
+def test_a_bar_of_two_cells_turns_as_saint_venant_says():
+    """Within 2 % in both formulations."""
+    for formulation in ("reference", "moving"):
+        assert abs(statics.twisted(formulation, 2, 2)["error %"]) <= 2.0
+
+
 def test_a_column_sinks_under_its_weight():
     """Within 0.03 % with 32 cells, where a sticking wall has an error of 0.9 %."""
     assert abs(statics.column("reference", 32, 2)["error %"]) <= 0.03

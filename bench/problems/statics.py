@@ -20,6 +20,8 @@ MU = YOUNG / (2 * (1 + POISSON))
 LAME = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
 INSIDE = 4
 """Cells of a body in a sticking wall."""
+ON_KNOTS = 0.5
+"""Cells from a node to the next knot of the splines."""
 
 
 def held(kind: str, axis: int, h: float, dim: int) -> tuple[float, float, softmpm.Wall]:
@@ -31,12 +33,14 @@ def held(kind: str, axis: int, h: float, dim: int) -> tuple[float, float, softmp
     return plane, plane - INSIDE * h, softmpm.Wall(normal=normal, offset=plane, contact="stick")
 
 
-def rod(kind: str, dim: int, cells: int, per_cell: int, below: float = 0.0, **settings):
-    """Scene of a rod that begins at a wall, with so many cells across."""
+def rod(
+    kind: str, dim: int, cells: int, per_cell: int, below: float = 0.0, beyond: float = ON_KNOTS, **settings
+):
+    """Scene of a rod that begins at a wall, with so many cells across; its sides are so many cells beyond nodes."""
     h = HEIGHT / cells
     plane, begin, wall = held(kind, 0, h, dim)
-    floor = math.ceil(below / h + 3) * h
-    lower, upper = (begin, floor, 3 * h)[:dim], (plane + LENGTH, floor + HEIGHT, 3 * h + HEIGHT)[:dim]
+    floor, side = (math.ceil(below / h + 3) + beyond) * h, (3 + beyond) * h
+    lower, upper = (begin, floor, side)[:dim], (plane + LENGTH, floor + HEIGHT, side + HEIGHT)[:dim]
     shape = softmpm.box(lower, upper, spacing=h / per_cell)
     material = softmpm.NeoHookean(density=DENSITY, young=YOUNG, poisson=POISSON)
     return scene_of(h, shape, material, walls=[wall], **settings)
@@ -89,7 +93,7 @@ def beam(
     return result(one, one.settled(periods / frequency, sunk), want)
 
 
-def twisted(kind: str, cells: int, per_cell: int) -> dict:
+def twisted(kind: str, cells: int, per_cell: int, beyond: float = ON_KNOTS) -> dict:
     """Twist of the end of a square bar under a uniform torque per length, by forces on its particles."""
     exact_twist = 0.05
     polar = HEIGHT**4 / 6
@@ -99,7 +103,7 @@ def twisted(kind: str, cells: int, per_cell: int) -> dict:
         1 + 3 / cells**2
     )  # mass that is gathered on nodes turns with an arm of its own, h²/2 in the mean
     frequency = math.pi / 2 / LENGTH * math.sqrt(stiffness / (DENSITY * lumped))
-    scene = rod(kind, 3, cells, per_cell, damping=1.8 * frequency, step=1.0)
+    scene = rod(kind, 3, cells, per_cell, damping=1.8 * frequency, beyond=beyond, step=1.0)
     one = Simulation(scene, kind, inputs=("force",))
     model = one.model
     arms = (
