@@ -202,9 +202,10 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
-        alive = running(words, world)
         if wp.static(by_slabs):
             alive = running(before, world)
+        else:
+            alive = running(words, world)
         origin = window.origin[world]
         held = world * window.count  # nodes of the worlds before
         old = Particle()
