@@ -16,6 +16,7 @@ import softmpm
 
 CONTACTS = [("reference", "surface"), ("reference", "nodes"), ("moving", "surface"), ("moving", "nodes")]
 LONG = 10 / 32
+"""Length of the larger block [m]."""
 BLOCKS = [
     *((LONG, degrees, 32, 4e-3, *contact) for degrees in (3.0, 0.5, -0.5) for contact in CONTACTS),
     *((LONG, degrees, 32, 1e-3, *contact) for degrees in (3.0, -0.5) for contact in CONTACTS),
