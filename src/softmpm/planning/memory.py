@@ -1,10 +1,12 @@
 """Memory plan of a differentiable call: which states are checkpointed and which are recomputed. Formula: docs/memory.md.
 
 A call is divided into chunks. The backward pass of a chunk needs all of its intermediate states and the mass and momentum of the
-nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks:
+nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks, and U bytes of a state
+inside that follow from its S:
 
-    store all: all intermediate states of all chunks, N (S + G) and one S for each chunk; nothing is recomputed
-    schedule:  one chunk at a time is recomputed, L (S + G), for each shape that chunks have; of the ⌈N/L⌉ states between
+    store all: all intermediate states of all chunks, N (S + G) and one S for each chunk; nothing but U is recomputed, for one
+               chunk at a time of each shape that chunks have, (L + 1) U
+    schedule:  one chunk at a time is recomputed, L (S + U + G), for each shape; of the ⌈N/L⌉ states between
                chunks, s are stored, s B, and the others are recomputed with as few chunks as possible (checkpointing.py)
 
 In a closed loop one backward pass covers many calls, each of which also stores its initial state, the final state of the previous
@@ -85,6 +87,8 @@ class Sizes(NamedTuple):
     """Overhead of each chunk, in substeps."""
     calls: int
     """Number of calls that share the budget."""
+    follows: int = 0
+    """What else belongs to a state inside a chunk and follows from the stored ones, in the backward pass of the chunk only [B]."""
 
 
 def default_budget(device: torch.device, sizes: Sizes) -> int:
@@ -100,12 +104,12 @@ def default_budget(device: torch.device, sizes: Sizes) -> int:
     return max(min(sizes.calls, most) * one, one + (sizes.calls - 1) * sizes.start)
 
 
-def sizes_of(model, *, inside: int, nodes: int, between: int) -> Sizes:
-    """Sizes of a scheme whose states take this number of bytes; the rest does not depend on the scheme."""
+def sizes_of(model, *, inside: int, nodes: int, between: int, follows: int = 0) -> Sizes:
+    """Sizes of a scheme whose states take these numbers of bytes; the rest does not depend on the scheme."""
     particles = model.worlds * model.particle_count
     start = state_bytes(particles, model.dim, model.dtype.itemsize)
     price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
-    return Sizes(inside, nodes, between, start, longest_chunk(particles), price, model.calls)
+    return Sizes(inside, nodes, between, start, longest_chunk(particles), price, model.calls, follows)
 
 
 class Plan(NamedTuple):
@@ -118,11 +122,11 @@ class Plan(NamedTuple):
     kept: int
     """Bytes that the forward pass of one call stores."""
     recomputed: int
-    """Bytes of the chunk that the backward pass recomputes at a time."""
+    """Bytes that the backward pass recomputes for one chunk at a time."""
 
     @property
     def keep_all(self) -> bool:
-        """True if all intermediate states are stored and nothing is recomputed."""
+        """True if all intermediate states are stored and no substep is recomputed."""
         return self.checkpoints == 0
 
 
@@ -136,16 +140,20 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     Raises:
         ValueError: Not even one substep at a time fits.
     """
-    chunks = len(horizon.chunks(sizes.longest))
-    everything = horizon.total * (sizes.inside + sizes.nodes) + chunks * sizes.inside
-    others = sizes.calls - 1
-    if sizes.calls * everything + others * sizes.start <= budget or horizon.total == 0:
-        return Plan(sizes.longest, 0, everything, 0)
+    chunks = horizon.chunks(sizes.longest)
+    everything = horizon.total * (sizes.inside + sizes.nodes) + len(chunks) * sizes.inside
+    following, others = (
+        sizes.follows * sum(n + 1 for n, _ in {chunk.shape for chunk in chunks}),
+        sizes.calls - 1,
+    )
+    if sizes.calls * everything + following + others * sizes.start <= budget or horizon.total == 0:
+        return Plan(sizes.longest, 0, everything, following)
     room = budget - others * (sizes.start - sizes.between)  # the first checkpoint is the initial state
     best, least = None, math.inf
     for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
-        inside = sum((n + 1) * sizes.inside + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
+        one = sizes.inside + sizes.follows
+        inside = sum((n + 1) * one + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
         stored = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
         if stored < 1:
             continue
@@ -155,7 +163,7 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
         if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
             best, least = Plan(longest, stored, stored * sizes.between, inside + sizes.between), cost
     if best is None:
-        smallest = 2 * (sizes.inside + sizes.between) + sizes.nodes + others * sizes.start
+        smallest = 2 * (sizes.inside + sizes.follows + sizes.between) + sizes.nodes + others * sizes.start
         raise ValueError(
             f"a gradient {f'through {sizes.calls} calls ' if sizes.calls > 1 else ''}needs at least {smallest:,} bytes for states, "
             f"memory_budget is {budget:,} bytes: raise it, or make the scene smaller."

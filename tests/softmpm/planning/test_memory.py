@@ -29,11 +29,12 @@ def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
     return substeps + sizes.price * chunks
 
 
+@pytest.mark.parametrize("follows", [0, 40])
 @pytest.mark.parametrize("calls", [1, 5])
 @pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
-def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
+def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls, follows):
     """Stored and recomputed states of all calls fit, shorter last chunks included; more memory never costs time."""
-    times, sizes = [], SIZES._replace(calls=calls)
+    times, sizes = [], SIZES._replace(calls=calls, follows=follows, inside=SIZES.inside - follows)
     for budget in np.geomspace(600 + 200 * calls, 100_000 * calls, 20).astype(int):
         chosen = plan(horizon, sizes, int(budget))
         if chosen.keep_all:
@@ -47,6 +48,15 @@ def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls):
         assert calls * chosen.kept + starts + chosen.recomputed <= budget
         times.append(seconds(chosen, horizon, SIZES))
     assert len(times) > 3 and times == sorted(times, reverse=True)
+
+
+def test_what_follows_from_stored_states_is_needed_once():
+    """Five calls of 99 substeps, in chunks of 50 and 49, store less where a part of each state follows from the others."""
+    horizon, sizes = Horizon(1, 99), SIZES._replace(calls=5, inside=60, follows=40)
+    everything = 101 * 60 + 99 * 10
+    needed = 5 * everything + 4 * 130 + (51 + 50) * 40
+    assert plan(horizon, sizes, needed) == Plan(longest=64, checkpoints=0, kept=everything, recomputed=4040)
+    assert not plan(horizon, sizes, needed - 1).keep_all
 
 
 def test_calls_share_a_budget():

@@ -30,7 +30,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     ParticleInputs, forced = input_types(spec).ParticleInputs, one.forced
     check, check_step, check_now = one.check, one.check_step, one.check_now
     memory = chunk(dim, spec.dtype)
-    Chunk, state_of = memory.Chunk, memory.state_of
+    Chunk, state_of, u_of = memory.Chunk, memory.state_of, memory.u_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number) for number in range(2))
     stage, stage_u, stage_v = of_u.stage, of_u.stage_at, of_v.stage_at
     gradient_u, gradient_v, seat = of_u.gradient, of_v.gradient, seats(spec, bricks)
@@ -53,9 +53,8 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         at: Chunk,
         s: int,
     ):
-        now = state_of(at, s)
-        u = at.u[now]
-        v = at.v[now]
+        u = at.u[u_of(at, s)]
+        v = at.v[state_of(at, s)]
         corner = seat.corner
         who = seat.occupant
         stage_u(u, seat.nodes, world, lane)

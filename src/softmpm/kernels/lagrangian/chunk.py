@@ -15,10 +15,11 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
 
     class Chunk:
         """See :class:`softmpm.schemes.lagrangian.buffers.ChunkBuffers`. The first axis of u, v, anchor and shift counts states, that of
-        w substeps (record.py); without ``keep`` two states take turns, and w has none."""
+        w substeps (record.py); without ``keep`` two states take turns, and w has none. So do two of u without ``keep_u``."""
 
         length: int
         keep: int
+        keep_u: int
         words: wp.array(dtype=wp.int64)
         mass: wp.array2d(dtype=real)
         partial: wp.array2d(dtype=vec)
@@ -65,8 +66,23 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
             return s % 2
 
     @wp.func
+    def u_of(of: Chunk, s: int) -> int:
+        """Number of the displacements before substep ``s``."""
+        if of.keep_u == 1:
+            return s
+        else:
+            return s % 2
+
+    @wp.func
     def lost(a: vec, b: vec) -> vec:
         """What rounding keeps from a + b, where b is small."""
         return b - ((a + b) - a)
 
-    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, lost=lost)
+    @wp.func
+    def moved(u: vec, d: vec, dt: real, v: vec, low: vec):
+        """u' of (Q4), and what rounding keeps from it; ``low`` is what it kept from u."""
+        here = u - d
+        du = dt * v + low
+        return here + du, lost(here, du)
+
+    return SimpleNamespace(Chunk=Chunk, Adjoint=Adjoint, state_of=state_of, u_of=u_of, lost=lost, moved=moved)

@@ -30,7 +30,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     Constants, dim = t.Constants, spec.dim
     ParticleInputs, forced, given_to = input_types(spec).ParticleInputs, one.forced, one.given_to
     check_now, sound, memory, mat = one.check_now, one.sound, chunk(dim, spec.dtype), t.mat
-    Chunk, state_of = memory.Chunk, memory.state_of
+    Chunk, state_of, u_of = memory.Chunk, memory.state_of, memory.u_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage_at, of_v.stage_at, sums(dim, spec.dtype, bricks, False).clear
     one_layer, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
@@ -54,9 +54,8 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         at: Chunk,
         s: int,
     ):
-        now = state_of(at, s)
-        u = at.u[now]
-        v = at.v[now]
+        u = at.u[u_of(at, s)]
+        v = at.v[state_of(at, s)]
         corner = seat.corner
         place = seat.places
         stage_u(u, seat.nodes, world, lane)

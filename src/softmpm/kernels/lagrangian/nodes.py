@@ -47,7 +47,8 @@ def nodes(spec: Spec) -> SimpleNamespace:
     apart = surface and not spec.constrained  # nodes that no surface points act on are done here
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
-    Chunk, state_of, lost, store = memory.Chunk, memory.state_of, memory.lost, record(spec).store
+    Chunk, state_of, u_of, store = memory.Chunk, memory.state_of, memory.u_of, record(spec).store
+    lost, moved = memory.lost, memory.moved
     row = rows(spec.dim, spec.dtype)
 
     @wp.struct
@@ -86,7 +87,8 @@ def nodes(spec: Spec) -> SimpleNamespace:
         """(Q3), (Q4). Where surface points act on a node, the velocity without contact goes to ``free``, and surface.py goes on."""
         now = state_of(at, s)
         then = state_of(at, s + 1)
-        u = row(at.u, now, world)
+        u = row(at.u, u_of(at, s), world)
+        new_u = row(at.u, u_of(at, s + 1), world)
         lost_u = row(at.low, world, 0)
         lost_v = row(at.low, world, 1)
         here = u[i]  # all of it loaded while the status is awaited
@@ -105,10 +107,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
             w = new + dv
             store(at, world, i, node.touched, s, w)
             new = after_free(constants, inputs, world, x, w, node.m)  # (Q3)
-            here = here - d
-            du = constants.dt * new + low_u
-            low_u = lost(here, du)
-            here = here + du  # (Q4)
+            here, low_u = moved(here, d, constants.dt, new, low_u)  # (Q4)
         lost_v[i] = low_v
         if i == 0:
             at.shift[then, world] = shift + exact(d)
@@ -116,11 +115,11 @@ def nodes(spec: Spec) -> SimpleNamespace:
             row(at.free, world)[i] = new
         if wp.static(apart):
             if node.touched < 0:
-                row(at.u, then, world)[i] = here
+                new_u[i] = here
                 lost_u[i] = low_u
                 row(at.v, then, world)[i] = new
         if wp.static(not surface):
-            row(at.u, then, world)[i] = here
+            new_u[i] = here
             lost_u[i] = low_u
             row(at.v, then, world)[i] = new
 

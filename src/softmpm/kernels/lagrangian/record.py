@@ -1,6 +1,7 @@
-"""Storage of w, the nodal velocity before damping, walls and contact (nodes.py).
+"""What a gradient stores of the nodes in each substep.
 
-Where none of these acts, w is the new velocity and is not stored.
+The velocities v, and w, that before damping, walls and contact (nodes.py); where none of these acts, w is the new velocity and is not
+stored. The displacements follow from the velocities (displacements.py), but for scenes with constraints, which may set both.
 """
 
 from types import SimpleNamespace
@@ -16,6 +17,11 @@ from softmpm.kernels.structs import Spec, types
 def stores_all(spec: Spec) -> bool:
     """True if w is stored at all nodes, because damping, walls or constraints may act on any of them."""
     return spec.damping or spec.constrained or bool(spec.node_walls)
+
+
+def stores_u(spec: Spec) -> bool:
+    """True if the displacements are stored, because constraints may act on them."""
+    return spec.constrained
 
 
 @kernel_factory

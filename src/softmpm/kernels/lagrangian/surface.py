@@ -45,7 +45,7 @@ def surface(spec: Spec) -> SimpleNamespace:
     count, friction_of = len(walls), wall_face(spec).friction_of
     touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, memory = f.Frame, f.recentring, chunk(dim, spec.dtype)
-    Chunk, state_of, lost = memory.Chunk, memory.state_of, memory.lost
+    Chunk, state_of, u_of, moved = memory.Chunk, memory.state_of, memory.u_of, memory.moved
     face, depth = wall_face(spec).face, wall_face(spec).depth
     running, was_running, report = (
         getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
@@ -112,7 +112,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         """(K2) to (K4), (K6), (K7): impulse A J of each point."""
         now = state_of(at, s)
         then = state_of(at, s + 1)
-        u = row(at.u, now, world)
+        u = row(at.u, u_of(at, s), world)
         anchor = at.anchor[now]
         middle = u[moving.middle]  # all of it loaded while the status is awaited
         x = present(point, at_point(point, u))
@@ -174,7 +174,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         now = state_of(at, s)
         then = state_of(at, s + 1)
         i = node.i
-        u = row(at.u, now, world)
+        u = row(at.u, u_of(at, s), world)
         lows = row(at.low, world, 0)
         here = u[i]
         low = lows[i]
@@ -186,14 +186,11 @@ def surface(spec: Spec) -> SimpleNamespace:
         if running(at.words, world):
             if node.last > node.first - lane:
                 new += (real(1.0) / m) * push
-            here = here - recentring(moving, middle)
-            du = constants.dt * new + low
-            low = lost(here, du)
-            here = here + du
+            here, low = moved(here, recentring(moving, middle), constants.dt, new, low)
         else:
             new = old
         if lane == 0:
-            row(at.u, then, world)[i] = here
+            row(at.u, u_of(at, s + 1), world)[i] = here
             lows[i] = low
             row(at.v, then, world)[i] = new
 

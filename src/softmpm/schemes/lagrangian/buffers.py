@@ -8,6 +8,7 @@ from torch import Tensor
 
 from softmpm.errors import FROZEN, NEVER
 from softmpm.kernels.lagrangian.chunk import chunk as memory
+from softmpm.kernels.lagrangian.record import stores_u
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
@@ -24,11 +25,17 @@ from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
 from softmpm.state import Nodal
 
 
+def views(fields: Tensor, kind: Any) -> list[wp.array]:
+    """Each of these fields as an array."""
+    return [view(one, kind) for one in fields]
+
+
 class ChunkBuffers:
     """Everything that the launches of a chunk read and write.
 
     Attributes:
-        u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns.
+        u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns. Of u there are two
+            in any case where it follows from v (record.py).
         low: What rounding has kept from u and v of the latest state.
         force: Mean forces of the walls on the surface points in the present control step.
         w: Velocities of the nodes after each substep, without damping, walls and contact, where ``keep`` needs them (record.py).
@@ -46,7 +53,8 @@ class ChunkBuffers:
         self.types, self.rest = types(model.spec.dim, model.spec.dtype), rest_struct(model)
         nodal = model.worlds, model.rest_grid.count, model.dim
         stored, substeps = (chunk.length + 1, chunk.length) if keep else (2, 0)
-        self.u, self.v = self.tensor(stored, *nodal), self.tensor(stored, *nodal)
+        stored_u = stored if stores_u(model.spec) else 2
+        self.u, self.v = self.tensor(stored_u, *nodal), self.tensor(stored, *nodal)
         self.w, self.mass, self.low = (
             self.tensor(substeps, model.worlds, stored_nodes(model), model.dim),
             self.tensor(*nodal[:2]),
@@ -60,18 +68,14 @@ class ChunkBuffers:
         order = model.rest_grid.order.expand(model.worlds, -1).contiguous()
         self.order, self.inputs = order, SortedInputs(model, chunk, order)
         vec, real = self.types.vec, self.types.real
-        self.u_arrays, self.v_arrays, self.w_arrays = (
-            [view(one, vec) for one in stored] for stored in (self.u, self.v, self.w)
-        )
+        self.u_arrays, self.v_arrays, self.w_arrays = (views(one, vec) for one in (self.u, self.v, self.w))
         self.shift_arrays = [view(one, types(model.spec.dim, "float64").vec) for one in self.shift]
         self.mass_array, self.partial_array = view(self.mass, real), view(self.partial, vec)
         self.placed_mass = view(self.inputs.values["mass"], real)
         self.words_array = view(self.words, wp.int64)
-        self.contact = self.reflection = None
-        self.struct = self._struct()
-        if model.surface is not None:
-            self.contact = SurfaceContact(model, chunk)
-            self.contact.add_to(self.struct)
+        self.contact = None if model.surface is None else SurfaceContact(model, chunk)
+        self.reflection = None
+        self.struct = self.struct_on(self.u)
         if model.mirror is not None:
             self.reflection = Reflection(model, self.mass)
         self.overlap = None if model.overlap is None else OverlapCheck(model)
@@ -79,14 +83,17 @@ class ChunkBuffers:
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
 
-    def _struct(self) -> Any:
-        """Struct of the memory, as kernels see it."""
+    def struct_on(self, u: Tensor) -> Any:
+        """Struct of the memory with these displacements, as kernels see it."""
         t, exact = self.types, types(self.model.spec.dim, "float64").vec
         struct = memory(self.model.spec.dim, self.model.spec.dtype).Chunk()
-        struct.length, struct.keep = self.chunk.length, int(self.keep)
+        struct.length, struct.keep, struct.keep_u = self.chunk.length, int(self.keep), int(len(u) > 2)
         struct.words, struct.mass, struct.shift = self.words_array, self.mass_array, view(self.shift, exact)
-        for name in ("partial", "low", "u", "v", "w", "anchor", "force"):
+        struct.u = view(u, t.vec)
+        for name in ("partial", "low", "v", "w", "anchor", "force"):
             setattr(struct, name, view(getattr(self, name), t.vec))
+        if self.contact is not None:
+            self.contact.add_to(struct)
         return struct
 
     @property
@@ -100,6 +107,10 @@ class ChunkBuffers:
     def index(self, s: int) -> int:
         """Number of the state before substep ``s``."""
         return s if self.keep else s % 2
+
+    def index_u(self, s: int) -> int:
+        """Number of the displacements before substep ``s``."""
+        return s if self.struct.keep_u else s % 2
 
     def load(
         self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Tensor | None
@@ -128,8 +139,8 @@ class ChunkBuffers:
 
     def end(self) -> Nodal:
         """Copy of the final state: a result must not keep all states alive."""
-        last = self.index(self.chunk.length)
-        u, v, anchor, shift = (one[last].clone() for one in (self.u, self.v, self.anchor, self.shift))
+        last, u = self.index(self.chunk.length), self.u[self.index_u(self.chunk.length)].clone()
+        v, anchor, shift = (one[last].clone() for one in (self.v, self.anchor, self.shift))
         return Nodal(u, v, anchor, self.force.clone(), shift, low=self.low.clone())
 
 
@@ -141,6 +152,7 @@ class SharedAdjoint:
         f: Adjoint of the forces on the nodes.
         mass: Adjoint of the masses of the nodes.
         partials: Sums of the bricks for the adjoints of displacements and velocities.
+        low: What rounding has kept from the first displacements of a chunk whose others follow from its velocities.
     """
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
@@ -158,12 +170,20 @@ class SharedAdjoint:
         self.u_array, self.v_array = view(self.u, vec), view(self.v, vec)
         self.mass_array = view(self.mass, buffers.types.real)
         self.partial_arrays = [view(one, vec) for one in self.partials]
+        self.low = torch.empty_like(self.u)
+        self._displacements = self.u.new_empty(0)
         self._accumulators: dict[int, Accumulators] = {}
 
     @property
     def state(self) -> tuple[Tensor, ...]:
         """Adjoint of the state, in the order of :class:`Nodal`."""
         return self.u, self.v, self.anchor, self.force
+
+    def displacements(self, states: int) -> Tensor:
+        """Memory for those of so many states; chunks with fewer have a part of it."""
+        if len(self._displacements) < states:
+            self._displacements = torch.empty(states, *self.u.shape, dtype=self.u.dtype, device=self.u.device)
+        return self._displacements[:states]
 
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""
@@ -178,6 +198,7 @@ class ChunkAdjoint:
     Attributes:
         forward: Buffers with the stored states.
         shared: Buffers that other chunks use as well.
+        at, u, u_arrays: Struct of the memory of the chunk with the displacements of all states, and these.
         found: Accumulated adjoints of the inputs, those of particles in the order of their places.
     """
 
@@ -189,6 +210,10 @@ class ChunkAdjoint:
         self.adj_placed_mass = None
         if "mass" in self.found.tensors:
             self.adj_placed_mass = view(self.found.tensors["mass"], forward.types.real)
+        self.at, self.u, self.u_arrays = forward.struct, forward.u, forward.u_arrays
+        if not stores_u(self.model.spec):
+            self.u = shared.displacements(chunk.length + 1)
+            self.at, self.u_arrays = forward.struct_on(self.u), views(self.u, forward.types.vec)
         self.contact = self.reflection = None
         if forward.reflection is not None:
             given = forward.words_array, shared.mass_array
@@ -209,8 +234,14 @@ class ChunkAdjoint:
             self.contact.add_to(struct)
         return struct
 
-    def load(self, adj_end: Nodal) -> None:
-        """Copy the adjoint of the final state into the buffers, and clear all sums."""
+    def load(self, start: Nodal, adj_end: Nodal) -> None:
+        """Copy the initial displacements and the adjoint of the final state into the buffers, and clear all sums."""
+        if not stores_u(self.model.spec):
+            self.u[0].copy_(start.u.detach())
+            if start.low is None:
+                clear(self.shared.low)
+            else:
+                self.shared.low.copy_(start.low.detach()[:, 0])
         self.found.clear()
         self.forward.words.fill_(NEVER)
         clear(self.shared.mass)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
-from softmpm.kernels.lagrangian.record import stores_all
+from softmpm.kernels.lagrangian.record import stores_all, stores_u
 from softmpm.planning.memory import Buffers, Plan, Sizes, input_bytes, sizes_of
 from softmpm.schemes.lagrangian.overlap import overlap_bytes
 from softmpm.surface_grid import SurfaceGrid
@@ -32,15 +32,17 @@ class LagrangianFootprint:
         field, anchors = _field_bytes(model), _anchor_bytes(model)
         w = model.worlds * stored_nodes(model) * model.dim * model.dtype.itemsize
         held = math.prod(model.reaction_shape) * model.dtype.itemsize
-        inside, between = 2 * field + w + anchors, 4 * field + 2 * anchors + held
-        return sizes_of(model, inside=inside, nodes=0, between=between)
+        u = field if stores_u(model.spec) else 0
+        inside, between = field + u + w + anchors, 4 * field + 2 * anchors + held
+        return sizes_of(model, inside=inside, nodes=0, between=between, follows=field - u)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         real, nodal = model.dtype.itemsize, 3 * _field_bytes(model) + _anchor_bytes(model)
         sums = model.worlds * model.rest_grid.window.numel() * model.dim * real
         forward = 2 * nodal + 2 * _field_bytes(model) + sums + input_bytes(model, 1) + overlap_bytes(model)
         kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
-        return Buffers(forward, kept, 2 * nodal + 2 * sums)
+        low = 0 if stores_u(model.spec) else _field_bytes(model)
+        return Buffers(forward, kept, 2 * nodal + low + 2 * sums)
 
 
 def _field_bytes(model) -> int:

@@ -5,9 +5,12 @@ from typing import Any
 import warp as wp
 
 from softmpm.kernels.lagrangian.cells import cells, cells_adj
+from softmpm.kernels.lagrangian.displacements import displacements
 from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.projection import masses
+from softmpm.kernels.lagrangian.record import stores_u
+from softmpm.schemes.buffers import view
 from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node_launch
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
 from softmpm.schemes.lagrangian.driven import drive, drive_adj
@@ -37,7 +40,7 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
 def _check_end(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Check the state after the last substep ``s``, of which no forces are computed."""
     model, inputs = buffers.model, buffers.inputs.particle_struct(s, s)
-    u, words = buffers.u_arrays[buffers.index(s + 1)], buffers.words_array
+    u, words = buffers.u_arrays[buffers.index_u(s + 1)], buffers.words_array
     limited = s > 0  # else the next substep is checked
     kernel, arguments = cells(model.spec, model.rest_grid.bricks).check_state, (s, limited, True, u, words)
     brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
@@ -80,7 +83,7 @@ def _constrain(
     buffers: ChunkBuffers, s: int, inputs: Any, velocity: wp.array, anew: int, launch: KernelLauncher
 ) -> None:
     """Constraints of nodes in substep ``s``, for the new velocity or for that without contact."""
-    u, new_u = buffers.u_arrays[buffers.index(s)], buffers.u_arrays[buffers.index(s + 1)]
+    u, new_u = buffers.u_arrays[buffers.index_u(s)], buffers.u_arrays[buffers.index_u(s + 1)]
     if buffers.reflection is not None:
         buffers.reflection.advance(launch, buffers.words_array, u, velocity, new_u, anew)
     drive(buffers.model, launch, inputs, buffers.words_array, u, new_u, velocity)
@@ -91,6 +94,9 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     model, chunk = forward.model, forward.chunk
     cluster = cluster_of(model)
+    if not stores_u(model.spec):
+        kernel, low = displacements(model.spec.dim, model.spec.dtype), view(shared.low, forward.types.vec)
+        node_launch(model, launch, kernel, model.constants, low, adjoint.at)
     for first, last in reversed(list(segments(chunk))):
         if cluster is not None:
             launch_march_adj(adjoint, cluster, first, last, launch)
@@ -102,7 +108,7 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
                 _forces_adj(adjoint, s, launch)
         adjoint.found.collect(chunk.row(first), forward.inputs.values, launch)
     if adjoint.contact is not None:
-        adjoint.contact.finish(launch, forward.struct, adjoint.struct)
+        adjoint.contact.finish(launch, adjoint.at, adjoint.struct)
     if adjoint.adj_placed_mass is not None:
         kernel = masses(model.spec.dim, model.spec.dtype, model.rest_grid.bricks).masses_adj
         brick_launch(model, launch, kernel, forward.rest, shared.mass_array, adjoint.adj_placed_mass)
@@ -113,14 +119,14 @@ def _advance_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     model, reflection = forward.model, adjoint.reflection
     inputs, adj_inputs = forward.inputs.grid_struct(s), adjoint.found.grid_struct(forward.chunk.row(s))
-    given, out = (inputs, forward.rest), (forward.struct, adjoint.struct, adj_inputs, s)
+    given, out = (inputs, forward.rest), (adjoint.at, adjoint.struct, adj_inputs, s)
     state = shared.u_array, shared.v_array
     drive_adj(model, launch, shared.wanted, model.scene.dt, *state, adj_inputs)
     if reflection is not None:
-        stored = forward.u_arrays[s], forward.w_arrays[s], forward.v_arrays[s + 1]
+        stored = adjoint.u_arrays[s], forward.w_arrays[s], forward.v_arrays[s + 1]
         reflection.begin(launch, *given, *stored, *state)
     if adjoint.contact is not None:
-        adjoint.contact.advance(launch, *given, *out, forward.u_arrays[s])
+        adjoint.contact.advance(launch, *given, *out, adjoint.u_arrays[s])
         drive_adj(model, launch, shared.wanted, 0.0, *state, adj_inputs)
     if reflection is not None:
         reflection.finish(launch, forward.chunk.anew(s), *state)
@@ -134,7 +140,7 @@ def _forces_adj(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     forward, wanted, row = adjoint.forward, adjoint.shared.wanted, adjoint.forward.chunk.row(s)
     model, bricks = forward.model, forward.model.rest_grid.bricks
     parameters = (model.constants, forward.inputs.particle_struct(s, s), forward.rest)
-    out = (forward.struct, adjoint.struct, adjoint.found.particle_struct(row, row), s)
+    out = (adjoint.at, adjoint.struct, adjoint.found.particle_struct(row, row), s)
     if bricks.lattice:
         kernel, lattice = lattice_cells_adj(model.spec, wanted, bricks).forces_adj, lattice_struct(model)
         brick_launch(model, launch, kernel, *parameters, lattice, *out, layered=True)

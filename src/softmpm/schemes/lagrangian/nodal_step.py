@@ -59,7 +59,7 @@ class NodalStep:
         if wanted not in self._adjoints:
             self._adjoints[wanted] = ChunkGraphAdj(graph, SharedAdjoint(graph.buffers, wanted))
         adjoint = self._adjoints[wanted]
-        adjoint.load(adj_then)
+        adjoint.load(now, adj_then)
         adjoint.run(self.stream)
         self._take(graph.buffers.words, substep)
         return adjoint.unload(self.stream, ONE, adj_inputs), adj_inputs

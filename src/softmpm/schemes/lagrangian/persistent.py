@@ -81,7 +81,7 @@ def launch_march_adj(
     arguments = (model.constants, inputs, forward.inputs.grid_struct(first), forward.rest, weights, body)
     kernel = march_adj(model.spec, adjoint.shared.wanted, cluster)
     span, dim = (first, last, forward.chunk.anew(first)), (model.worlds, cluster.blocks, cluster.threads)
-    launch(kernel, dim, *arguments, forward.struct, adjoint.struct, *out, *span, block_dim=cluster.threads)
+    launch(kernel, dim, *arguments, adjoint.at, adjoint.struct, *out, *span, block_dim=cluster.threads)
 
 
 def _constants(buffers: ChunkBuffers) -> tuple[Any, Any]:

@@ -61,9 +61,9 @@ class ChunkGraphAdj:
         self.buffers = ChunkAdjoint(graph.buffers, shared)
         self._replay = LaunchReplay(graph.buffers.model)
 
-    def load(self, adj_end: Nodal) -> None:
-        """Copy the adjoint of the final state into the buffers, and clear all sums."""
-        self.buffers.load(adj_end)
+    def load(self, start: Nodal, adj_end: Nodal) -> None:
+        """Copy the initial displacements and the adjoint of the final state into the buffers, and clear all sums."""
+        self.buffers.load(start, adj_end)
         if self.buffers.reflection is not None:
             self.buffers.reflection.load(adj_end)
 
@@ -121,7 +121,7 @@ class LagrangianRun:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         with self.pool.lock:
             adjoint = self.pool.adjoint(self._lease.cached, wanted)
-            adjoint.load(adj_end)
+            adjoint.load(self.start, adj_end)
             stream = stream_of(self.pool.model.device)
             adjoint.run(stream)
             return adjoint.unload(stream, self.chunk, adj_inputs)
