@@ -23,7 +23,7 @@ from softmpm_learn.objective import (
     Term,
     Tilt,
 )
-from softmpm_learn.tasks import BipedConf, make_task
+from softmpm_learn.tasks import ArmConf, BipedConf, make_task
 
 
 @pytest.fixture
@@ -83,10 +83,11 @@ def test_stretch_is_what_is_beyond_the_limit():
     torch.testing.assert_close(late.value(path), torch.tensor([0.3**2 / 2]))
 
 
-def test_a_crack_costs_what_strains_do_not():
-    """A walker torn in two rigid halves, which have no strain, pays for each pair across the crack; it costs nothing at rest, and a
+@pytest.mark.parametrize("conf", [BipedConf(), ArmConf()], ids=lambda conf: conf.name)
+def test_a_crack_costs_what_strains_do_not(conf):
+    """A robot torn in two rigid halves, which have no strain, pays for each pair across the crack; it costs nothing at rest, and a
     stretch by half costs nothing either. Without pairs there is nothing to pay for."""
-    task = make_task(BipedConf())
+    task = make_task(conf)
     (stretch,) = (term for term in task.objective.terms if isinstance(term, Stretch))
     rest = softmpm.build(task.scene, device="cpu").rest()
     right = rest.x[..., :1] > rest.x[..., :1].mean()

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softmpm import Body, Grid, Muscle, Scene, Wall
-from softmpm_learn.objective import Effort, Objective, Reach, Still
+from softmpm import Body, Grid, Muscle, Scene, Wall, neighbour_pairs
+from softmpm_learn.objective import Effort, Objective, Reach, Still, Stretch
 from softmpm_learn.tasks.outline import Limb
-from softmpm_learn.tasks.task import LASTING, Task, TaskConf, clock, filled, neo_hookean
+from softmpm_learn.tasks.task import LASTING, STRETCH, Task, TaskConf, clock, filled, neo_hookean
 
 BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
@@ -44,10 +44,12 @@ class ArmConf(TaskConf):
     """Time at the end of the episode during which the tip should stay at the goal [s], at most all of it."""
     still: float = 5e-2
     """Weight of the tip's mean squared speed during that time in the loss [s²]."""
+    stretch: float = 10.0
+    """Weight of stretches beyond 1.6 in the loss [m²]: an arm at the limit of fracture cannot learn, since every step fails."""
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("hold", "still")
+        self.need_not_negative("hold", "still", "stretch")
         if len(self.goal) != 2 or not all(math.isfinite(c) for c in self.goal):
             raise ValueError(
                 f"task.goal must be two numbers, x and y, such as task.goal=[0.6,0.35], got {self.goal}."
@@ -102,6 +104,7 @@ def arm(conf: ArmConf) -> Task:
             Reach(particles=tip, target=goal, begin=held),
             Still(particles=tip, weight=conf.still, begin=held),
             Effort(weight=conf.effort),
+            Stretch(weight=conf.stretch, pairs=neighbour_pairs(scene), rest=rest, most=STRETCH),
         ),
         body_length=LENGTH,
         goal=goal,

@@ -20,6 +20,10 @@ WIDTH = 0.01
 LASTING = 3
 """Number of episodes in a row over which a motion is evaluated, to choose the best."""
 
+STRETCH = 1.6
+"""Stretch of neighbouring particles of a robot that costs nothing. Those on the lattice part for good at 2.8, with 1.4 cells between
+them (:class:`softmpm.Alarms`)."""
+
 
 class Resolution(Enum):
     """Cells of the background grid per metre; two particles per cell along each axis."""

@@ -10,7 +10,7 @@ import numpy as np
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Effort, Objective, Progress, Stretch, Tilt
-from softmpm_learn.tasks.task import LASTING, Task, TaskConf, clock
+from softmpm_learn.tasks.task import LASTING, STRETCH, Task, TaskConf, clock
 
 STEP = 0.1
 """Time after which a robot on legs has forgotten what a muscle did [s]: a part of a step."""
@@ -29,9 +29,6 @@ SOLES = 0.15
 """Part of a walker's height, from below, that belongs to its soles."""
 EDGE = 0.012
 """Distance from the corner at which the bevelled edge of a sole begins [m]: one cell as a draft."""
-STRETCH = 1.6
-"""Stretch of neighbouring particles of a walker that costs nothing. Those on the lattice part for good at 2.8, with 1.4 cells between
-them (:class:`softmpm.Alarms`)."""
 
 
 @dataclass(kw_only=True)
