@@ -12,12 +12,15 @@ from softmpm.kernels.lagrangian.rest import LAGRANGIAN
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.structs import types
 
+AHEAD = 8
+"""Substeps whose velocities and shifts are loaded together: on a GPU a thread has one node, and would wait for the memory in each."""
+
 
 @kernel_factory
 def displacements(dim: int, dtype: str) -> wp.Kernel:
     t, exact_vec, memory = types(dim, dtype), types(dim, "float64").vec, chunk(dim, dtype)
     real, vec, Constants, Chunk, moved = t.real, t.vec, t.Constants, memory.Chunk, memory.moved
-    row = rows(dim, dtype)
+    row, vecs, several = rows(dim, dtype), wp.types.matrix((AHEAD, dim), t.real), AHEAD
 
     @wp.func
     def between(a: exact_vec, b: exact_vec) -> vec:
@@ -34,9 +37,16 @@ def displacements(dim: int, dtype: str) -> wp.Kernel:
         for i in range(first_of(k), end_of(k, low.shape[1])):
             u = row(at.u, 0, world)[i]
             kept = row(low, world)[i]
-            for s in range(at.length):
-                d = between(at.shift[s, world], at.shift[s + 1, world])
-                u, kept = moved(u, d, constants.dt, row(at.v, s + 1, world)[i], kept)
-                row(at.u, s + 1, world)[i] = u
+            for first in range(0, at.length, several):
+                v = vecs()
+                d = vecs()
+                for n in range(several):
+                    s = wp.min(first + n, at.length - 1)
+                    v[n] = row(at.v, s + 1, world)[i]
+                    d[n] = between(at.shift[s, world], at.shift[s + 1, world])
+                for n in range(several):
+                    if first + n < at.length:
+                        u, kept = moved(u, d[n], constants.dt, v[n], kept)
+                        row(at.u, first + n + 1, world)[i] = u
 
     return displacements
