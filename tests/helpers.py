@@ -193,7 +193,7 @@ def assert_relative(got, want, limit: float, what: str = "") -> None:
 def little_memory(model) -> dict[str, int]:
     """Settings with which a call of 3 times 7 substeps stores one state and recomputes chunks."""
     sizes = model.sizes()
-    budget = 4 * (sizes.inside + sizes.nodes) + 3 * sizes.between
+    budget = 4 * (sizes.inside + sizes.derived + sizes.nodes) + sizes.apart + 3 * sizes.between
     assert not plan(Horizon(3, 7), sizes, budget).keep_all
     return {"memory_budget": budget}
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene
+from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, little_memory
 from surface_scenes import by_reference, compare
 
 import softmpm
@@ -244,15 +244,39 @@ def test_auto_takes_the_reference_formulation_where_it_serves():
         full_scene(2, body_contact="no")
 
 
-def test_a_particle_that_collapses_is_named():
-    """With world, particle and substep, and the state before it."""
+def collapsing(device: str = "cpu", **settings) -> tuple[softmpm.Model, softmpm.State]:
+    """Two worlds, of which the second collapses."""
     made = busy_scene(2, ("fixed_corotated",), walls=[], muscles=[], per_law=30)
-    model = softmpm.build(made, device="cpu", dtype=torch.float64, worlds=2, formulation="reference")
+    model = softmpm.build(
+        made, device=device, dtype=torch.float64, worlds=2, formulation="reference", **settings
+    )
     state = model.rest()
     state.F[1] = 0.3 * state.F[1]
-    state.C[1] = -400.0 * torch.eye(2, dtype=torch.float64)
+    state.C[1] = -400.0 * torch.eye(2).to(state.C)
     center = state.x[1].mean(0)
-    state = state._replace(x=torch.stack([state.x[0], center + 0.3 * (state.x[1] - center)]))
+    return model, state._replace(x=torch.stack([state.x[0], center + 0.3 * (state.x[1] - center)]))
+
+
+@pytest.mark.parametrize("memory", ["stored", "recomputed"])
+def test_a_world_that_fails_takes_no_gradient_and_leaves_that_of_the_others(memory, device):
+    """Its velocities no longer move its nodes, and the gradient computes displacements from velocities."""
+    model, state = collapsing(device)
+    settings = {} if memory == "stored" else little_memory(model)
+    model, state = collapsing(device, **settings)
+    found = []
+    for start in (state, model.rest()):
+        start = start._replace(v=(start.v + 0.1).requires_grad_())
+        failures = softmpm.Failures("freeze")
+        end = softmpm.simulate(model, start, None, model.params(), substeps=40, failures=failures)
+        found.append(torch.autograd.grad((end.x**2).sum(), start.v)[0])
+        assert [error.substep for error in failures.errors] == [1] * (start.x is state.x)
+    assert torch.equal(found[0][0], found[1][0]) and found[0][0].abs().max() > 0
+    assert not found[0][1].any()
+
+
+def test_a_particle_that_collapses_is_named():
+    """With world, particle and substep, and the state before it."""
+    model, state = collapsing()
     with pytest.raises(softmpm.UnstableError, match="of world 1") as caught:
         softmpm.simulate(model, state, None, model.params(), substeps=40)
     assert caught.value.kind == "collapsed" and caught.value.substep >= 0

@@ -1,12 +1,12 @@
 """Memory plan of a differentiable call: which states are checkpointed and which are recomputed. Formula: docs/memory.md.
 
 A call is divided into chunks. The backward pass of a chunk needs all of its intermediate states and the mass and momentum of the
-nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks, and U bytes of a state
-inside that follow from its S:
+nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks, U bytes
+that are derived from a state inside, and A bytes of other buffers of each chunk:
 
-    store all: all intermediate states of all chunks, N (S + G) and one S for each chunk; nothing but U is recomputed, for one
-               chunk at a time of each shape that chunks have, (L + 1) U
-    schedule:  one chunk at a time is recomputed, L (S + U + G), for each shape; of the ⌈N/L⌉ states between
+    store all: all intermediate states of all chunks, N (S + G) and S + A for each chunk; no substep is recomputed, but U is derived
+               for one chunk at a time, L U for each shape that chunks have
+    schedule:  one chunk at a time is recomputed, L (S + U + G) + S + A for each shape; of the ⌈N/L⌉ states between
                chunks, s are stored, s B, and the others are recomputed with as few chunks as possible (checkpointing.py)
 
 In a closed loop one backward pass covers many calls, each of which also stores its initial state, the final state of the previous
@@ -87,8 +87,10 @@ class Sizes(NamedTuple):
     """Overhead of each chunk, in substeps."""
     calls: int
     """Number of calls that share the budget."""
-    follows: int = 0
-    """What else belongs to a state inside a chunk and follows from the stored ones, in the backward pass of the chunk only [B]."""
+    derived: int = 0
+    """Part of a state inside a chunk that is not stored: the backward pass of the chunk computes it from the rest [B]."""
+    apart: int = 0
+    """Other buffers of each chunk that stores its states [B]."""
 
 
 def default_budget(device: torch.device, sizes: Sizes) -> int:
@@ -104,12 +106,13 @@ def default_budget(device: torch.device, sizes: Sizes) -> int:
     return max(min(sizes.calls, most) * one, one + (sizes.calls - 1) * sizes.start)
 
 
-def sizes_of(model, *, inside: int, nodes: int, between: int, follows: int = 0) -> Sizes:
+def sizes_of(model, *, inside: int, nodes: int, between: int, derived: int = 0, apart: int = 0) -> Sizes:
     """Sizes of a scheme whose states take these numbers of bytes; the rest does not depend on the scheme."""
     particles = model.worlds * model.particle_count
     start = state_bytes(particles, model.dim, model.dtype.itemsize)
     price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
-    return Sizes(inside, nodes, between, start, longest_chunk(particles), price, model.calls, follows)
+    longest = longest_chunk(particles)
+    return Sizes(inside, nodes, between, start, longest, price, model.calls, derived, apart)
 
 
 class Plan(NamedTuple):
@@ -141,19 +144,17 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
         ValueError: Not even one substep at a time fits.
     """
     chunks = horizon.chunks(sizes.longest)
-    everything = horizon.total * (sizes.inside + sizes.nodes) + len(chunks) * sizes.inside
-    following, others = (
-        sizes.follows * sum(n + 1 for n, _ in {chunk.shape for chunk in chunks}),
-        sizes.calls - 1,
-    )
-    if sizes.calls * everything + following + others * sizes.start <= budget or horizon.total == 0:
-        return Plan(sizes.longest, 0, everything, following)
+    everything = horizon.total * (sizes.inside + sizes.nodes) + len(chunks) * (sizes.inside + sizes.apart)
+    derived = sizes.derived * sum(n for n, _ in {chunk.shape for chunk in chunks})
+    others = sizes.calls - 1
+    if sizes.calls * everything + derived + others * sizes.start <= budget or horizon.total == 0:
+        return Plan(sizes.longest, 0, everything, derived)
     room = budget - others * (sizes.start - sizes.between)  # the first checkpoint is the initial state
     best, least = None, math.inf
     for longest in _lengths(horizon.substeps, sizes.longest):
         chunks = horizon.chunks(longest)
-        one = sizes.inside + sizes.follows
-        inside = sum((n + 1) * one + n * sizes.nodes for n, _ in {chunk.shape for chunk in chunks})
+        step, once = sizes.inside + sizes.derived + sizes.nodes, sizes.inside + sizes.apart
+        inside = sum(n * step + once for n, _ in {chunk.shape for chunk in chunks})
         stored = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
         if stored < 1:
             continue
@@ -163,7 +164,8 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
         if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
             best, least = Plan(longest, stored, stored * sizes.between, inside + sizes.between), cost
     if best is None:
-        smallest = 2 * (sizes.inside + sizes.follows + sizes.between) + sizes.nodes + others * sizes.start
+        one = 2 * sizes.inside + sizes.derived + sizes.nodes + sizes.apart
+        smallest = one + 2 * sizes.between + others * sizes.start
         raise ValueError(
             f"a gradient {f'through {sizes.calls} calls ' if sizes.calls > 1 else ''}needs at least {smallest:,} bytes for states, "
             f"memory_budget is {budget:,} bytes: raise it, or make the scene smaller."
@@ -225,7 +227,7 @@ class Memory(NamedTuple):
     backward: int
     """Peak memory of the backward pass, stored states included [B]."""
     runs: float
-    """Mean number of forward runs of a substep: 1 if nothing is recomputed, more if memory is short."""
+    """Mean number of forward runs of a substep: 1 if none is recomputed, more if memory is short."""
 
 
 def memory(model, horizon) -> Memory:

@@ -29,18 +29,21 @@ def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
     return substeps + sizes.price * chunks
 
 
-@pytest.mark.parametrize("follows", [0, 40])
+@pytest.mark.parametrize("derived, apart", [(0, 0), (40, 25)])
 @pytest.mark.parametrize("calls", [1, 5])
 @pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
-def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls, follows):
+def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls, derived, apart):
     """Stored and recomputed states of all calls fit, shorter last chunks included; more memory never costs time."""
-    times, sizes = [], SIZES._replace(calls=calls, follows=follows, inside=SIZES.inside - follows)
+    times, sizes = (
+        [],
+        SIZES._replace(calls=calls, derived=derived, apart=apart, inside=SIZES.inside - derived),
+    )
     for budget in np.geomspace(600 + 200 * calls, 100_000 * calls, 20).astype(int):
         chosen = plan(horizon, sizes, int(budget))
         if chosen.keep_all:
             break
         shapes = {chunk.shape: chunk.length for chunk in horizon.chunks(chosen.longest)}
-        inside = sum((length + 1) * SIZES.inside + length * SIZES.nodes for length in shapes.values())
+        inside = sum((n + 1) * SIZES.inside + n * SIZES.nodes - derived + apart for n in shapes.values())
         assert (
             chosen.kept == chosen.checkpoints * SIZES.between and chosen.recomputed == inside + SIZES.between
         )
@@ -50,12 +53,12 @@ def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls, fol
     assert len(times) > 3 and times == sorted(times, reverse=True)
 
 
-def test_what_follows_from_stored_states_is_needed_once():
-    """Five calls of 99 substeps, in chunks of 50 and 49, store less where a part of each state follows from the others."""
-    horizon, sizes = Horizon(1, 99), SIZES._replace(calls=5, inside=60, follows=40)
-    everything = 101 * 60 + 99 * 10
-    needed = 5 * everything + 4 * 130 + (51 + 50) * 40
-    assert plan(horizon, sizes, needed) == Plan(longest=64, checkpoints=0, kept=everything, recomputed=4040)
+def test_what_is_derived_from_stored_states_is_needed_once():
+    """Five calls of 99 substeps, in chunks of 50 and 49, store less where a part of each state is derived from the rest."""
+    horizon, sizes = Horizon(1, 99), SIZES._replace(calls=5, inside=60, derived=40, apart=7)
+    everything = 101 * 60 + 99 * 10 + 2 * 7
+    needed = 5 * everything + 4 * 130 + 99 * 40
+    assert plan(horizon, sizes, needed) == Plan(longest=64, checkpoints=0, kept=everything, recomputed=3960)
     assert not plan(horizon, sizes, needed - 1).keep_all
 
 

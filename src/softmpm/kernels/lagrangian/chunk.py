@@ -15,7 +15,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
 
     class Chunk:
         """See :class:`softmpm.schemes.lagrangian.buffers.ChunkBuffers`. The first axis of u, v, anchor and shift counts states, that of
-        w substeps (record.py); without ``keep`` two states take turns, and w has none. So do two of u without ``keep_u``."""
+        w substeps (record.py); without ``keep`` two states take turns, and w has none; without ``keep_u`` two displacements do."""
 
         length: int
         keep: int

@@ -20,33 +20,36 @@ AHEAD = 8
 def displacements(dim: int, dtype: str) -> wp.Kernel:
     t, exact_vec, memory = types(dim, dtype), types(dim, "float64").vec, chunk(dim, dtype)
     real, vec, Constants, Chunk, moved = t.real, t.vec, t.Constants, memory.Chunk, memory.moved
-    row, vecs, several = rows(dim, dtype), wp.types.matrix((AHEAD, dim), t.real), AHEAD
+    row, vecs, ahead = rows(dim, dtype), wp.types.matrix((AHEAD, dim), t.real), AHEAD
 
     @wp.func
-    def between(a: exact_vec, b: exact_vec) -> vec:
-        """b − a of two shifts, which is exact."""
+    def difference(a: exact_vec, b: exact_vec) -> vec:
+        """a − b of two shifts, which is exact if they are multiples of the quantum of (Q9)."""
         d = vec()
         for axis in range(dim):
-            d[axis] = real(b[axis] - a[axis])
+            d[axis] = real(a[axis] - b[axis])
         return d
 
     @kernel(LAGRANGIAN)
     def displacements(constants: Constants, low: wp.array2d(dtype=vec), at: Chunk):
-        """All but the first; ``low`` is what rounding has kept from these."""
+        """Displacements before each substep but the first. ``low`` is what rounding has kept from the first ones; it is overwritten."""
         world, k = wp.tid()
-        for i in range(first_of(k), end_of(k, low.shape[1])):
-            u = row(at.u, 0, world)[i]
-            kept = row(low, world)[i]
-            for first in range(0, at.length, several):
+        last = at.length - 1
+        for first in range(0, last, ahead):  # outside, so that a CPU reads few rows at a time
+            d = vecs()
+            for n in range(ahead):
+                s = wp.min(first + n, last)
+                d[n] = difference(at.shift[s + 1, world], at.shift[s, world])
+            for i in range(first_of(k), end_of(k, low.shape[1])):
+                u = row(at.u, first, world)[i]
+                lost = row(low, world)[i]
                 v = vecs()
-                d = vecs()
-                for n in range(several):
-                    s = wp.min(first + n, at.length - 1)
-                    v[n] = row(at.v, s + 1, world)[i]
-                    d[n] = between(at.shift[s, world], at.shift[s + 1, world])
-                for n in range(several):
-                    if first + n < at.length:
-                        u, kept = moved(u, d[n], constants.dt, v[n], kept)
+                for n in range(ahead):
+                    v[n] = row(at.v, wp.min(first + n, last) + 1, world)[i]
+                for n in range(ahead):
+                    if first + n < last:
+                        u, lost = moved(u, d[n], constants.dt, v[n], lost)
                         row(at.u, first + n + 1, world)[i] = u
+                row(low, world)[i] = lost
 
     return displacements

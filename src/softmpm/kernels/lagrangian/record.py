@@ -1,7 +1,8 @@
-"""What a gradient stores of the nodes in each substep.
+"""Storage of the nodes in each substep, for a gradient.
 
-The velocities v, and w, that before damping, walls and contact (nodes.py); where none of these acts, w is the new velocity and is not
-stored. The displacements follow from the velocities (displacements.py), but for scenes with constraints, which may set both.
+It has the velocity v, and the velocity w before damping, walls and contact (nodes.py); where none of these acts, w is the new velocity
+and is not stored. Displacements are recomputed from the velocities (displacements.py), except in scenes with constraints, which may set
+both.
 """
 
 from types import SimpleNamespace

@@ -35,7 +35,7 @@ class ChunkBuffers:
 
     Attributes:
         u, v, anchor, shift: Nodal states: if ``keep``, one more than there are substeps, else two that take turns. Of u there are two
-            in any case where it follows from v (record.py).
+            in any case where a gradient recomputes it from v (record.py).
         low: What rounding has kept from u and v of the latest state.
         force: Mean forces of the walls on the surface points in the present control step.
         w: Velocities of the nodes after each substep, without damping, walls and contact, where ``keep`` needs them (record.py).
@@ -53,7 +53,8 @@ class ChunkBuffers:
         self.types, self.rest = types(model.spec.dim, model.spec.dtype), rest_struct(model)
         nodal = model.worlds, model.rest_grid.count, model.dim
         stored, substeps = (chunk.length + 1, chunk.length) if keep else (2, 0)
-        stored_u = stored if stores_u(model.spec) else 2
+        self._keeps_u = keep and stores_u(model.spec)
+        stored_u = stored if self._keeps_u else 2
         self.u, self.v = self.tensor(stored_u, *nodal), self.tensor(stored, *nodal)
         self.w, self.mass, self.low = (
             self.tensor(substeps, model.worlds, stored_nodes(model), model.dim),
@@ -87,7 +88,7 @@ class ChunkBuffers:
         """Struct of the memory with these displacements, as kernels see it."""
         t, exact = self.types, types(self.model.spec.dim, "float64").vec
         struct = memory(self.model.spec.dim, self.model.spec.dtype).Chunk()
-        struct.length, struct.keep, struct.keep_u = self.chunk.length, int(self.keep), int(len(u) > 2)
+        struct.length, struct.keep, struct.keep_u = self.chunk.length, int(self.keep), int(self._keeps_u)
         struct.words, struct.mass, struct.shift = self.words_array, self.mass_array, view(self.shift, exact)
         struct.u = view(u, t.vec)
         for name in ("partial", "low", "v", "w", "anchor", "force"):
@@ -110,7 +111,7 @@ class ChunkBuffers:
 
     def index_u(self, s: int) -> int:
         """Number of the displacements before substep ``s``."""
-        return s if self.struct.keep_u else s % 2
+        return s if self._keeps_u else s % 2
 
     def load(
         self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Tensor | None
@@ -152,7 +153,7 @@ class SharedAdjoint:
         f: Adjoint of the forces on the nodes.
         mass: Adjoint of the masses of the nodes.
         partials: Sums of the bricks for the adjoints of displacements and velocities.
-        low: What rounding has kept from the first displacements of a chunk whose others follow from its velocities.
+        low: What rounding has kept from the displacements of a chunk that are recomputed.
     """
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
@@ -170,8 +171,8 @@ class SharedAdjoint:
         self.u_array, self.v_array = view(self.u, vec), view(self.v, vec)
         self.mass_array = view(self.mass, buffers.types.real)
         self.partial_arrays = [view(one, vec) for one in self.partials]
-        self.low = torch.empty_like(self.u)
         self._displacements = self.u.new_empty(0)
+        self.low = self._displacements if stores_u(self.model.spec) else torch.empty_like(self.u)
         self._accumulators: dict[int, Accumulators] = {}
 
     @property
@@ -179,11 +180,12 @@ class SharedAdjoint:
         """Adjoint of the state, in the order of :class:`Nodal`."""
         return self.u, self.v, self.anchor, self.force
 
-    def displacements(self, states: int) -> Tensor:
-        """Memory for those of so many states; chunks with fewer have a part of it."""
-        if len(self._displacements) < states:
-            self._displacements = torch.empty(states, *self.u.shape, dtype=self.u.dtype, device=self.u.device)
-        return self._displacements[:states]
+    def displacements(self, substeps: int) -> Tensor:
+        """Memory for the displacements before each of so many substeps; chunks with fewer have a part of it."""
+        if len(self._displacements) < substeps:
+            shape = substeps, *self.u.shape
+            self._displacements = torch.empty(shape, dtype=self.u.dtype, device=self.u.device)
+        return self._displacements[:substeps]
 
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""
@@ -198,7 +200,8 @@ class ChunkAdjoint:
     Attributes:
         forward: Buffers with the stored states.
         shared: Buffers that other chunks use as well.
-        at, u, u_arrays: Struct of the memory of the chunk with the displacements of all states, and these.
+        u, u_arrays: Displacements before each substep, stored or recomputed.
+        at: Struct of the memory of the chunk with these displacements.
         found: Accumulated adjoints of the inputs, those of particles in the order of their places.
     """
 
@@ -212,7 +215,7 @@ class ChunkAdjoint:
             self.adj_placed_mass = view(self.found.tensors["mass"], forward.types.real)
         self.at, self.u, self.u_arrays = forward.struct, forward.u, forward.u_arrays
         if not stores_u(self.model.spec):
-            self.u = shared.displacements(chunk.length + 1)
+            self.u = shared.displacements(chunk.length)
             self.at, self.u_arrays = forward.struct_on(self.u), views(self.u, forward.types.vec)
         self.contact = self.reflection = None
         if forward.reflection is not None:

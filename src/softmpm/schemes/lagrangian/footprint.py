@@ -34,11 +34,12 @@ class LagrangianFootprint:
         held = math.prod(model.reaction_shape) * model.dtype.itemsize
         u = field if stores_u(model.spec) else 0
         inside, between = field + u + w + anchors, 4 * field + 2 * anchors + held
-        return sizes_of(model, inside=inside, nodes=0, between=between, follows=field - u)
+        apart = 2 * (field - u) + 2 * field + _sum_bytes(model)  # two displacements that take turns; low
+        return sizes_of(model, inside=inside, nodes=0, between=between, derived=field - u, apart=apart)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
         real, nodal = model.dtype.itemsize, 3 * _field_bytes(model) + _anchor_bytes(model)
-        sums = model.worlds * model.rest_grid.window.numel() * model.dim * real
+        sums = _sum_bytes(model)
         forward = 2 * nodal + 2 * _field_bytes(model) + sums + input_bytes(model, 1) + overlap_bytes(model)
         kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
         low = 0 if stores_u(model.spec) else _field_bytes(model)
@@ -48,6 +49,11 @@ class LagrangianFootprint:
 def _field_bytes(model) -> int:
     """Bytes of a vector at each node."""
     return model.worlds * model.rest_grid.count * model.dim * model.dtype.itemsize
+
+
+def _sum_bytes(model) -> int:
+    """Bytes of the sums of the bricks."""
+    return model.worlds * model.rest_grid.window.numel() * model.dim * model.dtype.itemsize
 
 
 def _anchor_bytes(model) -> int:

@@ -94,7 +94,7 @@ def launch_chunk_adj(adjoint: ChunkAdjoint, launch: KernelLauncher) -> None:
     forward, shared = adjoint.forward, adjoint.shared
     model, chunk = forward.model, forward.chunk
     cluster = cluster_of(model)
-    if not stores_u(model.spec):
+    if not stores_u(model.spec) and chunk.length > 1:
         kernel, low = displacements(model.spec.dim, model.spec.dtype), view(shared.low, forward.types.vec)
         node_launch(model, launch, kernel, model.constants, low, adjoint.at)
     for first, last in reversed(list(segments(chunk))):
