@@ -15,6 +15,7 @@ COUNT_BYTES = 64
 SECTIONS = 8
 """Sections of the parts of a launch, each with a counter."""
 HEADER = f"#define SOFTMPM_SECTIONS {SECTIONS}\n" + Path(__file__).with_name("parts.h").read_text()
+FLUSHING = Path(__file__).with_name("flushing.h").read_text()
 
 
 def in_parts(source: str = "", before: str = "") -> wp.ModuleBuildOptions:
@@ -36,9 +37,10 @@ def may_be_divided(kernel: wp.Kernel) -> bool:
 
 @kernel_factory
 def runner() -> wp.Kernel:
-    """Kernel that takes part in the launches from ``first`` to ``last`` of a program."""
+    """Kernel that takes part in the launches from ``first`` to ``last`` of a program, without denormal numbers."""
 
     @wp.func_native(
+        "softmpm::Flushing flushing; "
         "softmpm::run_parts(reinterpret_cast<const softmpm::Row*>(program), reinterpret_cast<softmpm::Count*>(counts), "
         "reinterpret_cast<wp::int32*>(stop), reinterpret_cast<softmpm::GiveWay>(give_way), helper, section, first, last);"
     )
@@ -53,7 +55,7 @@ def runner() -> wp.Kernel:
         last: int,
     ): ...
 
-    @kernel({"extra_build_options": in_parts()})
+    @kernel({"extra_build_options": in_parts(before=FLUSHING)})
     def run(
         program: wp.int64,  # address of one row for each launch
         counts: wp.int64,  # address of the counters, zero at the start
