@@ -1,5 +1,5 @@
-// Numbers below 1.2e-38 (float32) are zero while an object of this class lives, in this thread. Bodies that fly freely or hardly deform
-// are full of them, and on many x86 processors an operation with one takes a hundred times longer.
+// Denormal numbers, below 1.2e-38 in float32, are zero in this thread while an object of this class lives: in simulations of free bodies
+// they are frequent, and some x86 processors compute slowly with them (docs/performance.md).
 namespace softmpm {
 class Flushing {
 #if defined(__SSE__)

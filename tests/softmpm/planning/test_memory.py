@@ -34,10 +34,8 @@ def seconds(chosen: Plan, horizon: Horizon, sizes: Sizes) -> int:
 @pytest.mark.parametrize("horizon", [Horizon(1, 1000), Horizon(1, 997), Horizon(25, 40), Horizon(7, 9)])
 def test_a_plan_stays_within_its_budget_and_memory_buys_time(horizon, calls, derived, apart):
     """Stored and recomputed states of all calls fit, shorter last chunks included; more memory never costs time."""
-    times, sizes = (
-        [],
-        SIZES._replace(calls=calls, derived=derived, apart=apart, inside=SIZES.inside - derived),
-    )
+    sizes = SIZES._replace(calls=calls, derived=derived, apart=apart, inside=SIZES.inside - derived)
+    times = []
     for budget in np.geomspace(600 + 200 * calls, 100_000 * calls, 20).astype(int):
         chosen = plan(horizon, sizes, int(budget))
         if chosen.keep_all:

@@ -172,7 +172,7 @@ class SharedAdjoint:
         self.mass_array = view(self.mass, buffers.types.real)
         self.partial_arrays = [view(one, vec) for one in self.partials]
         self._displacements = self.u.new_empty(0)
-        self.low = self._displacements if stores_u(self.model.spec) else torch.empty_like(self.u)
+        self.low = self.u.new_empty(0 if stores_u(self.model.spec) else self.u.shape)
         self._accumulators: dict[int, Accumulators] = {}
 
     @property
@@ -181,7 +181,7 @@ class SharedAdjoint:
         return self.u, self.v, self.anchor, self.force
 
     def displacements(self, substeps: int) -> Tensor:
-        """Memory for the displacements before each of so many substeps; chunks with fewer have a part of it."""
+        """Memory for the displacements before each of this number of substeps; shorter chunks use the beginning of it."""
         if len(self._displacements) < substeps:
             shape = substeps, *self.u.shape
             self._displacements = torch.empty(shape, dtype=self.u.dtype, device=self.u.device)
