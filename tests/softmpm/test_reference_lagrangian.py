@@ -473,33 +473,32 @@ def test_adjoint_of_the_projection(dim):
 
 
 @pytest.mark.parametrize(
-    ("law", "J", "of_P", "of_F"),
+    ("law", "J", "limit"),
     [
-        (reference.fixed_corotated, 0.1, 2e-7, 4e-7),
-        (reference.fixed_corotated, 0.01, 5e-7, 1e-5),
-        (reference.fixed_corotated, 0.001, 4e-6, 1e-3),
-        (reference_stress.stable_neo_hookean, 0.001, 12e-6, 3e-3),
-        (reference.neo_hookean, 0.001, 4e-6, 8e-6),
+        (reference.fixed_corotated, 0.1, 2e-7),
+        (reference.fixed_corotated, 0.01, 5e-7),
+        (reference.fixed_corotated, 0.001, 4e-6),
+        (reference_stress.stable_neo_hookean, 0.001, 12e-6),
+        (reference.neo_hookean, 0.001, 4e-6),
     ],
 )
-def test_rounding_near_collapse(law, J, of_P, of_F):
-    """Median relative errors of P = τ F⁻ᵀ and of its F̄ in float32 for stretches (1, 1, J): the figures of the page, within 30 %."""
+def test_rounding_near_collapse(law, J, limit):
+    """Median relative error of P = τ F⁻ᵀ in float32 for stretches (1, 1, J): the figures of the page, within 30 %."""
     Q = torch.linalg.qr(randn(2, 4000, 3, 3))[0]
     U, V = Q * torch.linalg.det(Q).sign()[..., None, None]
     exact = ((U * f64([1.0, 1.0, J])) @ V.mT).float().double()
-    cotangent, constants = randn(*exact.shape, seed=1), f64([1.0, 1.5])
+    constants = f64([1.0, 1.5])
 
-    def go(kind):
-        F = exact.to(kind).requires_grad_()
+    def stress(kind):
+        F = exact.to(kind)
         mu, lam = constants.to(kind)[:, None].expand(-1, len(F))
         rows = [torch.linalg.cross(F[:, i - 2], F[:, i - 1]) for i in range(3)]
         cofactor = torch.stack(rows, 1) / reference_stress.det(F)[:, None, None]
-        P = law(F, mu, lam) @ cofactor
-        return P.detach().double(), torch.autograd.grad(P, F, cotangent.to(kind))[0].double()
+        return (law(F, mu, lam) @ cofactor).double()
 
-    for got, want, limit in zip(go(torch.float32), go(torch.float64), (of_P, of_F), strict=True):
-        error = ((got - want).norm(dim=(1, 2)) / want.norm(dim=(1, 2))).median()
-        assert error <= 1.3 * limit
+    got, want = stress(torch.float32), stress(torch.float64)
+    error = ((got - want).norm(dim=(1, 2)) / want.norm(dim=(1, 2))).median()
+    assert error <= 1.3 * limit
 
 
 @DIMS

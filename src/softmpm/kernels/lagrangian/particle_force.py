@@ -1,7 +1,9 @@
 """Force of one particle on its nodes, and its adjoint. Derivation: docs/math/lagrangian.md.
 
 P = τ F⁻ᵀ of law and actuators, and that of viscosity (E6.P),  the force is −V P g_i              (Q2)
-P̄ = −V Σ f̄_i ⊗ g_i,  τ̄ = P̄ F⁻¹,  F̄ −= F⁻ᵀ P̄ᵀ P                                                  (Q2.adj)
+P̄ = −V Σ f̄_i ⊗ g_i,  F̄ by the adjoint of P of law and actuators                                   (Q2.adj)
+
+P is the product of a symmetric τ, whose rounding does not turn a free body; its adjoint needs no τ.
 """
 
 from types import SimpleNamespace
@@ -31,7 +33,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
     real, mat, Constants, dim = t.real, t.mat, t.Constants, spec.dim
     ParticleInputs, total_of = input_types(spec).ParticleInputs, total_stress(spec)
-    rotation, stress, identity = total_of.rotation, total_of.stress, k.identity
+    rotation, stress, shifted = total_of.rotation, total_of.stress, k.shifted
     volume_change, inverse_transpose = k.volume_change, k.inverse_transpose
     viscous_piola, viscous = viscosity(dim, spec.dtype).viscous_piola, spec.viscosity
     Material, material_ahead = material(spec).Material, material(spec).material_ahead
@@ -57,16 +59,11 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         return out
 
     @wp.func
-    def piola(own: Given, H: mat, Q: mat, R: mat) -> mat:
-        """P of law and actuators [Pa]; R is F⁻ᵀ."""
-        return stress(own.material, H, Q) * R
-
-    @wp.func
     def forced(own: Given, H: mat, rate: mat) -> mat:
         """−V P of a particle; ``rate`` is Ḟ."""
-        P = piola(own, H, rotation(own.material, H), inverse_transpose(H))
+        P = stress(own.material, H, rotation(own.material, H)) * inverse_transpose(H)
         if wp.static(viscous):
-            P += viscous_piola(identity() + H, rate, own.viscosity)
+            P += viscous_piola(shifted(H, real(1.0)), rate, own.viscosity)
         return -own.volume * P
 
     @wp.func
@@ -122,7 +119,6 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
     return SimpleNamespace(
         Given=Given,
         given_to=given_to,
-        piola=piola,
         forced=forced,
         sound=sound,
         check=check,
@@ -134,15 +130,11 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
 @kernel_factory
 def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     """Adjoint of the functions of one particle."""
-    mat, k = types(spec.dim, spec.dtype).mat, kinematics(spec.dim, spec.dtype)
-    identity, inverse_transpose = k.identity, k.inverse_transpose
-    rotation, piola, Given = (
-        total_stress(spec).rotation,
-        particle_forces(spec).piola,
-        particle_forces(spec).Given,
-    )
+    t, k = types(spec.dim, spec.dtype), kinematics(spec.dim, spec.dtype)
+    real, mat = t.real, t.mat
+    shifted, rotation, Given = k.shifted, total_stress(spec).rotation, particle_forces(spec).Given
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
-    stress_adj, viscous = total_stress_adj(spec, wanted).stress_adj, spec.viscosity
+    piola_adj, viscous = total_stress_adj(spec, wanted, "piola").stress_adj, spec.viscosity
     viscous_piola_adj = viscosity(spec.dim, spec.dtype).viscous_piola_adj
     to_particle = accumulate(spec.dtype).to_particle
     report, bad_gradient = status.report(spec.dim, spec.dtype).report, int(Kind.GRADIENT)
@@ -163,15 +155,11 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_inputs: ParticleInputsAdj,
     ) -> ForceAdj:
         """(Q2.adj)"""
-        R = inverse_transpose(H)
-        Q = rotation(own.material, H)
-        P = piola(own, H, Q, R)
         adj_P = -own.volume * G
         adj = ForceAdj()
-        adj.F = stress_adj(own.material, H, Q, adj_P * wp.transpose(R), world, p, adj_inputs)
-        adj.F -= R * (wp.transpose(adj_P) * P)
+        adj.F = piola_adj(own.material, H, rotation(own.material, H), adj_P, world, p, adj_inputs)
         if wp.static(viscous):
-            found = viscous_piola_adj(identity() + H, rate, own.viscosity, adj_P)
+            found = viscous_piola_adj(shifted(H, real(1.0)), rate, own.viscosity, adj_P)
             adj.F += found.F
             adj.rate = found.rate
             if wp.static("viscosity" in wanted):

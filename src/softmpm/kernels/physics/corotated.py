@@ -3,6 +3,9 @@
     τ = 2μ S + λ p(j) I,   S = (H − Q) Fᵀ = U + U Hᵀ,   U = H − Q
     F̄ = 2μ T (2F − R) + λ p' tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,   T = (τ̄ + τ̄ᵀ) / 2
     μ̄ = 2 ⟨T F, F − R⟩,   λ̄ = tr(τ̄) p(j)
+    P = 2μ (H − Q) + f' C,   C = cof F                                                        (E2.P)
+    F̄ = 2μ P̄ + f' (P̄ × F) + f'' ⟨P̄, C⟩ C + adjoint of R for R̄ = −2μ P̄
+    μ̄ = 2 ⟨P̄, H − Q⟩,   λ̄ = ⟨P̄, C⟩ p/J
     K ≤ 2μ max(2s² − s, 0) + d max(λ J p', 0)            with the largest principal stretch s, in d dimensions
     σ = 2μ,  f' = λ p/J,  f'' = λ (p/J)'                                                              in (Q8)
 
@@ -29,6 +32,7 @@ def corotated(
     Moduli = moduli_type(dtype)
     real, mat = t.real, t.mat
     identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
+    shifted, cofactor_change, cofactor_adj = k.shifted, k.cofactor_change, k.cofactor_adj
     rotation, rotation_adj = polar(dim, dtype).rotation, polar(dim, dtype).rotation_adj
 
     @wp.func
@@ -56,6 +60,19 @@ def corotated(
         return adj
 
     @wp.func
+    def piola_adj(H: mat, Q: mat, mu: real, lam: real, adj_P: mat) -> LawAdj:
+        C = shifted(cofactor_change(H), real(1.0))
+        slopes = energy_slopes(volume_change(H))
+        along = wp.ddot(adj_P, C)
+        two_mu = real(2.0) * mu
+        adj = LawAdj()
+        adj.F = two_mu * adj_P + rotation_adj(H, Q, -two_mu * adj_P)
+        adj.F += lam * (slopes[0] * cofactor_adj(H, adj_P) + (slopes[1] * along) * C)
+        adj.mu = real(2.0) * wp.ddot(adj_P, H - Q)
+        adj.lam = along * slopes[0]
+        return adj
+
+    @wp.func
     def bound(square: real, j: real, trace: real, mu: real, lam: real) -> real:
         shape = wp.max(real(2.0) * square - wp.sqrt(square), real(0.0))
         volume = wp.max(lam * (real(1.0) + j) * pressure_slope(j), real(0.0))
@@ -71,5 +88,10 @@ def corotated(
         return m
 
     return SimpleNamespace(
-        rotation=rotation, stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli
+        rotation=rotation,
+        stress=stress,
+        stress_adj=stress_adj,
+        piola_adj=piola_adj,
+        bound=bound,
+        moduli=moduli,
     )

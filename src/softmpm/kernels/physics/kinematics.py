@@ -20,6 +20,14 @@ def kinematics(dim: int, dtype: str) -> SimpleNamespace:
     def identity() -> mat:
         return wp.identity(n=dim, dtype=real)
 
+    @wp.func
+    def shifted(M: mat, t: real) -> mat:
+        """M + t I."""
+        out = M
+        for i in range(dim):
+            out[i, i] = out[i, i] + t
+        return out
+
     if dim == 2:
 
         @wp.func
@@ -32,10 +40,14 @@ def kinematics(dim: int, dtype: str) -> SimpleNamespace:
             return H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
 
         @wp.func
-        def inverse_transpose(H: mat) -> mat:
-            """F⁻ᵀ."""
-            scale = real(1.0) / (real(1.0) + volume_change(H))
-            return scale * (cofactor(H) + identity())
+        def cofactor_change(H: mat) -> mat:
+            """cof F − I."""
+            return cofactor(H)
+
+        @wp.func
+        def cofactor_adj(H: mat, adj_C: mat) -> mat:
+            """Adjoint of F of cof F, which is linear in F."""
+            return cofactor(adj_C)
     else:
 
         @wp.func
@@ -54,14 +66,29 @@ def kinematics(dim: int, dtype: str) -> SimpleNamespace:
             return wp.trace(H) + wp.trace(G) + (H[0, 0] * G[0, 0] + H[0, 1] * G[0, 1] + H[0, 2] * G[0, 2])
 
         @wp.func
-        def inverse_transpose(H: mat) -> mat:
-            """F⁻ᵀ, with cof F = (1 + tr H) I − Hᵀ + cof H."""
-            scale = real(1.0) / (real(1.0) + volume_change(H))
-            C = cofactor(H) - wp.transpose(H)
-            t = real(1.0) + wp.trace(H)
-            for i in range(3):
-                C[i, i] = C[i, i] + t
-            return scale * C
+        def cofactor_change(H: mat) -> mat:
+            """cof F − I = tr(H) I − Hᵀ + cof H."""
+            return shifted(cofactor(H) - wp.transpose(H), wp.trace(H))
+
+        @wp.func
+        def cofactor_adj(H: mat, adj_C: mat) -> mat:
+            """Adjoint of cof F, C̄ × F, whose part C̄ × I is tr(C̄) I − C̄ᵀ. Its rows are vector products."""
+            a = vec(H[0, 0], H[0, 1], H[0, 2])
+            b = vec(H[1, 0], H[1, 1], H[1, 2])
+            c = vec(H[2, 0], H[2, 1], H[2, 2])
+            adj_a = vec(adj_C[0, 0], adj_C[0, 1], adj_C[0, 2])
+            adj_b = vec(adj_C[1, 0], adj_C[1, 1], adj_C[1, 2])
+            adj_c = vec(adj_C[2, 0], adj_C[2, 1], adj_C[2, 2])
+            x = wp.cross(b, adj_c) + wp.cross(adj_b, c)
+            y = wp.cross(c, adj_a) + wp.cross(adj_c, a)
+            z = wp.cross(a, adj_b) + wp.cross(adj_a, b)
+            own = mat(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
+            return shifted(own - wp.transpose(adj_C), wp.trace(adj_C))
+
+    @wp.func
+    def inverse_transpose(H: mat) -> mat:
+        """F⁻ᵀ."""
+        return (real(1.0) / (real(1.0) + volume_change(H))) * shifted(cofactor_change(H), real(1.0))
 
     @wp.func
     def log1p(j: real) -> real:
@@ -71,7 +98,10 @@ def kinematics(dim: int, dtype: str) -> SimpleNamespace:
 
     return SimpleNamespace(
         identity=identity,
+        shifted=shifted,
         cofactor=cofactor,
+        cofactor_change=cofactor_change,
+        cofactor_adj=cofactor_adj,
         volume_change=volume_change,
         inverse_transpose=inverse_transpose,
         log1p=log1p,

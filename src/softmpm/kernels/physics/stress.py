@@ -202,7 +202,8 @@ def material(spec: Spec) -> SimpleNamespace:
 
 
 @kernel_factory
-def total_stress_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
+def total_stress_adj(spec: Spec, wanted: RequestedGrads, measure: str = "stress") -> SimpleNamespace:
+    """Adjoint of the total stress: of τ (``stress``), or of P = τ F⁻ᵀ (``piola``); ``adj_tau`` is then P̄."""
     t = types(spec.dim, spec.dtype)
     real, vec, mat, Material = t.real, t.vec, t.mat, material(spec).Material
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
@@ -214,8 +215,8 @@ def total_stress_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     to_particle, to_slot = accumulate(spec.dtype).to_particle, accumulate(spec.dtype).to_slot
 
     def stress_adj_from(k: int) -> wp.Function:
-        """Adjoint of τ by the laws from number ``k`` on."""
-        own, last = laws[k].stress_adj, k + 1 == len(laws)
+        """Adjoint of the stress by the laws from number ``k`` on."""
+        own, last = getattr(laws[k], f"{measure}_adj"), k + 1 == len(laws)
         others = None if last else stress_adj_from(k + 1)
 
         @wp.func
@@ -229,7 +230,7 @@ def total_stress_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
 
     def active_stress_adj_from(k: int) -> wp.Function:
         """Adjoint of the active stress by the kinds of actuators from number ``k`` on."""
-        own, last = actuators[k].stress_adj, k + 1 == len(actuators)
+        own, last = getattr(actuators[k], f"{measure}_adj"), k + 1 == len(actuators)
         others = None if last else active_stress_adj_from(k + 1)
 
         @wp.func

@@ -4,6 +4,7 @@ A file has a factory ``actuator(dim, dtype)``, which gives the Warp functions
 
     stress(H, fibre, p) → τ                     active Kirchhoff stress [Pa] for p = activation · strength [Pa]
     stress_adj(H, fibre, p, τ̄) → ActuatorAdj    adjoints of F, of p and of the fibre direction
+    piola_adj(H, fibre, p, P̄) → ActuatorAdj     the same for P = τ F⁻ᵀ
     bound(F, j, fibre, p) → K                   at least what it adds to the stiffness of (W3) [Pa]
     moduli(p) → Moduli                          what it adds to those of (Q8)
 

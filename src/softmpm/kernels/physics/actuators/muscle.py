@@ -2,6 +2,7 @@
 
     τ = p f fᵀ,  f = F d = d + H d                                                                   (M1)
     p̄ = fᵀ τ̄ f,  F̄ = p (τ̄ + τ̄ᵀ) f dᵀ,  d̄ = p Fᵀ (τ̄ + τ̄ᵀ) f                                         (M1.adj)
+    P = p f dᵀ,  p̄ = f·P̄ d,  F̄ = p P̄ d dᵀ,  d̄ = p (Fᵀ P̄ d + P̄ᵀ f)                                   (M1.P)
 
 with the unit direction d in the rest shape and the active stress p [Pa]: positive contracts. Source: Spielberg et al. 2021 (Robotica).
 """
@@ -37,6 +38,16 @@ def actuator(dim: int, dtype: str) -> SimpleNamespace:
         return adj
 
     @wp.func
+    def piola_adj(H: mat, fibre: vec, p: real, adj_P: mat) -> ActuatorAdj:
+        f = fibre + H * fibre
+        pull = adj_P * fibre
+        adj = ActuatorAdj()
+        adj.F = p * wp.outer(pull, fibre)
+        adj.active_stress = wp.dot(f, pull)
+        adj.fibre = p * (pull + wp.transpose(H) * pull + wp.transpose(adj_P) * f)
+        return adj
+
+    @wp.func
     def bound(F: mat, j: real, fibre: vec, p: real) -> real:
         f = F * fibre
         return real(2.0) * wp.max(p, real(0.0)) * wp.dot(f, f)
@@ -47,4 +58,6 @@ def actuator(dim: int, dtype: str) -> SimpleNamespace:
         m.shear = wp.max(p, real(0.0))
         return m
 
-    return SimpleNamespace(stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli)
+    return SimpleNamespace(
+        stress=stress, stress_adj=stress_adj, piola_adj=piola_adj, bound=bound, moduli=moduli
+    )

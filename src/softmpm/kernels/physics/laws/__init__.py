@@ -5,6 +5,7 @@ A file has a factory ``law(dim, dtype)``, which gives the Warp functions
     rotation(H) → Q                         what the stress needs of the rotation R = I + Q; zero if nothing
     stress(H, Q, mu, lam) → τ               Kirchhoff stress [Pa]
     stress_adj(H, Q, mu, lam, τ̄) → LawAdj   adjoints of F, μ and λ
+    piola_adj(H, Q, mu, lam, P̄) → LawAdj    the same for P = τ F⁻ᵀ, without a quotient by J where P has none
     bound(square, j, trace, mu, lam) → K    at least the stiffness of (W3) [Pa], and equal to it at rest, from the square of the largest
                                             principal stretch or more, j = J − 1 and the trace of F Fᵀ
     moduli(j, trace, mu, lam) → Moduli      those of (Q8), for the step limit of the reference formulation

@@ -2,6 +2,8 @@
 
 τ = μ (H + Hᵀ + H Hᵀ) + λ log(1 + j) I                                                          (E1)
 F̄ = μ (τ̄ + τ̄ᵀ) F + λ tr(τ̄) cof(F) / J,  μ̄ = ⟨τ̄, H + Hᵀ + H Hᵀ⟩,  λ̄ = tr(τ̄) log(1 + j)
+P = μ (F − C/J) + λ log(1 + j) C/J,  C = cof F                                                  (E1.P)
+F̄ = μ (P̄ − X) + (f' + μ) X + f'' ⟨P̄, C⟩ C,  X = P̄ × F,  μ̄ = ⟨P̄, F − C/J⟩,  λ̄ = ⟨P̄, C⟩ log(1 + j)/J
 K ≤ 2μ s² + d max(λ, 0)                              with the largest principal stretch s, in d dimensions
 σ = μ,  f' = (λ log J − μ)/J,  f'' ≤ (μ + max(λ (1 − log J), 0))/J²                                  in (Q8)
 """
@@ -23,6 +25,7 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
     Moduli = moduli_type(dtype)
     real, mat, divide = t.real, t.mat, t.divide
     identity, cofactor, volume_change, log1p = k.identity, k.cofactor, k.volume_change, k.log1p
+    shifted, cofactor_change, cofactor_adj = k.shifted, k.cofactor_change, k.cofactor_adj
 
     @wp.func
     def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
@@ -40,6 +43,23 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
         return adj
 
     @wp.func
+    def piola_adj(H: mat, Q: mat, mu: real, lam: real, adj_P: mat) -> LawAdj:
+        j = volume_change(H)
+        D = cofactor_change(H)
+        C = shifted(D, real(1.0))
+        inverse = divide(real(1.0), real(1.0) + j)
+        logarithm = log1p(j)
+        pressure = lam * logarithm
+        X = cofactor_adj(H, adj_P)
+        along = wp.ddot(adj_P, C) * inverse
+        curved = along * (mu + lam - pressure) * inverse  # f'' ⟨P̄, C⟩
+        adj = LawAdj()
+        adj.F = mu * (adj_P - X) + ((mu * j + pressure) * inverse) * X + curved * C
+        adj.mu = wp.ddot(adj_P, H - D) + along * j  # F − C/J = H − D + C j/J
+        adj.lam = along * logarithm
+        return adj
+
+    @wp.func
     def bound(square: real, j: real, trace: real, mu: real, lam: real) -> real:
         return real(2.0) * mu * square + real(dim) * wp.max(lam, real(0.0))
 
@@ -54,5 +74,10 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
         return m
 
     return SimpleNamespace(
-        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli
+        rotation=no_rotation(dim, dtype),
+        stress=stress,
+        stress_adj=stress_adj,
+        piola_adj=piola_adj,
+        bound=bound,
+        moduli=moduli,
     )

@@ -3,6 +3,9 @@
     τ = μ (E + k B) + ((λ + ⅚ μ) (1 + j) − μ) j I,   E = B − I,   k = s / (12 + 3 s),   s = tr E          (E5)
     F̄ = 2μ ((1 + k) T + k' ⟨T, B⟩ I) F + p' tr(τ̄) cof(F),   k' = 4 / (3 (4 + s)²),   T = (τ̄ + τ̄ᵀ) / 2
     μ̄ = ⟨T, E + k B⟩ + tr(τ̄) (⅚ (1 + j) − 1) j,   λ̄ = tr(τ̄) (1 + j) j
+    P = μ (1 + k) F + f' C,   C = cof F                                                                   (E5.P)
+    F̄ = μ (P̄ − X) + μ k P̄ + (f' + μ) X + 2μ k' ⟨P̄, F⟩ F + f'' ⟨P̄, C⟩ C,   X = P̄ × F,   f'' = λ + ⅚ μ
+    μ̄ = ⟨P̄, F − C + k F⟩ + ⅚ j ⟨P̄, C⟩,   λ̄ = j ⟨P̄, C⟩
     K ≤ 2μ ((1 + k) s₁² + k' s₁² tr B) + d max(p' J, 0),   p' = (λ + ⅚ μ) (2J − 1) − μ
     σ = μ (1 + k),  κ = 2μ k',  f' = (λ + ⅚ μ) j − μ,  f'' ≤ max(λ, 0) + ⅚ μ                             in (Q8)
 
@@ -26,6 +29,7 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
     Moduli = moduli_type(dtype)
     real, mat, divide = t.real, t.mat, t.divide
     identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
+    shifted, cofactor_change, cofactor_adj = k.shifted, k.cofactor_change, k.cofactor_adj
     five_sixths, four_thirds = (
         real(5.0 / 6.0),
         real(4.0 / 3.0),
@@ -81,6 +85,25 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
         return adj
 
     @wp.func
+    def piola_adj(H: mat, Q: mat, mu: real, lam: real, adj_P: mat) -> LawAdj:
+        F = shifted(H, real(1.0))
+        D = cofactor_change(H)
+        C = shifted(D, real(1.0))
+        s = real(2.0) * wp.trace(H) + wp.ddot(H, H)
+        k = softening(s)
+        j = volume_change(H)
+        X = cofactor_adj(H, adj_P)
+        stretched = wp.ddot(adj_P, F)
+        along = wp.ddot(adj_P, C)
+        adj = LawAdj()
+        adj.F = mu * (adj_P - X) + (mu * k) * adj_P + (real(2.0) * mu * softening_slope(s) * stretched) * F
+        adj.F += bulk(mu, lam) * (j * X + along * C)
+        volume = along * j
+        adj.mu = wp.ddot(adj_P, H - D) + k * stretched + five_sixths * volume
+        adj.lam = volume
+        return adj
+
+    @wp.func
     def bound(square: real, j: real, trace: real, mu: real, lam: real) -> real:
         s = trace - real(dim)
         shape = (real(1.0) + softening(s)) * square + softening_slope(s) * square * trace
@@ -98,5 +121,10 @@ def law(dim: int, dtype: str) -> SimpleNamespace:
         return m
 
     return SimpleNamespace(
-        rotation=no_rotation(dim, dtype), stress=stress, stress_adj=stress_adj, bound=bound, moduli=moduli
+        rotation=no_rotation(dim, dtype),
+        stress=stress,
+        stress_adj=stress_adj,
+        piola_adj=piola_adj,
+        bound=bound,
+        moduli=moduli,
     )
