@@ -4,7 +4,7 @@
     F̄ = 2μ T (2F − R) + λ p' tr(τ̄) cof(F) + adjoint of R for R̄ = −2μ T F,   T = (τ̄ + τ̄ᵀ) / 2
     μ̄ = 2 ⟨T F, F − R⟩,   λ̄ = tr(τ̄) p(j)
     P = 2μ (H − Q) + f' C,   C = cof F                                                        (E2.P)
-    F̄ = 2μ P̄ + f' (P̄ × F) + f'' ⟨P̄, C⟩ C + adjoint of R for R̄ = −2μ P̄
+    F̄ = f' (P̄ × F) + f'' ⟨P̄, C⟩ C + adjoint of F − R for 2μ P̄
     μ̄ = 2 ⟨P̄, H − Q⟩,   λ̄ = ⟨P̄, C⟩ p/J
     K ≤ 2μ max(2s² − s, 0) + d max(λ J p', 0)            with the largest principal stretch s, in d dimensions
     σ = 2μ,  f' = λ p/J,  f'' = λ (p/J)'                                                              in (Q8)
@@ -33,7 +33,8 @@ def corotated(
     real, mat = t.real, t.mat
     identity, cofactor, volume_change = k.identity, k.cofactor, k.volume_change
     shifted, cofactor_change, cofactor_adj = k.shifted, k.cofactor_change, k.cofactor_adj
-    rotation, rotation_adj = polar(dim, dtype).rotation, polar(dim, dtype).rotation_adj
+    turning = polar(dim, dtype)
+    rotation, rotation_adj, strain_adj = turning.rotation, turning.rotation_adj, turning.strain_adj
 
     @wp.func
     def stress(H: mat, Q: mat, mu: real, lam: real) -> mat:
@@ -64,10 +65,10 @@ def corotated(
         C = shifted(cofactor_change(H), real(1.0))
         slopes = energy_slopes(volume_change(H))
         along = wp.ddot(adj_P, C)
-        two_mu = real(2.0) * mu
         adj = LawAdj()
-        adj.F = two_mu * adj_P + rotation_adj(H, Q, -two_mu * adj_P)
-        adj.F += lam * (slopes[0] * cofactor_adj(H, adj_P) + (slopes[1] * along) * C)
+        adj.F = (real(2.0) * mu) * strain_adj(H, Q, adj_P) + lam * (
+            slopes[0] * cofactor_adj(H, adj_P) + (slopes[1] * along) * C
+        )
         adj.mu = real(2.0) * wp.ddot(adj_P, H - Q)
         adj.lam = along * slopes[0]
         return adj

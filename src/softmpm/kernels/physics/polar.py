@@ -10,6 +10,7 @@ Functions take H = F − I and give Q = R − I, so that a small deformation kee
     R ← R exp[ω],  (tr(S) I − S) ω = axl(RᵀF)                                                      (R3)
     with axl(M) = (M₂₁ − M₁₂, M₀₂ − M₂₀, M₁₀ − M₀₁).
 Adjoint: F̄ += R [y],  (tr(S) I − S) y = axl(RᵀR̄)                                                    (R3.F)
+of F − R, with M = RᵀP̄ and a = axl(M):  F̄ = R (sym M + ½ [y]),  (tr(S) I − S) y = (tr(S − I) I − (S − I)) a   (R4)
 
 (R3.F) has no singular values in a denominator but their pairwise sums: it is singular only where R itself is not unique.
 Source: Davenport's q-method (Markley & Mortari 2000) for (R2); the rest is derived.
@@ -61,7 +62,18 @@ def _polar2(dtype: str) -> SimpleNamespace:
         angle = -s * (adj_R[0, 0] + adj_R[1, 1]) + c * (adj_R[1, 0] - adj_R[0, 1])
         return (angle / r) * mat(-s, -c, c, -s)
 
-    return SimpleNamespace(rotation=rotation, rotation_adj=rotation_adj)
+    @wp.func
+    def strain_adj(H: mat, Q: mat, adj: mat) -> mat:
+        """∂L/∂F (R4)."""
+        U = H - Q
+        E = U + wp.transpose(Q) * U  # S − I, small where U is, also if R is not quite orthogonal
+        M = adj + wp.transpose(Q) * adj
+        even = real(0.5) * (M[0, 1] + M[1, 0])
+        odd = real(0.5) * (M[1, 0] - M[0, 1]) * wp.trace(E) / (real(2.0) + wp.trace(E))
+        out = mat(M[0, 0], even - odd, even + odd, M[1, 1])
+        return out + Q * out
+
+    return SimpleNamespace(rotation=rotation, rotation_adj=rotation_adj, strain_adj=strain_adj)
 
 
 def _polar3(dtype: str) -> SimpleNamespace:
@@ -196,4 +208,15 @@ def _polar3(dtype: str) -> SimpleNamespace:
         y = turn(H + wp.transpose(Q) + wp.transpose(Q) * H, axl(wp.transpose(R) * adj_R))
         return R * wp.skew(y)
 
-    return SimpleNamespace(rotation=rotation, rotation_adj=rotation_adj)
+    @wp.func
+    def strain_adj(H: mat, Q: mat, adj: mat) -> mat:
+        """∂L/∂F (R4)."""
+        U = H - Q
+        E = U + wp.transpose(Q) * U  # S − I, small where U is, also if R is not quite orthogonal
+        M = adj + wp.transpose(Q) * adj
+        a = axl(M)
+        y = turn(E, wp.trace(E) * a - real(0.5) * ((E + wp.transpose(E)) * a))
+        out = real(0.5) * (M + wp.transpose(M) + wp.skew(y))
+        return out + Q * out
+
+    return SimpleNamespace(rotation=rotation, rotation_adj=rotation_adj, strain_adj=strain_adj)

@@ -63,18 +63,17 @@ def test_rotation_keeps_the_digits_of_a_small_deformation(dim, size):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_rotation_adj_is_the_finite_difference(dim, device):
-    """⟨W, R⟩ for random W, central differences along every entry of F, at every special point."""
+@pytest.mark.parametrize("of", ["rotation", "strain"])
+def test_the_adjoint_is_the_finite_difference(dim, of, device):
+    """⟨W, R⟩ and ⟨W, F − R⟩ for random W, central differences along every entry of F, at every special point."""
     points = {k: F for k, F in special_deformations(dim).items() if k not in ("nearly flat",)}
     generator = torch.Generator().manual_seed(1)
     mat, eye, h = types(dim, "float64").mat, torch.eye(dim, dtype=torch.float64), 1e-6
     H = torch.stack(list(points.values())) - eye
     W = torch.randn(H.shape, generator=generator, dtype=torch.float64)
-    blocks = polar(dim, "float64")
+    adjoint = getattr(polar(dim, "float64"), f"{of}_adj")
     Q = rotation(dim, "float64", H.to(device))
-    got = apply(
-        blocks.rotation_adj, mat, (dim, dim), (H.to(device), mat), (Q, mat), (W.to(device), mat)
-    ).cpu()
+    got = apply(adjoint, mat, (dim, dim), (H.to(device), mat), (Q, mat), (W.to(device), mat)).cpu()
     for n, (name, F) in enumerate(points.items()):
         want = torch.zeros(dim, dim, dtype=torch.float64)
         for i in range(dim):
@@ -82,9 +81,34 @@ def test_rotation_adj_is_the_finite_difference(dim, device):
                 step = np.zeros((dim, dim))
                 step[i, j] = h
                 change = svd_rotation(F.numpy() + step) - svd_rotation(F.numpy() - step)
+                if of == "strain":
+                    change = 2 * step - change
                 want[i, j] = float((W[n].numpy() * change).sum() / (2 * h))
         error = (got[n] - want).abs().max() / want.abs().max().clamp_min(1.0)
         assert error < 1e-8, (name, error.item())
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_rounding_of_the_adjoint_of_the_strain_turns_nothing(dim):
+    """For a cotangent W F, which turns the body, ⟨W, F̄ Fᵀ⟩ in float32 is that in float64 to 1e-9 where strains are 1e-3."""
+    generator = torch.Generator().manual_seed(2)
+    R = torch.linalg.qr(torch.randn(500, dim, dim, generator=generator, dtype=torch.float64))[0]
+    R[:, :, 0] *= torch.linalg.det(R)[:, None]
+    E, W = torch.randn(2, 500, dim, dim, generator=generator, dtype=torch.float64)
+    eye = torch.eye(dim, dtype=torch.float64)
+    H, skew = (
+        (R @ (eye + 5e-4 * (E + E.mT)) - eye).float(),
+        (W - W.mT) / (W - W.mT).norm(dim=(1, 2))[:, None, None],
+    )
+    Q, turned = rotation(dim, "float32", H), (skew @ (eye + H)).float()
+
+    def power(dtype):
+        mat, real = types(dim, dtype).mat, DTYPES[dtype]
+        given = (H.to(real), mat), (Q.to(real), mat), (turned.to(real), mat)
+        adj = apply(polar(dim, dtype).strain_adj, mat, (dim, dim), *given).double()
+        return (skew * (adj @ (eye + H).mT)).sum((1, 2))
+
+    assert (power("float32") - power("float64")).abs().mean() < 1e-9
 
 
 def test_rotation_adj_is_not_finite_where_the_rotation_is_not_unique():
