@@ -12,10 +12,10 @@ from softmpm.schemes.capture import is_capturing, keep_alive, once_in_capture
 
 
 class CachedGraph(NamedTuple):
-    """A chunk graph and its adjoint graphs, which refer to it."""
+    """A chunk graph and its adjoint graphs, which refer to it, with the shared buffers that each works on."""
 
     graph: Any
-    adjoints: dict[RequestedGrads, Any]
+    adjoints: dict[RequestedGrads, tuple[Any, Any]]
 
 
 RETAINED_SHAPES = {False: 4, True: 2}
@@ -38,6 +38,8 @@ class GraphCache(ABC):
 
     Graphs of the most recent chunk shapes are always retained. Older ones are retained only while all of them fit into one call's
     share of the memory budget, since calls of different lengths have different shapes.
+
+    A graph that PyTorch captures takes those that it uses out of the cache, and its calls lease them from each other.
     """
 
     def __init__(self, model: Model):
@@ -45,8 +47,8 @@ class GraphCache(ABC):
         # By whether they store their intermediate states, then by shape, the most recent last:
         self._free: dict[bool, dict[tuple, _FreeList]] = {False: {}, True: {}}
         self._shared_adjoints: dict[RequestedGrads, Any] = {}
-        # Guards the shared adjoints: the backward pass of this thread's calls may run in other threads.
-        self.lock = threading.Lock()
+        # The backward pass of this thread's calls may run in other threads.
+        self.lock = threading.RLock()
 
     @abstractmethod
     def new_graph(self, chunk: Chunk, keep: bool) -> Any:
@@ -61,18 +63,27 @@ class GraphCache(ABC):
         """Adjoint of a graph on these buffers."""
 
     def take(self, chunk: Chunk, keep: bool) -> tuple[CachedGraph, _FreeList]:
-        """Acquire a graph, and the list that it is returned to; only this thread adds lists to the cache."""
-        shapes = self._free[keep]
-        free = shapes[chunk.shape] = shapes.pop(chunk.shape, _FreeList())
-        if free:
-            cached = free.pop()
+        """Acquire a graph, and the list that it is returned to."""
+        with self.lock:
+            shapes = self._free[keep]
+            free = shapes[chunk.shape] = shapes.pop(chunk.shape, _FreeList())
             if is_capturing(self.model):
-                # With its adjoints: their graphs must not be destroyed during a capture.
-                keep_alive(cached)
-            return cached, free
-        if not is_capturing(self.model):  # else no graph may be destroyed
+                return self._take_in_capture(chunk, keep, free)
+            if free:
+                return free.pop(), free
             self._forget(keep)
-        return CachedGraph(self.new_graph(chunk, keep), {}), free
+            return CachedGraph(self.new_graph(chunk, keep), {}), free
+
+    def _take_in_capture(self, chunk: Chunk, keep: bool, free: _FreeList) -> tuple[CachedGraph, _FreeList]:
+        """A graph that a call of the same capture has returned, else one of the cache, or a new one. No graph may be destroyed now."""
+        own = once_in_capture((self, keep, chunk.shape), _FreeList)
+        if own:
+            return own.pop(), own
+        if not free:
+            return CachedGraph(self.new_graph(chunk, keep), {}), own
+        cached = free.pop()
+        keep_alive(cached)  # with its adjoints
+        return cached, own
 
     def _forget(self, keep: bool) -> None:
         """Evict old shapes to make room for another graph."""
@@ -85,21 +96,34 @@ class GraphCache(ABC):
     def adjoint(self, cached: CachedGraph, wanted: RequestedGrads) -> Any:
         """The adjoint of a graph for the requested gradients, built on first use."""
         graph, adjoints = cached
-        if is_capturing(self.model):
-            # Shared with the other chunks of the capture, but not with calls outside of it:
-            shared = once_in_capture((self, wanted), lambda: self.new_shared(graph, wanted))
-            return self.new_adjoint(graph, shared)
-        if wanted not in self._shared_adjoints:
-            self._shared_adjoints[wanted] = self.new_shared(graph, wanted)
-        if wanted not in adjoints:
-            adjoints[wanted] = self.new_adjoint(graph, self._shared_adjoints[wanted])
-        return adjoints[wanted]
+        shared = self._shared_in_capture(graph, wanted) if is_capturing(self.model) else None
+        if shared is None:
+            if wanted not in self._shared_adjoints:
+                self._shared_adjoints[wanted] = self.new_shared(graph, wanted)
+            shared = self._shared_adjoints[wanted]
+        known = adjoints.get(wanted)
+        if known is None or known[0] is not shared:
+            if known is not None and is_capturing(self.model):
+                keep_alive(known)
+            known = adjoints[wanted] = shared, self.new_adjoint(graph, shared)
+        return known[1]
+
+    def _shared_in_capture(self, graph: Any, wanted: RequestedGrads) -> Any:
+        """Buffers that the backward passes of the capture share, but not with calls outside of it: those of the cache, which gets
+        others on next use."""
+
+        def take() -> Any:
+            idle = [one for shapes in self._free.values() for free in shapes.values() for one in free]
+            keep_alive([one.adjoints.pop(wanted, None) for one in idle])
+            taken = self._shared_adjoints.pop(wanted, None)
+            return self.new_shared(graph, wanted) if taken is None else taken
+
+        return once_in_capture((self, wanted), take)
 
 
 class Lease:
-    """Lease of a chunk graph; returned to the cache when no result references its buffers."""
+    """Lease of a chunk graph; returned when no result references its buffers."""
 
     def __init__(self, pool: GraphCache, chunk: Chunk, keep: bool):
         self.cached, free = pool.take(chunk, keep)
-        if not is_capturing(pool.model):  # else it belongs to the graph that is being captured
-            weakref.finalize(self, _return_to_cache, weakref.ref(free), self.cached)
+        weakref.finalize(self, _return_to_cache, weakref.ref(free), self.cached)

@@ -14,6 +14,7 @@ import warp as wp
 from softmpm.kernels.compile import THREADS, compile_together, launch, runs_in_order
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
+from softmpm.schemes.child_graph import add_child
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.program import Divided, Program
 
@@ -79,28 +80,28 @@ class LaunchTemplate:
     """
 
     def __init__(self, made: Any):
-        self._made, self._kinds = copy.copy(made), [type(value) for value in made.params[1:]]
+        self._made, kinds = copy.copy(made), [type(value) for value in made.params[1:]]
+        self._kinds = [(kind, issubclass(kind, ctypes.Structure)) for kind in kinds]
+        self._addresses = ctypes.c_void_p * len(made.params)
         # The first inputs must not live as long as the template:
         self._made.params = made.params[:1]
         self._made.fwd_args = ()
 
     def on(self, inputs: Sequence) -> wp.Launch:
         """The same launch on other inputs, which it keeps alive."""
-        made: Any = copy.copy(self._made)
-        values = [_packed(kind, value) for kind, value in zip(self._kinds, inputs, strict=True)]
-        made.params, made.fwd_args = [made.bounds, *values], inputs
+        made: Any = object.__new__(wp.Launch)
+        made.__dict__.update(self._made.__dict__)
+        pairs = zip(self._kinds, inputs, strict=True)
+        made.params = [made.bounds, *[_native(kind, v) if native else kind(v) for (kind, native), v in pairs]]
+        made.fwd_args = inputs
         if made.params_addr is not None:
-            made.params_addr = (ctypes.c_void_p * len(made.params))(*map(ctypes.addressof, made.params))
+            made.params_addr = self._addresses(*map(ctypes.addressof, made.params))
         return made
 
 
-def _packed(kind: type, value: Any) -> Any:
-    """An input of a launch as the native value of a type."""
-    if isinstance(value, kind):
-        return value
-    if not issubclass(kind, ctypes.Structure):
-        return kind(value)
-    found = value.__ctype__()
+def _native(kind: type, value: Any) -> Any:
+    """An array or a struct as the native value of a type; vectors are such values."""
+    found = value if type(value) is kind else value.__ctype__()
     assert type(found) is kind, f"a repeated launch got {type(found)}, the first one {kind}"
     return found
 
@@ -148,8 +149,8 @@ class LaunchReplay:
 
     The function is passed at each use and not stored, since its owner holds this object.
 
-    While PyTorch captures a CUDA graph, the launches become part of that graph. Warp's CPU graphs would also capture what other
-    threads launch meanwhile.
+    While PyTorch captures a CUDA graph, the launches become part of that graph, at once if they were captured before. Warp's CPU graphs
+    would also capture what other threads launch meanwhile.
     """
 
     def __init__(self, model: Model):
@@ -161,7 +162,10 @@ class LaunchReplay:
         if stream is None:
             self._run_program(launches)
         elif is_capturing(self.model):
-            launches(KernelLauncher(self.model, stream))
+            if self._graph is None:
+                launches(KernelLauncher(self.model, stream))
+            else:
+                add_child(self._graph, stream)
         else:
             if self._graph is None:
                 self._compile(launches)
