@@ -52,7 +52,7 @@ class Trail:
 
     def keep(self, run: Run) -> None:
         """Retain a run without its final state: the last one is the result of the call, which refers to this trail."""
-        del run.end
+        run.release()
         self.runs.append(run)
 
     @property

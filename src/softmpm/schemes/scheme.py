@@ -28,6 +28,10 @@ class Run(Protocol):
     words: Tensor
     outgrow: Callable[[], None] | None
 
+    def release(self) -> None:
+        """Let go of what :meth:`vjp` does not need, its final state first of all, once the run is valid."""
+        ...
+
     def vjp(self, adj_end: Any, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Any:
         """Adjoint of the initial state; those of the inputs are added into ``adj_inputs``. The run must have stored its states."""
         ...

@@ -5,6 +5,7 @@ the inputs (sorted_inputs.py) and the initial state.
 """
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -37,6 +38,17 @@ def sums_over(model: Model, rows: Callable[[], Tensor], nodes: Sequence[wp.array
     if model.spec.deterministic:
         return FixedPointSums(model, view(rows(), wp.float32), nodes)
     return SlabSums(model, rows(), nodes) if model.spec.slabs else NodeSums(nodes)
+
+
+class StoredStates(NamedTuple):
+    """Copies of what the adjoint of a chunk reads, but for the inputs; see :class:`ChunkBuffers`."""
+
+    version: int
+    """Of the layout that order and origin are of."""
+    order: Tensor
+    origin: Tensor
+    states: list[Tensor]
+    """Packed states and nodes, then anchors and impulses of surface points."""
 
 
 class ChunkBuffers:
@@ -173,23 +185,51 @@ class ChunkBuffers:
             values: Inputs that the call sets; those with rows have one for each control step of the chunk.
             frozen: True for worlds whose particles do not move, shape (world,).
         """
-        moved = is_capturing(self.model) or self._version != self.layout.version
+        layout = self.layout
+        moved = self._follow(layout.version, layout.order, layout.origin)
         if moved:
-            self._version = -1  # until the inputs are in this order too
-            self.order.copy_(self.layout.order)
-            self.origin.copy_(self.layout.origin)
-            if self.contact is not None:
-                self.contact.reorder(self.order)
-            self.layout.place_neighbours()
+            layout.place_neighbours()
         self.reset_status()
         if frozen is not None:
             self.words[: self.model.worlds].masked_fill_(frozen, FROZEN)
         self.inputs.take(stream, chunk, values, moved)
-        self._version = self.layout.version
+        self._version = layout.version
         self.load_state(stream, start)
         if self.contact is not None and start.surface is not None:
             self.contact.load(chunk, start.surface)
         self.sums.begin(values["mass"])
+
+    def _follow(self, version: int, order: Tensor, origin: Tensor) -> bool:
+        """Take the order of the particles and the origin of the window of this version of the layout; True if they were others, and the
+        inputs are to be permuted. Nothing is of a version until they are."""
+        if not is_capturing(self.model) and self._version == version:
+            return False
+        self._version = -1
+        self.order.copy_(order)
+        self.origin.copy_(origin)
+        if self.contact is not None:
+            self.contact.reorder(self.order)
+        return True
+
+    @property
+    def _stored(self) -> list[Tensor]:
+        contact = [] if self.contact is None else [self.contact.anchor, self.contact.impulse]
+        return [self.base, self.rows, self.nodes, *contact]
+
+    def copy(self) -> StoredStates:
+        """What :meth:`restore` takes, in new tensors."""
+        states = [tensor.clone() for tensor in self._stored]
+        return StoredStates(self._version, self.order.clone(), self.origin.clone(), states)
+
+    def restore(self, stream: wp.Stream | None, chunk: Chunk, stored: StoredStates, values: Values) -> None:
+        """Copy everything that the adjoint of a chunk reads into the buffers, after they have served other chunks of this shape."""
+        moved = self._follow(stored.version, stored.order, stored.origin)
+        self.inputs.take(stream, chunk, values, moved)
+        self._version = stored.version
+        for own, copied in zip(self._stored, stored.states, strict=True):
+            own.copy_(copied)
+        if self.contact is not None:
+            self.contact.restore(chunk)
 
     def load_state(self, stream: wp.Stream | None, start: State | SortedState) -> None:
         """Copy the initial state into the buffers, permuted into the present order."""

@@ -19,6 +19,19 @@ from softmpm.planning.memory import (
     window_shape,
 )
 
+COPIED, MANY_CALLS = 16_384, 8
+"""See :func:`copies`."""
+
+
+def copies(model) -> bool:
+    """True if calls copy the states of a chunk that they store instead of keeping its chunk graph.
+
+    On a GPU the host needs far longer to make the chunk graph of a small scene than the device to run it, and a loop of many calls
+    needs one for each. A copy takes a hundredth of the time of the substeps; with many particles it takes a tenth, and a graph little.
+    """
+    few = model.worlds * model.particle_count <= COPIED and model.calls >= MANY_CALLS
+    return model.device.type == "cuda" and few and not model.spec.deterministic
+
 
 class FastFootprint:
     """Memory of the fast scheme; see :class:`softmpm.planning.memory.Footprint`."""
@@ -62,6 +75,13 @@ class FastFootprint:
         if model.surface is not None:
             # The same again, velocities of a second substep, and what contact adds to the adjoints of the nodes.
             passed += second + 2 * sizes.nodes
+        if chosen.keep_all and copies(model):
+            order = 4 * model.worlds * model.particle_count
+            states = max(chunk.length for chunk in horizon.chunks(chosen.longest)) * (
+                sizes.inside + sizes.nodes
+            )
+            kept = model.calls * order * len(horizon.chunks(chosen.longest))
+            return Buffers(forward, kept + _at_once(horizon, chosen.longest) * (small + states), passed)
         if chosen.keep_all:
             kept = model.calls * graph * len(horizon.chunks(chosen.longest))
             return Buffers(forward, kept, passed)

@@ -18,8 +18,9 @@ from softmpm.schemes.carried import check_start
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import began_outside, outgrown
 from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
+from softmpm.schemes.fast.chunk_buffers import StoredStates
 from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
-from softmpm.schemes.fast.footprint import FastFootprint
+from softmpm.schemes.fast.footprint import FastFootprint, copies
 from softmpm.schemes.fast.kernels import first_kernels
 from softmpm.schemes.fast.particle_order import ParticleLayout
 from softmpm.schemes.fast.sorted_state import SortedAdj, SortedState, Unpacker
@@ -47,7 +48,8 @@ class LayoutGraphs(GraphCache):
 
 
 class FastRun:
-    """A chunk that has been launched; its chunk graph is leased as long as it or its final state lives.
+    """A chunk that has been launched; its chunk graph is leased as long as it or its final state lives. If it copies the states that it
+    stores, only its final state has the lease, and :meth:`vjp` another one.
 
     Attributes:
         updated: True if the particle layout was updated for its initial state.
@@ -67,7 +69,7 @@ class FastRun:
         frozen: Tensor | None = None,
     ):
         self.pool, self.updated, self.chunk, self.start = pool, updated, chunk, start
-        self._lease = Lease(pool, chunk, keep)
+        self._lease: Lease | None = Lease(pool, chunk, keep)
         graph, stream = self._lease.cached.graph, stream_of(pool.model.device)
         buffers = graph.buffers
         buffers.load(stream, chunk, start, values, frozen)
@@ -76,20 +78,38 @@ class FastRun:
         packed = buffers.base[-1], buffers.rows[-1], buffers.order
         self.end = SortedState(pool.unpacker, *packed, surface, self._lease)
         self.words = buffers.words
+        self._stored: StoredStates | None = None
+        if keep and copies(pool.model):
+            self._stored, self._values, self._lease = buffers.copy(), values, None
+            self.words = buffers.words.clone()
         self.outgrow: Callable[[], None] | None = pool.layout.outgrow
+
+    def release(self) -> None:
+        del self.start, self.end  # each may hold the lease of a chunk graph
 
     def vjp(self, adj_end: State | SortedAdj, adj_inputs: InputsAdj, wanted: RequestedGrads) -> SortedAdj:
         """Adjoint of the initial state; the adjoints of the inputs are added into ``adj_inputs``."""
         with self.pool.lock:
-            adjoint = self.pool.adjoint(self._lease.cached, wanted)
-            buffers, stream = adjoint.buffers, stream_of(self.pool.model.device)
+            lease, stream = self._lease or self._restored(), stream_of(self.pool.model.device)
+            adjoint = self.pool.adjoint(lease.cached, wanted)
+            buffers = adjoint.buffers
             buffers.load(stream, adj_end)
             adjoint.run(stream)
             buffers.unload(stream, self.chunk, adj_inputs)
             adj, order = buffers.shared.adj, buffers.forward.order  # both are reused by other runs
             contact = buffers.shared.contact
             surface = None if contact is None else contact.start(self.chunk)
+            if self._stored is not None:
+                self.words = buffers.forward.words.clone()
             return SortedAdj(self.pool.unpacker, adj.clone(), order.clone(), surface)
+
+    def _restored(self) -> Lease:
+        """Lease of a chunk graph that has got the copied states."""
+        assert self._stored is not None
+        lease = Lease(self.pool, self.chunk, keep=True)
+        stream = stream_of(self.pool.model.device)
+        lease.cached.graph.buffers.restore(stream, self.chunk, self._stored, self._values)
+        return lease
 
 
 class Fast:

@@ -117,6 +117,9 @@ class LagrangianRun:
         graph.run(stream)
         self.end, self.words = graph.end(), graph.buffers.words
 
+    def release(self) -> None:
+        del self.end
+
     def vjp(self, adj_end: Nodal, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Nodal:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         with self.pool.lock:

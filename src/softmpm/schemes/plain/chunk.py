@@ -76,6 +76,9 @@ class PlainRun:
         if not same or self.model.spec.moving:
             self.step.grid_inputs = grid_struct(self.model, self._values, row, s)
 
+    def release(self) -> None:
+        del self.end
+
     def vjp(self, adj_end: State, adj_inputs: InputsAdj, wanted: RequestedGrads) -> State:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         model, chunk, step = self.model, self.chunk, self.step
