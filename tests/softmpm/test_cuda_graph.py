@@ -13,7 +13,7 @@ from softmpm import autograd, rollout, runner
 from softmpm.errors import NEVER
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
-from softmpm.schemes import capture
+from softmpm.schemes import capture, graph_cache
 from softmpm.schemes.fast import chunk_buffers
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.lagrangian import nodal
@@ -45,7 +45,7 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
     built = softmpm.build(busy_scene(2), device="cpu", **settings)
     inputs = busy_inputs(built)
     run(softmpm.simulate, built, inputs, 5).x.sum().backward()
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         end = run(softmpm.simulate, built, inputs, 5)
@@ -148,7 +148,7 @@ def test_a_recording_goes_on_without_a_world_that_failed(settings, monkeypatch):
     alone = three_calls(model, start._replace(C=healthy(start.C)), None)
     called, recorded = softmpm.Failures("reset"), softmpm.Failures("reset")
     assert_goes_on(model, three_calls(model, start, called), called, alone)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         end = three_calls(model, start, recorded)
@@ -212,7 +212,7 @@ def test_a_recording_differentiates_the_worlds_that_did_not_fail(settings, budge
     )
     assert_gradient(gradient(model, start, called), want)
     assert_one_failure(called, kind)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         got = gradient(model, start, recorded)
@@ -240,7 +240,7 @@ def test_a_world_that_failed_in_a_recording_stops(policy, monkeypatch):
     """In the chunks after it is where it failed, so it leaves no window."""
     model, start, soft = torn_in_flight()
     softmpm.simulate(model, start._replace(v=torch.zeros_like(start.v)), None, soft, substeps=256)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     failures = softmpm.Failures(policy)
     with capture.collected_resources() as resources, torch.no_grad():
@@ -255,7 +255,7 @@ def test_a_failure_is_counted_once_where_another_is_raised(monkeypatch):
     """The work is then done again outside of the recording, which counts it."""
     model, start = falling_pair()
     gradient(model, start._replace(C=healthy(start.C)), None)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     failures, v = softmpm.Failures("reset"), start.v.clone().requires_grad_()
     with capture.collected_resources() as resources:
@@ -272,7 +272,7 @@ def test_a_recording_keeps_no_history_of_its_tensors(settings, monkeypatch):
     model, start = falling_pair(**settings)
     gradient(model, start._replace(C=healthy(start.C)), None)
     young = model.params().young.expand(2, -1).clone().requires_grad_()
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, nodal):
+    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
 
     def marks() -> dict:

@@ -110,11 +110,9 @@ class GraphCache(ABC):
 
     def _shared_in_capture(self, graph: Any, wanted: RequestedGrads) -> Any:
         """Buffers that the backward passes of the capture share, but not with calls outside of it: those of the cache, which gets
-        others on next use."""
+        others on next use. Adjoints on other buffers are made anew where they are used."""
 
         def take() -> Any:
-            idle = [one for shapes in self._free.values() for free in shapes.values() for one in free]
-            keep_alive([one.adjoints.pop(wanted, None) for one in idle])
             taken = self._shared_adjoints.pop(wanted, None)
             return self.new_shared(graph, wanted) if taken is None else taken
 

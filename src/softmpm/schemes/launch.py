@@ -100,7 +100,7 @@ class LaunchTemplate:
 
 
 def _native(kind: type, value: Any) -> Any:
-    """An array or a struct as the native value of a type; vectors are such values."""
+    """An array or a struct as the native value of a type."""
     found = value if type(value) is kind else value.__ctype__()
     assert type(found) is kind, f"a repeated launch got {type(found)}, the first one {kind}"
     return found

@@ -1,7 +1,7 @@
 """Chunk graphs: the launches of a chunk, forward (launches.py) or adjoint (launches_adj.py), captured once on fixed buffers.
 
-A chunk graph is leased to one call: until its backward pass has run if it stores states, otherwise until no later chunk reads its final
-state.
+A chunk graph is leased to one call: until its backward pass has run if it stores states that are not copied, otherwise until no later
+chunk reads its final state.
 """
 
 import warp as wp

@@ -18,7 +18,6 @@ from softmpm.schemes.carried import check_start
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import began_outside, outgrown
 from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
-from softmpm.schemes.fast.chunk_buffers import StoredStates
 from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
 from softmpm.schemes.fast.footprint import FastFootprint, copies
 from softmpm.schemes.fast.kernels import first_kernels
@@ -48,12 +47,12 @@ class LayoutGraphs(GraphCache):
 
 
 class FastRun:
-    """A chunk that has been launched; its chunk graph is leased as long as it or its final state lives. If it copies the states that it
-    stores, only its final state has the lease, and :meth:`vjp` another one.
+    """A chunk that has been launched; its chunk graph is leased as long as it or its final state lives. Once released, a run that
+    copies its states has no lease, and :meth:`vjp` takes another one.
 
     Attributes:
         updated: True if the particle layout was updated for its initial state.
-        start, end: Initial and final state; the final one lies in the buffers of the chunk graph.
+        start, end: Initial and final state, until the run is released; the final one lies in the buffers of the chunk graph.
         words: Status words, see errors.py; then the number of changes of cell along the order of the particles, and whether a
             particle is near the window's edge; shape (world + 2,).
     """
@@ -78,14 +77,14 @@ class FastRun:
         packed = buffers.base[-1], buffers.rows[-1], buffers.order
         self.end = SortedState(pool.unpacker, *packed, surface, self._lease)
         self.words = buffers.words
-        self._stored: StoredStates | None = None
-        if keep and copies(pool.model):
-            self._stored, self._values, self._lease = buffers.copy(), values, None
-            self.words = buffers.words.clone()
+        self._values, self._stored = values, None  # a StoredStates once they are copied
         self.outgrow: Callable[[], None] | None = pool.layout.outgrow
 
     def release(self) -> None:
         del self.start, self.end  # each may hold the lease of a chunk graph
+        if copies(self.pool.model) and self._lease is not None:
+            self._stored, self._lease = self._lease.cached.graph.buffers.copy(), None
+            del self.words  # those of a graph that others get; vjp has new ones
 
     def vjp(self, adj_end: State | SortedAdj, adj_inputs: InputsAdj, wanted: RequestedGrads) -> SortedAdj:
         """Adjoint of the initial state; the adjoints of the inputs are added into ``adj_inputs``."""

@@ -5,24 +5,31 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import assert_relative, bar, busy_inputs, busy_scene, cotangent, dot, run
+from helpers import assert_relative, bar, busy_inputs, busy_scene, cotangent, dot, little_memory, run
 
 import softmpm
 from softmpm import autograd, rollout, runner
-from softmpm.schemes import capture, graph_cache
+from softmpm.schemes import capture, graph_cache, launch
 from softmpm.schemes.fast import chunk_buffers
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.footprint import COPIED, MANY_CALLS, copies
+from softmpm.schemes.fast.particle_order import ParticleLayout
 
-WALL = softmpm.Wall(normal=(0.1, 1.0), offset=0.47, contact="separate", friction=0.4)
+WALL = softmpm.Wall(normal=(0.1, 1.0), offset=0.4752, contact="separate", friction=0.4)
 SCENES = {
-    "surface points on a belt, and forces": (
+    "surface points on a floor that rises, and forces": (
         lambda: bar(walls=[WALL], gravity=(0.3, -9.8)),
-        ("wall_velocity", "force"),
+        ("wall_offset", "force"),
     ),
     "3D": (lambda: busy_scene(3), ()),
 }
 """Scenes, with the inputs of their calls."""
+LOOPS = {
+    "one chunk a call": (2, 10 * [9]),
+    "two": (2, 4 * [70]),
+    "control steps of two lengths": (1, [140, 70, 140, 70]),
+}
+"""Control steps of a call, and the substeps of each, for every call."""
 
 
 @pytest.fixture
@@ -39,69 +46,133 @@ def made(monkeypatch) -> list[bool]:
     return graphs
 
 
-def loop(model: softmpm.Model, calls: int, substeps: int) -> Callable[[], list[torch.Tensor]]:
-    """Function that makes so many calls one after another, on tensors that exist: their end, and their gradient twice."""
-    v = (model.rest().v + 0.1).requires_grad_()
+@pytest.fixture
+def wandering(monkeypatch):
+    """Makes a CPU sort the particles into another order, one after the other, wherever it would not change the order."""
+    sort = ParticleLayout.resort
+
+    def resort(self, x):
+        sort(self, x)
+        self.order.copy_(self.order.roll(self.version, dims=1))
+
+    monkeypatch.setattr(ParticleLayout, "resort", resort)
+
+
+def layout_of(model: softmpm.Model) -> ParticleLayout | None:
+    """Order and window as they are now, if there are any."""
+    pool = fast_scheme.Fast.of(model)._pool
+    return None if pool is None else pool.layout
+
+
+def loop(
+    model: softmpm.Model, substeps: list[int], rows: int = 2, moves: bool = False
+) -> Callable[[], list[torch.Tensor]]:
+    """Function that makes calls one after another, on tensors that exist: their end, and their gradient twice.
+
+    Args:
+        moves: Particles are sorted anew before each call, and the window is enlarged in between.
+    """
+    v = (model.rest().v - 0.1).requires_grad_()
     params = softmpm.Params(*(value.clone().requires_grad_() for value in model.params()))
-    shape = (calls, 2, model.worlds, model.muscle_count)
+    shape = (len(substeps), rows, model.worlds, model.muscle_count)
     activation = (0.3 * torch.sin(torch.arange(torch.Size(shape).numel()).view(shape))).to(v).requires_grad_()
     inputs, weights = None, cotangent(model.rest())
     if "force" in model.spec.given:
-        belt = v.new_tensor([0.2, 0.01]) * torch.arange(1.0, 3.0, device=v.device).view(2, 1, 1, 1)
-        force = torch.full((2, 1, model.particle_count, model.dim), 1e-5).to(v).requires_grad_()
-        inputs = softmpm.Inputs(wall_velocity=belt.requires_grad_(), force=force)
+        rises = 0.4752 + 2e-4 * torch.arange(rows + 1, dtype=torch.float64, device=v.device).view(-1, 1, 1)
+        force = torch.full((rows, 1, model.particle_count, model.dim), 1e-5).to(v).requires_grad_()
+        inputs = softmpm.Inputs(wall_offset=rises.requires_grad_(), force=force)
     leaves = [v, activation, *params, *(value for value in inputs or () if value is not None)]
 
     def work() -> list[torch.Tensor]:
-        end = model.rest()._replace(v=v)
-        for row in activation:
-            end = softmpm.simulate(model, end, row, params, substeps=substeps, inputs=inputs)
-        loss = dot(weights, end)
+        end, forces = model.rest()._replace(v=v), []
+        for k, (row, count) in enumerate(zip(activation, substeps, strict=True)):
+            if moves and (layout := layout_of(model)):
+                layout.stale, layout.outgrown = True, k == 2
+            end = softmpm.simulate(model, end, row, params, substeps=count, inputs=inputs)
+            if end.surface is not None:
+                forces.append(end.surface.force.square().sum())
+        loss = dot(weights, end) + 1e3 * sum(forces)
         first = torch.autograd.grad(loss, leaves, retain_graph=True)
         return [*(part.detach() for part in end[:4]), *first, *torch.autograd.grad(loss, leaves)]
 
     return work
 
 
-@pytest.mark.parametrize("calls, substeps", [(10, 9), (4, 70)], ids=["one chunk a call", "two"])
+@pytest.mark.parametrize("rows, substeps", LOOPS.values(), ids=LOOPS)
 @pytest.mark.parametrize("scene, inputs", SCENES.values(), ids=SCENES)
-def test_copied_states_change_no_bit(scene, inputs, calls, substeps, made, monkeypatch):
+def test_copied_states_change_no_bit(scene, inputs, rows, substeps, made, monkeypatch):
     """A few calls and their gradient, twice, on a few chunk graphs instead of one for each chunk."""
-    model = softmpm.build(scene(), device="cpu", calls=calls, inputs=inputs)
+    model = softmpm.build(scene(), device="cpu", calls=len(substeps), inputs=inputs)
     assert not copies(model)
-    want, count = loop(model, calls, substeps)(), made.count(True)
+    want, count = loop(model, substeps, rows)(), made.count(True)
     assert count > 5
     made.clear()
     monkeypatch.setattr(fast_scheme, "copies", lambda model: True)
-    model = softmpm.build(scene(), device="cpu", calls=calls, inputs=inputs)
-    for got, one in zip(loop(model, calls, substeps)(), want, strict=True):
+    model = softmpm.build(scene(), device="cpu", calls=len(substeps), inputs=inputs)
+    for got, one in zip(loop(model, substeps, rows)(), want, strict=True):
         assert torch.equal(got, one)
     assert made.count(True) <= 4
 
 
+@pytest.mark.parametrize("scene, inputs", SCENES.values(), ids=SCENES)
+def test_the_order_of_copied_states_is_theirs(scene, inputs, made, wandering, monkeypatch):
+    """Each call has another order of the particles, and the window grows: again no bit changes."""
+    want, found = [], []
+    for copied, results in ((False, want), (True, found)):
+        monkeypatch.setattr(fast_scheme, "copies", lambda model, copied=copied: copied)
+        model = softmpm.build(scene(), device="cpu", calls=5, inputs=inputs)
+        results += loop(model, 5 * [9], moves=True)()
+        layout = layout_of(model)
+        assert layout is not None and layout.version == 3  # of the larger window
+    for got, one in zip(found, want, strict=True):
+        assert torch.equal(got, one)
+
+
+def test_recomputed_states_are_not_copied(made, monkeypatch):
+    """With little memory the chunk graphs are as many, and no state is copied."""
+    counts = []
+    for copied in (False, True):
+        monkeypatch.setattr(fast_scheme, "copies", lambda model, copied=copied: copied)
+        settings = little_memory(softmpm.build(bar(), device="cpu", calls=3))
+        model = softmpm.build(bar(), device="cpu", **settings)
+        made.clear()
+        if copied:
+            monkeypatch.setattr(chunk_buffers.ChunkBuffers, "copy", None)
+        activation = torch.zeros(3, 1, 2, requires_grad=True)
+        end = softmpm.simulate(model, model.rest(), activation, model.params(), substeps=7)
+        torch.autograd.grad(end.x.sum(), activation)
+        counts.append(list(made))
+    assert counts[0] == counts[1] and True in counts[0]
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("scene, inputs", SCENES.values(), ids=SCENES)
-def test_a_loop_on_a_gpu_copies_its_states(scene, inputs, made):
-    """Ten declared calls, by themselves, captured and replayed, as the same calls undeclared, but for rounding."""
-    about = dict(device="cuda", dtype=torch.float64, inputs=inputs)
-    want = loop(softmpm.build(scene(), **about), 10, 9)()
+def test_a_loop_on_a_gpu_copies_its_states(scene, inputs, made, monkeypatch):
+    """Ten declared calls, by themselves, captured and replayed, as the same calls undeclared, but for rounding. Chunk graphs become
+    parts of the captured graph."""
+    about = dict(device="cuda", dtype=torch.float64, scheme="fast", inputs=inputs)
+    want = loop(softmpm.build(scene(), **about), 10 * [9])()
     assert made.count(True) >= 10
     made.clear()
+    children = []
+    add = launch.add_child
+    monkeypatch.setattr(launch, "add_child", lambda *given: (children.append(given), add(*given)))
     model = softmpm.build(scene(), calls=10, **about)
     assert copies(model)
-    work = loop(model, 10, 9)
+    work = loop(model, 10 * [9])
     graph = softmpm.Graph(work, model.device)
-    for found in (work(), *(graph() for _ in range(4))):
-        for got, one in zip(found, want, strict=True):
+    for run_once in (work, *4 * [graph]):
+        for got, one in zip(run_once(), want, strict=True):
             assert_relative(got, one, 1e-9)
     assert made.count(True) <= 8  # for either stream at most four, and none for a capture
+    assert len(children) == 30  # ten calls, and their backward passes twice
 
 
 @pytest.mark.parametrize(
     "device, particles, calls, deterministic, copied",
     [
         ("cuda", COPIED, MANY_CALLS, False, True),
-        ("cuda", COPIED + 1, MANY_CALLS, False, False),
+        ("cuda", COPIED + 2, MANY_CALLS, False, False),
         ("cuda", COPIED, MANY_CALLS - 1, False, False),
         ("cuda", COPIED, MANY_CALLS, True, False),
         ("cpu", COPIED, MANY_CALLS, False, False),
@@ -111,7 +182,7 @@ def test_where_states_are_copied(device, particles, calls, deterministic, copied
     """In loops of many calls of small scenes on a GPU, and not in a deterministic model."""
     spec = SimpleNamespace(deterministic=deterministic)
     model = SimpleNamespace(
-        device=torch.device(device), worlds=2, particle_count=(particles + 1) // 2, calls=calls, spec=spec
+        device=torch.device(device), worlds=2, particle_count=particles // 2, calls=calls, spec=spec
     )
     assert copies(model) is copied
 

@@ -13,7 +13,7 @@ from softmpm import autograd, rollout, runner
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
-from softmpm.schemes import capture
+from softmpm.schemes import capture, graph_cache
 from softmpm.schemes.fast import adjoint_buffers, chunk_buffers, chunk_graph, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.sorted_state import SortedState
@@ -310,7 +310,7 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     backward(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
     with_graphs = [weakref.ref(made) for made in living((chunk_graph.ChunkGraph, chunk_graph.ChunkGraphAdj))]
-    for module in (autograd, chunk_buffers, fast_scheme, rollout, runner):
+    for module in (autograd, chunk_buffers, fast_scheme, rollout, runner, graph_cache):
         monkeypatch.setattr(module, "is_capturing", lambda model: True)
     with capture.collected_resources() as resources:
         backward(*call(built))

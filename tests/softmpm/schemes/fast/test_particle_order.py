@@ -15,6 +15,7 @@ from helpers import LAWS, assert_relative, cotangent, dot
 import softmpm
 from softmpm import autograd, rollout, runner
 from softmpm.planning.memory import MARGIN
+from softmpm.schemes import graph_cache
 from softmpm.schemes.fast import chunk_buffers, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.particle_order import STALE_FEW, ParticleLayout
@@ -388,7 +389,15 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
         @contextlib.contextmanager
         def blindly(*_, **__):
             with monkeypatch.context() as patch:
-                for module in (particle_order, autograd, fast_scheme, chunk_buffers, rollout, runner):
+                for module in (
+                    particle_order,
+                    autograd,
+                    fast_scheme,
+                    chunk_buffers,
+                    rollout,
+                    runner,
+                    graph_cache,
+                ):
                     patch.setattr(module, "is_capturing", lambda model: True)
                 yield
 
