@@ -7,9 +7,8 @@
               points: the part of L̄ in their adjoints (K9.adj), L of the substep before, its stored impulses into that other V (K10)
     g2p2g_adj, press_adj
 
-Sums of two successive substeps have two buffers: one is added to while the other is cleared. On a GPU the two substeps of ``grid_adj``
-have threads of their own, since a small scene waits for memory and not for threads. On a CPU a thread takes both, and points have no
-threads: their parts are launches of their own, ``add_loads``, ``add_loads_adj`` and ``push_all``.
+Sums of two successive substeps have two buffers: one is added to while the other is cleared. On a CPU these launches have no threads of
+points, whose parts are launches of their own: ``add_loads``, ``add_loads_adj`` and ``push_all``.
 """
 
 from types import SimpleNamespace
@@ -112,7 +111,7 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
         inputs: GridInputs,
         window: Window,
         outline: Outline,
-        first: int,  # threads of the nodes of a substep, in whole blocks
+        first: int,  # thread of the first point
         owner: wp.array2d(dtype=wp.int32),
         # In:
         node: wp.array(dtype=node_vec),  # of this substep; empty after the last
@@ -139,14 +138,10 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
         adj_inputs: GridInputsAdj,
     ):
         i = wp.tid()
-        held = velocity.shape[0]
-        j = i  # the same node of the substep before
-        if wp.static(not spec.slabs):
-            j = i - first  # which has a thread of its own
-        if i < held:
-            world = world_of(i, window.count, held)
+        if i < velocity.shape[0]:
+            world = world_of(i, window.count, velocity.shape[0])
+            place = place_of(constants, window, world, i)
             if i < node.shape[0]:
-                place = place_of(constants, window, world, i)
                 here = load_node(node, i)
                 more = load_node(gained, i)
                 adj_v = head(load_node(adj_node, i)) + head(more)
@@ -156,41 +151,30 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
                     )
                     store_node(adj_node, i, aligned(back.p, back.m + more[dim]))
                 store_node(gained, i, node_vec())
-        if j >= 0 and j < node_before.shape[0]:
-            world = world_of(j, window.count, held)
-            place = place_of(constants, window, world, j)
-            there = load_node(node_before, j)
-            if there[dim] > real(0.0):
-                v = aligned(
-                    node_velocity(constants, inputs, world, place, head(there), there[dim]), real(0.0)
-                )
-                store_node(free, j, v)
-                wp.atomic_add(velocity, j, v)
-            store_node(cleared, j, node_vec())
-            store_node(cleared_velocity, j, node_vec())
-            cleared_load[world, j - world * window.count] = real(0.0)
-            cleared_adj_load[world, j - world * window.count] = real(0.0)
-        if wp.static(not spec.slabs):
-            lane = j - first
-            if lane >= 0:
-                k = lane / outline.lanes
-                lane -= k * outline.lanes
-                points = owner.shape[0] * owner.shape[1]
-                if k < points:
-                    world = k / owner.shape[1]
-                    p = k - world * owner.shape[1]
-                    if node.shape[0] > 0:
-                        add_load_adj(
-                            constants, window, outline, now, world, p, lane, owner[world, p], adj_load, adj
-                        )
-                elif node_before.shape[0] > 0:
-                    k -= points
-                    world = k / owner.shape[1]
-                    p = k - world * owner.shape[1]
-                    at = point_of(constants, window, outline, before, world, p, owner[world, p])
-                    add_load(window, outline, at, world, p, lane, load)
-                    J = impulse[world, p]
-                    if wp.dot(J, J) > real(0.0):
-                        push(window, at, J, world, lane, outline.lanes, masses_before, pushed)
+            if i < node_before.shape[0]:
+                there = load_node(node_before, i)
+                if there[dim] > real(0.0):
+                    v = aligned(
+                        node_velocity(constants, inputs, world, place, head(there), there[dim]), real(0.0)
+                    )
+                    store_node(free, i, v)
+                    wp.atomic_add(velocity, i, v)
+                store_node(cleared, i, node_vec())
+                store_node(cleared_velocity, i, node_vec())
+                cleared_load[world, i - world * window.count] = real(0.0)
+                cleared_adj_load[world, i - world * window.count] = real(0.0)
+        elif i >= first:
+            k = (i - first) / outline.lanes
+            world = k / owner.shape[1]
+            p = k - world * owner.shape[1]
+            lane = i - first - k * outline.lanes
+            if node.shape[0] > 0:
+                add_load_adj(constants, window, outline, now, world, p, lane, owner[world, p], adj_load, adj)
+            if node_before.shape[0] > 0:
+                at = point_of(constants, window, outline, before, world, p, owner[world, p])
+                add_load(window, outline, at, world, p, lane, load)
+                J = impulse[world, p]
+                if wp.dot(J, J) > real(0.0):
+                    push(window, at, J, world, lane, outline.lanes, masses_before, pushed)
 
     return grid_and_loads_adj

@@ -70,7 +70,6 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
     about = forward.masses(earlier), contact.impulses[earlier]
     loads, adj_loads = forward.load_arrays, shared.adj_load_arrays
     point, threads = point_threads(forward)
-    threads *= 1 if model.spec.slabs else 2  # those of two substeps
     beside = model.spec.slabs and not last
     if beside:  # beside the nodes; the loads of the substep before follow beside the particles
         of_loads = forward.packed[s], adj_loads[s % 2], shared.adj_array
