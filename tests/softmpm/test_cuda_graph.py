@@ -104,6 +104,27 @@ def test_a_function_without_a_simulation_is_captured_too():
 FORMULATIONS = {"moving": {}, "reference": dict(formulation="reference")}
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
+def test_a_recording_begins_at_a_wall_that_moves(settings):
+    """From particles alone, whose surface points take the normals of the call: it is the same when it is replayed."""
+    wall = softmpm.Wall(normal=(0.1, 1.0), offset=0.4752, friction=0.4)
+    model = softmpm.build(
+        bar(walls=[wall], gravity=(0.0, -9.8)), device="cuda", inputs=("wall_offset",), **settings
+    )
+    offset = (0.4752 + 2e-4 * torch.arange(2, dtype=torch.float64, device="cuda")).view(2, 1, 1)
+    start = softmpm.State(*model.rest()[:4])
+
+    @torch.no_grad()
+    def work() -> softmpm.State:
+        inputs = softmpm.Inputs(wall_offset=offset)
+        return softmpm.simulate(model, start, None, model.params(), substeps=20, inputs=inputs)
+
+    graph, want = softmpm.Graph(work, model.device), work()
+    for _ in range(3):
+        assert_relative(graph().x - start.x, want.x - start.x, 1e-3)
+
+
 def falling_pair(device: str = "cpu", rate: float = -400.0, **settings):
     """A model and a start from which world 1 fails in the first of a few calls, while world 0 goes on.
 

@@ -49,6 +49,14 @@ class ReusedParticleStruct:
         return particle_struct(self._model, new, struct=self._struct)
 
 
+def of_surface_walls(model: Model, normals: Tensor) -> Tensor:
+    """Of normals of all walls, shape (world, wall, dim), those of the walls that surface points meet.
+
+    A list of indices would be copied to the GPU, which must not happen while a graph is captured.
+    """
+    return torch.stack([normals[:, wall] for wall in model.spec.surface_walls], dim=1)
+
+
 def grid_struct(model: Model, values: Mapping[str, Tensor], row: int = 0, substep: int = 0):
     """Struct of the inputs of nodes, in a row and a substep of ``values``; walls at rest are stored by value in the struct."""
     struct, spec = input_types(model.spec).GridInputs(), model.spec

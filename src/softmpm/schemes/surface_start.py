@@ -4,7 +4,7 @@ import torch
 
 from softmpm.model import Model
 from softmpm.schemes.carried import points_of
-from softmpm.schemes.inputs import Values
+from softmpm.schemes.inputs import Values, of_surface_walls
 from softmpm.state import State, SurfaceState
 
 
@@ -19,7 +19,7 @@ def with_surface(model: Model, start: State, values: Values) -> State:
     points = points_of(model)
     x = points.shown(start)
     if "normal" in values:
-        n = values["normal"][0][:, model.spec.surface_walls]  # at the beginning of the call
+        n = of_surface_walls(model, values["normal"][0])  # at the beginning of the call
     else:
         n = points.normals.expand(model.worlds, -1, -1)
     height = (x[:, None] * n[:, :, None]).sum(-1)

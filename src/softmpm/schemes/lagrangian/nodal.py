@@ -19,6 +19,7 @@ from softmpm.model import Model
 from softmpm.schemes.buffers import cleared, passing
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu
+from softmpm.schemes.inputs import of_surface_walls
 from softmpm.schemes.lagrangian.bricks import brick_launch, empty_partial, node_launch, rest_struct
 from softmpm.schemes.lagrangian.frame import quantum, shift_of
 from softmpm.schemes.lagrangian.kernels import compile_first
@@ -261,5 +262,5 @@ def _anchors(model: Model, u: Tensor, normals: Tensor | None) -> Tensor:
     if normals is None:
         n = surface.normals.expand(len(u), -1, -1).to(u.dtype)
     else:
-        n = normals[:, model.spec.surface_walls].to(u.dtype)
+        n = of_surface_walls(model, normals).to(u.dtype)
     return x[:, None] - (x[:, None] * n[:, :, None]).sum(-1, keepdim=True) * n[:, :, None]
