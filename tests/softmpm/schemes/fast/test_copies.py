@@ -9,8 +9,10 @@ from helpers import assert_relative, bar, busy_inputs, busy_scene, cotangent, do
 
 import softmpm
 from softmpm import autograd, rollout, runner
+from softmpm.planning.chunks import Chunk, Horizon
+from softmpm.planning.memory import memory
 from softmpm.schemes import capture, graph_cache, launch
-from softmpm.schemes.fast import chunk_buffers
+from softmpm.schemes.fast import chunk_buffers, footprint
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.footprint import COPIED, MANY_CALLS, copies
 from softmpm.schemes.fast.particle_order import ParticleLayout
@@ -143,6 +145,26 @@ def test_recomputed_states_are_not_copied(made, monkeypatch):
         torch.autograd.grad(end.x.sum(), activation)
         counts.append(list(made))
     assert counts[0] == counts[1] and True in counts[0]
+
+
+@pytest.mark.parametrize("scene, inputs", SCENES.values(), ids=SCENES)
+def test_the_plan_of_memory_counts_copies(scene, inputs, monkeypatch):
+    """What calls keep until the backward pass, with three chunk graphs, is what the formula says: within 20 %."""
+    for module in (footprint, fast_scheme):
+        monkeypatch.setattr(module, "copies", lambda model: True)
+    model = softmpm.build(scene(), device="cpu", calls=60, inputs=inputs)
+    copied, copy = [], chunk_buffers.ChunkBuffers.copy
+
+    def noted(self) -> chunk_buffers.StoredStates:
+        stored = copy(self)
+        copied.append(sum(t.nbytes for t in (stored.order, stored.origin, *stored.states)))
+        return stored
+
+    monkeypatch.setattr(chunk_buffers.ChunkBuffers, "copy", noted)
+    loop(model, 60 * [3])()
+    graph = fast_scheme.ChunkGraph(model, layout_of(model), Chunk(0, 6, 3), keep=True)
+    kept = sum(copied) + 3 * graph.buffers.bytes
+    assert len(copied) == 60 and abs(kept / memory(model, Horizon(2, 3)).kept - 1) < 0.2
 
 
 @pytest.mark.gpu
