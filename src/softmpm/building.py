@@ -56,7 +56,7 @@ def build(
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower, and in the plain scheme
             and ``step`` much slower: float32 and the fast scheme are best. The CPU adds in one order anyway. See docs/conventions.md.
         calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
-            budget, and from eight on a small scene takes a GPU less time to begin. If there are more, they keep more.
+            budget. If there are more, they keep more. With eight or more, the first iterations of small scenes on a GPU are faster.
         threads: CPU threads that share a simulation; None takes those of PyTorch (``torch.get_num_threads()``) at each call. Results
             have the same bits with any number of them. It has no effect on a GPU, nor in the plain scheme, which has one.
         alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.

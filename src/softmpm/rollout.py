@@ -51,8 +51,7 @@ class Trail:
         return torch.tensor([world in self.frozen for world in range(model.worlds)], device=model.device)
 
     def keep(self, run: Run) -> None:
-        """Retain what a backward pass needs of a run, not its final state: the last one is the result of the call, which refers to this
-        trail."""
+        """Retain a run without its final state: the last one is the result of the call, which refers to this trail."""
         run.release()
         self.runs.append(run)
 

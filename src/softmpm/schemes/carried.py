@@ -116,14 +116,14 @@ class SurfaceContact:
     def load(self, chunk: Chunk, start: SurfaceState) -> None:
         """Copy the initial state of a chunk of this shape into the buffers."""
         self.anchor[0].copy_(start.anchor.detach())
-        self.restore(chunk)
+        self.set_rate(chunk)
         if chunk.begins:
             self.force.zero_()
         else:
             self.force.copy_(start.force.detach())
 
-    def restore(self, chunk: Chunk) -> None:
-        """Take what depends on a chunk of this shape besides its states."""
+    def set_rate(self, chunk: Chunk) -> None:
+        """Set the duration of a control step, in which chunks of one shape may differ."""
         self.rate.fill_(1.0 / (chunk.substeps * self.model.scene.dt))
 
     @property

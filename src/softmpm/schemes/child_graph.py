@@ -1,7 +1,7 @@
-"""A CUDA graph as one node of the graph that is being captured: it takes no launch of its kernels once more.
+"""Captured CUDA graphs as child nodes of a graph that is being captured, so that their kernels need not be launched again.
 
-A graph cannot be launched on a stream that is being captured, and Warp's own function ends the capture for a moment, after which
-PyTorch no longer takes it for its own. Hence the functions of the driver.
+CUDA does not allow a graph launch on a capturing stream. Warp's function for child nodes interrupts the capture, whose identifier then
+changes, and PyTorch's allocator no longer recognises it. Therefore the functions of the driver are called.
 """
 
 import ctypes
@@ -11,15 +11,15 @@ import sys
 import warp as wp
 
 _SET_DEPENDENCIES = 1
-"""CU_STREAM_SET_CAPTURE_DEPENDENCIES: what comes next follows the new node alone."""
+"""CU_STREAM_SET_CAPTURE_DEPENDENCIES: the new node replaces the dependencies of the capturing stream."""
 
 
 def add_child(graph: wp.Graph, stream: wp.Stream) -> None:
-    """Add a copy of ``graph`` to the graph that is being captured on a stream; the kernels that it calls must outlive that one.
+    """Add a copy of ``graph`` as a child node to the graph that is being captured on a stream. Its modules must outlive that graph.
 
     Raises:
-        RuntimeError: The driver refuses: nothing is being captured, or the launch before waits for another one as only programmatic
-            dependent launches do.
+        RuntimeError: The driver reports an error, for example because no capture is active, or because the last captured launch has a
+            programmatic dependency.
     """
     driver, handle = _driver(), ctypes.c_void_p(stream.cuda_stream)
     status, capture, count = ctypes.c_int(), ctypes.c_uint64(), ctypes.c_size_t()
@@ -43,5 +43,5 @@ def _driver() -> ctypes.CDLL:
 def _check(code: int) -> None:
     if code != 0:
         raise RuntimeError(
-            f"a graph of substeps cannot become part of the graph that is being captured: the CUDA driver answers with error {code}."
+            f"a graph of substeps cannot become part of the graph that is being captured: the CUDA driver reported error {code}."
         )

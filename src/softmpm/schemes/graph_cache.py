@@ -39,7 +39,7 @@ class GraphCache(ABC):
     Graphs of the most recent chunk shapes are always retained. Older ones are retained only while all of them fit into one call's
     share of the memory budget, since calls of different lengths have different shapes.
 
-    A graph that PyTorch captures takes those that it uses out of the cache, and its calls lease them from each other.
+    A capture by PyTorch takes the graphs that it uses out of the cache, and its calls share them.
     """
 
     def __init__(self, model: Model):
@@ -75,7 +75,7 @@ class GraphCache(ABC):
             return CachedGraph(self.new_graph(chunk, keep), {}), free
 
     def _take_in_capture(self, chunk: Chunk, keep: bool, free: _FreeList) -> tuple[CachedGraph, _FreeList]:
-        """A graph that a call of the same capture has returned, else one of the cache, or a new one. No graph may be destroyed now."""
+        """A graph that an earlier call of the capture returned, else one from the cache, else a new one; none is evicted meanwhile."""
         own = once_in_capture((self, keep, chunk.shape), _FreeList)
         if own:
             return own.pop(), own
@@ -96,27 +96,23 @@ class GraphCache(ABC):
     def adjoint(self, cached: CachedGraph, wanted: RequestedGrads) -> Any:
         """The adjoint of a graph for the requested gradients, built on first use."""
         graph, adjoints = cached
-        shared = self._shared_in_capture(graph, wanted) if is_capturing(self.model) else None
-        if shared is None:
-            if wanted not in self._shared_adjoints:
-                self._shared_adjoints[wanted] = self.new_shared(graph, wanted)
-            shared = self._shared_adjoints[wanted]
-        known = adjoints.get(wanted)
+        shared, known = self._shared(graph, wanted), adjoints.get(wanted)
         if known is None or known[0] is not shared:
-            if known is not None and is_capturing(self.model):
-                keep_alive(known)
+            if is_capturing(self.model):
+                keep_alive(known)  # no graph may be destroyed now
             known = adjoints[wanted] = shared, self.new_adjoint(graph, shared)
         return known[1]
 
-    def _shared_in_capture(self, graph: Any, wanted: RequestedGrads) -> Any:
-        """Buffers that the backward passes of the capture share, but not with calls outside of it: those of the cache, which gets
-        others on next use. Adjoints on other buffers are made anew where they are used."""
+    def _shared(self, graph: Any, wanted: RequestedGrads) -> Any:
+        """Buffers that all backward passes share. A capture takes those of the cache, since its replays may run beside other calls."""
 
         def take() -> Any:
-            taken = self._shared_adjoints.pop(wanted, None)
-            return self.new_shared(graph, wanted) if taken is None else taken
+            return self._shared_adjoints.pop(wanted, None) or self.new_shared(graph, wanted)
 
-        return once_in_capture((self, wanted), take)
+        if is_capturing(self.model):
+            return once_in_capture((self, wanted), take)
+        shared = self._shared_adjoints[wanted] = take()
+        return shared
 
 
 class Lease:

@@ -50,9 +50,9 @@ class ReusedParticleStruct:
 
 
 def of_surface_walls(model: Model, normals: Tensor) -> Tensor:
-    """Of normals of all walls, shape (world, wall, dim), those of the walls that surface points meet.
+    """Normals of the walls that surface points meet, selected from those of all walls, shape (world, wall, dim).
 
-    A list of indices would be copied to the GPU, which must not happen while a graph is captured.
+    Indexing with a list would copy it to the GPU, which is not allowed during a capture.
     """
     return torch.stack([normals[:, wall] for wall in model.spec.surface_walls], dim=1)
 

@@ -149,8 +149,8 @@ class LaunchReplay:
 
     The function is passed at each use and not stored, since its owner holds this object.
 
-    While PyTorch captures a CUDA graph, the launches become part of that graph, at once if they were captured before. Warp's CPU graphs
-    would also capture what other threads launch meanwhile.
+    While PyTorch captures a CUDA graph, the launches become part of that graph, as one child node if they were captured
+    before. Warp's CPU graphs would also capture what other threads launch meanwhile.
     """
 
     def __init__(self, model: Model):

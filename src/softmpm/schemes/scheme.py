@@ -29,7 +29,7 @@ class Run(Protocol):
     outgrow: Callable[[], None] | None
 
     def release(self) -> None:
-        """Let go of what :meth:`vjp` does not need, once the run is valid: ``end``, and perhaps ``start`` and ``words``."""
+        """Release ``end``, and whatever else :meth:`vjp` does not need, once the run is valid."""
         ...
 
     def vjp(self, adj_end: Any, adj_inputs: InputsAdj, wanted: RequestedGrads) -> Any:

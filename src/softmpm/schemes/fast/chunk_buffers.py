@@ -41,10 +41,10 @@ def sums_over(model: Model, rows: Callable[[], Tensor], nodes: Sequence[wp.array
 
 
 class StoredStates(NamedTuple):
-    """Copies of what the adjoint of a chunk reads, but for the inputs; see :class:`ChunkBuffers`."""
+    """Copies of the stored states of a chunk, and of the particle order and window that they refer to."""
 
     version: int
-    """Of the layout that order and origin are of."""
+    """Version of the layout, see :class:`ParticleLayout`."""
     order: Tensor
     origin: Tensor
     states: list[Tensor]
@@ -200,8 +200,11 @@ class ChunkBuffers:
         self.sums.begin(values["mass"])
 
     def _follow(self, version: int, order: Tensor, origin: Tensor) -> bool:
-        """Take the order of the particles and the origin of the window of this version of the layout; True if they were others, and the
-        inputs are to be permuted. Nothing is of a version until they are."""
+        """Copy the particle order and the window origin of a layout version into the buffers, unless they are those of this version.
+
+        Returns:
+            True if the inputs must be permuted; the caller sets the version afterwards.
+        """
         if not is_capturing(self.model) and self._version == version:
             return False
         self._version = -1
@@ -217,19 +220,19 @@ class ChunkBuffers:
         return [self.base, self.rows, self.nodes, *contact]
 
     def copy(self) -> StoredStates:
-        """What :meth:`restore` takes, in new tensors."""
+        """Copy the stored states into new tensors, for :meth:`restore`."""
         states = [tensor.clone() for tensor in self._stored]
         return StoredStates(self._version, self.order.clone(), self.origin.clone(), states)
 
     def restore(self, stream: wp.Stream | None, chunk: Chunk, stored: StoredStates, values: Values) -> None:
-        """Copy everything that the adjoint of a chunk reads into the buffers, after they have served other chunks of this shape."""
+        """Copy stored states back, and everything else that the adjoint of their chunk reads, after other chunks used the buffers."""
         moved = self._follow(stored.version, stored.order, stored.origin)
         self.inputs.take(stream, chunk, values, moved)
         self._version = stored.version
         for own, copied in zip(self._stored, stored.states, strict=True):
             own.copy_(copied)
         if self.contact is not None:
-            self.contact.restore(chunk)
+            self.contact.set_rate(chunk)
 
     def load_state(self, stream: wp.Stream | None, start: State | SortedState) -> None:
         """Copy the initial state into the buffers, permuted into the present order."""

@@ -24,10 +24,10 @@ COPIED, MANY_CALLS = 16_384, 8
 
 
 def copies(model) -> bool:
-    """True if calls copy the states of a chunk that they store instead of keeping its chunk graph.
+    """True if the stored states of a chunk are copied, so that its chunk graph is free for other calls.
 
-    On a GPU the host needs far longer to make the chunk graph of a small scene than the device to run it, and a loop of many calls
-    needs one for each. The copies take a fiftieth of the time of the substeps; with many particles it would be a sixth.
+    On a GPU, building the chunk graph of a small scene takes the host far longer than the device needs to run it, and without copies a
+    loop builds one for each call. The copies take a fiftieth of the time of the substeps; with many particles it would be a sixth.
     """
     few = model.worlds * model.particle_count <= COPIED and model.calls >= MANY_CALLS
     return model.device.type == "cuda" and few and not model.spec.deterministic

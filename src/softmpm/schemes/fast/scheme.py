@@ -47,8 +47,8 @@ class LayoutGraphs(GraphCache):
 
 
 class FastRun:
-    """A chunk that has been launched; its chunk graph is leased as long as it or its final state lives. Once released, a run that
-    copies its states has no lease, and :meth:`vjp` takes another one.
+    """A chunk that has been launched; its chunk graph is leased as long as it or its final state lives. If states are copied, this
+    ends with :meth:`release`, and :meth:`vjp` leases a chunk graph again.
 
     Attributes:
         updated: True if the particle layout was updated for its initial state.
@@ -77,14 +77,14 @@ class FastRun:
         packed = buffers.base[-1], buffers.rows[-1], buffers.order
         self.end = SortedState(pool.unpacker, *packed, surface, self._lease)
         self.words = buffers.words
-        self._values, self._stored = values, None  # a StoredStates once they are copied
+        self._values, self._stored = values, None  # StoredStates after release, if they are copied
         self.outgrow: Callable[[], None] | None = pool.layout.outgrow
 
     def release(self) -> None:
         del self.start, self.end  # each may hold the lease of a chunk graph
         if copies(self.pool.model) and self._lease is not None:
             self._stored, self._lease = self._lease.cached.graph.buffers.copy(), None
-            del self.words  # those of a graph that others get; vjp has new ones
+            del self.words  # other runs overwrite them; vjp sets new ones
 
     def vjp(self, adj_end: State | SortedAdj, adj_inputs: InputsAdj, wanted: RequestedGrads) -> SortedAdj:
         """Adjoint of the initial state; the adjoints of the inputs are added into ``adj_inputs``."""
@@ -103,7 +103,7 @@ class FastRun:
             return SortedAdj(self.pool.unpacker, adj.clone(), order.clone(), surface)
 
     def _restored(self) -> Lease:
-        """Lease of a chunk graph that has got the copied states."""
+        """Lease of a chunk graph into which the copied states were restored."""
         assert self._stored is not None
         lease = Lease(self.pool, self.chunk, keep=True)
         stream = stream_of(self.pool.model.device)
