@@ -3,12 +3,17 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
 import softmpm
-from softmpm import reference_contact
+from softmpm import autograd, reference_contact, rollout, runner
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
+from softmpm.schemes import graph_cache
+from softmpm.schemes.fast import chunk_buffers, particle_order
+from softmpm.schemes.fast import scheme as fast_scheme
+from softmpm.schemes.lagrangian import nodal
 
 LAWS = {
     "neo_hookean": softmpm.NeoHookean,
@@ -208,3 +213,18 @@ def thrown_out() -> softmpm.State:
     start = model.rest()
     start.v[0, 1, 0] = 100.0
     return softmpm.simulate(model, start, None, model.params(), substeps=10)
+
+
+def pretend_capture(patch: pytest.MonkeyPatch) -> None:
+    """Let calls on a CPU behave as if PyTorch were capturing a CUDA graph."""
+    for module in (
+        autograd,
+        chunk_buffers,
+        fast_scheme,
+        graph_cache,
+        nodal,
+        particle_order,
+        rollout,
+        runner,
+    ):
+        patch.setattr(module, "is_capturing", lambda model: True)

@@ -6,17 +6,13 @@ import threading
 
 import pytest
 import torch
-from helpers import KINDS, assert_relative, bar, busy_inputs, busy_scene, run
+from helpers import KINDS, assert_relative, bar, busy_inputs, busy_scene, pretend_capture, run
 
 import softmpm
-from softmpm import autograd, rollout, runner
 from softmpm.errors import NEVER
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
-from softmpm.schemes import capture, graph_cache
-from softmpm.schemes.fast import chunk_buffers
-from softmpm.schemes.fast import scheme as fast_scheme
-from softmpm.schemes.lagrangian import nodal
+from softmpm.schemes import capture
 
 
 def test_one_captures_at_a_time():
@@ -45,8 +41,7 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
     built = softmpm.build(busy_scene(2), device="cpu", **settings)
     inputs = busy_inputs(built)
     run(softmpm.simulate, built, inputs, 5).x.sum().backward()
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
     with capture.collected_resources() as resources:
         end = run(softmpm.simulate, built, inputs, 5)
         torch.autograd.grad((end.x[0, 1] * torch.inf).sum(), inputs["v"], retain_graph=True)
@@ -106,8 +101,8 @@ FORMULATIONS = {"moving": {}, "reference": dict(formulation="reference")}
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("settings", FORMULATIONS.values(), ids=FORMULATIONS)
-def test_a_recording_begins_at_a_wall_that_moves(settings):
-    """From particles alone, whose surface points take the normals of the call: it is the same when it is replayed."""
+def test_a_captured_call_starts_at_a_moving_wall(settings):
+    """From particles alone: the anchors of the surface points then depend on the normals that the call gives."""
     wall = softmpm.Wall(normal=(0.1, 1.0), offset=0.4752, friction=0.4)
     model = softmpm.build(
         bar(walls=[wall], gravity=(0.0, -9.8)), device="cuda", inputs=("wall_offset",), **settings
@@ -169,8 +164,7 @@ def test_a_recording_goes_on_without_a_world_that_failed(settings, monkeypatch):
     alone = three_calls(model, start._replace(C=healthy(start.C)), None)
     called, recorded = softmpm.Failures("reset"), softmpm.Failures("reset")
     assert_goes_on(model, three_calls(model, start, called), called, alone)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
     with capture.collected_resources() as resources:
         end = three_calls(model, start, recorded)
     assert not recorded.errors
@@ -233,8 +227,7 @@ def test_a_recording_differentiates_the_worlds_that_did_not_fail(settings, budge
     )
     assert_gradient(gradient(model, start, called), want)
     assert_one_failure(called, kind)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
     with capture.collected_resources() as resources:
         got = gradient(model, start, recorded)
     assert resources.collect()
@@ -261,8 +254,7 @@ def test_a_world_that_failed_in_a_recording_stops(policy, monkeypatch):
     """In the chunks after it is where it failed, so it leaves no window."""
     model, start, soft = torn_in_flight()
     softmpm.simulate(model, start._replace(v=torch.zeros_like(start.v)), None, soft, substeps=256)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
     failures = softmpm.Failures(policy)
     with capture.collected_resources() as resources, torch.no_grad():
         softmpm.simulate(model, start, None, soft, substeps=256, failures=failures)
@@ -276,8 +268,7 @@ def test_a_failure_is_counted_once_where_another_is_raised(monkeypatch):
     """The work is then done again outside of the recording, which counts it."""
     model, start = falling_pair()
     gradient(model, start._replace(C=healthy(start.C)), None)
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
     failures, v = softmpm.Failures("reset"), start.v.clone().requires_grad_()
     with capture.collected_resources() as resources:
         end = softmpm.simulate(
@@ -293,8 +284,7 @@ def test_a_recording_keeps_no_history_of_its_tensors(settings, monkeypatch):
     model, start = falling_pair(**settings)
     gradient(model, start._replace(C=healthy(start.C)), None)
     young = model.params().young.expand(2, -1).clone().requires_grad_()
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache, nodal):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
 
     def marks() -> dict:
         """Of the node that adds up the gradient of ``young``, which lives as long as a history that contains it."""

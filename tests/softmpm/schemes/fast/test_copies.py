@@ -1,17 +1,26 @@
-"""Chunk graphs that serve one chunk after the other: states are copied for the backward pass, and calls of a recording share graphs."""
+"""Chunk graphs that several calls share: stored states are copied for the backward pass, and calls of a capture use the same graphs."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import assert_relative, bar, busy_inputs, busy_scene, cotangent, dot, little_memory, run
+from helpers import (
+    assert_relative,
+    bar,
+    busy_inputs,
+    busy_scene,
+    cotangent,
+    dot,
+    little_memory,
+    pretend_capture,
+    run,
+)
 
 import softmpm
-from softmpm import autograd, rollout, runner
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import memory
-from softmpm.schemes import capture, graph_cache, launch
+from softmpm.schemes import capture, launch
 from softmpm.schemes.fast import chunk_buffers, footprint
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.footprint import COPIED, MANY_CALLS, copies
@@ -50,7 +59,7 @@ def made(monkeypatch) -> list[bool]:
 
 @pytest.fixture
 def wandering(monkeypatch):
-    """Makes a CPU sort the particles into another order, one after the other, wherever it would not change the order."""
+    """Gives the particles another order at each sorting, also on a CPU, which otherwise never changes it."""
     sort = ParticleLayout.resort
 
     def resort(self, x):
@@ -149,7 +158,7 @@ def test_recomputed_states_are_not_copied(made, monkeypatch):
 
 @pytest.mark.parametrize("scene, inputs", SCENES.values(), ids=SCENES)
 def test_the_plan_of_memory_counts_copies(scene, inputs, monkeypatch):
-    """What calls keep until the backward pass, with three chunk graphs, is what the formula says: within 20 %."""
+    """Copied states and three chunk graphs take the memory of the formula, within 20 %."""
     for module in (footprint, fast_scheme):
         monkeypatch.setattr(module, "copies", lambda model: True)
     model = softmpm.build(scene(), device="cpu", calls=60, inputs=inputs)
@@ -209,15 +218,14 @@ def test_where_states_are_copied(device, particles, calls, deterministic, copied
     assert copies(model) is copied
 
 
-def test_calls_of_a_recording_share_chunk_graphs(made, monkeypatch):
-    """Calls without a gradient need as few as outside of it, and what a recording has taken is not given to later calls."""
+def test_calls_of_a_capture_share_chunk_graphs(made, monkeypatch):
+    """Calls without a gradient need no more of them than outside of it, and later calls use none of those that a capture took."""
     model = softmpm.build(busy_scene(2), device="cpu")
     inputs = busy_inputs(model)
     with torch.no_grad():
         want = run(softmpm.simulate, model, inputs, 5)
         count = len(made)
-        for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache):
-            monkeypatch.setattr(module, "is_capturing", lambda model: True)
+        pretend_capture(monkeypatch)
         with capture.collected_resources() as resources:
             for _ in range(4):
                 found = run(softmpm.simulate, model, inputs, 5)
@@ -232,8 +240,8 @@ def test_calls_of_a_recording_share_chunk_graphs(made, monkeypatch):
     assert taken and left and not taken & left
 
 
-def test_a_recording_has_the_shared_buffers_of_its_backward_passes_to_itself(made, monkeypatch):
-    """Those of a call before it are its own then, and a call after it gets others, with the same gradient."""
+def test_a_capture_takes_the_buffers_that_backward_passes_share(made, monkeypatch):
+    """A call after it gets new ones, and the same gradient."""
     model = softmpm.build(busy_scene(2), device="cpu")
     inputs = busy_inputs(model)
 
@@ -244,12 +252,9 @@ def test_a_recording_has_the_shared_buffers_of_its_backward_passes_to_itself(mad
     want, pool = gradient(), fast_scheme.Fast.of(model)._pool
     assert pool is not None
     (before,) = pool._shared_adjoints.values()
-    patched = pytest.MonkeyPatch()
-    for module in (autograd, fast_scheme, chunk_buffers, rollout, runner, graph_cache):
-        patched.setattr(module, "is_capturing", lambda model: True)
-    with capture.collected_resources() as resources:
+    with monkeypatch.context() as patch, capture.collected_resources() as resources:
+        pretend_capture(patch)
         assert torch.equal(gradient(), want) and torch.equal(gradient(), want)
-    patched.undo()
     assert any(one is before for one in resources.made.values()) and not pool._shared_adjoints
     assert torch.equal(gradient(), want)
     (after,) = pool._shared_adjoints.values()

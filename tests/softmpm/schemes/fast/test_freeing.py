@@ -6,15 +6,24 @@ import weakref
 
 import pytest
 import torch
-from helpers import KINDS, assert_relative, busy_inputs, busy_scene, cotangent, dot, little_memory, run
+from helpers import (
+    KINDS,
+    assert_relative,
+    busy_inputs,
+    busy_scene,
+    cotangent,
+    dot,
+    little_memory,
+    pretend_capture,
+    run,
+)
 
 import softmpm
-from softmpm import autograd, rollout, runner
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
-from softmpm.schemes import capture, graph_cache
-from softmpm.schemes.fast import adjoint_buffers, chunk_buffers, chunk_graph, particle_order
+from softmpm.schemes import capture
+from softmpm.schemes.fast import adjoint_buffers, chunk_graph, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.sorted_state import SortedState
 from softmpm.schemes.plain import chunk as plain_chunk
@@ -310,8 +319,7 @@ def test_a_recorded_graph_keeps_what_it_uses(living, budget, monkeypatch):
     backward(*call(built))  # makes what a recording must not
     before = {id(made) for made in living(HOLD_MEMORY)}
     with_graphs = [weakref.ref(made) for made in living((chunk_graph.ChunkGraph, chunk_graph.ChunkGraphAdj))]
-    for module in (autograd, chunk_buffers, fast_scheme, rollout, runner, graph_cache):
-        monkeypatch.setattr(module, "is_capturing", lambda model: True)
+    pretend_capture(monkeypatch)
     with capture.collected_resources() as resources:
         backward(*call(built))
         assert with_graphs and all(made() is not None for made in with_graphs), (

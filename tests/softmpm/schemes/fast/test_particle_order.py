@@ -10,13 +10,11 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
-from helpers import LAWS, assert_relative, cotangent, dot
+from helpers import LAWS, assert_relative, cotangent, dot, pretend_capture
 
 import softmpm
-from softmpm import autograd, rollout, runner
 from softmpm.planning.memory import MARGIN
-from softmpm.schemes import graph_cache
-from softmpm.schemes.fast import chunk_buffers, particle_order
+from softmpm.schemes.fast import particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.particle_order import STALE_FEW, ParticleLayout
 
@@ -389,16 +387,7 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
         @contextlib.contextmanager
         def blindly(*_, **__):
             with monkeypatch.context() as patch:
-                for module in (
-                    particle_order,
-                    autograd,
-                    fast_scheme,
-                    chunk_buffers,
-                    rollout,
-                    runner,
-                    graph_cache,
-                ):
-                    patch.setattr(module, "is_capturing", lambda model: True)
+                pretend_capture(patch)
                 yield
 
         pretended = SimpleNamespace(
