@@ -89,7 +89,7 @@ class LaunchTemplate:
 
     def on(self, inputs: Sequence) -> wp.Launch:
         """The same launch on other inputs, which it keeps alive."""
-        made: Any = object.__new__(wp.Launch)  # copy.copy takes as long as half of this method
+        made: Any = object.__new__(wp.Launch)  # copy.copy takes 3 to 5 µs more
         made.__dict__.update(self._made.__dict__)
         pairs = zip(self._kinds, inputs, strict=True)
         made.params = [made.bounds, *[_native(kind, v) if native else kind(v) for (kind, native), v in pairs]]
