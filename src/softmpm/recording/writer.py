@@ -150,16 +150,20 @@ class Recorder:
         """One row in each table for each frame; they count once the last rows, those of ``frame/index``, are written."""
         self._need_open()
         count, index = dict(self._count), []
-        size = sum(one.nbytes for frame in frames for one in (frame.values | frame.parts).values())
+        rows: dict[str, list[np.ndarray]] = {}
+        for frame in frames:
+            for name, one in frame.values.items():
+                rows.setdefault(f"frame/{name}", []).append(one)
+            at = {name: count[table] if name in frame.parts else -1 for name, table in PARTS.items()}
+            for name, one in frame.parts.items():
+                rows.setdefault(PARTS[name], []).append(one)
+                count[PARTS[name]] += 1
+            index.append((frame.episode._row, frame.time, *at.values()))
+        begin = self._count | {f"frame/{name}": self._count["frame/index"] for name in frames[0].values}
+        size = sum(one.nbytes for many in rows.values() for one in many)
         with room(self._file, size + (len(frames) - 1) * FURTHER_FRAME):
-            for row, frame in enumerate(frames, start=count["frame/index"]):
-                for name, one in frame.values.items():
-                    put(self._tables[f"frame/{name}"], row, one[None])
-                at = {name: count[table] if name in frame.parts else -1 for name, table in PARTS.items()}
-                for name, one in frame.parts.items():
-                    put(self._tables[PARTS[name]], at[name], one[None])
-                    count[PARTS[name]] += 1
-                index.append((frame.episode._row, frame.time, *at.values()))
+            for table, many in rows.items():
+                put(self._tables[table], begin[table], np.stack(many))
         self._write("frame/index", np.array(index, FRAME))
         self._count |= {table: count[table] for table in PARTS.values()}
         for frame in frames:
