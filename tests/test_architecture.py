@@ -12,7 +12,7 @@ import softmpm
 SRC = Path(__file__).parents[1] / "src"
 LAYERS = """
     validate summary devices batches compiling workspace kernels.compile
-    state inputs kernels.parts
+    state inputs kernels.parts kernels.dependent
     errors
     scene planning alarms kernels.structs
     checks

@@ -12,9 +12,11 @@ import torch
 import warp as wp
 
 from softmpm.kernels.compile import THREADS, compile_together, launch, runs_in_order
+from softmpm.kernels.dependent import awaits_previous
 from softmpm.model import Model
 from softmpm.schemes.capture import exclusive_capture, is_capturing
 from softmpm.schemes.child_graph import add_child
+from softmpm.schemes.dependent_launch import begin_early
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.program import Divided, Program
 
@@ -144,6 +146,24 @@ class KernelList(KernelLauncher):
         self.found[kernel, block_dim] = None
 
 
+class CapturedLaunches(KernelLauncher):
+    """Launches kernels on a capturing stream.
+
+    Attributes:
+        waiting: Functions of those that wait for the previous kernel, as handles of the driver.
+    """
+
+    def __init__(self, model: Model, stream: wp.Stream):
+        super().__init__(model, stream)
+        self.waiting: set[int] = set()
+
+    def _recorded(self, kernel, dim, inputs: Sequence, block_dim: int) -> wp.Launch:
+        made: Any = super()._recorded(kernel, dim, inputs, block_dim)
+        if awaits_previous(kernel):
+            self.waiting.add(made.hooks.forward)
+        return made
+
+
 class LaunchReplay:
     """Captures ``launches(launcher)`` on first use, as a CUDA graph or, on the CPU, as a program, and replays it.
 
@@ -194,9 +214,11 @@ class LaunchReplay:
             if not acquired:
                 return None
             stream = _capture_stream(self.model.device)
+            launcher = CapturedLaunches(self.model, stream)
             with wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-                launches(KernelLauncher(self.model, stream))
+                launches(launcher)
             assert capture.graph is not None
+            begin_early(capture.graph, launcher.waiting)
             return capture.graph
 
 

@@ -19,6 +19,7 @@ from softmpm.kernels.carried.point import outline_type, surface_point
 from softmpm.kernels.carried.surface import surface
 from softmpm.kernels.carried.surface_adj import loads_adj
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import NATIVE, native
@@ -31,6 +32,7 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
     """``grid`` of the table above, and a kernel that clears sums."""
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), stencil(spec.dim, spec.dtype)
     real, node_vec, Constants, Window = t.real, t.aligned, t.Constants, t.Window
+    exact_vec = types(dim, "float64").vec
     Outline, GridInputs = outline_type(dim, spec.dtype), input_types(spec).GridInputs
     point, add_load = surface_point(dim, spec.dtype, True), surface(spec, True).add_load
     Particles, point_of = point.Particles, point.point_of
@@ -38,13 +40,13 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 
-    @kernel(NATIVE)
+    @kernel(NATIVE, grid_stride=False)
     def clear(one: wp.array2d(dtype=real), other: wp.array2d(dtype=real)):
         world, i = wp.tid()
         one[world, i] = real(0.0)
         other[world, i] = real(0.0)
 
-    @kernel(NATIVE)
+    @kernel(NATIVE, grid_stride=False)
     def grid_and_loads(
         # Parameters:
         constants: Constants,
@@ -65,9 +67,22 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
         load: wp.array2d(dtype=real),
     ):
         i = wp.tid()
+        world = int(0)
+        p = int(0)
+        lane = int(0)
+        particle = int(0)
+        place = exact_vec()
         if i < node.shape[0]:
             world = world_of(i, window.count, node.shape[0])
             place = place_of(constants, window, world, i)
+        elif i >= first:
+            k = (i - first) / outline.lanes
+            world = k / owner.shape[1]
+            p = k - world * owner.shape[1]
+            lane = i - first - k * outline.lanes
+            particle = owner[world, p]
+        await_previous()  # the particles and their sums
+        if i < node.shape[0]:
             here = load_node(node, i)
             if here[dim] > real(0.0):
                 v = aligned(node_velocity(constants, inputs, world, place, head(here), here[dim]), real(0.0))
@@ -77,11 +92,7 @@ def contact_stage(spec: Spec) -> SimpleNamespace:
                 store_node(cleared, i, node_vec())
             cleared_load[world, i - world * window.count] = real(0.0)
         elif i >= first:
-            k = (i - first) / outline.lanes
-            world = k / owner.shape[1]
-            p = k - world * owner.shape[1]
-            lane = i - first - k * outline.lanes
-            at = point_of(constants, window, outline, now, world, p, owner[world, p])
+            at = point_of(constants, window, outline, now, world, p, particle)
             add_load(window, outline, at, world, p, lane, load)
 
     return SimpleNamespace(clear=clear, grid_and_loads=grid_and_loads)
@@ -92,6 +103,7 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     """``grid_adj`` of the table above."""
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), stencil(spec.dim, spec.dtype)
     real, vec, node_vec, Constants, Window = t.real, t.vec, t.aligned, t.Constants, t.Window
+    exact_vec = types(dim, "float64").vec
     Outline, point = outline_type(dim, spec.dtype), surface_point(dim, spec.dtype, True)
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     Particles, ParticlesAdj, point_of = point.Particles, point.ParticlesAdj, point.point_of
@@ -104,7 +116,7 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 
-    @kernel(NATIVE)
+    @kernel(NATIVE, grid_stride=False)
     def grid_and_loads_adj(
         # Parameters:
         constants: Constants,
@@ -138,11 +150,29 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
         adj_inputs: GridInputsAdj,
     ):
         i = wp.tid()
+        world = int(0)
+        p = int(0)
+        lane = int(0)
+        particle = int(0)
+        place = exact_vec()
+        here = node_vec()
+        there = node_vec()
         if i < velocity.shape[0]:
             world = world_of(i, window.count, velocity.shape[0])
             place = place_of(constants, window, world, i)
             if i < node.shape[0]:
                 here = load_node(node, i)
+            if i < node_before.shape[0]:
+                there = load_node(node_before, i)
+        elif i >= first:
+            k = (i - first) / outline.lanes
+            world = k / owner.shape[1]
+            p = k - world * owner.shape[1]
+            lane = i - first - k * outline.lanes
+            particle = owner[world, p]
+        await_previous()  # the adjoints
+        if i < velocity.shape[0]:
+            if i < node.shape[0]:
                 more = load_node(gained, i)
                 adj_v = head(load_node(adj_node, i)) + head(more)
                 if here[dim] > real(0.0):
@@ -152,7 +182,6 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
                     store_node(adj_node, i, aligned(back.p, back.m + more[dim]))
                 store_node(gained, i, node_vec())
             if i < node_before.shape[0]:
-                there = load_node(node_before, i)
                 if there[dim] > real(0.0):
                     v = aligned(
                         node_velocity(constants, inputs, world, place, head(there), there[dim]), real(0.0)
@@ -164,14 +193,10 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
                 cleared_load[world, i - world * window.count] = real(0.0)
                 cleared_adj_load[world, i - world * window.count] = real(0.0)
         elif i >= first:
-            k = (i - first) / outline.lanes
-            world = k / owner.shape[1]
-            p = k - world * owner.shape[1]
-            lane = i - first - k * outline.lanes
             if node.shape[0] > 0:
-                add_load_adj(constants, window, outline, now, world, p, lane, owner[world, p], adj_load, adj)
+                add_load_adj(constants, window, outline, now, world, p, lane, particle, adj_load, adj)
             if node_before.shape[0] > 0:
-                at = point_of(constants, window, outline, before, world, p, owner[world, p])
+                at = point_of(constants, window, outline, before, world, p, particle)
                 add_load(window, outline, at, world, p, lane, load)
                 J = impulse[world, p]
                 if wp.dot(J, J) > real(0.0):

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
+from softmpm.kernels.dependent import recent
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import NATIVE, WARP, native
 from softmpm.kernels.physics.lanes import lane_sum
@@ -60,6 +61,17 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
     Particles = t.Packed if packed else t.Motion
     ParticlesAdj = wp.array(dtype=real) if packed else t.MotionAdj
 
+    vector = f"wp::vec_t<{dim}, {t.c_name}>"
+
+    @wp.func_native(recent(vector, "i, j, k"))
+    def load_state(values: wp.array3d(dtype=vec), i: int, j: int, k: int) -> vec: ...
+
+    @wp.func_native(recent(vector, "i, j"))
+    def load_velocity(values: wp.array2d(dtype=vec), i: int, j: int) -> vec: ...
+
+    @wp.func_native(recent(t.c_name, "i, j"))
+    def load_number(values: wp.array2d(dtype=real), i: int, j: int) -> real: ...
+
     @wp.struct
     class Point:
         base: ivec  # first node of the particle's stencil, counted from the first of the window
@@ -94,7 +106,7 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
             t.row_low,
             t.row_h,
         )
-        load_vec, load_mat, rows = n.load_vec, n.load_mat, t.rows
+        load_vec, load_mat, load_base, rows = n.load_vec, n.load_mat, n.load_base, t.rows
 
         @wp.func
         def point_of(
@@ -111,7 +123,9 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
             H = load_mat(now.rows, owner, row_H)
             fx = load_vec(now.rows, owner, row_fx)
             low = load_vec(now.rows, owner, row_low)
-            return put(constants, window, world, unpack_base(now.base[owner]), fx, low, arm + H * arm)
+            return put(
+                constants, window, world, unpack_base(load_base(now.base, owner)), fx, low, arm + H * arm
+            )
 
         @wp.func
         def add_adj(adj: ParticlesAdj, world: int, owner: int, fx: vec, H: mat):
@@ -199,6 +213,9 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
         PlaceAdj=PlaceAdj,
         Particles=Particles,
         ParticlesAdj=ParticlesAdj,
+        load_state=load_state,
+        load_velocity=load_velocity,
+        load_number=load_number,
         point_of=point_of,
         share=share,
         with_share_adj=with_share_adj,

@@ -18,6 +18,7 @@ import warp as wp
 from softmpm.errors import Kind
 from softmpm.kernels.carried.point import options_of, outline_type, surface_point
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
@@ -38,6 +39,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         wall_face(spec),
     )
     Particles, point_of, share = point.Particles, point.point_of, point.share
+    load_state = point.load_state
     Point, offset, node_index, size = point.Point, s.offset, s.node_index, s.count
     vD, summed = wp.types.vector(dim + 1, real), lane_sum(dim + 1, real)
     face, depth, friction_of = one.face, one.depth, one.friction_of
@@ -143,7 +145,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
         add_load(window, outline, at, world, p, lane, load)
 
-    @kernel(options_of(packed))
+    @kernel(options_of(packed), grid_stride=False)
     def press(
         # Parameters:
         constants: Constants,
@@ -172,13 +174,12 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         velocity: wp.array2d(dtype=vec),  # v', or left to ``push_all``
     ):
         world, p, lane = wp.tid()
-        alive = running(words_before, world)
         before = vecs()
         pushed = vecs()
         for q in range(count):
-            before[q] = anchor[world, q, p]
+            before[q] = load_state(anchor, world, q, p)
             if anew == 0:
-                pushed[q] = force[world, q, p]
+                pushed[q] = load_state(force, world, q, p)
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
         wall = faces_of(constants, inputs, world, at.x, before)
         stiffness = outline.stiffness[p]
@@ -186,6 +187,8 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         deepest = outline.deepest[p]
         per_force = rate[0] * outline.newtons[p]
         found = vD()
+        await_previous()  # free and load
+        alive = running(words_before, world)
         if wall.near == 1:
             for n in range(lane, size, outline.lanes):
                 i = node_index(at.base, offset(n), window.shape)

@@ -17,6 +17,7 @@ import warp as wp
 from softmpm.kernels.carried.point import options_of, outline_type, surface_point
 from softmpm.kernels.carried.surface import surface
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
 from softmpm.kernels.physics.surface_contact import surface_contact
@@ -78,7 +79,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     Particles, ParticlesAdj, PlaceAdj = point.Particles, point.ParticlesAdj, point.PlaceAdj
     point_of, share, with_share_adj = point.point_of, point.share, point.with_share_adj
     add_place_adj = point.add_place_adj
-    vDp, summed = wp.types.vector(2 * dim + 1, real), lane_sum(2 * dim + 1, real)
+    load_state, load_velocity, load_number = point.load_state, point.load_velocity, point.load_number
+    vD, summed, pulled = wp.types.vector(dim + 1, real), lane_sum(dim + 1, real), lane_sum(dim, real)
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
     touch_adj, meet, number = surface_contact(dim, spec.dtype).touch_adj, one.meet, one.number
     faces_of, face_adj = one.faces_of, wall_face_adj(spec, wanted)
@@ -86,7 +88,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     add_load_adj, count = loads_adj(dim, spec.dtype, packed), len(spec.surface_walls)
     apart = one.apart
 
-    @kernel(options_of(packed))
+    @kernel(options_of(packed), grid_stride=False)
     def press_adj(
         # Parameters:
         constants: Constants,
@@ -119,8 +121,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         adj_pushed = vecs()
         for q in range(count):
             before[q] = anchor[world, q, p]
-            adj_after[q] = adj_anchor[world, q, p]
-            adj_pushed[q] = adj_force[world, q, p]
+            adj_after[q] = load_state(adj_anchor, world, q, p)
+            adj_pushed[q] = load_state(adj_force, world, q, p)
         at = point_of(constants, window, outline, now, world, p, owner[world, p])
         wall = faces_of(constants, inputs, world, at.x, before)
         if wp.static(apart):
@@ -129,6 +131,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
                 for axis in range(dim):
                     idle = idle and adj_after[q, axis] == real(0.0)
             if idle:
+                await_previous()
                 if anew == 1:
                     for q in range(count):
                         adj_force[world, q, p] = vec()
@@ -136,31 +139,23 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         stiffness = outline.stiffness[p]
         area = outline.areas[p]
         per_force = rate[0] * outline.newtons[p]
-        found = vDp()
+        found = vD()
         if wall.near == 1:
             for n in range(lane, size, outline.lanes):
                 i = node_index(at.base, offset(n), window.shape)
                 m = node[world, i][dim]
-                v_i = free[world, i]
-                L_i = load[world, i]
-                adj_v = adj_velocity[world, i]
+                v_i = load_velocity(free, world, i)
+                L_i = load_number(load, world, i)
                 b = share(at, n)
                 for axis in range(dim):
                     found[axis] = found[axis] + b * v_i[axis]
                 if m > real(0.0):
                     found[dim] = found[dim] + wp.abs(b) * L_i / m
-                    for axis in range(dim):
-                        found[dim + 1 + axis] = found[dim + 1 + axis] + (b / m) * adj_v[axis]
             found = summed(found, outline.lanes)
-        meet_lanes(outline.lanes)
         D = found[dim]
-        if wall.near == 1 and not D > real(0.0):  # a point of a world that failed
-            return
         v = vec()
-        pull = vec()
         for axis in range(dim):
             v[axis] = found[axis]
-            pull[axis] = area * found[dim + 1 + axis]
         reached = vecs()
         given = vecs()
         total = vec()
@@ -170,6 +165,18 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
             given[q] = met.J
             v += D * met.J
             total += met.J
+        await_previous()  # adj_velocity
+        if wall.near == 1 and not D > real(0.0):  # a point of a world that failed
+            return
+        pull = vec()
+        if wall.near == 1:
+            for n in range(lane, size, outline.lanes):
+                i = node_index(at.base, offset(n), window.shape)
+                m = node[world, i][dim]
+                if m > real(0.0):
+                    pull += (area * share(at, n) / m) * adj_velocity[world, i]
+            pull = pulled(pull, outline.lanes)
+        meet_lanes(outline.lanes)
         back_x = vec()
         back_v = vec()
         back_D = real(0.0)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import NATIVE, native
 from softmpm.kernels.structs import types
@@ -109,6 +110,7 @@ def fixed(dim: int) -> SimpleNamespace:
         sums: Sums,
     ):
         i = wp.tid()
+        await_previous()
         first = int(-1)
         g = vec()
         b = vec()

@@ -21,6 +21,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import BLOCK, NATIVE, native
@@ -42,7 +43,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     particle_of, world_of = s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
-    scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
+    scatter, load_node, store_node, load_base = n.scatter, n.load_node, n.store_node, n.load_base
     rotation, moved = one.rotation, one.moved
     linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum
     node_velocity, position = grid(spec).node_velocity, grid(spec).position
@@ -94,7 +95,8 @@ def fused(spec: Spec) -> SimpleNamespace:
     ):
         i = wp.tid()
         world = world_of(i, window.count, velocity.shape[0])
-        place = place_of(constants, window, world, i)  # computed while the node is being loaded
+        place = place_of(constants, window, world, i)
+        await_previous()
         here = take(node, i)
         if here[dim] > real(0.0):
             v = node_velocity(constants, inputs, world, place, head(here), here[dim])
@@ -161,6 +163,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
+        await_previous()
         H = load_mat(start.rows, i, row_H)
         g = centre(load_vec(start.rows, i, row_fx))
         v = load_vec(start.rows, i, row_v)
@@ -202,21 +205,22 @@ def fused(spec: Spec) -> SimpleNamespace:
         i = wp.min(place, total - 1)
         world = world_of(i, count, total)
         p = i - world * count
+        origin = window.origin[world]
+        held = world * window.count  # nodes of the worlds before
+        old = Particle()
+        old.base = unpack_base(load_base(now.base, i))
+        old.fx = load_vec(now.rows, i, row_fx)
+        old.low = load_vec(now.rows, i, row_low)
+        old.H = load_mat(now.rows, i, row_H)
+        await_previous()  # velocity and words
         if wp.static(by_slabs):
             alive = running(before, world)
         else:
             alive = running(words, world)
-        origin = window.origin[world]
-        held = world * window.count  # nodes of the worlds before
-        old = Particle()
-        old.base = unpack_base(now.base[i])
-        old.fx = load_vec(now.rows, i, row_fx)
         g = centre(old.fx)
         # (T2) by (A3)
         sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
         B = sums.outer - wp.outer(sums.value, g)
-        old.low = load_vec(now.rows, i, row_low)
-        old.H = load_mat(now.rows, i, row_H)
         new = moved(constants, inputs, world, p, origin, window.shape, old, sums.value, B)  # (T3)
         base = old.base
         if new.valid:

@@ -16,6 +16,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
@@ -77,8 +78,14 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         i = wp.tid()
         world = world_of(i, window.count, velocity.shape[0])
         place = place_of(constants, window, world, i)
+        here = node_vec()
+        there = node_vec()
         if i < node.shape[0]:
             here = load_node(node, i)
+        if i < node_before.shape[0]:
+            there = load_node(node_before, i)
+        await_previous()  # adj
+        if i < node.shape[0]:
             adj_v = take(adj, i)
             if here[dim] > real(0.0):
                 back = node_velocity_adj(
@@ -86,7 +93,6 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 )
                 leave(adj, i, aligned(back.p, back.m))
         if i < node_before.shape[0]:
-            there = load_node(node_before, i)
             if there[dim] > real(0.0):
                 v = node_velocity(constants, inputs, world, place, head(there), there[dim])
                 store_node(velocity, i, aligned(v, real(0.0)))
@@ -119,13 +125,20 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         adj_velocity: Shares,  # of the substep before
     ):
         i = particle_of(wp.tid(), per_warp, total)
+        world = int(0)
         first = int(-1)
         plane = int(0)
+        v = vec()
+        C = mat()
+        if i < total:
+            world = world_of(i, count, total)
+            v = load_vec(now.rows, i, row_v)
+            C = load_mat(now.rows, i, row_C)
+        await_previous()  # the adjoints and the velocity
         g = vec()
         b = vec()
         B = mat()
         if i < total:
-            world = world_of(i, count, total)
             p = i - world * count
             origin = window.origin[world]
             held = world * window.count
@@ -133,8 +146,6 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj = ParticleAdj()
             adj.fx = load_vec(adj_now, i, row_fx)
             adj.H = load_mat(adj_now, i, row_H)
-            v = load_vec(now.rows, i, row_v)
-            C = load_mat(now.rows, i, row_C)
             if end:
                 adj.v = load_vec(adj_now, i, row_v)
                 adj.C = load_mat(adj_now, i, row_C)

@@ -61,6 +61,9 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func_native("softmpm::store_node(node.data, i, value);")
     def store_node(node: wp.array(dtype=node_vec), i: int, value: node_vec): ...
 
+    @wp.func_native("return softmpm::recent(base.data + i);")
+    def load_base(base: wp.array(dtype=wp.int32), i: int) -> int: ...
+
     @wp.func_native(
         f"wp::vec_t<{dim}, {t.c_name}> value; softmpm::load_rows<{rows}, {dim}>(packed.data, i, r, value.c); return value;"
     )
@@ -92,6 +95,7 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         scatter_planes=scatter_planes,
         load_node=load_node,
         store_node=store_node,
+        load_base=load_base,
         load_vec=load_vec,
         load_mat=load_mat,
         store_vec=store_vec,

@@ -41,7 +41,7 @@ template <typename T> struct Four {
 template <typename T> CUDA_CALLABLE inline Four<T> load(const T* p) { return { p[0], p[1], p[2], p[3] }; }
 template <> CUDA_CALLABLE inline Four<float> load(const float* p)
 {
-    float4 v = __ldg(reinterpret_cast<const float4*>(p));
+    float4 v = *reinterpret_cast<const float4*>(p);  // the kernel before may still write: not as read-only memory
     return { v.x, v.y, v.z, v.w };
 }
 
@@ -365,11 +365,21 @@ template <int ROWS, typename T> CUDA_CALLABLE inline T* packed(T* rows, int i, i
     return rows + (unsigned(i) / LANES * (ROWS * LANES) + unsigned(i) % LANES + r * LANES);
 }
 
+// A load past the nearest cache, which might hold an older copy, see kernels/dependent.py.
+template <typename T> CUDA_CALLABLE inline T recent(const T* p)
+{
+#if defined(__CUDA_ARCH__)
+    return __ldcg(p);
+#else
+    return *p;
+#endif
+}
+
 template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(const T* rows, int i, int r, T* out)
 {
     const T* at = packed<ROWS>(rows, i, r);
     for (int k = 0; k < COUNT; ++k)
-        out[k] = at[k * LANES];
+        out[k] = recent(at + k * LANES);
 }
 
 template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(T* rows, int i, int r, const T* in)

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.lagrangian.bricks import Bricks, brick_options, meet
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
@@ -98,6 +99,7 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     ):
         world, brick, lane = wp.tid()
         seat = seat_of(inside, inputs, world, brick, lane)
+        await_previous()
         forces_at(world, brick, lane, seat, constants, inputs, inside, at, s)
 
     @kernel(options, **settings)
@@ -242,6 +244,7 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
     ):
         world, brick, lane = wp.tid()
         seat = seat_of(inside, inputs, world, brick, lane)
+        await_previous()
         forces_adj_at(world, brick, lane, seat, constants, inputs, inside, at, bar, adj_inputs, s)
 
     return SimpleNamespace(seat_of=seat_of, forces_adj=forces_adj, forces_adj_at=forces_adj_at)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.lagrangian.bricks import Bricks, block_number, brick_options, meet, thread_number
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.interpolation import field, sums
@@ -110,6 +111,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
             brick = block_number() - world * inside.corners.shape[0]
             lane = thread_number()
         seat = seat_of(inside, inputs, world, brick, lane)
+        await_previous()
         forces_at(world, brick, lane, seat, constants, inputs, inside, lattice, at, s)
 
     return SimpleNamespace(seat_of=seat_of, forces=forces, forces_at=forces_at)
@@ -214,6 +216,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
             brick = block_number() - world * inside.corners.shape[0]
             lane = thread_number()
         seat = seat_of(inside, inputs, world, brick, lane)
+        await_previous()
         forces_adj_at(world, brick, lane, seat, constants, inputs, inside, lattice, at, bar, adj_inputs, s)
 
     return SimpleNamespace(seat_of=seat_of, forces_adj=forces_adj, forces_adj_at=forces_adj_at)

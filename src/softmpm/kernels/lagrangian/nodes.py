@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous, recent
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.node_sums import gathering
@@ -51,6 +52,9 @@ def nodes(spec: Spec) -> SimpleNamespace:
     lost, moved = memory.lost, memory.moved
     row = rows(spec.dim, spec.dtype)
 
+    @wp.func_native(recent(t.c_name, "world, i"))
+    def load_mass(values: wp.array2d(dtype=real), world: int, i: int) -> real: ...
+
     @wp.struct
     class Node:
         """What is the same in every substep of a chunk."""
@@ -64,7 +68,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
     @wp.func
     def node_of(constants: Constants, inside: Rest, mass: wp.array2d(dtype=real), world: int, i: int) -> Node:
         out = Node()
-        out.m = row(mass, world)[i]
+        out.m = load_mass(mass, world, i)
         out.per_m = wp.where(out.m > real(0.0), real(1.0) / out.m, real(0.0))
         out.entries = entries_of(inside, i)
         out.rest = position(constants, inside.nodes[i])
@@ -135,6 +139,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             node = node_of(constants, inside, at.mass, world, i)
+            await_previous()  # the forces
             advance_at(world, i, node, constants, inputs, body, at, s)
 
     return SimpleNamespace(Node=Node, node_of=node_of, advance=advance, advance_at=advance_at)
@@ -254,6 +259,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             node = node_of(constants, inside, at.mass, world, i)
+            await_previous()  # the adjoints
             advance_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
     @kernel(LAGRANGIAN)
@@ -262,6 +268,7 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             entries = entries_of(inside, i)
+            await_previous()  # the adjoints
             bar.u[world, i] = bar.u[world, i] + gathered(row(bar.partial_u, world), entries)
             if wp.static(viscous):
                 bar.v[world, i] = bar.v[world, i] + gathered(row(bar.partial_v, world), entries)

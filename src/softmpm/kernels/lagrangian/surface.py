@@ -15,6 +15,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.frame import frame
 from softmpm.kernels.lagrangian.portions import end_of, first_of
@@ -206,13 +207,17 @@ def surface(spec: Spec) -> SimpleNamespace:
     ):
         world, k = wp.tid()
         for p in range(first_of(k), end_of(k, body.points.shape[0])):
-            press_at(world, p, point_of(body, p), constants, inputs, body, moving, at, s, anew)
+            point = point_of(body, p)
+            await_previous()  # the velocity without contact
+            press_at(world, p, point, constants, inputs, body, moving, at, s, anew)
 
     @kernel(LAGRANGIAN)
     def settle(constants: Constants, body: Surface, moving: Frame, at: Chunk, s: int):
         world, k, lane = wp.tid()
         for n in range(first_of(k), end_of(k, body.nodes.shape[0])):
-            settle_at(world, lane, touched_of(body, n, lane), constants, body, moving, at, s)
+            entry = touched_of(body, n, lane)
+            await_previous()  # the impulses
+            settle_at(world, lane, entry, constants, body, moving, at, s)
 
     @kernel(LAGRANGIAN)
     def check_depth(

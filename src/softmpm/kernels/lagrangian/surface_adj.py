@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softmpm.kernels.compile import kernel, kernel_factory
+from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.lagrangian.chunk import chunk
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.portions import end_of, first_of
@@ -212,6 +213,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         world, k = wp.tid()
         for i in range(first_of(k), end_of(k, inside.nodes.shape[0])):
             node = node_of(constants, inside, at.mass, world, i)
+            await_previous()  # the adjoints
             settle_adj_at(world, i, node, constants, inputs, at, bar, adj_inputs, s)
 
     @kernel(LAGRANGIAN)
@@ -227,7 +229,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         world, k = wp.tid()
         for p in range(first_of(k), end_of(k, body.points.shape[0])):
-            press_adj_at(world, p, point_of(body, p), constants, inputs, body, at, bar, adj_inputs, s, anew)
+            point = point_of(body, p)
+            await_previous()  # the adjoints
+            press_adj_at(world, p, point, constants, inputs, body, at, bar, adj_inputs, s, anew)
 
     @kernel(LAGRANGIAN)
     def spread_adj(
@@ -244,6 +248,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         for n in range(first_of(k), end_of(k, body.nodes.shape[0])):
             entry = touched_of(body, n, lane)
             node = node_of(constants, inside, at.mass, world, entry.i)
+            await_previous()  # the adjoints
             spread_adj_at(world, lane, entry, node, constants, inputs, body, at, bar, adj_inputs, s)
 
     @kernel(LAGRANGIAN)
