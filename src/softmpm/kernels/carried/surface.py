@@ -61,6 +61,11 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         friction: reals
 
     @wp.func
+    def add_share(window: Window, at: Point, n: int, area: real, world: int, load: wp.array2d(dtype=real)):
+        i = node_index(at.base, offset(n), window.shape)
+        wp.atomic_add(load, world, i, area * wp.abs(share(at, n)))
+
+    @wp.func
     def add_load(
         window: Window,
         outline: Outline,
@@ -72,9 +77,12 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     ):
         """The lane's part of L (K9)"""
         area = outline.areas[p]
-        for n in range(lane, size, outline.lanes):
-            i = node_index(at.base, offset(n), window.shape)
-            wp.atomic_add(load, world, i, area * wp.abs(share(at, n)))
+        if wp.static(apart):  # one lane; in an unrolled loop the weights along an axis are computed once
+            for n in range(size):
+                add_share(window, at, n, area, world, load)
+        else:
+            for n in range(lane, size, outline.lanes):
+                add_share(window, at, n, area, world, load)
 
     @wp.func
     def faces_of(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, anchor: vecs) -> Faces:
