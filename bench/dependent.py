@@ -1,7 +1,7 @@
 """Kernels that begin before the previous one has ended, against kernels that do not: `python bench/dependent.py [--json FILE]`
 
-Microseconds of one more substep in a call, and of one more with its adjoint in a call with gradient: from the difference between a
-long and a short call, medians. ``ratio``: with kernels that begin early over without, which take turns.
+Microseconds of one more substep in a call that stores its states, and of one more together with its adjoint: from the difference
+between a long and a short call, medians. ``ratio``: with kernels that begin early over without, which take turns.
 """
 
 import statistics

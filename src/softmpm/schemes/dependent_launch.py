@@ -5,7 +5,6 @@ kernels/dependent.py.
 """
 
 import ctypes
-import functools
 from collections.abc import Collection
 
 import warp as wp
@@ -21,13 +20,7 @@ _PLAIN = 0
 """CUgraphEdgeData of a dependency on the end of a node."""
 _PROGRAMMATIC = 1 | 1 << 16
 """CUgraphEdgeData with from_port = CU_GRAPH_KERNEL_NODE_PORT_PROGRAMMATIC and type = CU_GRAPH_DEPENDENCY_TYPE_PROGRAMMATIC."""
-_FUNCTIONS = (
-    "cuGraphGetEdges_v2",
-    "cuGraphRemoveDependencies_v2",
-    "cuGraphAddDependencies_v2",
-    "cuGraphKernelNodeGetParams_v2",
-    "cuFuncGetAttribute",
-)
+_WHAT = "a captured graph cannot be given programmatic dependencies"
 _Handle = ctypes.c_void_p
 
 
@@ -58,9 +51,9 @@ def begin_early(graph: wp.Graph, waiting: Collection[int]) -> int:
     Raises:
         RuntimeError: The driver reports an error.
     """
-    waiting = {function for function in waiting if _is_known() and _arch_of(function) >= LEAST_ARCH}
-    if not waiting:
+    if not waiting or not hasattr(driver(), "cuGraphGetEdges_v2"):  # as in drivers before CUDA 12.3
         return 0
+    waiting = {function for function in waiting if _arch_of(function) >= LEAST_ARCH}
     one, count = driver(), ctypes.c_size_t()
     succeed(one.cuGraphGetEdges_v2(graph.graph, None, None, None, ctypes.byref(count)), _WHAT)
     before, after = (_Handle * count.value)(), (_Handle * count.value)()
@@ -80,9 +73,6 @@ def begin_early(graph: wp.Graph, waiting: Collection[int]) -> int:
     return len(found)
 
 
-_WHAT = "a captured graph cannot be given programmatic dependencies"
-
-
 def _arch_of(function: int) -> int:
     """Architecture that a function was compiled for, such as 90."""
     version = ctypes.c_int()
@@ -98,9 +88,3 @@ def _function_of(node: int) -> int | None:
         return None
     succeed(driver().cuGraphKernelNodeGetParams_v2(node, ctypes.byref(params)), _WHAT)
     return params.function
-
-
-@functools.cache
-def _is_known() -> bool:
-    """True if the driver has the functions for dependencies with ports, as those from CUDA 12.3 on."""
-    return all(hasattr(driver(), name) for name in _FUNCTIONS)

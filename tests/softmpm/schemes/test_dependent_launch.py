@@ -1,7 +1,6 @@
 """Programmatic dependencies of captured graphs."""
 
 import ctypes
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -56,12 +55,10 @@ class Driver:
 
 
 @pytest.fixture
-def driver(monkeypatch) -> Iterator[Driver]:
+def driver(monkeypatch) -> Driver:
     found = Driver()
     monkeypatch.setattr(dependent_launch, "driver", lambda: found)
-    dependent_launch._is_known.cache_clear()
-    yield found
-    dependent_launch._is_known.cache_clear()
+    return found
 
 
 GRAPH = SimpleNamespace(graph=ctypes.c_void_p(1))
