@@ -25,9 +25,8 @@ import numpy as np
 import torch
 
 import softmpm
-from softmpm import Failures, Model, State
-from softmpm_learn.design import declared_inputs
-from softmpm_learn.episode import Frame, run_episode
+from softmpm import Failures, State
+from softmpm_learn.episode import Frame, kicked, run_episode
 from softmpm_learn.objective import Reach, Still, Tilt
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
@@ -116,9 +115,9 @@ def motion(runs: Runs, task: Task, name: str, kick: float = 0.0) -> list[Path | 
         name: Of the question, for the log.
         kick: Speed of the start along the first axis [m/s].
     """
-    model, (params, inputs) = built(task, runs.all[0], runs.model.worlds), runs.design()
+    model, (params, inputs) = runs.all[0].model_of(task, runs.model.worlds), runs.design()
     start = model.rest()
-    start = start._replace(v=start.v + kick * torch.eye(model.dim, dtype=model.dtype, device=model.device)[0])
+    start = kicked(start, start.v.new_full((model.worlds,), kick))
     frames, failures = list[Frame](), Failures("reset")
     settings: dict[str, Any] = dict(inputs=inputs, goal=runs.middle_goals(), start=start, failures=failures)
     run_episode(task, model, runs.observer, runs.policy, params, **settings, on_frame=frames.append)
@@ -129,7 +128,7 @@ def motion(runs: Runs, task: Task, name: str, kick: float = 0.0) -> list[Path | 
 
 def replayed(runs: Runs, task: Task, own: list[Path | None]) -> list[Path | None]:
     """Motion of the robots of another task, with the same muscles, under the activations of these motions and the runs' designs."""
-    model, (params, inputs) = built(task, runs.all[0], runs.model.worlds), transferred(runs, task)
+    model, (params, inputs) = runs.all[0].model_of(task, runs.model.worlds), transferred(runs, task)
     known = next((path.activation for path in own if path is not None), None)
     if known is None:
         return own
@@ -162,13 +161,6 @@ def rubbed(task: Task, factor: float) -> Task:
     """The task with so many times the friction."""
     walls = [dataclasses.replace(wall, friction=factor * wall.friction) for wall in task.scene.walls]
     return dataclasses.replace(task, scene=dataclasses.replace(task.scene, walls=walls))
-
-
-def built(task: Task, run: Run, worlds: int = 1) -> Model:
-    """Model of a task on the device of a run, with the inputs that its design gives."""
-    settings = task.build | {"inputs": declared_inputs(run.settings.design), "worlds": worlds}
-    settings |= {"threads": run.model.threads}
-    return softmpm.build(task.scene, device=run.model.device, dtype=run.model.dtype, **settings)
 
 
 def transferred(run: Run | Runs, task: Task) -> tuple[softmpm.Params, softmpm.Inputs]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import softmpm
 from softmpm import Inputs, Model, Params
-from softmpm_learn.episode import Decisions, Episode, Frame, Policy, run_episode, times_of
+from softmpm_learn.episode import Decisions, Episode, Frame, Policy, kicked, run_episode, times_of
 from softmpm_learn.lasting import AGAIN, FURTHER, STARTS
 from softmpm_learn.observe import Observer
 
@@ -29,13 +29,23 @@ def _captures(model: Model) -> bool:
     return not (model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64))
 
 
+def starts_at_once(task: "Task") -> int:
+    """Number of starts from which an :class:`Evaluator` simulates a task at once."""
+    return 1 if task.lasting is None else len(STARTS)
+
+
 class Evaluator:
     """Simulates a task under a policy without a gradient, again and again; on a GPU as one captured graph, as :class:`ClosedLoop`.
 
+    A GPU that simulates one robot is mostly idle, and simulates it from several starts in hardly more time than from one. So every
+    world of the runs is simulated from several starts at once.
+
     Args:
-        policy, design: As of :class:`ClosedLoop`.
+        model: With :func:`starts_at_once` times the worlds of the runs: neighbouring worlds differ in the start alone.
+        policy, design: As of :class:`ClosedLoop`, for these worlds.
 
     Attributes:
+        at_once: Number of starts that are simulated at once.
         starts: Speeds along the first axis with which an evaluation starts [m/s]: those of :data:`softmpm_learn.lasting.STARTS` if the
             motion should last, else rest.
         further: Those of a motion that would be the best: :data:`softmpm_learn.lasting.FURTHER`, or none.
@@ -54,39 +64,42 @@ class Evaluator:
     ):
         rest = ((0.0,), (), (0.0,))
         self.starts, self.further, self.again = rest if task.lasting is None else (STARTS, FURTHER, AGAIN)
+        self.at_once = starts_at_once(task)
         self.failures = failures = softmpm.Failures("reset")
         goals = list[Tensor]()  # a reference to self here would be a cycle through the graph
-        self._kick = kick = torch.zeros(model.dim, dtype=model.dtype, device=model.device)
+        self._kicks = kicks = torch.zeros(self.at_once, dtype=model.dtype, device=model.device)
 
         @torch.no_grad()
-        def work() -> tuple[Tensor, Tensor]:
+        def work() -> Tensor:
             params, inputs = design()
-            rest = model.rest()
+            start = kicked(model.rest(), kicks.repeat(model.worlds // len(kicks)))
             about: dict[str, Any] = dict(inputs=inputs, goal=goals[0] if goals else None)
-            about |= dict(start=rest._replace(v=rest.v + kick), failures=failures)
+            about |= dict(start=start, failures=failures)
             episode = run_episode(task, model, observer, policy, params, **about)
             assert episode.path is not None
             lasts = torch.ones_like(episode.loss) if task.lasting is None else task.lasting(episode.path)
-            return episode.loss, lasts.to(episode.loss)
+            return torch.stack([episode.loss, lasts.to(episode.loss)]).unflatten(1, (-1, len(kicks)))
 
         self._goals, self._work = goals, work
         self._graph = softmpm.Graph(work, model.device) if _captures(model) else None
 
-    def __call__(self, goal: Tensor | None, kick: float = 0.0) -> tuple[Tensor, Tensor]:
-        """Loss of each world, and 1 where the motion lasts or the task does not ask, else 0, shape (world,) each; they mean
-        nothing of a world that failed.
+    def __call__(self, goal: Tensor | None, kicks: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """Loss of each world of the runs from each start, and 1 where the motion lasts or the task does not ask, else 0, shape
+        (world, start) each; they mean nothing of one that failed.
 
         Args:
-            kick: Speed of the start along the first axis [m/s].
+            goal: Goal of each world of the runs [m], shape (world, dim), where it is not the task's own.
+            kicks: Speeds along the first axis with which they start [m/s], :attr:`at_once` of them.
         """
         self.failures.errors.clear()
-        self._kick[0] = kick
-        if goal is not None and not self._goals:
-            self._goals.append(goal.clone())
-        elif goal is not None:
-            self._goals[0].copy_(goal)
-        loss, lasts = self._graph() if self._graph else self._work()
-        return loss.clone(), lasts.clone()
+        self._kicks.copy_(torch.tensor(kicks))
+        goals = None if goal is None else goal.repeat_interleave(self.at_once, dim=0)
+        if goals is not None and not self._goals:
+            self._goals.append(goals)
+        elif goals is not None:
+            self._goals[0].copy_(goals)
+        loss, lasts = (self._graph() if self._graph else self._work()).clone()
+        return loss, lasts
 
 
 class ClosedLoop:

@@ -4,14 +4,15 @@ import dataclasses
 import json
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+import softmpm
 from softmpm import Model
 from softmpm_learn import settling
-from softmpm_learn.design import Design
+from softmpm_learn.design import Design, declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.fallback import Fallback
 from softmpm_learn.goals import Goals
@@ -88,6 +89,13 @@ class Run:
         self.optimizer = make_optimizer(settings.optimizer, *rates)
         self._first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.safe: list[Tensor] = []
+
+    def model_of(self, task: "Task", worlds: int = 1) -> Model:
+        """Model of another task, or with other worlds, for simulations as those of this run, without a gradient."""
+        own, inputs = self.model, declared_inputs(self.settings.design)
+        settings: dict[str, Any] = dict(device=own.device, dtype=own.dtype, threads=own.threads)
+        settings |= dict(deterministic=own.deterministic, inputs=inputs, worlds=worlds)
+        return softmpm.build(task.scene, **settings, **task.build)
 
     def _make_policy(self, name: str) -> nn.Module:
         """With first weights from the random stream of this name."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from softmpm import UnstableError
 from softmpm_learn.design import declared_inputs
-from softmpm_learn.loops import ClosedLoop, Evaluator
+from softmpm_learn.loops import ClosedLoop, Evaluator, starts_at_once
 from softmpm_learn.run import Run
 from softmpm_learn.settings import Settings
 from softmpm_learn.side_by_side import Designs, Observers, Policies
@@ -44,20 +44,12 @@ class Runs:
             need_equal(first.settings, run.settings)
         self._resting = torch.zeros(len(runs), dtype=torch.bool, device=self.model.device)
         self.observer, self.policy, self.design = first.observer, first.policy, first.design
-        self._together: tuple[Observers, Policies] | None = None
+        self._together: tuple[Observers, Policies, Designs] | None = None
         if len(runs) > 1:
-            self._together = Observers(runs, self.share), Policies(runs, self.share, self._resting)
-            self.observer, self.policy = self._together
-            self.design = Designs(runs, self.share, self._resting)
-        episodes = first.settings.train.endurance or 1
-        longer = dataclasses.replace(self.task, control_steps=episodes * self.task.control_steps)
-        self.evaluator = Evaluator(
-            longer if episodes > 1 else dataclasses.replace(longer, lasting=None),
-            self.model,
-            self.observer,
-            self.policy,
-            self.design,
-        )
+            about = self.share, self._resting
+            self._together = Observers(runs, self.share), Policies(runs, *about), Designs(runs, *about)
+            self.observer, self.policy, self.design = self._together
+        self.evaluator = self._make_evaluator()
         self.loop = ClosedLoop(
             self.task,
             self.model,
@@ -72,10 +64,27 @@ class Runs:
             records=any(run.settings.train.record_every for run in runs),
         )
 
+    def _make_evaluator(self) -> Evaluator:
+        first = self.all[0]
+        episodes = first.settings.train.endurance or 1
+        task = dataclasses.replace(self.task, control_steps=episodes * self.task.control_steps)
+        if episodes == 1:
+            task = dataclasses.replace(task, lasting=None)
+        times = starts_at_once(task)
+        model = first.model_of(task, times * self.model.worlds) if times > 1 else self.model
+        if not self._together:
+            return Evaluator(task, model, self.observer, self.policy, self.design)
+        observers, policies, designs = self._together
+        wide = observers.widened(times), policies.widened(times), designs.widened(times)
+        return Evaluator(task, model, *wide)
+
     @property
     def stacks(self) -> list[Stacked]:
         """Encoders and policies that are evaluated at once, of each kind."""
-        return [stack for part in self._together or () for stack in part.stacks]
+        if self._together is None:
+            return []
+        observers, policies, _ = self._together
+        return [*observers.stacks, *policies.stacks]
 
     @property
     def active(self) -> list[int]:
@@ -100,13 +109,13 @@ class Runs:
         for stack in self.stacks:
             stack.attach()
 
-    def owner(self, error: UnstableError) -> int:
-        """Number of the run in whose world a simulation failed."""
-        return error.world // self.share
+    def owner(self, error: UnstableError, times: int = 1) -> int:
+        """Number of the run in whose world a simulation failed, of a model with so many times the worlds."""
+        return error.world // (times * self.share)
 
-    def failed(self, errors: Sequence[UnstableError]) -> dict[int, UnstableError]:
+    def failed(self, errors: Sequence[UnstableError], times: int = 1) -> dict[int, UnstableError]:
         """The first of some failures in the worlds of each run that has one, by its number."""
-        return {self.owner(error): error for error in reversed(errors)}
+        return {self.owner(error, times): error for error in reversed(errors)}
 
     @contextlib.contextmanager
     def failing_together(self) -> Iterator[None]:

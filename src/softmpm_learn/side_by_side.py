@@ -4,6 +4,7 @@ Runs of one kind, which differ in nothing but the values of their weights, are e
 one kind after another. What kinds have in different numbers, features and what is observed, is filled up with zeros.
 """
 
+import copy
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ class Kinds:
     """
 
     def __init__(self, of: Sequence[Any], share: int, device: torch.device):
+        self._of, self._share, self._device = of, share, device
         first = [k for k, kind in enumerate(of) if kind not in of[:k]]
         self.members = [[k for k, kind in enumerate(of) if kind == of[f]] for f in first]
         self.worlds = [
@@ -43,6 +45,10 @@ class Kinds:
             for runs in self.members
         ]
         self._places = torch.cat(self.worlds).argsort()
+
+    def widened(self, times: int) -> "Kinds":
+        """With so many times the worlds for each run."""
+        return Kinds(self._of, self._share * times, self._device)
 
     def split(self, values: Tensor, dim: int) -> list[Tensor]:
         """Part of each kind, of values with the worlds along an axis."""
@@ -85,6 +91,12 @@ class Observers(Observer):
             for members, worlds in parts
         ]
         self.size = max(run.observer.size for run in runs)
+
+    def widened(self, times: int) -> "Observers":
+        """The same observers for so many times the worlds of each run."""
+        wide = copy.copy(self)
+        wide._seeing, wide._encoding = self._seeing.widened(times), self._encoding.widened(times)
+        return wide
 
     def observe(self, model: Model, state: State) -> Tensor:
         seen = [eye.observe(model, state) for eye in self._eyes]
@@ -133,6 +145,12 @@ class Policies:
             for members in self._kinds.members
         ]
 
+    def widened(self, times: int) -> "Policies":
+        """The same policies for so many times the worlds of each run."""
+        wide = copy.copy(self)
+        wide._kinds = self._kinds.widened(times)
+        return wide
+
     def __call__(self, z: Tensor, time: Tensor, goal: Tensor | None = None) -> Tensor:
         features = self._kinds.split(z, -2)
         goals = [None] * len(features) if goal is None else self._kinds.split(goal, 0)
@@ -172,6 +190,12 @@ class Designs:
         self._start: dict[str, Tensor] = {}
         for design in self.each:
             self._start |= design.start
+
+    def widened(self, times: int) -> "Designs":
+        """The same designs for so many times the worlds of each run."""
+        wide = copy.copy(self)
+        wide.share = self.share * times
+        return wide
 
     def __call__(self) -> tuple[Params, Inputs]:
         """Shape (world, particle) or (world, muscle) where a run designs it."""
