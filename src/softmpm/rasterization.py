@@ -4,14 +4,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.errors import NEVER, UnstableError
+from softmpm.errors import NEVER, UnstableError, decode
 from softmpm.kernels.rasterize import raster
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.schemes.buffers import passing, view
 from softmpm.schemes.capture import defer_status_check, is_capturing, keep_alive
 from softmpm.schemes.device import on_its_gpu
-from softmpm.schemes.failure_report import raise_failure
+from softmpm.schemes.failure_report import failed_worlds, raise_failure
 from softmpm.schemes.launch import launcher
 from softmpm.state import GridField, State
 
@@ -55,10 +55,15 @@ def _sums(model: Model, state: State, words: Tensor) -> Tensor:
     return torch.cat([node[..., :-1] * momentum, node[..., -1:] * mass], -1).to(model.dtype)
 
 
+def _no_failure(model: Model) -> Tensor:
+    """Status words, one for each world."""
+    return torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+
+
 @on_its_gpu
 def rasterize_nodes(model: Model, state: State) -> GridField:
     """Mass (world, *nodes) and velocity (world, *nodes, dim) of what :func:`softmpm.rasterize` sees."""
-    words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+    words = _no_failure(model)
     node = _sums(model, state, words)
     if is_capturing(model):
         defer_status_check(words)
@@ -88,21 +93,22 @@ def rasterize_nodes_adj(model: Model, state: State, field: GridField, adj: GridF
     moving = [tensor.contiguous() for tensor in (state.x, state.v, state.C)]
     adj_moving = [torch.empty_like(tensor) for tensor in moving]
     inputs = (passing(model.mass, t.real), *_particles(model, *moving), adj_node)
-    lead = (model.worlds, model.particle_count)
-    launch(kernels.splat_adj, lead, model.constants, *inputs, *_particles(model, *adj_moving))
-    _raise_gradient_failure(model, adj, adj_moving)
+    lead, words = (model.worlds, model.particle_count), _no_failure(model)
+    found = (passing(words, wp.int64), *_particles(model, *adj_moving))
+    launch(kernels.splat_adj, lead, model.constants, *inputs, *found)
+    if is_capturing(model):
+        defer_status_check(words)
+    else:
+        _raise_gradient_failure(model, words.tolist(), adj)
     return State(*adj_moving, F=torch.empty(0))  # nothing: F does not enter
 
 
-def _raise_gradient_failure(model: Model, adj: GridField, adj_moving: list[Tensor]) -> None:
-    """Raise for the first particle whose adjoint is not finite; reads back once."""
-    bad = ~torch.stack([torch.isfinite(tensor).flatten(2).all(-1) for tensor in adj_moving]).all(0)
-    if is_capturing(model):
-        defer_status_check(torch.where(bad.any(1), 0, NEVER))
+def _raise_gradient_failure(model: Model, words: list[int], adj: GridField) -> None:
+    """Raise for the first particle whose adjoint is not finite, if any."""
+    failed = failed_worlds(words)
+    if not failed:
         return
-    if not bool(bad.any()):
-        return
-    world, particle = bad.nonzero()[0].tolist()
+    world, particle = failed[0], decode(words[failed[0]])[2]
     given = all(bool(torch.isfinite(tensor[world]).all()) for tensor in adj)
     cause = (
         "It overflowed in the backward pass: scale the loss"

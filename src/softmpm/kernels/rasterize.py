@@ -26,7 +26,7 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
     pack, momentum, report = s.pack, s.momentum, status.report(dim, dtype).report
-    bad_start = int(Kind.START)
+    bad_start, bad_gradient = int(Kind.START), int(Kind.GRADIENT)
 
     @wp.func
     def placed(constants: Constants, x: vec, v: vec, C: mat) -> Entered:
@@ -111,6 +111,8 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
         v: wp.array2d(dtype=vec),
         C: wp.array2d(dtype=mat),
         adj_node: wp.array2d(dtype=node_vec),
+        # Out, lowered:
+        words: wp.array(dtype=wp.int64),
         # Out:
         adj_x: wp.array2d(dtype=vec),
         adj_v: wp.array2d(dtype=vec),
@@ -136,9 +138,14 @@ def raster(dim: int, dtype: str) -> SimpleNamespace:
             sum_fx -= share * (wp.transpose(affine) * adj_p)
             sum_v += share * adj_p
             sum_C += wp.outer(share * adj_p, r)
-        adj_x[world, p] = (m / constants.spacing) * sum_fx
-        adj_v[world, p] = m * sum_v
-        adj_C[world, p] = (m * constants.spacing) * sum_C
+        sum_fx *= m / constants.spacing
+        sum_v *= m
+        sum_C *= m * constants.spacing
+        if not (wp.isfinite(sum_fx) and wp.isfinite(sum_v) and wp.isfinite(sum_C)):
+            report(words, world, 0, bad_gradient, p)
+        adj_x[world, p] = sum_fx
+        adj_v[world, p] = sum_v
+        adj_C[world, p] = sum_C
 
     @kernel()
     def divide(
