@@ -8,6 +8,9 @@ robot were only displaced:
     s_k = γ s_k + (1 − γ) sg(s_k),   c_k = c_{k−1} + (1 − γ) (x_k − sg(x_k)),   x_k + c_{k−1} is what the objective sees
 
 with sg for a value without its gradient: all values stay what they are, and c is zero. A distance counts every step, however long ago.
+So only gradients are computed, x̄_k = s̄_k + c̄_k for what goes on, and with that of the next step
+
+    x̄_k += γ s̄_k + (1 − γ) c̄_k,   c̄_{k−1} = c̄_k + that of what the objective sees of x_k
 """
 
 import math
@@ -19,16 +22,30 @@ from softmpm import State
 
 
 class _Fade(torch.autograd.Function):
-    """Tensors as they are, whose gradients are multiplied by a factor, or by one for each world."""
+    """A carry, and tensors as they are, whose gradients are multiplied by a factor, or by one for each world; the first is carried."""
 
     @staticmethod
-    def forward(ctx, factor: float | Tensor, *tensors: Tensor):
+    def forward(ctx, factor: float | Tensor, carry: Tensor, *tensors: Tensor):
         ctx.factor = factor
-        return tuple(tensor.view_as(tensor) for tensor in tensors)
+        return tuple(tensor.view_as(tensor) for tensor in (carry, *tensors))
 
     @staticmethod
     def backward(ctx, *adj: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return None, *(None if one is None else _times(ctx.factor, one) for one in adj)
+        carried, first, *others = adj
+        found = (_times(ctx.factor, one) for one in (first - carried, *others))
+        return None, carried, carried + next(found), *found
+
+
+class _Add(torch.autograd.Function):
+    """A tensor as it is, with the gradient of a sum with a carry."""
+
+    @staticmethod
+    def forward(ctx, tensor: Tensor, carry: Tensor):
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx, adj: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return adj, adj
 
 
 def _times(factor: float | Tensor, adj: Tensor) -> Tensor:
@@ -54,14 +71,17 @@ class Fading:
         """The state from which the simulation goes on, and the state as the objective sees it."""
         if not state.x.requires_grad or (isinstance(self.factor, float) and self.factor == 1.0):
             return state, state
-        seen = state if self._carry is None else state._replace(x=state.x + self._carry)
-        lost = _Fade.apply(1.0 - self.factor, state.x)[0] - state.x.detach()
-        self._carry = lost if self._carry is None else self._carry + lost
+        if self._carry is None:
+            self._carry, seen = state.x.new_zeros(()).expand_as(state.x), state
+        else:
+            seen = state._replace(x=_Add.apply(state.x, self._carry))
         return self._faded(state), seen
 
     def _faded(self, state: State) -> State:
-        faded = State.of(_Fade.apply(self.factor, *state.differentiable()))._replace(low=state.low)
+        nodes = () if state.nodes is None else state.nodes[:4]
+        self._carry, *found = _Fade.apply(self.factor, self._carry, *state.differentiable(), *nodes)
+        faded = State.of(found[: len(found) - len(nodes)])._replace(low=state.low)
         if state.nodes is None:
             return faded
-        u, v, anchor, force = _Fade.apply(self.factor, *state.nodes[:4])
+        u, v, anchor, force = found[-len(nodes) :]
         return faded._replace(nodes=state.nodes._replace(u=u, v=v, anchor=anchor, force=force))
