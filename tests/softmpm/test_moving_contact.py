@@ -1,6 +1,7 @@
 """Contact at surface points on the moving grid: every value and gradient against the float64 reference, state, and mechanics."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -11,11 +12,15 @@ from surface_scenes import G, block, slab, velocity
 
 import softmpm
 from softmpm import Inputs, reference_moving_contact
+from softmpm.errors import NEVER, Kind, decode
 from softmpm.inputs import QUANTITIES
 from softmpm.kernels.physics import lanes
 from softmpm.kernels.structs import types
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
+from softmpm.schemes.carried import check_start
+from softmpm.schemes.failure_report import failed_worlds
+from softmpm.schemes.penetration import deepest
 from softmpm.surface_points import CarriedPoints
 
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
@@ -407,6 +412,26 @@ def test_places_are_exact_for_affine_motion():
         state = softmpm.State(x, torch.zeros_like(x), torch.zeros_like(F), F, low)
         want = points_of(model).points @ B.T + 0.1
         torch.testing.assert_close(points_of(model).shown(state)[0], want, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_depth_of_a_start_is_that_of_its_points(dtype, device):
+    """Of a body that is turned and sheared: the alarm is that of the first point that is too deep, and of no point a little higher."""
+    B = torch.tensor([[1.02, 0.1], [-0.15, 0.97]], dtype=torch.float64)
+    for above, low in itertools.product((-1e-4, 1e-4), (True, False)):
+        model = build(slab(), dtype=dtype, alarms=softmpm.Alarms(), device=device)
+        exact = torch.from_numpy(model.exact_positions).to(device) @ B.T.to(device) + 0.1
+        x, F = exact.to(dtype)[None], B.to(device, dtype).expand(1, len(exact), 2, 2)
+        rest = softmpm.Low((exact - x[0].double()).to(dtype)[None], torch.zeros_like(F)) if low else None
+        state = softmpm.State(x, torch.zeros_like(x), torch.zeros_like(F), F, rest)
+        height = (points_of(model).points @ B.T.to(device) + 0.1)[:, 1] + deepest(model)
+        wall = softmpm.Wall(normal=(0.0, 1.0), offset=height.min().item() - above / 32)
+        model = build(slab(walls=[wall]), dtype=dtype, alarms=softmpm.Alarms(), device=device)
+        words = torch.full((1,), NEVER, dtype=torch.int64, device=device)
+        check_start(model, state, {}, words)
+        found = failed_worlds(words.tolist())
+        assert found == ([] if above > 0 else [0])
+        assert not found or decode(words.item())[1:] == (Kind.IN_WALL, int(height.argmin()))
 
 
 def test_what_cannot_be_is_refused(settled):

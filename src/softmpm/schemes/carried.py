@@ -13,7 +13,7 @@ from softmpm.kernels.physics.lanes import lanes_for
 from softmpm.kernels.structs import types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
-from softmpm.schemes.buffers import view
+from softmpm.schemes.buffers import passing, view
 from softmpm.schemes.inputs import Values, elapsed, grid_struct
 from softmpm.schemes.launch import launcher
 from softmpm.schemes.penetration import deepest
@@ -197,11 +197,14 @@ def contact_on_grid(model: Model, chunk: Chunk, keep: bool) -> SurfaceContact:
 
 def check_start(model: Model, start: State, values: Values, words: Tensor) -> None:
     """Check the depth of the points in the initial state of a call, with the inputs of its first substep."""
-    known = model.fixed | values
+    known, points = model.fixed | values, points_of(model)
     if model.spec.moving:
         known["elapsed"] = elapsed(model, 0, 1, 1)
-    x = points_of(model).shown(start.detach()).contiguous()
-    places = view(x, types(model.spec.dim, "float64").vec)
-    arguments = (grid_struct(model, known), outline_struct(model), places, view(words, wp.int64))
+    t, exact_vec = types(model.dim, model.spec.dtype), types(model.dim, "float64").vec
+    low = start.low or (start.x.new_empty(0, 0, model.dim), start.x.new_empty(0, 0, model.dim, model.dim))
+    given = [tensor.contiguous() for tensor in (start.x, start.F, *low)]
+    where = passing(points.nearest, wp.int64), passing(points.arms, exact_vec)
+    fields = (passing(one, kind) for one, kind in zip(given, (t.vec, t.mat) * 2, strict=True))
+    arguments = (grid_struct(model, known), outline_struct(model), *where, *fields, passing(words, wp.int64))
     launch, kernel = launcher(model), start_depth(model.spec)
-    launch(kernel, tuple(x.shape[:2]), *arguments, block_dim=POINT_BLOCK)
+    launch(kernel, (model.worlds, points.count), *arguments, block_dim=POINT_BLOCK)

@@ -302,7 +302,8 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
 @kernel_factory
 def start_depth(spec: Spec) -> wp.Kernel:
     """Kernel that checks the depth of the points in the initial state of a call."""
-    exact_vec, Outline = types(spec.dim, "float64").vec, outline_type(spec.dim, spec.dtype)
+    t, exact_vec = types(spec.dim, spec.dtype), types(spec.dim, "float64").vec
+    dim, vec, mat, Outline = spec.dim, t.vec, t.mat, outline_type(spec.dim, spec.dtype)
     depth, GridInputs = wall_face(spec).depth, input_types(spec).GridInputs
     report, in_wall = status.report(spec.dim, spec.dtype).report, int(Kind.IN_WALL)
     walls = spec.surface_walls
@@ -313,14 +314,30 @@ def start_depth(spec: Spec) -> wp.Kernel:
         # Parameters:
         inputs: GridInputs,
         outline: Outline,
+        nearest: wp.array(dtype=wp.int64),  # particle of each point
+        arms: wp.array(dtype=exact_vec),  # X_s − X_p [m]
         # In:
-        x: wp.array2d(dtype=exact_vec),
+        x: wp.array2d(dtype=vec),
+        F: wp.array2d(dtype=mat),
+        low_x: wp.array2d(dtype=vec),  # empty without low-order parts
+        low_F: wp.array2d(dtype=mat),
         # Out:
         words: wp.array(dtype=wp.int64),
     ):
-        world, p = wp.tid()
+        world, s = wp.tid()
+        p = int(nearest[s])
+        place = exact_vec()
+        for axis in range(dim):
+            place[axis] = wp.float64(x[world, p][axis])
+            if low_x.shape[0] > 0:
+                place[axis] += wp.float64(low_x[world, p][axis])
+            for other in range(dim):
+                entry = wp.float64(F[world, p][axis, other])
+                if low_x.shape[0] > 0:
+                    entry += wp.float64(low_F[world, p][axis, other])
+                place[axis] += entry * arms[s][other]
         for q in range(count):
-            if depth(inputs, world, number[q], wp.float64(0.0), x[world, p]) > outline.deepest[p]:
-                report(words, world, 0, in_wall, q * x.shape[1] + p)
+            if depth(inputs, world, number[q], wp.float64(0.0), place) > outline.deepest[s]:
+                report(words, world, 0, in_wall, q * nearest.shape[0] + s)
 
     return check_start
