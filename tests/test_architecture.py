@@ -21,7 +21,7 @@ LAYERS = """
     reference reference_step kernels.physics
     reference_contact reference_driven reference_overlap reference_mirror
     stability kernels.convert reference_lagrangian reference_moving_contact
-    kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
+    kernels.material kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     kernels.carried
     rest_grid
     surface_points
@@ -31,7 +31,7 @@ LAYERS = """
     model
     schemes
     schemes.plain schemes.fast schemes.lagrangian recording
-    schemes.registry
+    schemes.registry material
     kernel_inputs
     building runner rasterization cuda_graph
     rollout forces quantities warp_nodal
@@ -120,6 +120,7 @@ def test_one_module_per_outside_world():
             assert library not in roots or name in allowed, f"{name} imports {library}"
         own = (
             "autograd",
+            "batches",
             "schemes.lagrangian.nodal",
             "schemes.lagrangian.driven",
             "reference",

@@ -1,4 +1,4 @@
-"""The PyTorch boundary. Nothing else mentions torch.autograd; no kernel is launched here."""
+"""The PyTorch boundary: what a user calls, as functions with an explicit adjoint; no kernel is launched here."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
-from softmpm.batches import FORWARD, UNAVAILABLE, refuse_batches
+from softmpm.batches import Adjoint, FirstOrder, refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
 from softmpm.checks import check_activation, check_finite, check_horizon, check_state
 from softmpm.compiling import opaque
@@ -25,11 +25,6 @@ from softmpm.schemes.inputs import Values
 from softmpm.schemes.lagrangian.nodal import particles_of, start_of
 from softmpm.schemes.surface_start import with_surface
 from softmpm.state import GridField, Low, Nodal, Params, State, SurfaceState
-
-_SECOND = (
-    "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
-    "call backward without create_graph=True."
-)
 
 
 def simulate(
@@ -216,19 +211,7 @@ class _Call:
         return dict(zip(self.names, tensors[:count], strict=True)), list(tensors[count:])
 
 
-class _Function(torch.autograd.Function):
-    """Base of the functions below: refuses the transforms that PyTorch offers besides the gradient."""
-
-    @staticmethod
-    def vmap(*_):
-        raise RuntimeError(UNAVAILABLE)
-
-    @staticmethod
-    def jvp(*_):
-        raise RuntimeError(FORWARD)
-
-
-class _Simulate(_Function):
+class _Simulate(FirstOrder):
     """Of a :class:`_Call`, its inputs, the start and its low-order parts."""
 
     @staticmethod
@@ -259,9 +242,7 @@ class _Simulate(_Function):
         return None, *backward(*given), *(len(adj_end) - count) * (None,)
 
 
-class _SimulateBackward(_Function):
-    """A function of its own, so that a second derivative raises instead of silently losing this term."""
-
+class _SimulateBackward(Adjoint):
     @staticmethod
     def forward(*given):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
@@ -279,16 +260,8 @@ class _SimulateBackward(_Function):
         )
         return *exact, *adj.differentiable()
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
 
-    @staticmethod
-    def backward(ctx, *adj):
-        raise RuntimeError(_SECOND)
-
-
-class _Rasterize(_Function):
+class _Rasterize(FirstOrder):
     @staticmethod
     def forward(model, x, v, C):
         return rasterize_nodes(model, State(x, v, C, F=C))
@@ -304,20 +277,10 @@ class _Rasterize(_Function):
         return None, *_RasterizeBackward.apply(ctx.model, adj_mass, adj_velocity, *ctx.saved_tensors)
 
 
-class _RasterizeBackward(_Function):
-    """As :class:`_SimulateBackward`: a second derivative raises."""
-
+class _RasterizeBackward(Adjoint):
     @staticmethod
     def forward(model, adj_mass, adj_velocity, x, v, C, mass, velocity):
         adj = rasterize_nodes_adj(
             model, State(x, v, C, F=C), GridField(mass, velocity), GridField(adj_mass, adj_velocity)
         )
         return adj.x, adj.v, adj.C
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
-
-    @staticmethod
-    def backward(ctx, *adj):
-        raise RuntimeError(_SECOND)

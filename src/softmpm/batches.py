@@ -1,4 +1,4 @@
-"""PyTorch's own batches (``torch.vmap``, batched gradients), which the kernels cannot see: refused, since worlds are batches."""
+"""What PyTorch offers besides the gradient, and the kernels do not have: refused, and for its batches worlds are advised."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -14,6 +14,35 @@ FORWARD = (
     "softmpm: forward-mode and second derivatives (jvp, jacfwd, hessian) are not available; use reverse mode (backward, "
     "grad, vjp), and for the rows of a Jacobian build the model with worlds=N, one row in each world."
 )
+
+SECOND = (
+    "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
+    "call backward without create_graph=True."
+)
+
+
+class FirstOrder(torch.autograd.Function):
+    """Base of functions with an explicit adjoint: refuses the transforms that PyTorch offers besides the gradient."""
+
+    @staticmethod
+    def vmap(*_):
+        raise RuntimeError(UNAVAILABLE)
+
+    @staticmethod
+    def jvp(*_):
+        raise RuntimeError(FORWARD)
+
+
+class Adjoint(FirstOrder):
+    """Base of the adjoint of such a function: a second derivative raises instead of silently losing this term."""
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+    @staticmethod
+    def backward(ctx, *adj):
+        raise RuntimeError(SECOND)
 
 
 def refuse_batches(tensors: Iterable[Tensor | None]) -> None:

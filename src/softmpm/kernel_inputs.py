@@ -1,27 +1,14 @@
-"""Derivation of the kernels' inputs from those of users (inputs.py), in differentiable PyTorch operations."""
+"""Derivation of the kernels' inputs from those of users (inputs.py), differentiable."""
 
 import torch
 from torch import Tensor
 
-from softmpm.checks import check_bounds, check_params
+from softmpm.material import material
 from softmpm.model import Model
 from softmpm.planning.chunks import Horizon
-from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.lagrangian.driven import of_nodes
 from softmpm.state import Params, State
-
-
-def lame(params: Params) -> tuple[Tensor, Tensor]:
-    """Lamé's μ = E / 2(1 + ν) and λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
-    young, poisson = params.young, params.poisson
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-
-
-def masses(model: Model, params: Params) -> Tensor:
-    """Mass of the particles in units of ``model.mass_unit``: exactly one in a uniform body, so that sums of masses are not biased."""
-    mass = params.density * model.volume
-    return mass / model.mass_unit  # a tensor: division by a number would multiply by the reciprocal on a GPU
 
 
 def derive(
@@ -99,39 +86,3 @@ def _poses(model: Model, offset: Tensor, normal: Tensor, horizon: Horizon) -> Va
         rate = torch.zeros_like(rows) if still else (pose[1:] - pose[:-1]) / seconds
         found |= {name: rows, f"{name}_rate": rate}
     return found
-
-
-def material(model: Model, params: Params) -> tuple[Tensor, Tensor, Tensor]:
-    """μ, λ [Pa] and mass [model.mass_unit], each of shape (world, particle).
-
-    The values of the previous call are reused if nothing changed and no gradient is needed; else ``params`` are checked.
-    """
-    last, seen = model.workspace.get(_Last, _Last), _seen(model, params)
-    if seen and seen == last.seen:
-        return last.found
-    check_params(model, params)
-    if not is_capturing(model):  # else nothing can be read back
-        check_bounds(params, params.density * model.volume, model.mass_unit)
-    lead = (model.worlds, model.particle_count)
-    mu, lam = (term.expand(lead).contiguous() for term in lame(params))
-    found = mu, lam, masses(model, params).expand(lead).contiguous()
-    if seen:
-        last.params, last.seen, last.found = params, seen, found
-    return found
-
-
-class _Last:
-    """Material of this thread's previous call. Other threads use other streams, on which their values may not be complete yet."""
-
-    params: Params | None = None  # referenced, so that no other tensor gets the identities in ``seen``
-    seen: tuple = ()
-    found: tuple[Tensor, Tensor, Tensor] = ()  # pyright: ignore[reportAssignmentType]
-
-
-def _seen(model: Model, params: Params) -> tuple:
-    """Identity, version and address of the parameters; empty if these could not reveal a change."""
-    if is_capturing(model) or torch._C._are_functorch_transforms_active() or not isinstance(params, Params):
-        return ()
-    if not all(type(p) is Tensor and not p.requires_grad and not p.is_inference() for p in params):
-        return ()
-    return tuple((id(p), p._version, p.data_ptr()) for p in params)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from softmpm.checks import check_params, check_state, check_tensor
 from softmpm.energy_density import DENSITIES
-from softmpm.kernel_inputs import lame
 from softmpm.model import Model, check_model
+from softmpm.reference_stress import lame
 from softmpm.rest_grid import nodes_around
 from softmpm.state import Params, State
 from softmpm.validate import need
@@ -152,7 +152,8 @@ def elastic_energy(model: Model, state: State, params: Params, *, per_body: bool
     check_params(model, params)
     lead = (model.worlds, model.particle_count)
     H = _displacement_gradient(state)
-    mu, lam = (constant.expand(lead) for constant in lame(Params(*(value.double() for value in params))))
+    constants = lame(params.young.double(), params.poisson.double())
+    mu, lam = (constant.expand(lead) for constant in constants)
     density = [DENSITIES[law](H[:, part], mu[:, part], lam[:, part]) for law, part in _laws(model)]
     return _total(model, model.volume.double() * torch.cat(density, 1), per_body)
 

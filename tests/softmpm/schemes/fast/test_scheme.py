@@ -24,9 +24,9 @@ from helpers import (
 
 import softmpm
 from softmpm.building import choose_scheme
-from softmpm.kernel_inputs import material
 from softmpm.kernels.fast.native import WARP
 from softmpm.kernels.structs import BASE_BITS, packed_rows
+from softmpm.material import material
 from softmpm.planning import memory
 from softmpm.planning.chunks import Chunk, Horizon
 from softmpm.planning.memory import plan
