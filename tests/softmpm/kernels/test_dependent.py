@@ -76,7 +76,7 @@ CONSTANT = {"constants", "window", "outline", "owner", "rate", "inside", "inputs
 """Arguments that nothing writes while a chunk runs; numbers are constant as well."""
 STORED = {
     "grid_velocity_adj": {"node", "node_before"},
-    "grid_and_loads_adj": {"node", "node_before"},
+    "grid_and_loads_adj": {"node", "node_before", "impulse"},
     "press_adj": {"node", "anchor"},
 }
 """What adjoint kernels read of the forward pass, which nothing writes while they run."""
@@ -85,6 +85,7 @@ OLDER = {
     "g2p2g_adj": {"now.rows"},
     "press": {"now.base", "now.rows", "anchor", "force"},
     "press_adj": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},
+    "grid_and_loads_adj": {f"{state}.{field}" for state in ("now", "before") for field in ("base", "rows")},
     "advance": {"at.mass"},
     "advance_adj": {"at.mass"},
     "settle_adj at rest": {"at.mass"},

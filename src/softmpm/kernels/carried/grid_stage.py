@@ -106,8 +106,8 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     exact_vec = types(dim, "float64").vec
     Outline, point = outline_type(dim, spec.dtype), surface_point(dim, spec.dtype, True)
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    Particles, ParticlesAdj, point_of = point.Particles, point.ParticlesAdj, point.point_of
-    add_load, push = surface(spec, True).add_load, surface(spec, True).push
+    Point, Particles, ParticlesAdj = point.Point, point.Particles, point.ParticlesAdj
+    point_of, add_load, push = point.point_of, surface(spec, True).add_load, surface(spec, True).push
     place_of, node_velocity = fused(spec).place_of, grid(spec).node_velocity
     node_velocity_adj, add_load_adj = (
         grid_adj(spec, wanted).node_velocity_adj,
@@ -157,6 +157,9 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
         place = exact_vec()
         here = node_vec()
         there = node_vec()
+        at_now = Point()
+        at_before = Point()
+        J = vec()
         if i < velocity.shape[0]:
             world = world_of(i, window.count, velocity.shape[0])
             place = place_of(constants, window, world, i)
@@ -170,6 +173,11 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
             p = k - world * owner.shape[1]
             lane = i - first - k * outline.lanes
             particle = owner[world, p]
+            if node.shape[0] > 0:
+                at_now = point_of(constants, window, outline, now, world, p, particle)
+            if node_before.shape[0] > 0:
+                at_before = point_of(constants, window, outline, before, world, p, particle)
+                J = impulse[world, p]
         await_previous()  # the adjoints
         if i < velocity.shape[0]:
             if i < node.shape[0]:
@@ -194,12 +202,10 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
                 cleared_adj_load[world, i - world * window.count] = real(0.0)
         elif i >= first:
             if node.shape[0] > 0:
-                add_load_adj(constants, window, outline, now, world, p, lane, particle, adj_load, adj)
+                add_load_adj(constants, window, outline, at_now, world, p, lane, particle, adj_load, adj)
             if node_before.shape[0] > 0:
-                at = point_of(constants, window, outline, before, world, p, particle)
-                add_load(window, outline, at, world, p, lane, load)
-                J = impulse[world, p]
+                add_load(window, outline, at_before, world, p, lane, load)
                 if wp.dot(J, J) > real(0.0):
-                    push(window, at, J, world, lane, outline.lanes, masses_before, pushed)
+                    push(window, at_before, J, world, lane, outline.lanes, masses_before, pushed)
 
     return grid_and_loads_adj

@@ -35,16 +35,16 @@ def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
         outline_type(dim, dtype),
     )
     real, vec, Constants, Window = t.real, t.vec, t.Constants, t.Window
-    Particles, ParticlesAdj, PlaceAdj = point.Particles, point.ParticlesAdj, point.PlaceAdj
-    point_of, share, with_share_adj = point.point_of, point.share, point.with_share_adj
-    add_place_adj, offset, node_index, size = point.add_place_adj, s.offset, s.node_index, s.count
+    Point, ParticlesAdj, PlaceAdj = point.Point, point.ParticlesAdj, point.PlaceAdj
+    share, with_share_adj, add_place_adj = point.share, point.with_share_adj, point.add_place_adj
+    offset, node_index, size = s.offset, s.node_index, s.count
 
     @wp.func
     def add_load_adj(
         constants: Constants,
         window: Window,
         outline: Outline,
-        now: Particles,
+        at: Point,
         world: int,
         p: int,
         lane: int,
@@ -52,7 +52,6 @@ def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
         adj_load: wp.array2d(dtype=real),
         adj: ParticlesAdj,
     ):
-        at = point_of(constants, window, outline, now, world, p, owner)
         area = outline.areas[p]
         found = PlaceAdj()
         for n in range(lane, size, outline.lanes):
@@ -254,6 +253,8 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         adj: ParticlesAdj,
     ):
         world, p, lane = wp.tid()
-        add_load_adj(constants, window, outline, now, world, p, lane, owner[world, p], adj_load, adj)
+        particle = owner[world, p]
+        at = point_of(constants, window, outline, now, world, p, particle)
+        add_load_adj(constants, window, outline, at, world, p, lane, particle, adj_load, adj)
 
     return SimpleNamespace(press_adj=press_adj, add_loads_adj=add_loads_adj)
