@@ -39,6 +39,11 @@ class Nodes(NamedTuple):
     """Sum of the areas of the points, each with its share."""
 
 
+def lanes_of(model: Model) -> int:
+    """Threads that share the nodes of a point."""
+    return lanes_for(model.dim, model.worlds * points_of(model).count, model.device)
+
+
 def outline_struct(model: Model):
     """Struct of the constants of the surface points."""
     return model.workspace.get(outline_struct, lambda: _outline_struct(model))
@@ -47,7 +52,7 @@ def outline_struct(model: Model):
 def _outline_struct(model: Model):
     t, points = types(model.spec.dim, model.spec.dtype), points_of(model)
     struct = outline_type(model.spec.dim, model.spec.dtype)()
-    struct.lanes = lanes_for(model.dim, model.worlds * points.count, model.device)
+    struct.lanes = lanes_of(model)
     struct.arms = view(points.arms.to(model.dtype), t.vec)
     struct.areas = view(points.areas.to(model.dtype), t.real)
     struct.newtons = view(points.areas.to(model.dtype) * model.mass_unit, t.real)

@@ -12,7 +12,7 @@ from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.buffers import view
-from softmpm.schemes.carried import POINT_BLOCK, Nodes, SurfaceContact
+from softmpm.schemes.carried import POINT_BLOCK, Nodes, SurfaceContact, lanes_of
 from softmpm.state import SurfaceState
 
 
@@ -25,7 +25,8 @@ class SurfaceContactAdj:
 
     def __init__(self, model: Model, wanted: RequestedGrads, packed: bool):
         t = types(model.spec.dim, model.spec.dtype)
-        self.kernels = surface_adj(model.spec, wanted, packed)
+        single = lanes_of(model) >= 3**model.dim
+        self.kernels = surface_adj(model.spec, wanted, packed, single)
 
         def tensor(*size: int) -> Tensor:
             return torch.empty(*size, dtype=model.dtype, device=model.device)

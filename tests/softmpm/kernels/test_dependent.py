@@ -55,7 +55,8 @@ KERNELS = {
     "grid_and_loads": lambda: contact_stage(SPEC).grid_and_loads,
     "grid_and_loads_adj": lambda: contact_stage_adj(SPEC, NONE),
     "press": lambda: surface(SPEC, True).press,
-    "press_adj": lambda: surface_adj(SPEC, NONE, True).press_adj,
+    "press_adj": lambda: surface_adj(SPEC, NONE, True, True).press_adj,
+    "press_adj of few lanes": lambda: surface_adj(SPEC, NONE, True, False).press_adj,
     "advance": lambda: nodes(SPEC).advance,
     "advance_adj": lambda: nodes_adj(WITHOUT, NONE).advance_adj,
     "gather_adj": lambda: nodes_adj(SPEC, NONE).gather_adj,
@@ -78,6 +79,7 @@ STORED = {
     "grid_velocity_adj": {"node", "node_before"},
     "grid_and_loads_adj": {"node", "node_before", "impulse"},
     "press_adj": {"node", "anchor"},
+    "press_adj of few lanes": {"node", "anchor"},
 }
 """What adjoint kernels read of the forward pass, which nothing writes while they run."""
 OLDER = {
@@ -85,6 +87,7 @@ OLDER = {
     "g2p2g_adj": {"now.rows"},
     "press": {"now.base", "now.rows", "anchor", "force"},
     "press_adj": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},
+    "press_adj of few lanes": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},
     "grid_and_loads_adj": {f"{state}.{field}" for state in ("now", "before") for field in ("base", "rows")},
     "advance": {"at.mass"},
     "advance_adj": {"at.mass"},

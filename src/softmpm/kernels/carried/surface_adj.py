@@ -65,8 +65,12 @@ def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
 
 
 @kernel_factory
-def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNamespace:
-    """Kernels on particles that are ``packed`` as in the fast scheme, or not."""
+def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool, single: bool) -> SimpleNamespace:
+    """Kernels on particles that are ``packed`` as in the fast scheme, or not.
+
+    Args:
+        single: Whether a lane has at most one node, which it then reads once.
+    """
     dim, t, s, one = (
         spec.dim,
         types(spec.dim, spec.dtype),
@@ -75,7 +79,12 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     )
     real, vec, node_vec, Constants, Window, pack = t.real, t.vec, t.node, t.Constants, t.Window, s.pack
     point, Outline = surface_point(dim, spec.dtype, packed), outline_type(dim, spec.dtype)
-    Particles, ParticlesAdj, PlaceAdj = point.Particles, point.ParticlesAdj, point.PlaceAdj
+    Point, Particles, ParticlesAdj, PlaceAdj = (
+        point.Point,
+        point.Particles,
+        point.ParticlesAdj,
+        point.PlaceAdj,
+    )
     point_of, share, with_share_adj = point.point_of, point.share, point.with_share_adj
     add_place_adj = point.add_place_adj
     load_state, load_velocity, load_number = point.load_state, point.load_velocity, point.load_number
@@ -86,6 +95,33 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
     offset, node_index, size, vecs = s.offset, s.node_index, s.count, one.vecs
     add_load_adj, count = loads_adj(dim, spec.dtype, packed), len(spec.surface_walls)
     apart = one.apart
+
+    @wp.struct
+    class Seen:
+        i: int  # number of the node
+        b: real  # W
+        m: real
+        v: vec  # v*
+        L: real
+
+    @wp.func
+    def seen(
+        window: Window,
+        at: Point,
+        n: int,
+        world: int,
+        node: wp.array2d(dtype=node_vec),
+        free: wp.array2d(dtype=vec),
+        load: wp.array2d(dtype=real),
+    ) -> Seen:
+        """Node ``n`` of a point."""
+        out = Seen()
+        out.i = node_index(at.base, offset(n), window.shape)
+        out.m = node[world, out.i][dim]
+        out.v = load_velocity(free, world, out.i)
+        out.L = load_number(load, world, out.i)
+        out.b = share(at, n)
+        return out
 
     @kernel(options_of(packed), grid_stride=False)
     def press_adj(
@@ -139,17 +175,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         area = outline.areas[p]
         per_force = rate[0] * outline.newtons[p]
         found = vD()
+        mine = Seen()
         if wall.near == 1:
             for n in range(lane, size, outline.lanes):
-                i = node_index(at.base, offset(n), window.shape)
-                m = node[world, i][dim]
-                v_i = load_velocity(free, world, i)
-                L_i = load_number(load, world, i)
-                b = share(at, n)
+                mine = seen(window, at, n, world, node, free, load)
                 for axis in range(dim):
-                    found[axis] = found[axis] + b * v_i[axis]
-                if m > real(0.0):
-                    found[dim] = found[dim] + wp.abs(b) * L_i / m
+                    found[axis] = found[axis] + mine.b * mine.v[axis]
+                if mine.m > real(0.0):
+                    found[dim] = found[dim] + wp.abs(mine.b) * mine.L / mine.m
             found = summed(found, outline.lanes)
         D = found[dim]
         v = vec()
@@ -168,12 +201,14 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         if wall.near == 1 and not D > real(0.0):  # a point of a world that failed
             return
         pull = vec()
+        adj_v = vec()
         if wall.near == 1:
             for n in range(lane, size, outline.lanes):
-                i = node_index(at.base, offset(n), window.shape)
-                m = node[world, i][dim]
-                if m > real(0.0):
-                    pull += (area * share(at, n) / m) * adj_velocity[world, i]
+                if wp.static(not single):
+                    mine = seen(window, at, n, world, node, free, load)
+                adj_v = adj_velocity[world, mine.i]
+                if mine.m > real(0.0):
+                    pull += (area * mine.b / mine.m) * adj_v
             pull = pulled(pull, outline.lanes)
         meet_lanes(outline.lanes)
         back_x = vec()
@@ -224,19 +259,20 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool) -> SimpleNames
         back_place = PlaceAdj()
         if wall.near == 1:
             for n in range(lane, size, outline.lanes):
-                i = node_index(at.base, offset(n), window.shape)
-                m = node[world, i][dim]
-                b = share(at, n)
+                if wp.static(not single):
+                    mine = seen(window, at, n, world, node, free, load)
+                    adj_v = adj_velocity[world, mine.i]
+                b = mine.b
                 lightness = real(0.0)
-                if m > real(0.0):
-                    lightness = real(1.0) / m
-                along = lightness * wp.dot(impulse, adj_velocity[world, i])
-                loaded = lightness * back_D * load[world, i]
-                adj_share = wp.dot(free[world, i], back_v) + along + wp.sign(b) * loaded
+                if mine.m > real(0.0):
+                    lightness = real(1.0) / mine.m
+                along = lightness * wp.dot(impulse, adj_v)
+                loaded = lightness * back_D * mine.L
+                adj_share = wp.dot(mine.v, back_v) + along + wp.sign(b) * loaded
                 back_place = with_share_adj(back_place, at, n, adj_share)
-                wp.atomic_add(adj_load, world, i, wp.abs(b) * lightness * back_D)
+                wp.atomic_add(adj_load, world, mine.i, wp.abs(b) * lightness * back_D)
                 adj_m = -lightness * (wp.abs(b) * loaded + b * along)
-                wp.atomic_add(gained, world, i, pack(b * back_v, adj_m))
+                wp.atomic_add(gained, world, mine.i, pack(b * back_v, adj_m))
         add_place_adj(constants, outline, back_place, back_x, world, p, owner[world, p], lane, adj)
 
     @kernel(options_of(packed))
