@@ -51,6 +51,7 @@ KERNELS = {
     "g2p2g": lambda: fused(SPEC).g2p2g[True],
     "grid_velocity_adj": lambda: fused_adj(WITHOUT, NONE).grid_velocity_adj,
     "g2p2g_adj": lambda: fused_adj(SPEC, NONE).g2p2g_adj[True],
+    "g2p2g_adj of many particles": lambda: fused_adj(SPEC, NONE).g2p2g_adj[False],
     "push": lambda: fixed(2).push,
     "grid_and_loads": lambda: contact_stage(SPEC).grid_and_loads,
     "grid_and_loads_adj": lambda: contact_stage_adj(SPEC, NONE),
@@ -84,7 +85,8 @@ STORED = {
 """What adjoint kernels read of the forward pass, which nothing writes while they run."""
 OLDER = {
     "g2p2g": {"now.base", "now.rows"},
-    "g2p2g_adj": {"now.rows"},
+    "g2p2g_adj": {"now.base", "now.rows"},
+    "g2p2g_adj of many particles": {"now.rows"},
     "press": {"now.base", "now.rows", "anchor", "force"},
     "press_adj": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},
     "press_adj of few lanes": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},

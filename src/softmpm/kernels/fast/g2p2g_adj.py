@@ -43,7 +43,13 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     aligned, head = s.aligned, s.head
     centre, place_of = fused(spec).centre, fused(spec).place_of
     particle_of, world_of = s.particle_of, s.world_of
-    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    load_base, load_vec, load_mat, store_vec, store_mat = (
+        n.load_base,
+        n.load_vec,
+        n.load_mat,
+        n.store_vec,
+        n.store_mat,
+    )
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
     gather, driven = s.gather, spec.driven
@@ -99,115 +105,151 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             if wp.static(not exact):
                 store_node(cleared, i, node_vec())
 
-    def g2p2g_adj(
-        # Parameters:
+    @wp.struct
+    class Spread:
+        first: int  # node of a particle
+        m: real
+        g: vec
+        b: vec
+        A: mat
+        H: mat
+        Q: mat
+
+    @wp.func
+    def spread(
         constants: Constants,
         inputs: ParticleInputs,
         window: Window,
-        back: int,  # substeps from the end
-        start: bool,  # nothing before
-        end: bool,  # nothing after
-        per_warp: int,
-        count: int,
-        total: int,
-        order: wp.array(dtype=wp.int32),
-        # In:
-        before: Packed,
         now: Packed,
-        velocity: wp.array(dtype=node_vec),  # of the substep before
-        adj_node: wp.array(dtype=node_vec),  # of this substep
-        # In and out:
-        adj_now: wp.array(dtype=real),
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        # Out, added into:
-        adj_inputs: ParticleInputsAdj,
-        adj_velocity: Shares,  # of the substep before
-    ):
-        i = particle_of(wp.tid(), per_warp, total)
-        world = int(0)
-        first = int(-1)
-        plane = int(0)
-        v = vec()
-        C = mat()
-        if i < total:
-            world = world_of(i, count, total)
-            v = load_vec(now.rows, i, row_v)
-            C = load_mat(now.rows, i, row_C)
-        await_previous()  # the adjoints and the velocity
-        g = vec()
-        b = vec()
-        B = mat()
-        if i < total:
-            p = i - world * count
-            origin = window.origin[world]
-            held = world * window.count
-            old_fx = load_vec(before.rows, i, row_fx)
-            adj = ParticleAdj()
-            adj.fx = load_vec(adj_now, i, row_fx)
-            adj.H = load_mat(adj_now, i, row_H)
-            if end:
-                adj.v = load_vec(adj_now, i, row_v)
-                adj.C = load_mat(adj_now, i, row_C)
-            else:
-                H = load_mat(now.rows, i, row_H)
-                g = centre(load_vec(now.rows, i, row_fx))
-                m = inputs.mass[world, p]
-                Q = rotation(inputs, world, p, H)
-                A = affine_momentum(constants, inputs, world, p, C, H, Q)
-                here = held + first_node(unpack_base(now.base[i]), origin, window.shape)
-                mv = linear_momentum(constants, inputs, world, p, v)
-                sums = gather_adj(adj_node, here, window.shape, g, mv - A * g, A, m)
-                B = sums.outer - wp.outer(sums.value, g)
-                # (T1.adj)
-                more = momentum_adj(
-                    constants, inputs, world, p, v, C, H, Q, sums.value, sums.mass, B, adj_inputs
-                )
-                adj.fx += sums.slope - wp.transpose(A) * sums.value  # (A6)
-                adj.v = more.v
-                adj.C = more.C
-                adj.H += more.H
-                size = (
-                    wp.dot(adj.fx, adj.fx)
-                    + wp.dot(adj.v, adj.v)
-                    + wp.ddot(adj.C, adj.C)
-                    + wp.ddot(adj.H, adj.H)
-                )
-                if not wp.isfinite(size):
-                    report(words, world, back, bad_gradient, order[i])
-            if start:
-                store_vec(adj_now, i, row_v, adj.v)
-                store_mat(adj_now, i, row_C, adj.C)
-            else:
-                base = unpack_base(before.base[i])
-                first = held + first_node(base, origin, window.shape)
-                plane = base[0] - origin[0]
-                g = centre(old_fx)
-                adj = moved_adj(
-                    constants, inputs, world, p, load_mat(before.rows, i, row_H), C, adj, adj_inputs
-                )  # (T3.adj)
-                if wp.static(driven):
-                    # The velocity of a driven particle is not that of the nodes around it.
-                    v = gather(velocity, first, window.shape, g).value
-                B = adj.C
-                b = adj.v - B * g
-                sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
-                adj.fx += sums.slope - wp.transpose(B) * v  # (T2.adj)
-            store_vec(adj_now, i, row_fx, adj.fx)
-            store_mat(adj_now, i, row_H, adj.H)
-        if not start:
-            if wp.static(exact):
-                give(adj_velocity, i, count, total, b, B)
-            if wp.static(by_slabs):
-                give_to_slabs(adj_velocity, i, plane, b, B)
-            if wp.static(not (exact or by_slabs)):
-                scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
+        world: int,
+        p: int,
+        i: int,
+        v: vec,
+        C: mat,
+    ) -> Spread:
+        """What a particle gave to its nodes (T1)."""
+        out = Spread()
+        out.H = load_mat(now.rows, i, row_H)
+        out.g = centre(load_vec(now.rows, i, row_fx))
+        base = unpack_base(load_base(now.base, i))
+        out.first = world * window.count + first_node(base, window.origin[world], window.shape)
+        out.m = inputs.mass[world, p]
+        out.Q = rotation(inputs, world, p, out.H)
+        out.A = affine_momentum(constants, inputs, world, p, C, out.H, out.Q)
+        out.b = linear_momentum(constants, inputs, world, p, v) - out.A * out.g
+        return out
 
-    def compiled(few: bool) -> wp.Kernel:
-        """``g2p2g_adj`` for few particles or for many, as in g2p2g.py; registers are limited so that ``blocks`` blocks fit."""
+    def of_particles(few: bool) -> wp.Kernel:
+        """``g2p2g_adj`` for few particles or for many, as in g2p2g.py; registers are limited so that ``blocks`` blocks fit. Few do
+        early what many have no registers for."""
         blocks = 2 if few else 3
-        return kernel(NATIVE, grid_stride=False, launch_bounds=(BLOCK, blocks))(g2p2g_adj)
+
+        @kernel(NATIVE, grid_stride=False, launch_bounds=(BLOCK, blocks))
+        def g2p2g_adj(
+            # Parameters:
+            constants: Constants,
+            inputs: ParticleInputs,
+            window: Window,
+            back: int,  # substeps from the end
+            start: bool,  # nothing before
+            end: bool,  # nothing after
+            per_warp: int,
+            count: int,
+            total: int,
+            order: wp.array(dtype=wp.int32),
+            # In:
+            before: Packed,
+            now: Packed,
+            velocity: wp.array(dtype=node_vec),  # of the substep before
+            adj_node: wp.array(dtype=node_vec),  # of this substep
+            # In and out:
+            adj_now: wp.array(dtype=real),
+            # Out:
+            words: wp.array(dtype=wp.int64),
+            # Out, added into:
+            adj_inputs: ParticleInputsAdj,
+            adj_velocity: Shares,  # of the substep before
+        ):
+            i = particle_of(wp.tid(), per_warp, total)
+            at = Spread()
+            world = int(0)
+            first = int(-1)
+            plane = int(0)
+            v = vec()
+            C = mat()
+            if i < total:
+                world = world_of(i, count, total)
+                v = load_vec(now.rows, i, row_v)
+                C = load_mat(now.rows, i, row_C)
+                if wp.static(few):
+                    if not end:
+                        at = spread(constants, inputs, window, now, world, i - world * count, i, v, C)
+            await_previous()  # the adjoints and the velocity
+            g = vec()
+            b = vec()
+            B = mat()
+            if i < total:
+                p = i - world * count
+                origin = window.origin[world]
+                held = world * window.count
+                old_fx = load_vec(before.rows, i, row_fx)
+                adj = ParticleAdj()
+                adj.fx = load_vec(adj_now, i, row_fx)
+                adj.H = load_mat(adj_now, i, row_H)
+                if end:
+                    adj.v = load_vec(adj_now, i, row_v)
+                    adj.C = load_mat(adj_now, i, row_C)
+                else:
+                    if wp.static(not few):
+                        at = spread(constants, inputs, window, now, world, p, i, v, C)
+                    sums = gather_adj(adj_node, at.first, window.shape, at.g, at.b, at.A, at.m)
+                    B = sums.outer - wp.outer(sums.value, at.g)
+                    # (T1.adj)
+                    more = momentum_adj(
+                        constants, inputs, world, p, v, C, at.H, at.Q, sums.value, sums.mass, B, adj_inputs
+                    )
+                    adj.fx += sums.slope - wp.transpose(at.A) * sums.value  # (A6)
+                    adj.v = more.v
+                    adj.C = more.C
+                    adj.H += more.H
+                    size = (
+                        wp.dot(adj.fx, adj.fx)
+                        + wp.dot(adj.v, adj.v)
+                        + wp.ddot(adj.C, adj.C)
+                        + wp.ddot(adj.H, adj.H)
+                    )
+                    if not wp.isfinite(size):
+                        report(words, world, back, bad_gradient, order[i])
+                if start:
+                    store_vec(adj_now, i, row_v, adj.v)
+                    store_mat(adj_now, i, row_C, adj.C)
+                else:
+                    base = unpack_base(before.base[i])
+                    first = held + first_node(base, origin, window.shape)
+                    plane = base[0] - origin[0]
+                    g = centre(old_fx)
+                    adj = moved_adj(
+                        constants, inputs, world, p, load_mat(before.rows, i, row_H), C, adj, adj_inputs
+                    )  # (T3.adj)
+                    if wp.static(driven):
+                        # The velocity of a driven particle is not that of the nodes around it.
+                        v = gather(velocity, first, window.shape, g).value
+                    B = adj.C
+                    b = adj.v - B * g
+                    sums = slope_adj(velocity, first, window.shape, g, b, B, real(0.0))
+                    adj.fx += sums.slope - wp.transpose(B) * v  # (T2.adj)
+                store_vec(adj_now, i, row_fx, adj.fx)
+                store_mat(adj_now, i, row_H, adj.H)
+            if not start:
+                if wp.static(exact):
+                    give(adj_velocity, i, count, total, b, B)
+                if wp.static(by_slabs):
+                    give_to_slabs(adj_velocity, i, plane, b, B)
+                if wp.static(not (exact or by_slabs)):
+                    scatter(adj_velocity, window.shape, first, g, b, B, real(0.0))
+
+        return g2p2g_adj
 
     return SimpleNamespace(
-        grid_velocity_adj=grid_velocity_adj, g2p2g_adj={few: compiled(few) for few in (False, True)}
+        grid_velocity_adj=grid_velocity_adj, g2p2g_adj={few: of_particles(few) for few in (False, True)}
     )
