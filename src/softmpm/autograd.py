@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
-from softmpm.batches import Adjoint, FirstOrder, refuse_batches
+from softmpm.batches import FirstOrder, FirstOrderAdjoint, refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
 from softmpm.checks import check_activation, check_finite, check_horizon, check_state
 from softmpm.compiling import opaque
@@ -242,7 +242,7 @@ class _Simulate(FirstOrder):
         return None, *backward(*given), *(len(adj_end) - count) * (None,)
 
 
-class _SimulateBackward(Adjoint):
+class _SimulateBackward(FirstOrderAdjoint):
     @staticmethod
     def forward(*given):
         # The start is not read, the trail has it; it stands here so that a second derivative finds this function.
@@ -277,7 +277,7 @@ class _Rasterize(FirstOrder):
         return None, *_RasterizeBackward.apply(ctx.model, adj_mass, adj_velocity, *ctx.saved_tensors)
 
 
-class _RasterizeBackward(Adjoint):
+class _RasterizeBackward(FirstOrderAdjoint):
     @staticmethod
     def forward(model, adj_mass, adj_velocity, x, v, C, mass, velocity):
         adj = rasterize_nodes_adj(

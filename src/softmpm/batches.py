@@ -1,4 +1,7 @@
-"""What PyTorch offers besides the gradient, and the kernels do not have: refused, and for its batches worlds are advised."""
+"""What PyTorch offers besides the gradient and the kernels do not have: batches, forward mode and second derivatives raise an error.
+
+Base classes of functions with an explicit adjoint, and the check for tensors that are batches.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -33,7 +36,7 @@ class FirstOrder(torch.autograd.Function):
         raise RuntimeError(FORWARD)
 
 
-class Adjoint(FirstOrder):
+class FirstOrderAdjoint(FirstOrder):
     """Base of the adjoint of such a function: a second derivative raises instead of silently losing this term."""
 
     @staticmethod

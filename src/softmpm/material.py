@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from softmpm.batches import Adjoint, FirstOrder
+from softmpm.batches import FirstOrder, FirstOrderAdjoint
 from softmpm.checks import check_bounds, check_params
 from softmpm.kernels.material import material as kernels_of
 from softmpm.kernels.structs import DTYPES
@@ -68,7 +68,7 @@ class _Constants(FirstOrder):
         return None, *_ConstantsAdj.apply(ctx.model, *ctx.saved_tensors, *adj)
 
 
-class _ConstantsAdj(Adjoint):
+class _ConstantsAdj(FirstOrderAdjoint):
     @staticmethod
     def forward(model, young, poisson, *adj):
         return _constants_adj(model, young, poisson, *adj)

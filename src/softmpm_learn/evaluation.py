@@ -102,8 +102,8 @@ def _repeats(run: Run, again: Evaluation) -> bool:
 def simulate(runs: Runs, of: Collection[int], starts: Sequence[float]) -> dict[int, Evaluation]:
     """Evaluate from starts with these speeds along the first axis [m/s], of which the worst counts."""
     times, found, failed = runs.evaluator.at_once, [], dict[int, tuple[float, softmpm.UnstableError]]()
-    at_once = [starts[k : k + times] for k in range(0, len(starts), times)]
-    for kicks, goal in itertools.product(at_once, runs.evaluation_goals() or [None]):
+    groups = [starts[k : k + times] for k in range(0, len(starts), times)]
+    for kicks, goal in itertools.product(groups, runs.evaluation_goals() or [None]):
         both = torch.stack(runs.evaluator(goal, kicks))
         found.append(both.unflatten(1, (len(runs.all), -1)).mean(dim=2))
         for k, error in runs.failed(runs.evaluator.failures.errors, times).items():
@@ -111,11 +111,11 @@ def simulate(runs: Runs, of: Collection[int], starts: Sequence[float]) -> dict[i
     for k, (kick, error) in failed.items():
         if k not in of:
             continue
-        start = f", from a start with {kick:g} m/s" if kick else ""
+        start = f", from a start with {kick:g} m/s" if times > 1 else ""
         logger.warning("Iteration %d: the evaluation failed%s: %s", runs.all[k].iteration, start, error)
         found[0][0, k] = math.inf
     means = runs.group.average(found)  # infinite in every process if it is in one
-    # of each start the mean over the goals, shape (starts at once, 2, run, start)
-    each = torch.stack(means).unflatten(0, (len(at_once), -1)).mean(dim=1)
+    # of each start the mean over the goals, shape (group of starts, 2, run, start)
+    each = torch.stack(means).unflatten(0, (len(groups), -1)).mean(dim=1)
     worst, least = each[:, 0].amax(dim=(0, 2)).tolist(), each[:, 1].amin(dim=(0, 2)).tolist()
     return {k: Evaluation(worst[k], least[k] > ALL) for k in of}

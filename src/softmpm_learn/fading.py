@@ -8,9 +8,9 @@ robot were only displaced:
     s_k = γ s_k + (1 − γ) sg(s_k),   c_k = c_{k−1} + (1 − γ) (x_k − sg(x_k)),   x_k + c_{k−1} is what the objective sees
 
 with sg for a value without its gradient: all values stay what they are, and c is zero. A distance counts every step, however long ago.
-So only gradients are computed, x̄_k = s̄_k + c̄_k for what goes on, and with that of the next step
+So only gradients are computed: with the gradient ō_k of what the objective sees of x_k,
 
-    x̄_k += γ s̄_k + (1 − γ) c̄_k,   c̄_{k−1} = c̄_k + that of what the objective sees of x_k
+    x̄_k = ō_k + γ s̄_k + (1 − γ) c̄_k,   c̄_{k−1} = ō_k + c̄_k
 """
 
 import math
@@ -22,7 +22,8 @@ from softmpm import State
 
 
 class _Fade(torch.autograd.Function):
-    """A carry, and tensors as they are, whose gradients are multiplied by a factor, or by one for each world; the first is carried."""
+    """A carry and tensors as they are. Their gradients are multiplied by γ, or by that of each world. That of the carry passes,
+    and 1 − γ of it is added to that of the first tensor."""
 
     @staticmethod
     def forward(ctx, factor: float | Tensor, carry: Tensor, *tensors: Tensor):

@@ -19,7 +19,8 @@ LEVEL = 30.0
 """Its tilt stays below this [degrees]."""
 STARTS = 0.0, 0.05
 """Speeds along the first axis with which an evaluation starts, of which the worse result counts [m/s]: what lasts by luck in one
-simulation may not in another that differs by rounding. They are simulated at once, and so are as many of the others."""
+simulation may not in another that differs by rounding. They are simulated at once, and the others below in groups of as many, so the
+number of each is a multiple of theirs."""
 FURTHER = -0.05, 0.025
 """Further such starts of a motion that would be the best: the best of many motions is often one that was lucky."""
 AGAIN = -0.0375, -0.0125, 0.0125, 0.0375

@@ -91,8 +91,10 @@ class Evaluator:
             goal: Goal of each world of the runs [m], shape (world, dim), where it is not the task's own.
             kicks: Speeds along the first axis with which they start [m/s], :attr:`at_once` of them.
         """
+        if len(kicks) != self.at_once:
+            raise ValueError(f"an evaluation takes {self.at_once} start(s) at once, got {len(kicks)}.")
         self.failures.errors.clear()
-        self._kicks.copy_(torch.tensor(kicks))
+        self._kicks.copy_(torch.tensor(kicks, dtype=self._kicks.dtype))
         goals = None if goal is None else goal.repeat_interleave(self.at_once, dim=0)
         if goals is not None and not self._goals:
             self._goals.append(goals)

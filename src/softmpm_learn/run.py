@@ -90,8 +90,8 @@ class Run:
         self._first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.safe: list[Tensor] = []
 
-    def model_of(self, task: "Task", worlds: int = 1) -> Model:
-        """Model of another task, or with other worlds, for simulations as those of this run, without a gradient."""
+    def model_of(self, task: "Task", worlds: int) -> Model:
+        """Model of another task, or with other worlds, built as the task says; for simulations without a gradient."""
         own, inputs = self.model, declared_inputs(self.settings.design)
         settings: dict[str, Any] = dict(device=own.device, dtype=own.dtype, threads=own.threads)
         settings |= dict(deterministic=own.deterministic, inputs=inputs, worlds=worlds)

@@ -95,7 +95,8 @@ def train(
 
     Args:
         task: A :class:`softmpm_learn.tasks.task.Task`.
-        model: Built from ``task.scene`` with ``settings.train.worlds`` worlds, or with this process's share of them.
+        model: Built from ``task.scene`` with ``task.build`` and ``settings.train.worlds`` worlds, or this process's share of them.
+            Evaluations of a walker and examinations build further models likewise.
         out, begin, sketch: See :class:`Plan`.
         progress: Called after each iteration with its number and metrics; in the first process only.
         stop: Asked after each iteration; once it says True in any process the run is saved and ends, ready to resume.

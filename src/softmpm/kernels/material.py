@@ -55,9 +55,12 @@ def material(dtype: str) -> SimpleNamespace:
     ):
         """(E0.adj)"""
         world, p = wp.tid()
-        E, nu = young[world, p], poisson[world, p]
-        s, t = real(1.0) / (real(1.0) + nu), real(1.0) / (real(1.0) - real(2.0) * nu)
-        half, of_lam = real(0.5) * adj_mu[world, p], adj_lam[world, p]
+        E = young[world, p]
+        nu = poisson[world, p]
+        s = real(1.0) / (real(1.0) + nu)
+        t = real(1.0) / (real(1.0) - real(2.0) * nu)
+        half = real(0.5) * adj_mu[world, p]
+        of_lam = adj_lam[world, p]
         adj_young[world, p] = s * (half + nu * t * of_lam)
         adj_poisson[world, p] = E * s * s * ((real(1.0) + real(2.0) * nu * nu) * t * t * of_lam - half)
         adj_density[world, p] = adj_mass[world, p] * volume[p] / unit[0]
