@@ -418,9 +418,8 @@ def test_places_are_exact_for_affine_motion():
 def test_the_depth_of_a_start_is_that_of_its_points(dtype, device):
     """Of a body that is turned and sheared: the alarm is that of the first point that is too deep, and of no point a little higher."""
     B = torch.tensor([[1.02, 0.1], [-0.15, 0.97]], dtype=torch.float64)
-    for above, low in itertools.product(
-        (-1e-4, 1e-4), (0.0, 2e-3)
-    ):  # what the low-order parts have, as if x and F were rounded so
+    # ``low`` is what the low-order parts have, as if x and F were rounded so.
+    for above, low in itertools.product((-1e-4, 1e-4), (0.0, 2e-3)):
         model = build(slab(), dtype=dtype, alarms=softmpm.Alarms(), device=device)
         exact = torch.from_numpy(model.exact_positions).to(device) @ B.T.to(device) + 0.1
         x, F = (exact - low).to(dtype)[None], (B - low).to(device, dtype).expand(1, len(exact), 2, 2)
