@@ -30,7 +30,12 @@ MANY, LONGEST_OF_MANY = 30_000, 64
 """From ``MANY`` particles on the host's overhead is hidden in any case and sorting matters more: chunks are shorter."""
 
 MARGIN = {2: 6, 3: 3}
-"""Initial margin of the window around the particles' stencils, in nodes on each side, in 2D and 3D."""
+"""Smallest margin of the window around the particles' stencils, in nodes on each side, in 2D and 3D."""
+
+
+def grown_margin(margin: int) -> int:
+    """That of the window after it proved too small."""
+    return 2 * margin + 1
 
 
 def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int, least: int = 0) -> tuple[int, ...]:
@@ -40,13 +45,13 @@ def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int, least: 
         grid: Nodes of the whole grid.
         reach: Distance between the outermost base nodes of the particles along each axis.
         margin: Nodes around their stencils on each side.
-        least: Nodes that there must be, of those of the grid; the margin is doubled until there are.
+        least: Nodes that there must be, of those of the grid; the margin grows until there are.
     """
     wide = [apart + 3 + 2 * margin for apart in reach]
     wide[-1] = 4 * math.ceil(wide[-1] / 4)  # so that columns are aligned for memory reads
     shape = tuple(min(nodes, w) for nodes, w in zip(grid, wide, strict=True))
     if math.prod(shape) < min(least, math.prod(grid)):
-        return window_shape(grid, reach, 2 * margin + 1, least)
+        return window_shape(grid, reach, grown_margin(margin), least)
     return shape
 
 

@@ -13,24 +13,41 @@ from softmpm.planning.memory import (
     Buffers,
     Plan,
     Sizes,
+    grown_margin,
     input_bytes,
     sizes_of,
     surface_bytes,
     window_shape,
 )
 
-COPIED, MANY_CALLS = 16_384, 8
-"""See :func:`copies`."""
+SMALL, MANY_CALLS = 16_384, 8
+"""See :func:`is_small_loop`."""
+
+
+def is_small_loop(model) -> bool:
+    """True for a loop of many calls of a small scene on a GPU, where the host takes far longer to build a graph than the device to run
+    it."""
+    small = model.worlds * model.particle_count <= SMALL
+    return model.device.type == "cuda" and small and model.calls >= MANY_CALLS
 
 
 def copies(model) -> bool:
     """True if the stored states of a chunk are copied, so that its chunk graph is free for other calls.
 
-    On a GPU, building the chunk graph of a small scene takes the host far longer than the device needs to run it, and without copies a
-    loop builds one for each call. The copies take a fiftieth of the time of the substeps; with many particles it would be a sixth.
+    Without copies a loop builds a chunk graph for each call. In a small scene the copies take a fiftieth of the time of the substeps;
+    with many particles it would be a sixth.
     """
-    few = model.worlds * model.particle_count <= COPIED and model.calls >= MANY_CALLS
-    return model.device.type == "cuda" and few and not model.spec.deterministic
+    return is_small_loop(model) and not model.spec.deterministic
+
+
+def first_margin(model) -> int:
+    """Initial margin of the window around the particles' stencils, in nodes on each side.
+
+    A window that grows costs a captured loop another call without the graph and another capture, seconds each, and further nodes cost a
+    small scene in 2D hardly any time: there it begins as if it had grown once. In 3D it would have twice the nodes.
+    """
+    margin = MARGIN[model.dim]
+    return grown_margin(margin) if model.dim == 2 and is_small_loop(model) else margin
 
 
 class FastFootprint:
@@ -51,7 +68,7 @@ class FastFootprint:
         cells = np.floor(model.exact_positions / model.scene.grid.spacing - 0.5)
         reach = np.ptp(cells, axis=0).astype(int).tolist()
         least = 0 if model.surface is None else model.surface.count
-        return math.prod(window_shape(model.scene.grid.shape, reach, MARGIN[model.dim], least))
+        return math.prod(window_shape(model.scene.grid.shape, reach, first_margin(model), least))
 
     def sizes(self, model) -> Sizes:
         real, d, particles = model.dtype.itemsize, model.dim, model.worlds * model.particle_count

@@ -20,11 +20,12 @@ from softmpm.kernels.fast.native import FEW
 from softmpm.kernels.fast.sorting import sorting
 from softmpm.kernels.structs import types
 from softmpm.model import Model
-from softmpm.planning.memory import MARGIN, window_shape
+from softmpm.planning.memory import grown_margin, window_shape
 from softmpm.schemes.buffers import placeholder, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.failure_report import Report
+from softmpm.schemes.fast.footprint import first_margin
 from softmpm.schemes.launch import RebindableLaunch
 
 STALE, STALE_FEW = 1.5, 3.0
@@ -36,7 +37,7 @@ class ParticleLayout:
 
     Args:
         x: Initial positions [m], shape (world, particle, dim).
-        before: A layout whose window was too small, or None. Its margin is doubled, and no axis gets shorter.
+        before: A layout whose window was too small, or None. Its margin grows, and no axis gets shorter.
 
     Attributes:
         order: Particle at each place, shape (world, particle), int32.
@@ -51,7 +52,7 @@ class ParticleLayout:
 
     def __init__(self, model: Model, x: Tensor, before: "ParticleLayout | None" = None):
         self.model, self.version = model, 0
-        self._margin = 2 * before._margin + 1 if before else MARGIN[model.dim]
+        self._margin = grown_margin(before._margin) if before else first_margin(model)
         self._fresh: Report | None = None  # changes of cell along the order just after sorting
         self.stale = self.left = self.outgrown = False
 

@@ -23,7 +23,7 @@ from softmpm.planning.memory import memory
 from softmpm.schemes import capture, launch
 from softmpm.schemes.fast import chunk_buffers, footprint
 from softmpm.schemes.fast import scheme as fast_scheme
-from softmpm.schemes.fast.footprint import COPIED, MANY_CALLS, copies
+from softmpm.schemes.fast.footprint import MANY_CALLS, SMALL, copies
 from softmpm.schemes.fast.particle_order import ParticleLayout
 
 WALL = softmpm.Wall(normal=(0.1, 1.0), offset=0.4752, contact="separate", friction=0.4)
@@ -202,11 +202,11 @@ def test_a_loop_on_a_gpu_copies_its_states(scene, inputs, made, monkeypatch):
 @pytest.mark.parametrize(
     "device, particles, calls, deterministic, copied",
     [
-        ("cuda", COPIED, MANY_CALLS, False, True),
-        ("cuda", COPIED + 2, MANY_CALLS, False, False),
-        ("cuda", COPIED, MANY_CALLS - 1, False, False),
-        ("cuda", COPIED, MANY_CALLS, True, False),
-        ("cpu", COPIED, MANY_CALLS, False, False),
+        ("cuda", SMALL, MANY_CALLS, False, True),
+        ("cuda", SMALL + 2, MANY_CALLS, False, False),
+        ("cuda", SMALL, MANY_CALLS - 1, False, False),
+        ("cuda", SMALL, MANY_CALLS, True, False),
+        ("cpu", SMALL, MANY_CALLS, False, False),
     ],
 )
 def test_where_states_are_copied(device, particles, calls, deterministic, copied):

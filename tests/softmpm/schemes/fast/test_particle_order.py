@@ -14,8 +14,9 @@ from helpers import LAWS, assert_relative, cotangent, dot, pretend_capture
 
 import softmpm
 from softmpm.planning.memory import MARGIN
-from softmpm.schemes.fast import particle_order
+from softmpm.schemes.fast import footprint, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
+from softmpm.schemes.fast.footprint import MANY_CALLS, SMALL, first_margin
 from softmpm.schemes.fast.particle_order import STALE_FEW, ParticleLayout
 
 DX = 1 / 16  # a power of two: shifting by whole cells is exact
@@ -150,6 +151,36 @@ def test_a_grown_window_has_twice_the_margin(device):
     assert found.grown(x).grown(x).shape == (80, 26)
     x[0, 0, 0] -= 40 * DX
     assert found.grown(x).grown(x).grown(x).shape == (80, 26)
+
+
+@pytest.mark.parametrize(
+    "device, dim, particles, calls, margin",
+    [
+        ("cuda", 2, SMALL, MANY_CALLS, 2 * MARGIN[2] + 1),
+        ("cuda", 2, SMALL + 2, MANY_CALLS, MARGIN[2]),
+        ("cuda", 2, SMALL, MANY_CALLS - 1, MARGIN[2]),
+        ("cuda", 3, SMALL, MANY_CALLS, MARGIN[3]),
+        ("cpu", 2, SMALL, MANY_CALLS, MARGIN[2]),
+    ],
+)
+def test_the_window_of_a_small_loop_begins_as_if_it_had_grown(device, dim, particles, calls, margin):
+    """A loop whose window grows is captured anew; in 3D, with many particles and on a CPU the nodes would cost more."""
+    model = SimpleNamespace(
+        device=torch.device(device), dim=dim, worlds=2, particle_count=particles // 2, calls=calls
+    )
+    assert first_margin(model) == margin
+
+
+@pytest.mark.parametrize("margin", [MARGIN[2], 2 * MARGIN[2] + 1])
+def test_the_margin_of_a_layout_is_that_of_the_plan(margin, monkeypatch):
+    """The memory that is planned for is that of the window, whatever its margin."""
+    for module in (particle_order, footprint):
+        monkeypatch.setattr(module, "first_margin", lambda model: margin)
+    model = robot(2, [(20, 20)], grid=(80, 80))
+    found = ParticleLayout(model, model.rest().x)
+    reach = np.ptp(bases(model, model.rest().x), axis=1).max(0)
+    assert found.shape[0] == reach[0] + 3 + 2 * margin
+    assert found.node_count == model.held_nodes
 
 
 def test_a_layout_grows_stale_by_disorder_or_near_the_edge(device):
