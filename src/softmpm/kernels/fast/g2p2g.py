@@ -24,7 +24,7 @@ from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import BLOCK, NATIVE, native
+from softmpm.kernels.fast.native import BLOCK, NATIVE, Crowd, native
 from softmpm.kernels.fast.slabs import slabs
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
@@ -179,88 +179,96 @@ def fused(spec: Spec) -> SimpleNamespace:
         plane = base[0] - origin[0]
         scatter_momentum(words, window, place, count, total, order, 0, plane, first, g, b, A, m, node)
 
-    def g2p2g(
-        # Parameters:
-        constants: Constants,
-        inputs: ParticleInputs,
-        window: Window,
-        substep: int,
-        last: bool,  # no P2G afterwards
-        per_warp: int,
-        count: int,
-        total: int,
-        order: wp.array(dtype=wp.int32),
-        # In:
-        before: wp.array(dtype=wp.int64),  # the words before this launch, of a model with slabs
-        velocity: wp.array(dtype=node_vec),
-        now: Packed,
-        # Out:
-        words: wp.array(dtype=wp.int64),
-        then: Packed,
-        # Out, added into:
-        node: Shares,
-    ):
-        # Idle lanes recompute the last particle and skip the stores, which avoids a divergent branch.
-        place = particle_of(wp.tid(), per_warp, total)
-        i = wp.min(place, total - 1)
-        world = world_of(i, count, total)
-        p = i - world * count
-        origin = window.origin[world]
-        held = world * window.count  # nodes of the worlds before
-        old = Particle()
-        old.base = unpack_base(load_base(now.base, i))
-        old.fx = load_vec(now.rows, i, row_fx)
-        old.low = load_vec(now.rows, i, row_low)
-        old.H = load_mat(now.rows, i, row_H)
-        await_previous()  # velocity and words
-        if wp.static(by_slabs):
-            alive = running(before, world)
-        else:
-            alive = running(words, world)
-        g = centre(old.fx)
-        # (T2) by (A3)
-        sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
-        B = sums.outer - wp.outer(sums.value, g)
-        new = moved(constants, inputs, world, p, origin, window.shape, old, sums.value, B)  # (T3)
-        base = old.base
-        if new.valid:
-            base = new.base
-        m = inputs.mass[world, p]
-        g = centre(new.fx)
-        A = affine_momentum(constants, inputs, world, p, new.C, new.H, rotation(inputs, world, p, new.H))
-        b = linear_momentum(constants, inputs, world, p, new.v) - A * g
-        first = held + first_node(base, origin, window.shape)
-        if place == total:
-            first = -1
-        # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
-        if place < total:
-            if alive:
-                then.base[i] = pack_base(base)
-                store_vec(then.rows, i, row_fx, new.fx)
-                store_vec(then.rows, i, row_low, new.low)
-                store_vec(then.rows, i, row_v, new.v)
-                store_mat(then.rows, i, row_H, new.H)
-                store_mat(then.rows, i, row_C, new.C)
-                if not new.valid:
-                    report_invalid(words, constants, world, order[i], substep, new.fx, new.base, new.H)
-            else:
-                copy_unchanged(i, now, then)
-        if not last:
-            plane = base[0] - origin[0]
-            scatter_momentum(
-                words, window, place, count, total, order, substep + 1, plane, first, g, b, A, m, node
-            )  # (T1)
+    def of_particles(crowd: Crowd) -> wp.Kernel:
+        """With few particles the kernel has registers to wait for all loads at once. Many are more than a GPU holds at a time: loaded
+        before the wait, they would take registers of which other warps could run."""
+        many, bounds = crowd is Crowd.MANY, {"launch_bounds": (BLOCK, 3)} if crowd is Crowd.FEW else {}
+        vector, matrix = (n.read_vec, n.read_mat) if many else (load_vec, load_mat)
 
-    def compiled(**bounds) -> wp.Kernel:
-        """``g2p2g`` for many particles, or with bounds for few: it has registers then to wait for all loads at once."""
-        return kernel(NATIVE, grid_stride=False, **bounds)(g2p2g)
+        @kernel(NATIVE, grid_stride=False, **bounds)
+        def g2p2g(
+            # Parameters:
+            constants: Constants,
+            inputs: ParticleInputs,
+            window: Window,
+            substep: int,
+            last: bool,  # no P2G afterwards
+            per_warp: int,
+            count: int,
+            total: int,
+            order: wp.array(dtype=wp.int32),
+            # In:
+            before: wp.array(dtype=wp.int64),  # the words before this launch, of a model with slabs
+            velocity: wp.array(dtype=node_vec),
+            now: Packed,
+            # Out:
+            words: wp.array(dtype=wp.int64),
+            then: Packed,
+            # Out, added into:
+            node: Shares,
+        ):
+            # Idle lanes recompute the last particle and skip the stores, which avoids a divergent branch.
+            place = particle_of(wp.tid(), per_warp, total)
+            i = wp.min(place, total - 1)
+            world = world_of(i, count, total)
+            p = i - world * count
+            origin = window.origin[world]
+            held = world * window.count  # nodes of the worlds before
+            if wp.static(many):
+                await_previous()
+            old = Particle()
+            old.base = unpack_base(load_base(now.base, i))
+            old.fx = vector(now.rows, i, row_fx)
+            old.low = vector(now.rows, i, row_low)
+            old.H = matrix(now.rows, i, row_H)
+            if wp.static(not many):
+                await_previous()  # velocity and words
+            if wp.static(by_slabs):
+                alive = running(before, world)
+            else:
+                alive = running(words, world)
+            g = centre(old.fx)
+            # (T2) by (A3)
+            sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
+            B = sums.outer - wp.outer(sums.value, g)
+            new = moved(constants, inputs, world, p, origin, window.shape, old, sums.value, B)  # (T3)
+            base = old.base
+            if new.valid:
+                base = new.base
+            m = inputs.mass[world, p]
+            g = centre(new.fx)
+            A = affine_momentum(constants, inputs, world, p, new.C, new.H, rotation(inputs, world, p, new.H))
+            b = linear_momentum(constants, inputs, world, p, new.v) - A * g
+            first = held + first_node(base, origin, window.shape)
+            if place == total:
+                first = -1
+            # Nothing is stored before everything is loaded: the compiler cannot know that they are apart.
+            if place < total:
+                if alive:
+                    then.base[i] = pack_base(base)
+                    store_vec(then.rows, i, row_fx, new.fx)
+                    store_vec(then.rows, i, row_low, new.low)
+                    store_vec(then.rows, i, row_v, new.v)
+                    store_mat(then.rows, i, row_H, new.H)
+                    store_mat(then.rows, i, row_C, new.C)
+                    if not new.valid:
+                        report_invalid(words, constants, world, order[i], substep, new.fx, new.base, new.H)
+                else:
+                    copy_unchanged(i, now, then)
+            if not last:
+                plane = base[0] - origin[0]
+                scatter_momentum(
+                    words, window, place, count, total, order, substep + 1, plane, first, g, b, A, m, node
+                )  # (T1)
+
+        return g2p2g
 
     return SimpleNamespace(
         clear=clear,
         remember=remember,
         grid_velocity=grid_velocity,
         p2g_first=p2g_first,
-        g2p2g={False: compiled(), True: compiled(launch_bounds=(BLOCK, 3))},
+        g2p2g={crowd: of_particles(crowd) for crowd in Crowd},
         centre=centre,
         place_of=place_of,
     )

@@ -3,6 +3,7 @@
 Each function also has a plain form for the CPU, for double precision and for GPUs before sm_90, selected at compile time.
 """
 
+import enum
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,8 +24,17 @@ WARP = 32
 """Threads per warp, and particles per block of packed rows."""
 BLOCK = 128
 """Threads per block."""
-FEW, VERY_FEW = 20_000, 10_000
-"""Up to ``FEW`` particles: separate kernels with one-warp blocks. Up to ``VERY_FEW``: half-populated warps."""
+FEW, VERY_FEW, MANY = 20_000, 10_000, 250_000
+"""Up to ``FEW`` particles: separate kernels with one-warp blocks. Up to ``VERY_FEW``: half-populated warps. Beyond ``MANY``: a separate
+kernel with fewer registers."""
+
+
+class Crowd(enum.Enum):
+    """Particles of all worlds, by the kernels that a GPU has for them; a CPU has those for ``SOME``."""
+
+    FEW = enum.auto()
+    SOME = enum.auto()
+    MANY = enum.auto()
 
 
 def padded(particles: int) -> int:
@@ -64,16 +74,24 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func_native("return softmpm::recent(base.data + i);")
     def load_base(base: wp.array(dtype=wp.int32), i: int) -> int: ...
 
-    @wp.func_native(
-        f"wp::vec_t<{dim}, {t.c_name}> value; softmpm::load_rows<{rows}, {dim}>(packed.data, i, r, value.c); return value;"
-    )
-    def load_vec(packed: wp.array(dtype=real), i: int, r: int) -> vec: ...
+    def row_loaders(function: str) -> tuple[wp.Function, wp.Function]:
+        """Functions that load a vector and a matrix of a packed particle by this one of scatter.h."""
 
-    @wp.func_native(
-        f"wp::mat_t<{dim}, {dim}, {t.c_name}> value; "
-        f"softmpm::load_rows<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]); return value;"
-    )
-    def load_mat(packed: wp.array(dtype=real), i: int, r: int) -> mat: ...
+        @wp.func_native(
+            f"wp::vec_t<{dim}, {t.c_name}> value; softmpm::{function}<{rows}, {dim}>(packed.data, i, r, value.c); return value;"
+        )
+        def vector(packed: wp.array(dtype=real), i: int, r: int) -> vec: ...
+
+        @wp.func_native(
+            f"wp::mat_t<{dim}, {dim}, {t.c_name}> value; "
+            f"softmpm::{function}<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]); return value;"
+        )
+        def matrix(packed: wp.array(dtype=real), i: int, r: int) -> mat: ...
+
+        return vector, matrix
+
+    load_vec, load_mat = row_loaders("load_rows")
+    read_vec, read_mat = row_loaders("read_rows")
 
     @wp.func_native(f"softmpm::store_rows<{rows}, {dim}>(packed.data, i, r, value.c);")
     def store_vec(packed: wp.array(dtype=real), i: int, r: int, value: vec): ...
@@ -98,6 +116,8 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         load_base=load_base,
         load_vec=load_vec,
         load_mat=load_mat,
+        read_vec=read_vec,
+        read_mat=read_mat,
         store_vec=store_vec,
         store_mat=store_mat,
         spread_vec=spread_vec,

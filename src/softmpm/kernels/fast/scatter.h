@@ -382,6 +382,14 @@ template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(c
         out[k] = recent(at + k * LANES);
 }
 
+// The same of what the kernel before has written, once it has ended.
+template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void read_rows(const T* rows, int i, int r, T* out)
+{
+    const T* at = packed<ROWS>(rows, i, r);
+    for (int k = 0; k < COUNT; ++k)
+        out[k] = at[k * LANES];
+}
+
 template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(T* rows, int i, int r, const T* in)
 {
     T* at = packed<ROWS>(rows, i, r);

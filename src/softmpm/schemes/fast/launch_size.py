@@ -2,8 +2,15 @@
 
 import functools
 
-from softmpm.kernels.fast.native import BLOCK, FEW, VERY_FEW, WARP
+from softmpm.kernels.fast.native import BLOCK, FEW, MANY, VERY_FEW, WARP, Crowd
 from softmpm.model import Model
+
+
+def crowd_of(particles: int) -> Crowd:
+    """That of so many particles on a GPU."""
+    if particles <= FEW:
+        return Crowd.FEW
+    return Crowd.SOME if particles <= MANY else Crowd.MANY
 
 
 class LaunchSize:
@@ -11,17 +18,23 @@ class LaunchSize:
 
     On a GPU the lanes of a warp cooperate, so that whole blocks are launched. With few particles each warp has a block of its own and
     the kernels may use more registers; with very few, half of the lanes stay empty, so that twice as many warps share the work, at
-    the price of more reductions (docs/decisions/0009-kept-machinery.md).
+    the price of more reductions (docs/decisions/0009-kept-machinery.md). With many particles registers decide how many warps run at a
+    time.
     """
 
     def __init__(self, model: Model):
         self.particles, self.on_gpu = model.worlds * model.particle_count, model.device.type == "cuda"
-        self.few = self.on_gpu and self.particles <= FEW
+        self.crowd = crowd_of(self.particles) if self.on_gpu else Crowd.SOME
         self.block = WARP if self.few else BLOCK
         may_halve = self.on_gpu and not model.spec.deterministic and self.particles <= VERY_FEW
         self.per_warp_adj = WARP // 2 if may_halve else WARP
         self.per_warp = self.per_warp_adj if model.dim == 2 else WARP
         """Particles of each warp in the forward kernels."""
+
+    @property
+    def few(self) -> bool:
+        """True if each warp has a block of its own."""
+        return self.crowd is Crowd.FEW
 
     @functools.cached_property
     def threads(self) -> int:

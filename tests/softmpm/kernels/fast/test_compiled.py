@@ -9,8 +9,9 @@ import warp as wp
 
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
-from softmpm.kernels.fast.native import BLOCK, WARP
+from softmpm.kernels.fast.native import BLOCK, FEW, MANY, WARP, Crowd
 from softmpm.kernels.structs import RequestedGrads, Spec
+from softmpm.schemes.fast.launch_size import crowd_of
 
 ARCH = 90
 CASES = [(2, "neo_hookean"), (2, "fixed_corotated"), (3, "neo_hookean"), (3, "fixed_corotated")]
@@ -39,12 +40,13 @@ def scene_spec(dim: int, law: str, bare: bool) -> Spec:
     )
 
 
-def kernel(dim: int, law: str, which: str, bare: bool, few: bool):
+def kernel(dim: int, law: str, which: str, bare: bool, crowd: Crowd):
     """A kernel over particles."""
     spec = scene_spec(dim, law, bare)
     if which == "adjoint":
-        return fused_adj(spec, RequestedGrads(() if bare else ("material", "activation"))).g2p2g_adj[few]
-    return fused(spec).g2p2g[few]
+        wanted = RequestedGrads(() if bare else ("material", "activation"))
+        return fused_adj(spec, wanted).g2p2g_adj[crowd is Crowd.FEW]
+    return fused(spec).g2p2g[crowd]
 
 
 def compiled(kernel, threads: int = BLOCK) -> tuple[str, cubin.Kernel]:
@@ -58,17 +60,19 @@ def compiled(kernel, threads: int = BLOCK) -> tuple[str, cubin.Kernel]:
     return code, facts
 
 
-@pytest.mark.parametrize("few", [False, True], ids=["many", "few"])
+@pytest.mark.parametrize(
+    "which, crowd",
+    [*(("forward", crowd) for crowd in Crowd), ("adjoint", Crowd.FEW), ("adjoint", Crowd.SOME)],
+)
 @pytest.mark.parametrize("bare", [False, True], ids=["full", "bare"])
-@pytest.mark.parametrize("which", ["forward", "adjoint"])
 @pytest.mark.parametrize("dim, law", CASES)
-def test_machine_code(dim, law, which, bare, few):
+def test_machine_code(dim, law, bare, which, crowd):
     """Nodes are read and added 16 bytes at a time, never number by number; no register is spilled, nothing is in local memory.
 
     Numbers that are added to singly are a particle's own: the gradients of both moduli and of the stress of two actuators.
     """
-    code, facts = compiled(kernel(dim, law, which, bare, few), WARP if few else BLOCK)
-    print(f"\n{dim}D {law} {which}: {facts}")
+    code, facts = compiled(kernel(dim, law, which, bare, crowd), WARP if crowd is Crowd.FEW else BLOCK)
+    print(f"\n{dim}D {law} {'bare' if bare else 'full'} {which} {crowd.name}: {facts}")
     assert len(re.findall(r"\bred\.global\.add\.v4\.f32", code)) > 0
     own = 4 if which == "adjoint" and not bare else 0
     assert len(re.findall(r"\b(?:red|atom)\.global\.add\.f32", code)) == own
@@ -80,6 +84,16 @@ def test_machine_code(dim, law, which, bare, few):
     assert not re.findall(r"^\s+[a-z]+\.\S*f64\b.*", code, re.MULTILINE), (
         "double precision where float32 is meant"
     )
+
+
+def test_many_particles_leave_room_for_other_warps():
+    """A multiprocessor has 65,536 registers: with 80 for a thread it holds six blocks, with 112, which loads before the wait take, four.
+
+    Those made a substep of eight million particles 16 % slower.
+    """
+    for law in ("neo_hookean", "fixed_corotated"):
+        _, facts = compiled(kernel(3, law, "forward", bare=True, crowd=Crowd.MANY))
+        assert facts.registers <= 80
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -95,9 +109,17 @@ def test_walls_are_not_in_memory(dim):
     assert loads[0] == loads[1] and min(loads[0]) > 0
 
 
+@pytest.mark.parametrize(
+    "particles, crowd",
+    [(FEW, Crowd.FEW), (FEW + 1, Crowd.SOME), (MANY, Crowd.SOME), (MANY + 1, Crowd.MANY)],
+)
+def test_the_variant_goes_by_the_particles_of_all_worlds(particles, crowd):
+    assert crowd_of(particles) is crowd
+
+
 def test_spilled_registers_would_be_seen():
     """The reader finds them where there must be some: the same kernel with room for four times as many blocks at a time."""
-    spilling = kernel(3, "neo_hookean", "adjoint", bare=False, few=False)
+    spilling = kernel(3, "neo_hookean", "adjoint", bare=False, crowd=Crowd.SOME)
     options = dict(spilling.options)
     try:
         spilling.options["launch_bounds"] = (BLOCK, 16)
