@@ -1,9 +1,9 @@
 """Both formulations on one body: `python bench/formulations.py [--device cpu --threads 1 2] [--json FILE]`
 
 Microseconds of a substep in calls without gradient, in calls that store their states, and of the backward pass; medians after a
-warm-up, the two formulations in turn. ``further``: of one more substep in a call without gradient, without what a call costs in any
-case; the median over pairs of a long and a short call. ``kept``: bytes that a gradient keeps for each substep. ``ratio`` is the moving
-formulation's figure over that of the reference formulation.
+warm-up, the two formulations in turn. ``further`` and ``adjoint``: of one more substep in a call without gradient, and in a backward
+pass, without what a call costs in any case; the median over pairs of a long and a short call. ``kept``: bytes that a gradient keeps for
+each substep. ``ratio`` is the moving formulation's figure over that of the reference formulation.
 
 ``cube``: particles on a lattice, without walls, in one world or several, with faces on knots of the splines. ``block`` has an
 outline; ``on a floor`` it also meets a wall with friction, at nodes in the moving and at surface points in the reference formulation,
@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 
 import torch
 from common import Table, arguments, cube, sync
-from gradient import measure, substeps_of
+from gradient import substeps_of
 
 import softmpm
 
@@ -34,7 +34,7 @@ CASES = [
 ]
 ON_A_CPU = [(2, 3_000, 96, 1), (2, 20_000, 192, 1), (3, 8_000, 32, 1)]
 """Dimension, particles of a world, nodes along an axis, worlds."""
-FIGURES = "forward", "further", "stored", "backward", "kept"
+FIGURES = "forward", "further", "stored", "backward", "adjoint", "kept"
 
 SHORTER = 5
 """Quotient of the lengths of two calls, whose difference is the cost of a further substep. The shorter one is added for it: in a longer
@@ -80,16 +80,38 @@ def call(
     return 1e6 * seconds, (time.process_time() - used) / seconds
 
 
-def forward(model: softmpm.Model, substeps: int, repeats: int) -> tuple[float, float, float]:
-    """Median microseconds of a substep in a call without gradient and of a further one, and the cores that were used."""
-    start, params, few = model.rest(), model.params(), substeps // SHORTER
-    pairs = [
-        [call(model, start, params, count) for count in (substeps, few)] for _ in range(PAIRS * repeats + 1)
-    ]
-    long, short = zip(*pairs[1:], strict=True)
-    whole, cores = sorted(long)[len(long) // 2]
-    further = statistics.median(a - b for (a, _), (b, _) in zip(long, short, strict=True)) / (substeps - few)
-    return whole / substeps, further, cores
+def call_with_gradient(
+    model: softmpm.Model, start: softmpm.State, params: softmpm.Params, substeps: int
+) -> tuple[float, float]:
+    """Microseconds of a call that stores its states, and of its backward pass."""
+    start.v.requires_grad_()
+    sync(model.device)
+    begin = time.perf_counter()
+    end = softmpm.simulate(model, start, None, params, substeps=substeps)
+    sync(model.device)
+    middle = time.perf_counter()
+    torch.autograd.grad(end.x.sum(), start.v)
+    sync(model.device)
+    return 1e6 * (middle - begin), 1e6 * (time.perf_counter() - middle)
+
+
+Times = tuple[float, float]
+
+
+def in_pairs(
+    work: Callable[..., Times], model: softmpm.Model, substeps: int, repeats: int
+) -> list[tuple[Times, Times]]:
+    """Times of pairs of a long and a short call, after a pair that compiles."""
+    about, lengths = (model, model.rest(), model.params()), (substeps, substeps // SHORTER)
+    pairs = [(work(*about, lengths[0]), work(*about, lengths[1])) for _ in range(PAIRS * repeats + 1)]
+    return pairs[1:]
+
+
+def one_more(pairs: list[tuple[Times, Times]], which: int, substeps: int) -> float:
+    """Median microseconds of one more substep."""
+    return statistics.median(long[which] - short[which] for long, short in pairs) / (
+        substeps - substeps // SHORTER
+    )
 
 
 def figures(
@@ -104,9 +126,14 @@ def figures(
         contact=contact,
         memory_budget=2**62,
     )
-    ahead, back = measure(model, substeps, args.repeats)
-    sizes, (alone, further, cores) = model.sizes(), forward(model, substeps, args.repeats)
-    return (alone, further, ahead, back, sizes.inside + sizes.nodes), cores
+    alone = in_pairs(call, model, substeps, args.repeats)
+    both = in_pairs(call_with_gradient, model, substeps, args.repeats)
+    forward, cores = sorted(long for long, _ in alone)[len(alone) // 2]
+    stored, backward = (statistics.median(long[which] for long, _ in both) for which in range(2))
+    sizes, whole = model.sizes(), [time / substeps for time in (forward, stored, backward)]
+    kept = sizes.inside + sizes.nodes
+    values = whole[0], one_more(alone, 0, substeps), *whole[1:], one_more(both, 1, substeps), kept
+    return values, cores
 
 
 def main():

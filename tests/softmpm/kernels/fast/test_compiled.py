@@ -87,7 +87,7 @@ def test_machine_code(dim, law, bare, which, crowd):
 
 
 def test_many_particles_leave_room_for_other_warps():
-    """A multiprocessor has 65,536 registers: with 80 for a thread it holds six blocks, with 112, which loads before the wait take, four.
+    """A multiprocessor has 65,536 registers: with 80 for a thread it holds six blocks, with 112, as loads before the wait take, four.
 
     Those made a substep of eight million particles 16 % slower.
     """
