@@ -1,7 +1,8 @@
 """Durations of the kernels of a substep and of its adjoint, for robots on a GPU: `python bench/kernels.py [--json FILE]`
 
 By the profiler of CUDA, in a call of 96 substeps that stores its states and in its backward pass, after two such calls: the median
-duration of a kernel, and what its launches add up to in a substep. What the GPU does between two kernels is in neither.
+duration of a kernel, and what its launches add up to in a substep. A kernel that begins while the previous one ends is timed from its
+beginning, its wait included, so kernels that follow each other overlap; what the GPU does between two others is in neither figure.
 """
 
 import collections
