@@ -1,7 +1,7 @@
 """Both formulations on one body: `python bench/formulations.py [--device cpu --threads 1 2] [--json FILE]`
 
 Microseconds of a substep in calls without gradient, in calls that store their states, and of the backward pass; medians after a
-warm-up, the two formulations in turn. ``further`` and ``adjoint``: of one more substep in a call without gradient, and in a backward
+warm-up, one formulation after the other. ``further`` and ``adjoint``: of one more substep in a call without gradient, and in a backward
 pass, without what a call costs in any case; the median over pairs of a long and a short call. ``kept``: bytes that a gradient keeps for
 each substep. ``ratio`` is the moving formulation's figure over that of the reference formulation.
 
@@ -96,6 +96,7 @@ def call_with_gradient(
 
 
 Times = tuple[float, float]
+"""What a call returns: its time [us] and the cores that it used, or its time and that of its backward pass."""
 
 
 def breathing(model: softmpm.Model) -> softmpm.State:
@@ -135,7 +136,7 @@ def figures(
     )
     alone = in_pairs(call, model, substeps, args.repeats)
     both = in_pairs(call_with_gradient, model, substeps, args.repeats)
-    forward, cores = sorted(long for long, _ in alone)[len(alone) // 2]
+    forward, cores = (statistics.median(long[which] for long, _ in alone) for which in range(2))
     stored, backward = (statistics.median(long[which] for long, _ in both) for which in range(2))
     sizes, whole = model.sizes(), [time / substeps for time in (forward, stored, backward)]
     kept = sizes.inside + sizes.nodes

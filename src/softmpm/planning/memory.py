@@ -34,7 +34,7 @@ MARGIN = {2: 6, 3: 3}
 
 
 def grown_margin(margin: int) -> int:
-    """That of the window after it proved too small."""
+    """Margin of the window after it proved too small."""
     return 2 * margin + 1
 
 

@@ -8,7 +8,9 @@ from helpers import cotangent, relative
 from surface_scenes import block
 
 import softmpm
+from softmpm.kernels.fast.native import Crowd
 from softmpm.schemes import dependent_launch, launch
+from softmpm.schemes.fast import launch_size
 from softmpm.schemes.lagrangian import launches
 
 KERNEL, MEMSET = 0, 2
@@ -98,10 +100,15 @@ FORMS = {
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("form", FORMS)
-def test_results_are_those_of_kernels_that_follow_one_another(form, monkeypatch):
+@pytest.mark.parametrize(
+    "form, crowd",
+    [*((form, None) for form in FORMS), ("moving, nodes", Crowd.SOME), ("moving, nodes", Crowd.MANY)],
+)
+def test_results_are_those_of_kernels_that_follow_one_another(form, crowd, monkeypatch):
     """State and gradients, of kernels that begin early and of kernels that do not: the same bits where sums have a fixed order, else
-    the same up to rounding. Three calls each, so that buffers hold what was there before."""
+    the same up to rounding. Three calls each, so that buffers hold what was there before. Also with the kernels for more particles."""
+    if crowd is not None:
+        monkeypatch.setattr(launch_size, "crowd_of", lambda particles: crowd)
     monkeypatch.setattr(launches, "cluster_of", lambda model: None)  # else one kernel has many substeps
     changed, found = [], []
     real = dependent_launch.begin_early

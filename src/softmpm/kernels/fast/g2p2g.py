@@ -180,8 +180,8 @@ def fused(spec: Spec) -> SimpleNamespace:
         scatter_momentum(words, window, place, count, total, order, 0, plane, first, g, b, A, m, node)
 
     def of_particles(crowd: Crowd) -> wp.Kernel:
-        """With few particles the kernel has registers to wait for all loads at once. Many are more than a GPU holds at a time: loaded
-        before the wait, they would take registers of which other warps could run."""
+        """``g2p2g`` for so many particles. With few it has registers to wait for all loads at once. With many it loads the particle
+        after the wait for the kernel before, and fewer registers leave room for other warps."""
         many, bounds = crowd is Crowd.MANY, {"launch_bounds": (BLOCK, 3)} if crowd is Crowd.FEW else {}
         vector, matrix = (n.read_vec, n.read_mat) if many else (load_vec, load_mat)
 

@@ -382,7 +382,7 @@ template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(c
         out[k] = recent(at + k * LANES);
 }
 
-// The same of what the kernel before has written, once it has ended.
+// The same by plain loads, for use after the wait.
 template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void read_rows(const T* rows, int i, int r, T* out)
 {
     const T* at = packed<ROWS>(rows, i, r);

@@ -7,7 +7,7 @@ from softmpm.model import Model
 
 
 def crowd_of(particles: int) -> Crowd:
-    """That of so many particles on a GPU."""
+    """The crowd of so many particles on a GPU."""
     if particles <= FEW:
         return Crowd.FEW
     return Crowd.SOME if particles <= MANY else Crowd.MANY

@@ -114,6 +114,7 @@ def test_walls_are_not_in_memory(dim):
     [(FEW, Crowd.FEW), (FEW + 1, Crowd.SOME), (MANY, Crowd.SOME), (MANY + 1, Crowd.MANY)],
 )
 def test_the_variant_goes_by_the_particles_of_all_worlds(particles, crowd):
+    """At the bounds themselves and beyond them."""
     assert crowd_of(particles) is crowd
 
 
