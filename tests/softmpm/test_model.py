@@ -19,7 +19,7 @@ import softmpm
 from softmpm import autograd
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
-from softmpm.kernels.fast.native import Crowd
+from softmpm.kernels.fast.native import SizeClass
 from softmpm.kernels.physics.grid import grid
 from softmpm.kernels.plain.transfer import transfer
 from softmpm.kernels.structs import RequestedGrads, input_types
@@ -129,8 +129,11 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
     b = softmpm.build(busy_scene(2, seed=5, dt=2e-3), device="cpu").spec
     assert a == b
     passive = fused(softmpm.build(plain_scene(), device="cpu").spec)
-    assert passive.clear is fused(a).clear and passive.g2p2g[Crowd.SOME] is not fused(a).g2p2g[Crowd.SOME]
-    assert fused(a).g2p2g[Crowd.SOME] is not fused(a).g2p2g[Crowd.FEW]
+    assert (
+        passive.clear is fused(a).clear
+        and passive.g2p2g[SizeClass.SOME] is not fused(a).g2p2g[SizeClass.SOME]
+    )
+    assert fused(a).g2p2g[SizeClass.SOME] is not fused(a).g2p2g[SizeClass.FEW]
     kernels = [fused(a).clear, fused(a).grid_velocity, fused(a).p2g_first, *fused(a).g2p2g.values()]
     assert all(list(kernel.module.kernels.values()) == [kernel] for kernel in kernels)
     less, more = (fused_adj(a, RequestedGrads(wanted)) for wanted in ((), ("material",)))

@@ -20,7 +20,7 @@ from softmpm.kernels.dependent import awaits_previous
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
-from softmpm.kernels.fast.native import BLOCK, Crowd
+from softmpm.kernels.fast.native import BLOCK, SizeClass
 from softmpm.kernels.lagrangian import surface as rest_surface
 from softmpm.kernels.lagrangian import surface_adj as rest_surface_adj
 from softmpm.kernels.lagrangian.bricks import bricks_for
@@ -48,9 +48,9 @@ CELLS, LATTICE = (bricks_for(2, 5000, GPU, torch.float32, places) for places in 
 KERNELS = {
     "grid_velocity": lambda: fused(WITHOUT).grid_velocity,
     "p2g_first": lambda: fused(SPEC).p2g_first,
-    "g2p2g": lambda: fused(SPEC).g2p2g[Crowd.FEW],
-    "g2p2g of some particles": lambda: fused(SPEC).g2p2g[Crowd.SOME],
-    "g2p2g of many particles": lambda: fused(SPEC).g2p2g[Crowd.MANY],
+    "g2p2g": lambda: fused(SPEC).g2p2g[SizeClass.FEW],
+    "g2p2g of some particles": lambda: fused(SPEC).g2p2g[SizeClass.SOME],
+    "g2p2g of many particles": lambda: fused(SPEC).g2p2g[SizeClass.MANY],
     "grid_velocity_adj": lambda: fused_adj(WITHOUT, NONE).grid_velocity_adj,
     "g2p2g_adj": lambda: fused_adj(SPEC, NONE).g2p2g_adj[True],
     "g2p2g_adj of many particles": lambda: fused_adj(SPEC, NONE).g2p2g_adj[False],

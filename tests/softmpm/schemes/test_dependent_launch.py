@@ -8,7 +8,7 @@ from helpers import cotangent, relative
 from surface_scenes import block
 
 import softmpm
-from softmpm.kernels.fast.native import Crowd
+from softmpm.kernels.fast.native import SizeClass
 from softmpm.schemes import dependent_launch, launch
 from softmpm.schemes.fast import launch_size
 from softmpm.schemes.lagrangian import launches
@@ -101,14 +101,14 @@ FORMS = {
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    "form, crowd",
-    [*((form, None) for form in FORMS), ("moving, nodes", Crowd.SOME), ("moving, nodes", Crowd.MANY)],
+    "form, size_class",
+    [*((form, None) for form in FORMS), ("moving, nodes", SizeClass.SOME), ("moving, nodes", SizeClass.MANY)],
 )
-def test_results_are_those_of_kernels_that_follow_one_another(form, crowd, monkeypatch):
+def test_results_are_those_of_kernels_that_follow_one_another(form, size_class, monkeypatch):
     """State and gradients, of kernels that begin early and of kernels that do not: the same bits where sums have a fixed order, else
     the same up to rounding. Three calls each, so that buffers hold what was there before. Also with the kernels for more particles."""
-    if crowd is not None:
-        monkeypatch.setattr(launch_size, "crowd_of", lambda particles: crowd)
+    if size_class is not None:
+        monkeypatch.setattr(launch_size, "size_class_of", lambda particles: size_class)
     monkeypatch.setattr(launches, "cluster_of", lambda model: None)  # else one kernel has many substeps
     changed, found = [], []
     real = dependent_launch.begin_early

@@ -24,7 +24,7 @@ from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
-from softmpm.kernels.fast.native import BLOCK, NATIVE, Crowd, native
+from softmpm.kernels.fast.native import BLOCK, NATIVE, SizeClass, native
 from softmpm.kernels.fast.slabs import slabs
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.grid import grid
@@ -179,10 +179,11 @@ def fused(spec: Spec) -> SimpleNamespace:
         plane = base[0] - origin[0]
         scatter_momentum(words, window, place, count, total, order, 0, plane, first, g, b, A, m, node)
 
-    def of_particles(crowd: Crowd) -> wp.Kernel:
-        """``g2p2g`` for so many particles. With few it has registers to wait for all loads at once. With many it loads the particle
-        after the wait for the kernel before, and fewer registers leave room for other warps."""
-        many, bounds = crowd is Crowd.MANY, {"launch_bounds": (BLOCK, 3)} if crowd is Crowd.FEW else {}
+    def of_particles(size_class: SizeClass) -> wp.Kernel:
+        """Variant of the kernel for a size class. That for few particles has registers to wait for all loads at once. That for many
+        loads its particle after the wait for the previous kernel, since fewer registers leave room for more warps."""
+        many = size_class is SizeClass.MANY
+        bounds = {"launch_bounds": (BLOCK, 3)} if size_class is SizeClass.FEW else {}
         vector, matrix = (n.read_vec, n.read_mat) if many else (load_vec, load_mat)
 
         @kernel(NATIVE, grid_stride=False, **bounds)
@@ -268,7 +269,7 @@ def fused(spec: Spec) -> SimpleNamespace:
         remember=remember,
         grid_velocity=grid_velocity,
         p2g_first=p2g_first,
-        g2p2g={crowd: of_particles(crowd) for crowd in Crowd},
+        g2p2g={size_class: of_particles(size_class) for size_class in SizeClass},
         centre=centre,
         place_of=place_of,
     )

@@ -29,8 +29,8 @@ FEW, VERY_FEW, MANY = 20_000, 10_000, 250_000
 kernel with fewer registers."""
 
 
-class Crowd(enum.Enum):
-    """Particles of all worlds, by the kernels that a GPU has for them; a CPU has those for ``SOME``."""
+class SizeClass(enum.Enum):
+    """Classes of numbers of particles, in all worlds, for which a GPU has kernels of their own. A CPU takes those for ``SOME``."""
 
     FEW = enum.auto()
     SOME = enum.auto()

@@ -2,15 +2,15 @@
 
 import functools
 
-from softmpm.kernels.fast.native import BLOCK, FEW, MANY, VERY_FEW, WARP, Crowd
+from softmpm.kernels.fast.native import BLOCK, FEW, MANY, VERY_FEW, WARP, SizeClass
 from softmpm.model import Model
 
 
-def crowd_of(particles: int) -> Crowd:
-    """The crowd of so many particles on a GPU."""
+def size_class_of(particles: int) -> SizeClass:
+    """Size class of a number of particles on a GPU."""
     if particles <= FEW:
-        return Crowd.FEW
-    return Crowd.SOME if particles <= MANY else Crowd.MANY
+        return SizeClass.FEW
+    return SizeClass.SOME if particles <= MANY else SizeClass.MANY
 
 
 class LaunchSize:
@@ -24,7 +24,7 @@ class LaunchSize:
 
     def __init__(self, model: Model):
         self.particles, self.on_gpu = model.worlds * model.particle_count, model.device.type == "cuda"
-        self.crowd = crowd_of(self.particles) if self.on_gpu else Crowd.SOME
+        self.size_class = size_class_of(self.particles) if self.on_gpu else SizeClass.SOME
         self.block = WARP if self.few else BLOCK
         may_halve = self.on_gpu and not model.spec.deterministic and self.particles <= VERY_FEW
         self.per_warp_adj = WARP // 2 if may_halve else WARP
@@ -34,7 +34,7 @@ class LaunchSize:
     @property
     def few(self) -> bool:
         """True if each warp has a block of its own."""
-        return self.crowd is Crowd.FEW
+        return self.size_class is SizeClass.FEW
 
     @functools.cached_property
     def threads(self) -> int:

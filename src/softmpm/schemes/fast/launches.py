@@ -137,7 +137,7 @@ def _g2p2g(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     )
     sizes = (model.particle_count, size.particles, buffers.order_flat)
     arguments = (*sizes, buffers.before_array, buffers.velocity_array, now, buffers.words_array, then)
-    kernel, part = fused(model.spec).g2p2g[size.crowd], particle_part(buffers)
+    kernel, part = fused(model.spec).g2p2g[size.size_class], particle_part(buffers)
     launch(kernel, size.threads, *parameters, *arguments, sums.sink(s + 1), block_dim=size.block, part=part)
     if not last:
         _accumulate(buffers, s + 1, then, launch)

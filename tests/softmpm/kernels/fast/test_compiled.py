@@ -9,9 +9,9 @@ import warp as wp
 
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
-from softmpm.kernels.fast.native import BLOCK, FEW, MANY, WARP, Crowd
+from softmpm.kernels.fast.native import BLOCK, FEW, MANY, WARP, SizeClass
 from softmpm.kernels.structs import RequestedGrads, Spec
-from softmpm.schemes.fast.launch_size import crowd_of
+from softmpm.schemes.fast.launch_size import size_class_of
 
 ARCH = 90
 CASES = [(2, "neo_hookean"), (2, "fixed_corotated"), (3, "neo_hookean"), (3, "fixed_corotated")]
@@ -40,13 +40,13 @@ def scene_spec(dim: int, law: str, bare: bool) -> Spec:
     )
 
 
-def kernel(dim: int, law: str, which: str, bare: bool, crowd: Crowd):
+def kernel(dim: int, law: str, which: str, bare: bool, size_class: SizeClass):
     """A kernel over particles."""
     spec = scene_spec(dim, law, bare)
     if which == "adjoint":
         wanted = RequestedGrads(() if bare else ("material", "activation"))
-        return fused_adj(spec, wanted).g2p2g_adj[crowd is Crowd.FEW]
-    return fused(spec).g2p2g[crowd]
+        return fused_adj(spec, wanted).g2p2g_adj[size_class is SizeClass.FEW]
+    return fused(spec).g2p2g[size_class]
 
 
 def compiled(kernel, threads: int = BLOCK) -> tuple[str, cubin.Kernel]:
@@ -61,18 +61,24 @@ def compiled(kernel, threads: int = BLOCK) -> tuple[str, cubin.Kernel]:
 
 
 @pytest.mark.parametrize(
-    "which, crowd",
-    [*(("forward", crowd) for crowd in Crowd), ("adjoint", Crowd.FEW), ("adjoint", Crowd.SOME)],
+    "which, size_class",
+    [
+        *(("forward", size_class) for size_class in SizeClass),
+        ("adjoint", SizeClass.FEW),
+        ("adjoint", SizeClass.SOME),
+    ],
 )
 @pytest.mark.parametrize("bare", [False, True], ids=["full", "bare"])
 @pytest.mark.parametrize("dim, law", CASES)
-def test_machine_code(dim, law, bare, which, crowd):
+def test_machine_code(dim, law, bare, which, size_class):
     """Nodes are read and added 16 bytes at a time, never number by number; no register is spilled, nothing is in local memory.
 
     Numbers that are added to singly are a particle's own: the gradients of both moduli and of the stress of two actuators.
     """
-    code, facts = compiled(kernel(dim, law, which, bare, crowd), WARP if crowd is Crowd.FEW else BLOCK)
-    print(f"\n{dim}D {law} {'bare' if bare else 'full'} {which} {crowd.name}: {facts}")
+    code, facts = compiled(
+        kernel(dim, law, which, bare, size_class), WARP if size_class is SizeClass.FEW else BLOCK
+    )
+    print(f"\n{dim}D {law} {'bare' if bare else 'full'} {which} {size_class.name}: {facts}")
     assert len(re.findall(r"\bred\.global\.add\.v4\.f32", code)) > 0
     own = 4 if which == "adjoint" and not bare else 0
     assert len(re.findall(r"\b(?:red|atom)\.global\.add\.f32", code)) == own
@@ -92,7 +98,7 @@ def test_many_particles_leave_room_for_other_warps():
     Those made a substep of eight million particles 16 % slower.
     """
     for law in ("neo_hookean", "fixed_corotated"):
-        _, facts = compiled(kernel(3, law, "forward", bare=True, crowd=Crowd.MANY))
+        _, facts = compiled(kernel(3, law, "forward", bare=True, size_class=SizeClass.MANY))
         assert facts.registers <= 80
 
 
@@ -110,17 +116,17 @@ def test_walls_are_not_in_memory(dim):
 
 
 @pytest.mark.parametrize(
-    "particles, crowd",
-    [(FEW, Crowd.FEW), (FEW + 1, Crowd.SOME), (MANY, Crowd.SOME), (MANY + 1, Crowd.MANY)],
+    "particles, size_class",
+    [(FEW, SizeClass.FEW), (FEW + 1, SizeClass.SOME), (MANY, SizeClass.SOME), (MANY + 1, SizeClass.MANY)],
 )
-def test_the_variant_goes_by_the_particles_of_all_worlds(particles, crowd):
+def test_the_variant_goes_by_the_particles_of_all_worlds(particles, size_class):
     """At the bounds themselves and beyond them."""
-    assert crowd_of(particles) is crowd
+    assert size_class_of(particles) is size_class
 
 
 def test_spilled_registers_would_be_seen():
     """The reader finds them where there must be some: the same kernel with room for four times as many blocks at a time."""
-    spilling = kernel(3, "neo_hookean", "adjoint", bare=False, crowd=Crowd.SOME)
+    spilling = kernel(3, "neo_hookean", "adjoint", bare=False, size_class=SizeClass.SOME)
     options = dict(spilling.options)
     try:
         spilling.options["launch_bounds"] = (BLOCK, 16)

@@ -234,13 +234,8 @@ def test_calls_of_a_closed_loop_share_the_budget(kind, monkeypatch):
         if told == calls:
             assert 0.9 < held[-1] / memory.memory(built, Horizon(3, 7)).kept < 1.15
         adj += torch.autograd.grad(end.x.sum(), start.v)
-        del (
-            built,
-            start,
-            params,
-            activation,
-            end,
-        )  # else the next round would count them before, and then free them
+        # Else the next round would count them before, and then free them:
+        del built, start, params, activation, end
     assert held[0] > calls * budget and held[1] < budget and held[2] > calls * budget
     assert_relative(adj[1], adj[0], 1e-12 if KINDS[kind].get("dtype") else 1e-5)
     assert_relative(adj[2], adj[0], 0.0)
