@@ -5,12 +5,12 @@ between a long and a short call, medians. ``ratio``: with kernels that begin ear
 """
 
 import statistics
-import time
 from unittest.mock import patch
 
 import torch
-from common import Table, arguments, cube, sync
+from common import Table, arguments, cube
 from episode import NODES, SURFACE, VISCOUS, task_of
+from gradient import seconds
 
 import softmpm
 from softmpm.schemes import launch
@@ -35,24 +35,17 @@ def cases():
             yield f"cube, {particles:,}", formulation, cube(3, particles, nodes, on_knots=True), settings
 
 
-def seconds(model: softmpm.Model, substeps: int) -> tuple[float, float]:
-    """Of a call, and of one with its backward pass."""
+def durations(model: softmpm.Model, substeps: int) -> tuple[float, float]:
+    """Seconds of a call, and of one with its backward pass."""
     params = softmpm.Params(*(value.clone().requires_grad_() for value in model.params()))
     activation = torch.full((1, model.worlds, model.muscle_count), 0.2, device=model.device)
-    start = model.rest()
-    sync(model.device)
-    begin = time.perf_counter()
-    end = softmpm.simulate(model, start, activation, params, substeps=substeps)
-    sync(model.device)
-    middle = time.perf_counter()
-    end.x.sum().backward()
-    sync(model.device)
-    return middle - begin, time.perf_counter() - begin
+    ahead, back = seconds(model, model.rest(), activation, params, substeps)
+    return ahead, ahead + back
 
 
 def microseconds(model: softmpm.Model) -> list[float]:
     """Of one more substep, without and with its adjoint."""
-    pairs = zip(*(seconds(model, substeps) for substeps in (SHORT, LONG)), strict=True)
+    pairs = zip(*(durations(model, substeps) for substeps in (SHORT, LONG)), strict=True)
     return [1e6 * (long - short) / (LONG - SHORT) for short, long in pairs]
 
 

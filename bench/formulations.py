@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 
 import torch
 from common import Table, arguments, cube, sync
-from gradient import substeps_of
+from gradient import seconds, substeps_of
 
 import softmpm
 
@@ -76,27 +76,8 @@ def call(
     with torch.no_grad():
         softmpm.simulate(model, start, None, params, substeps=substeps)
     sync(model.device)
-    seconds = time.perf_counter() - begin
-    return 1e6 * seconds, (time.process_time() - used) / seconds
-
-
-def call_with_gradient(
-    model: softmpm.Model, start: softmpm.State, params: softmpm.Params, substeps: int
-) -> tuple[float, float]:
-    """Microseconds of a call that stores its states, and of its backward pass."""
-    start.v.requires_grad_()
-    sync(model.device)
-    begin = time.perf_counter()
-    end = softmpm.simulate(model, start, None, params, substeps=substeps)
-    sync(model.device)
-    middle = time.perf_counter()
-    torch.autograd.grad(end.x.sum(), start.v)
-    sync(model.device)
-    return 1e6 * (middle - begin), 1e6 * (time.perf_counter() - middle)
-
-
-Times = tuple[float, float]
-"""What a call returns: its time [us] and the cores that it used, or its time and that of its backward pass."""
+    passed = time.perf_counter() - begin
+    return 1e6 * passed, (time.process_time() - used) / passed
 
 
 def breathing(model: softmpm.Model) -> softmpm.State:
@@ -104,6 +85,19 @@ def breathing(model: softmpm.Model) -> softmpm.State:
     start = model.rest()
     start.v.add_(start.x - start.x.mean(dim=1, keepdim=True), alpha=0.05)
     return start
+
+
+def call_with_gradient(
+    model: softmpm.Model, start: softmpm.State, params: softmpm.Params, substeps: int
+) -> tuple[float, float]:
+    """Microseconds of a call that stores its states, and of its backward pass."""
+    start.v.requires_grad_()
+    ahead, back = seconds(model, start, None, params, substeps)
+    return 1e6 * ahead, 1e6 * back
+
+
+Times = tuple[float, float]
+"""What these two return."""
 
 
 def in_pairs(

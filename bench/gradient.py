@@ -27,6 +27,24 @@ def substeps_of(particles: int, device: torch.device) -> dict[str, int]:
     return {"kept": kept, "again": 256 if particles > 5_000_000 else 512}
 
 
+def seconds(
+    model: softmpm.Model,
+    start: softmpm.State,
+    activation: torch.Tensor | None,
+    params: softmpm.Params,
+    substeps: int,
+) -> tuple[float, float]:
+    """Of a call that stores its states, and of its backward pass."""
+    sync(model.device)
+    begin = time.perf_counter()
+    end = softmpm.simulate(model, start, activation, params, substeps=substeps)
+    sync(model.device)
+    middle = time.perf_counter()
+    end.x.sum().backward()
+    sync(model.device)
+    return middle - begin, time.perf_counter() - middle
+
+
 def measure(
     model, substeps: int, repeats: int, *, materials: bool = False, turns: bool = False
 ) -> tuple[float, float]:
@@ -36,19 +54,9 @@ def measure(
     params = softmpm.Params(*(p.requires_grad_(materials) for p in model.params()))
     shape = (1, model.worlds, model.muscle_count)
     activation = torch.full(shape, 0.2, device=device, requires_grad=True) if model.muscle_count else None
-    ahead, back = [], []
-    for _ in range(repeats + 1):
-        sync(device)
-        begin = time.perf_counter()
-        end = softmpm.simulate(model, start, activation, params, substeps=substeps)
-        sync(device)
-        middle = time.perf_counter()
-        end.x.sum().backward()
-        sync(device)
-        ahead.append(middle - begin)
-        back.append(time.perf_counter() - middle)
-        del end
-    return tuple(sorted(times[1:])[repeats // 2] / substeps * 1e6 for times in (ahead, back))
+    times = [seconds(model, start, activation, params, substeps) for _ in range(repeats + 1)]
+    ahead, back = (sorted(way)[repeats // 2] / substeps * 1e6 for way in zip(*times[1:], strict=True))
+    return ahead, back
 
 
 def main():
