@@ -6,11 +6,10 @@ it wrote is visible. Elsewhere it does nothing.
 
 Before the call a kernel may read what the previous one does not write: all kernels before that one have ended, since it has waited for
 them. What one of these wrote in the same graph is loaded by :func:`recent`, past the nearest cache, which might hold an older copy. A
-kernel must not write before the call, and nowhere may it load what changes as read-only memory (``ld.global.nc``).
+kernel must not write before the call, and nowhere may it load what the previous one writes as read-only memory (``ld.global.nc``): that
+is left to kernels without the call, which begin when the previous one has ended.
 tests/softmpm/kernels/test_dependent.py checks this in PTX, with a list of what is read early.
 """
-
-import re
 
 import warp as wp
 
@@ -39,9 +38,17 @@ def await_previous():
     ends without it may end before the previous kernel, and the next one would begin too soon."""
 
 
+@wp.func
+def await_nothing():
+    """In place of :func:`await_previous`, for a variant of a kernel that begins when the previous one has ended."""
+
+
 def awaits_previous(kernel: wp.Kernel) -> bool:
-    """True for a kernel that calls :func:`await_previous`."""
-    return re.search(rf"^ *{await_previous.__name__}\(\)", kernel.adj.source, re.MULTILINE) is not None
+    """True for a kernel that calls :func:`await_previous`, by this name or as the ``wait`` of its factory."""
+    code, closure = kernel.func.__code__, kernel.func.__closure__
+    if "wait" in code.co_freevars:
+        return closure[code.co_freevars.index("wait")].cell_contents is await_previous
+    return await_previous.__name__ in code.co_names
 
 
 def recent(c_type: str, index: str) -> str:

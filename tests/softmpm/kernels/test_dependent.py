@@ -25,8 +25,10 @@ from softmpm.kernels.lagrangian import surface as rest_surface
 from softmpm.kernels.lagrangian import surface_adj as rest_surface_adj
 from softmpm.kernels.lagrangian.bricks import bricks_for
 from softmpm.kernels.lagrangian.cells import cells, cells_adj
+from softmpm.kernels.lagrangian.cluster import Cluster
 from softmpm.kernels.lagrangian.lattice import lattice_cells, lattice_cells_adj
 from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
+from softmpm.kernels.lagrangian.persistent import march, march_adj
 from softmpm.kernels.structs import RequestedGrads, Spec
 
 ARCH = 90
@@ -50,7 +52,6 @@ KERNELS = {
     "p2g_first": lambda: fused(SPEC).p2g_first,
     "g2p2g": lambda: fused(SPEC).g2p2g[SizeClass.FEW],
     "g2p2g of some particles": lambda: fused(SPEC).g2p2g[SizeClass.SOME],
-    "g2p2g of many particles": lambda: fused(SPEC).g2p2g[SizeClass.MANY],
     "grid_velocity_adj": lambda: fused_adj(WITHOUT, NONE).grid_velocity_adj,
     "g2p2g_adj": lambda: fused_adj(SPEC, NONE).g2p2g_adj[True],
     "g2p2g_adj of many particles": lambda: fused_adj(SPEC, NONE).g2p2g_adj[False],
@@ -89,7 +90,6 @@ OLDER = {
     "g2p2g": {"now.base", "now.rows"},
     "g2p2g of some particles": {"now.base", "now.rows"},
     "g2p2g_adj": {"now.base", "now.rows"},
-    "g2p2g_adj of many particles": {"now.rows"},
     "press": {"now.base", "now.rows", "anchor", "force"},
     "press_adj": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},
     "press_adj of few lanes": {"now.base", "now.rows", "adj_force", "adj_anchor", "free", "load"},
@@ -105,16 +105,20 @@ an earlier one of the same graph may."""
 
 def code_of(name: str) -> tuple[wp.Kernel, str]:
     """A kernel and its PTX."""
+    kernel = KERNELS[name]()
+    threads = LATTICE.threads if "lattice" in name else CELLS.threads if "cells" in name else BLOCK
+    return kernel, ptx_of(kernel, threads)
+
+
+def ptx_of(kernel: wp.Kernel, threads: int) -> str:
     wp.init()
     if ARCH not in wp.get_cuda_supported_archs():
         pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
-    kernel = KERNELS[name]()
-    threads = LATTICE.threads if "lattice" in name else CELLS.threads if "cells" in name else BLOCK
     wp.set_module_options({"block_dim": threads}, module=kernel.module)
     (file,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
     entry = re.compile(rf"{kernel.key}_\w*_cuda_kernel_forward")
     (code,) = (code for found, code in cubin.entries(file).items() if entry.fullmatch(found))
-    return kernel, code
+    return code
 
 
 def argument(kernel: wp.Kernel, parameter: ptx.Parameter) -> str | None:
@@ -186,14 +190,24 @@ def _waits(statement: ast.stmt) -> bool:
     """True if the call is in this statement of a kernel, which has no functions inside."""
     if any(isinstance(one, ast.FunctionDef) for one in ast.walk(statement)):
         return False
-    names = (
+    names = {
         one.func.id
         for one in ast.walk(statement)
-        if isinstance(one, ast.Call) and isinstance(one.func, ast.Name)
-    )
-    return "await_previous" in names
+        if isinstance(one, ast.Call) and isinstance(one.func, ast.Name) and not one.args
+    }
+    return not names.isdisjoint({"await_previous", "wait"})
+
+
+def test_a_kernel_that_loads_nodes_as_read_only_memory_does_not_wait():
+    """It begins when the previous one, which writes them, has ended."""
+    kernel = fused(SPEC).g2p2g[SizeClass.MANY]
+    code = ptx_of(kernel, BLOCK)
+    assert not awaits_previous(kernel)
+    assert "griddepcontrol" not in code and "ld.global.nc" in code
 
 
 def test_other_kernels_do_not_wait():
-    """One that runs once in a chunk has a dependency on the end of the previous one."""
-    assert not awaits_previous(fused(SPEC).clear)
+    """Those that run once in a chunk have a dependency on the end of the previous one."""
+    cluster = Cluster(CELLS, blocks=8, groups=1)
+    for kernel in (fused(SPEC).clear, march(WITHOUT, cluster), march_adj(WITHOUT, NONE, cluster)):
+        assert not awaits_previous(kernel)

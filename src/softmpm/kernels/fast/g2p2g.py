@@ -21,7 +21,7 @@ import warp as wp
 
 from softmpm.errors import Kind
 from softmpm.kernels.compile import kernel, kernel_factory
-from softmpm.kernels.dependent import await_previous
+from softmpm.kernels.dependent import await_nothing, await_previous
 from softmpm.kernels.fast.fixed_point import fixed
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import BLOCK, NATIVE, SizeClass, native
@@ -39,11 +39,11 @@ def fused(spec: Spec) -> SimpleNamespace:
     Constants, Packed, Window, Particle = t.Constants, t.Packed, t.Window, one.Particle
     ParticleInputs, GridInputs = input_types(spec).ParticleInputs, input_types(spec).GridInputs
     s, n, dim = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype), spec.dim
-    gather, first_node, pack_base, unpack_base = s.gather, s.first_node, s.pack_base, s.unpack_base
+    first_node, pack_base, unpack_base = s.first_node, s.pack_base, s.unpack_base
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     particle_of, world_of = s.particle_of, s.world_of
     load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
-    scatter, load_node, store_node, load_base = n.scatter, n.load_node, n.store_node, n.load_base
+    scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, moved = one.rotation, one.moved
     linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum
     node_velocity, position = grid(spec).node_velocity, grid(spec).position
@@ -131,16 +131,6 @@ def fused(spec: Spec) -> SimpleNamespace:
         if wp.static(not (exact or by_slabs)):
             scatter(node, window.shape, first, g, b, A, m)
 
-    @wp.func
-    def copy_unchanged(i: int, now: Packed, then: Packed):
-        """Copy a particle of a failed world unchanged."""
-        then.base[i] = now.base[i]
-        store_vec(then.rows, i, row_fx, load_vec(now.rows, i, row_fx))
-        store_vec(then.rows, i, row_low, load_vec(now.rows, i, row_low))
-        store_vec(then.rows, i, row_v, load_vec(now.rows, i, row_v))
-        store_mat(then.rows, i, row_H, load_mat(now.rows, i, row_H))
-        store_mat(then.rows, i, row_C, load_mat(now.rows, i, row_C))
-
     @kernel(NATIVE, grid_stride=False)
     def p2g_first(
         # Parameters:
@@ -181,10 +171,22 @@ def fused(spec: Spec) -> SimpleNamespace:
 
     def of_particles(size_class: SizeClass) -> wp.Kernel:
         """Variant of the kernel for a size class. That for few particles has registers to wait for all loads at once. That for many
-        loads its particle after the wait for the previous kernel, since fewer registers leave room for more warps."""
+        begins when the previous kernel has ended, so that it may load the nodes as read-only memory."""
         many = size_class is SizeClass.MANY
         bounds = {"launch_bounds": (BLOCK, 3)} if size_class is SizeClass.FEW else {}
-        vector, matrix = (n.read_vec, n.read_mat) if many else (load_vec, load_mat)
+        wait, gather = (await_nothing, s.gather_constant) if many else (await_previous, s.gather)
+        plain, recent = (n.read_base, n.read_vec, n.read_mat), (n.load_base, load_vec, load_mat)
+        base_of, vector, matrix = plain if many else recent
+
+        @wp.func
+        def copy_unchanged(i: int, now: Packed, then: Packed):
+            """Copy a particle of a failed world unchanged."""
+            then.base[i] = now.base[i]
+            store_vec(then.rows, i, row_fx, vector(now.rows, i, row_fx))
+            store_vec(then.rows, i, row_low, vector(now.rows, i, row_low))
+            store_vec(then.rows, i, row_v, vector(now.rows, i, row_v))
+            store_mat(then.rows, i, row_H, matrix(now.rows, i, row_H))
+            store_mat(then.rows, i, row_C, matrix(now.rows, i, row_C))
 
         @kernel(NATIVE, grid_stride=False, **bounds)
         def g2p2g(
@@ -215,15 +217,13 @@ def fused(spec: Spec) -> SimpleNamespace:
             p = i - world * count
             origin = window.origin[world]
             held = world * window.count  # nodes of the worlds before
-            if wp.static(many):
-                await_previous()
             old = Particle()
-            old.base = unpack_base(load_base(now.base, i))
+            old.base = unpack_base(base_of(now.base, i))
             old.fx = vector(now.rows, i, row_fx)
-            old.low = vector(now.rows, i, row_low)
-            old.H = matrix(now.rows, i, row_H)
             if wp.static(not many):
-                await_previous()  # velocity and words
+                old.low = vector(now.rows, i, row_low)
+                old.H = matrix(now.rows, i, row_H)
+            wait()  # for velocity and words
             if wp.static(by_slabs):
                 alive = running(before, world)
             else:
@@ -232,6 +232,9 @@ def fused(spec: Spec) -> SimpleNamespace:
             # (T2) by (A3)
             sums = gather(velocity, held + first_node(old.base, origin, window.shape), window.shape, g)
             B = sums.outer - wp.outer(sums.value, g)
+            if wp.static(many):
+                old.low = vector(now.rows, i, row_low)
+                old.H = matrix(now.rows, i, row_H)
             new = moved(constants, inputs, world, p, origin, window.shape, old, sums.value, B)  # (T3)
             base = old.base
             if new.valid:

@@ -43,13 +43,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     aligned, head = s.aligned, s.head
     centre, place_of = fused(spec).centre, fused(spec).place_of
     particle_of, world_of = s.particle_of, s.world_of
-    load_base, load_vec, load_mat, store_vec, store_mat = (
-        n.load_base,
-        n.load_vec,
-        n.load_mat,
-        n.store_vec,
-        n.store_mat,
-    )
+    load_base, store_vec, store_mat = n.load_base, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
     gather, driven = s.gather, spec.driven
@@ -106,7 +100,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 store_node(cleared, i, node_vec())
 
     @wp.struct
-    class Spread:
+    class Contribution:
         first: int  # node of a particle
         m: real
         g: vec
@@ -115,34 +109,35 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         H: mat
         Q: mat
 
-    @wp.func
-    def spread(
-        constants: Constants,
-        inputs: ParticleInputs,
-        window: Window,
-        now: Packed,
-        world: int,
-        p: int,
-        i: int,
-        v: vec,
-        C: mat,
-    ) -> Spread:
-        """What a particle gave to its nodes (T1)."""
-        out = Spread()
-        out.H = load_mat(now.rows, i, row_H)
-        out.g = centre(load_vec(now.rows, i, row_fx))
-        base = unpack_base(load_base(now.base, i))
-        out.first = world * window.count + first_node(base, window.origin[world], window.shape)
-        out.m = inputs.mass[world, p]
-        out.Q = rotation(inputs, world, p, out.H)
-        out.A = affine_momentum(constants, inputs, world, p, C, out.H, out.Q)
-        out.b = linear_momentum(constants, inputs, world, p, v) - out.A * out.g
-        return out
-
     def of_particles(few: bool) -> wp.Kernel:
-        """``g2p2g_adj`` for few particles or for many, as in g2p2g.py; registers are limited so that ``blocks`` blocks fit. Few do
-        early what many have no registers for."""
+        """``g2p2g_adj`` for few particles or for many; registers are limited so that ``blocks`` blocks fit. Few do early what many have
+        no registers for; these load after the wait, by plain loads, which are faster."""
         blocks = 2 if few else 3
+        vector, matrix = (n.load_vec, n.load_mat) if few else (n.read_vec, n.read_mat)
+
+        @wp.func
+        def contribution(
+            constants: Constants,
+            inputs: ParticleInputs,
+            window: Window,
+            now: Packed,
+            world: int,
+            p: int,
+            i: int,
+            v: vec,
+            C: mat,
+        ) -> Contribution:
+            """What a particle gave to its nodes (T1)."""
+            out = Contribution()
+            out.H = matrix(now.rows, i, row_H)
+            out.g = centre(vector(now.rows, i, row_fx))
+            base = unpack_base(load_base(now.base, i))
+            out.first = world * window.count + first_node(base, window.origin[world], window.shape)
+            out.m = inputs.mass[world, p]
+            out.Q = rotation(inputs, world, p, out.H)
+            out.A = affine_momentum(constants, inputs, world, p, C, out.H, out.Q)
+            out.b = linear_momentum(constants, inputs, world, p, v) - out.A * out.g
+            return out
 
         @kernel(NATIVE, grid_stride=False, launch_bounds=(BLOCK, blocks))
         def g2p2g_adj(
@@ -171,7 +166,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             adj_velocity: Shares,  # of the substep before
         ):
             i = particle_of(wp.tid(), per_warp, total)
-            at = Spread()
+            at = Contribution()
             world = int(0)
             first = int(-1)
             plane = int(0)
@@ -179,11 +174,11 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             C = mat()
             if i < total:
                 world = world_of(i, count, total)
-                v = load_vec(now.rows, i, row_v)
-                C = load_mat(now.rows, i, row_C)
                 if wp.static(few):
+                    v = vector(now.rows, i, row_v)
+                    C = matrix(now.rows, i, row_C)
                     if not end:
-                        at = spread(constants, inputs, window, now, world, i - world * count, i, v, C)
+                        at = contribution(constants, inputs, window, now, world, i - world * count, i, v, C)
             await_previous()  # the adjoints and the velocity
             g = vec()
             b = vec()
@@ -192,16 +187,19 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 p = i - world * count
                 origin = window.origin[world]
                 held = world * window.count
-                old_fx = load_vec(before.rows, i, row_fx)
+                old_fx = vector(before.rows, i, row_fx)
                 adj = ParticleAdj()
-                adj.fx = load_vec(adj_now, i, row_fx)
-                adj.H = load_mat(adj_now, i, row_H)
+                adj.fx = vector(adj_now, i, row_fx)
+                adj.H = matrix(adj_now, i, row_H)
+                if wp.static(not few):
+                    v = vector(now.rows, i, row_v)
+                    C = matrix(now.rows, i, row_C)
                 if end:
-                    adj.v = load_vec(adj_now, i, row_v)
-                    adj.C = load_mat(adj_now, i, row_C)
+                    adj.v = vector(adj_now, i, row_v)
+                    adj.C = matrix(adj_now, i, row_C)
                 else:
                     if wp.static(not few):
-                        at = spread(constants, inputs, window, now, world, p, i, v, C)
+                        at = contribution(constants, inputs, window, now, world, p, i, v, C)
                     sums = gather_adj(adj_node, at.first, window.shape, at.g, at.b, at.A, at.m)
                     B = sums.outer - wp.outer(sums.value, at.g)
                     # (T1.adj)
@@ -229,7 +227,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                     plane = base[0] - origin[0]
                     g = centre(old_fx)
                     adj = moved_adj(
-                        constants, inputs, world, p, load_mat(before.rows, i, row_H), C, adj, adj_inputs
+                        constants, inputs, world, p, matrix(before.rows, i, row_H), C, adj, adj_inputs
                     )  # (T3.adj)
                     if wp.static(driven):
                         # The velocity of a driven particle is not that of the nodes around it.

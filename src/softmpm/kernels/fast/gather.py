@@ -22,7 +22,7 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     real, vec, mat, ivec, node_vec = t.real, t.vec, t.mat, t.ivec, t.aligned
     triple = wp.types.vector(3, real)
-    load_node = native(dim, dtype).load_node
+    n = native(dim, dtype)
 
     @wp.struct
     class Sums:
@@ -79,31 +79,6 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         @wp.func
         def aligned(v: vec, m: real) -> node_vec:
             return node_vec(v[0], v[1], m, real(0.0))
-
-        @wp.func
-        def gather(node: wp.array(dtype=node_vec), first: int, shape: ivec, g: vec) -> Sums:
-            """Σ w v and Σ w v oᵀ."""
-            wx = weights(g[0])
-            wy = weights(g[1])
-            value = vec()
-            along_x = vec()
-            along_y = vec()
-            for i in range(3):
-                at = first + i * shape[1]
-                a = head(load_node(node, at))
-                b = head(load_node(node, at + 1))
-                c = head(load_node(node, at + 2))
-                row = wy[0] * a + wy[1] * b + wy[2] * c
-                value += wx[i] * row
-                along_y += wx[i] * (wy[2] * c - wy[0] * a)
-                if i == 0:
-                    along_x -= wx[0] * row
-                if i == 2:
-                    along_x += wx[2] * row
-            sums = Sums()
-            sums.value = value
-            sums.outer = wp.matrix_from_cols(along_x, along_y)
-            return sums
     else:
 
         @wp.func
@@ -132,43 +107,73 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         def aligned(v: vec, m: real) -> node_vec:
             return node_vec(v[0], v[1], v[2], m)
 
-        @wp.func
-        def gather(node: wp.array(dtype=node_vec), first: int, shape: ivec, g: vec) -> Sums:
-            """Σ w v and Σ w v oᵀ."""
-            wx = weights(g[0])
-            wy = weights(g[1])
-            wz = weights(g[2])
-            value = vec()
-            along_x = vec()
-            along_y = vec()
-            along_z = vec()
-            for i in range(3):
-                plane = vec()
-                plane_y = vec()
-                plane_z = vec()
-                for j in range(3):
-                    at = first + (i * shape[1] + j) * shape[2]
+    def gather_by(load_node: wp.Function) -> wp.Function:
+        """Σ w v and Σ w v oᵀ of nodes that this function loads."""
+        if dim == 2:
+
+            @wp.func
+            def gather(node: wp.array(dtype=node_vec), first: int, shape: ivec, g: vec) -> Sums:
+                wx = weights(g[0])
+                wy = weights(g[1])
+                value = vec()
+                along_x = vec()
+                along_y = vec()
+                for i in range(3):
+                    at = first + i * shape[1]
                     a = head(load_node(node, at))
                     b = head(load_node(node, at + 1))
                     c = head(load_node(node, at + 2))
-                    row = wz[0] * a + wz[1] * b + wz[2] * c
-                    plane += wy[j] * row
-                    plane_z += wy[j] * (wz[2] * c - wz[0] * a)
-                    if j == 0:
-                        plane_y -= wy[0] * row
-                    if j == 2:
-                        plane_y += wy[2] * row
-                value += wx[i] * plane
-                along_y += wx[i] * plane_y
-                along_z += wx[i] * plane_z
-                if i == 0:
-                    along_x -= wx[0] * plane
-                if i == 2:
-                    along_x += wx[2] * plane
-            sums = Sums()
-            sums.value = value
-            sums.outer = wp.matrix_from_cols(along_x, along_y, along_z)
-            return sums
+                    row = wy[0] * a + wy[1] * b + wy[2] * c
+                    value += wx[i] * row
+                    along_y += wx[i] * (wy[2] * c - wy[0] * a)
+                    if i == 0:
+                        along_x -= wx[0] * row
+                    if i == 2:
+                        along_x += wx[2] * row
+                sums = Sums()
+                sums.value = value
+                sums.outer = wp.matrix_from_cols(along_x, along_y)
+                return sums
+        else:
+
+            @wp.func
+            def gather(node: wp.array(dtype=node_vec), first: int, shape: ivec, g: vec) -> Sums:
+                wx = weights(g[0])
+                wy = weights(g[1])
+                wz = weights(g[2])
+                value = vec()
+                along_x = vec()
+                along_y = vec()
+                along_z = vec()
+                for i in range(3):
+                    plane = vec()
+                    plane_y = vec()
+                    plane_z = vec()
+                    for j in range(3):
+                        at = first + (i * shape[1] + j) * shape[2]
+                        a = head(load_node(node, at))
+                        b = head(load_node(node, at + 1))
+                        c = head(load_node(node, at + 2))
+                        row = wz[0] * a + wz[1] * b + wz[2] * c
+                        plane += wy[j] * row
+                        plane_z += wy[j] * (wz[2] * c - wz[0] * a)
+                        if j == 0:
+                            plane_y -= wy[0] * row
+                        if j == 2:
+                            plane_y += wy[2] * row
+                    value += wx[i] * plane
+                    along_y += wx[i] * plane_y
+                    along_z += wx[i] * plane_z
+                    if i == 0:
+                        along_x -= wx[0] * plane
+                    if i == 2:
+                        along_x += wx[2] * plane
+                sums = Sums()
+                sums.value = value
+                sums.outer = wp.matrix_from_cols(along_x, along_y, along_z)
+                return sums
+
+        return gather
 
     return SimpleNamespace(
         particle_of=particle_of,
@@ -179,7 +184,8 @@ def stencil(dim: int, dtype: str) -> SimpleNamespace:
         unpack_base=unpack_base,
         aligned=aligned,
         head=head,
-        gather=gather,
+        gather=gather_by(n.load_node),
+        gather_constant=gather_by(n.load_constant_node),
         weights=weights,
         Sums=Sums,
         triple=triple,

@@ -26,7 +26,7 @@ BLOCK = 128
 """Threads per block."""
 FEW, VERY_FEW, MANY = 20_000, 10_000, 250_000
 """Up to ``FEW`` particles: separate kernels with one-warp blocks. Up to ``VERY_FEW``: half-populated warps. Beyond ``MANY``: a separate
-kernel with fewer registers."""
+forward kernel, which does not begin early."""
 
 
 class SizeClass(enum.Enum):
@@ -68,11 +68,18 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func_native("return softmpm::load_node(node.data, i);")
     def load_node(node: wp.array(dtype=node_vec), i: int) -> node_vec: ...
 
+    @wp.func_native("return softmpm::load_constant_node(node.data, i);")
+    def load_constant_node(node: wp.array(dtype=node_vec), i: int) -> node_vec: ...
+
     @wp.func_native("softmpm::store_node(node.data, i, value);")
     def store_node(node: wp.array(dtype=node_vec), i: int, value: node_vec): ...
 
     @wp.func_native("return softmpm::recent(base.data + i);")
     def load_base(base: wp.array(dtype=wp.int32), i: int) -> int: ...
+
+    @wp.func
+    def read_base(base: wp.array(dtype=wp.int32), i: int) -> int:
+        return base[i]
 
     def row_loaders(function: str) -> tuple[wp.Function, wp.Function]:
         """Functions that load a vector and a matrix of a packed particle by this one of scatter.h."""
@@ -112,10 +119,12 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         scatter=scatter,
         scatter_planes=scatter_planes,
         load_node=load_node,
+        load_constant_node=load_constant_node,
         store_node=store_node,
         load_base=load_base,
         load_vec=load_vec,
         load_mat=load_mat,
+        read_base=read_base,
         read_vec=read_vec,
         read_mat=read_mat,
         store_vec=store_vec,

@@ -44,6 +44,12 @@ template <> CUDA_CALLABLE inline Four<float> load(const float* p)
     float4 v = *reinterpret_cast<const float4*>(p);  // the kernel before may still write: not as read-only memory
     return { v.x, v.y, v.z, v.w };
 }
+template <typename T> CUDA_CALLABLE inline Four<T> load_constant(const T* p) { return load(p); }
+template <> CUDA_CALLABLE inline Four<float> load_constant(const float* p)
+{
+    float4 v = __ldg(reinterpret_cast<const float4*>(p));
+    return { v.x, v.y, v.z, v.w };
+}
 
 template <typename T> CUDA_CALLABLE inline void add(T* p, T x, T y, T z, T m)
 {
@@ -266,6 +272,7 @@ template <typename T> inline Four<T> load(const T* p)
     __builtin_memcpy(&value, p, sizeof(value));
     return value;
 }
+template <typename T> inline Four<T> load_constant(const T* p) { return load(p); }
 template <typename T> inline void add(T* p, Four<T> term)
 {
     term += load(p);
@@ -342,6 +349,13 @@ CUDA_CALLABLE inline void scatter(
 template <typename T> CUDA_CALLABLE inline wp::vec_t<4, T> load_node(const wp::vec_t<4, T>* node, int i)
 {
     Four<T> n = load(reinterpret_cast<const T*>(node + i));
+    return wp::vec_t<4, T>(n.x, n.y, n.z, n.w);
+}
+
+// The same as read-only memory: of an array that nothing writes while the kernel runs.
+template <typename T> CUDA_CALLABLE inline wp::vec_t<4, T> load_constant_node(const wp::vec_t<4, T>* node, int i)
+{
+    Four<T> n = load_constant(reinterpret_cast<const T*>(node + i));
     return wp::vec_t<4, T>(n.x, n.y, n.z, n.w);
 }
 

@@ -82,7 +82,8 @@ def test_machine_code(dim, law, bare, which, size_class):
     assert len(re.findall(r"\bred\.global\.add\.v4\.f32", code)) > 0
     own = 4 if which == "adjoint" and not bare else 0
     assert len(re.findall(r"\b(?:red|atom)\.global\.add\.f32", code)) == own
-    assert len(re.findall(r"\bld\.global\.v4\.f32", code)) >= 3  # a row of nodes, at least
+    load = "ld.global.nc.v4.f32" if (which, size_class) == ("forward", SizeClass.MANY) else "ld.global.v4.f32"
+    assert code.count(load) >= 3  # a row of nodes, at least
     assert 0 < facts.registers <= 255
     declared = cubin.arrays(code)
     assert facts.frame == facts.stack == declared, f"{facts.frame - declared} bytes of registers are spilled"
@@ -93,10 +94,8 @@ def test_machine_code(dim, law, bare, which, size_class):
 
 
 def test_many_particles_leave_room_for_other_warps():
-    """A multiprocessor has 65,536 registers: with 80 for a thread it holds six blocks, with 112, as loads before the wait take, four.
-
-    Those made a substep of eight million particles 16 % slower.
-    """
+    """A multiprocessor has 65,536 registers: with 80 for a thread it holds six blocks. With 128, and four of them, a substep of eight
+    million particles took 1.23 times as long, with 96 and five 1.13 times."""
     for law in ("neo_hookean", "fixed_corotated"):
         _, facts = compiled(kernel(3, law, "forward", bare=True, size_class=SizeClass.MANY))
         assert facts.registers <= 80

@@ -29,6 +29,7 @@ inline float __int_as_float(int i) { return bits<float>(i); }
 inline int __float_as_int(float f) { return bits<int>(f); }
 
 template <typename T> T __ldcg(const T* p) { return *p; }
+template <typename T> T __ldg(const T* p) { return *p; }
 
 thread_local struct {
     int x;
