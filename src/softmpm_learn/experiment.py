@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import statistics
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from softmpm_learn.resuming import entered
 from softmpm_learn.saved import save
 from softmpm_learn.stop import Signals
 from softmpm_learn.tasks import Task, TaskConf, make_task
+from softmpm_learn.timing import account, clock
 from softmpm_learn.train import Plan, Result, train_side_by_side
 
 logger = logging.getLogger("softmpm_learn")
@@ -64,7 +66,7 @@ def run_side_by_side(
     Raises:
         ValueError: Settings that do not go together, or fewer seeds than processes.
     """
-    group, signals = group or Group(), signals or Signals()
+    began, group, signals = time.perf_counter(), group or Group(), signals or Signals()
     (conf, out), alone = jobs[0], len(jobs) == 1 and jobs[0][0].train.seeds == 1
     if len(jobs) > 1 and conf.train.seeds < group.size:
         raise ValueError(
@@ -118,13 +120,16 @@ def run_side_by_side(
         held.close()  # a signal now ends the program
         if alone and results[0].error:
             raise results[0].error
-        for result, own, (_, place) in zip(results, loggers, members, strict=True):
-            if conf.train.pictures and not result.error and (group.first or not alone):
-                draw(result, task, place)
-                own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
+        seconds = dict(results[0].seconds)
+        with clock(seconds, "draw"):
+            for result, own, (_, place) in zip(results, loggers, members, strict=True):
+                if conf.train.pictures and not result.error and (group.first or not alone):
+                    draw(result, task, place)
+                    own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
     rest = iter(results)
     found = [[next(rest) for _ in share] for share in shares]
     if group.first:
+        logger.info("%s", account(seconds, time.perf_counter() - began))
         for own, (_, place) in zip(found, jobs, strict=True):
             logger.info("%s", farewell(own[0], task, place) if alone else farewell_of_seeds(own, place))
         signals.advice = f"The run had ended; everything is in {out if len(jobs) == 1 else out.parent}."

@@ -1,10 +1,8 @@
 """The optimisation step: simulate, differentiate, update policy and design; a step that fails is halved and tried again."""
 
-import contextlib
 import logging
 import math
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -17,6 +15,7 @@ from softmpm_learn.run import Run
 from softmpm_learn.run_logger import RunLogger, recorded
 from softmpm_learn.runs import Runs
 from softmpm_learn.settling import SETTLED_SHARE
+from softmpm_learn.timing import clock
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -188,7 +187,7 @@ def attempt(
     """
     due = [loggers[k] for k in runs.active if loggers and loggers[k].due(runs.all[k].iteration)]
     with clock(seconds, "episode"):
-        with runs.failing_together(), recorded(runs, due) as on_frames:
+        with runs.failing_together(), recorded(runs, due, seconds=seconds) as on_frames:
             episode, gradients = runs.loop(goals, on_frames)
         return episode, take_gradients(runs, episode, gradients)
 
@@ -243,13 +242,3 @@ def _losses(runs: Runs, episode: Episode, k: int) -> dict[str, Tensor]:
     means = [term.mean() for term in own.values()]
     *losses, square = runs.group.average([*means, episode.activation[:, runs.worlds(k)].square().mean()])
     return dict(zip(own, losses, strict=True)) | {"activation": square.sqrt()}
-
-
-@contextlib.contextmanager
-def clock(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add the time that the block takes [s] to ``seconds[name]``, also if it raises an error."""
-    begin = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - begin

@@ -8,6 +8,8 @@ from types import TracebackType
 
 from tqdm import tqdm
 
+from softmpm_learn.timing import duration
+
 logger = logging.getLogger("softmpm_learn")
 
 
@@ -40,8 +42,7 @@ class ProgressBar:
             logger.info("after %d of %d iterations: %s, %s left", done, self.total, text, left)
 
     def _left(self, done: int, missing: int) -> str:
-        seconds = (time.monotonic() - self._began) / done * missing
-        return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
+        return duration((time.monotonic() - self._began) / done * missing)
 
     def __enter__(self) -> "ProgressBar":
         return self

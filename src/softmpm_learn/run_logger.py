@@ -21,20 +21,9 @@ from softmpm_learn.loggers import Loggers
 from softmpm_learn.loops import OnFrames
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
+from softmpm_learn.timing import TIMING, clock
 
 logger = logging.getLogger("softmpm_learn")
-
-TIMING = ["episode", "evaluate", "learn", "save", "draw"]
-"""Columns of timing.csv [s]:
-
-- ``episode``: simulation, gradient and its mean over the processes, also of attempts that failed, with their recording;
-- ``evaluate``: evaluations, and the step along the gradient;
-- ``learn``: learning phases, and adding observations to the replay buffer;
-- ``save``: checkpoints, that of the iteration before and those before a run goes back;
-- ``draw``: pictures of the iteration before.
-
-What follows the last iteration is in no row.
-"""
 
 
 def metrics(run: Run) -> list[str]:
@@ -133,8 +122,9 @@ class RunLogger:
 
     def add(self, iteration: int, row: dict[str, float], seconds: dict[str, float]) -> None:
         """End an iteration: a row of either table, for :meth:`flush`, and the figures to the recording and the loggers."""
-        self._timing.append(iteration, seconds)
-        self.add_figures(iteration, row, seconds)
+        times = {name: seconds[name] for name in TIMING}
+        self._timing.append(iteration, times)
+        self.add_figures(iteration, row, times)
         self._seal_recording(iteration + 1)
 
     def add_figures(
@@ -231,13 +221,18 @@ class RunLogger:
 
 @contextlib.contextmanager
 def recorded(
-    runs: Runs, loggers: Sequence[RunLogger], about: Sequence[dict] = ()
+    runs: Runs,
+    loggers: Sequence[RunLogger],
+    about: Sequence[dict] = (),
+    seconds: dict[str, float] | None = None,
 ) -> Iterator[OnFrames | None]:
     """Record an episode of some runs: gives what to call with its frames, or None if nothing is recorded.
 
     Args:
         about: What to keep with the episode of each.
+        seconds: The time that it takes is added to ``record`` [s].
     """
+    seconds = {} if seconds is None else seconds
     notes = zip(loggers, about or [{}] * len(loggers), strict=True)
     recording = [(one, note) for one, note in notes if one.records]
     with contextlib.ExitStack() as open_episodes:
@@ -249,7 +244,9 @@ def recorded(
         @torch.no_grad()
         def on_frames(frames: Sequence[Frame]) -> None:
             model = runs.model
-            with contextlib.ExitStack() as together:
+            if model.device.type == "cuda":
+                torch.cuda.synchronize(model.device)  # what is waited for is not the recording
+            with clock(seconds, "record"), contextlib.ExitStack() as together:
                 for one, _ in recording:
                     together.enter_context(one.together())
                 for frame in frames:

@@ -13,6 +13,7 @@ the same everywhere would take a replay buffer in each process, and bits that ag
 """
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,13 +25,14 @@ from softmpm_learn.distributed import Group
 from softmpm_learn.finishing import evaluate_ends, finish
 from softmpm_learn.learning_phase import learn_side_by_side
 from softmpm_learn.loggers import Loggers
-from softmpm_learn.optimisation import clock, optimise
+from softmpm_learn.optimisation import optimise
 from softmpm_learn.resuming import entered, resume
 from softmpm_learn.run import Run
-from softmpm_learn.run_logger import TIMING, RunLogger
+from softmpm_learn.run_logger import RunLogger
 from softmpm_learn.runs import Runs
 from softmpm_learn.settings import Settings
 from softmpm_learn.threads import at_once
+from softmpm_learn.timing import TIMING, clock
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class Result:
     best_iteration: int
     examination: dict[str, float]
     """What :func:`softmpm_learn.examination.examine` found, in the first process once the run is finished."""
+    seconds: dict[str, float]
+    """Of its parts in this process since it began or was resumed, by the names of :mod:`softmpm_learn.timing`."""
     error: Exception | None = None
     """Why it failed: a :class:`softmpm_learn.optimisation.TrainingError`."""
 
@@ -74,6 +78,9 @@ class _Work:
     loggers: list[RunLogger]
     """One for each run in the first process, none in the others."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMING, 0.0))
+    """Those of the parts of this iteration."""
+    passed: Counter = field(default_factory=Counter)
+    """Those of the iterations that have ended."""
 
 
 def train(
@@ -183,9 +190,12 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
                     work.loggers[k].flush()
                     work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
     _save_all(work)
-    ends = evaluate_ends(runs)
+    with clock(seconds, "end"):
+        ends = evaluate_ends(runs)
     _save_all(work)  # with what became of the best
-    found = finish(runs, work.loggers, finer, ends) if work.loggers else {}
+    with clock(seconds, "end"):
+        found = finish(runs, work.loggers, finer, ends) if work.loggers else {}
+    work.passed.update(seconds)
     return [
         Result(
             run,
@@ -193,6 +203,7 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result
             best_loss=run.best["loss"],
             best_iteration=run.best["iteration"],
             examination=found.get(k, {}),
+            seconds=dict(work.passed),
             error=runs.errors.get(k),
         )
         for k, run in enumerate(runs.all)
@@ -205,6 +216,8 @@ def _end_iteration(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) 
     loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
     with group.fail_together():
         at_once(lambda k: loggers[k].add(*ended[k], work.seconds), loggers)
+    work.passed.update(work.seconds)
+    work.seconds.clear()
     work.seconds |= dict.fromkeys(TIMING, 0.0)
     for k in ended:
         runs.all[k].iteration += 1

@@ -19,11 +19,12 @@ import softmpm
 from softmpm_learn import checkpoint, train
 from softmpm_learn.csv_log import Table
 from softmpm_learn.objective import Effort, Objective, Progress
-from softmpm_learn.optimisation import TrainingError, clock
+from softmpm_learn.optimisation import TrainingError
 from softmpm_learn.pictures import design
 from softmpm_learn.run import Run
 from softmpm_learn.runs import Runs
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
+from softmpm_learn.timing import clock
 
 
 def copy_of(settings: Settings, **changes) -> Settings:
@@ -101,12 +102,20 @@ def test_times_are_summed(monkeypatch):
 
 
 def test_times_are_those_of_an_iteration(task, model, settings, tmp_path):
-    """All rows together take no longer than the training: no time is in two of them."""
+    """All rows together take no longer than the training: no time is in two of them. The result has their sums, with what followed."""
     begin = time.perf_counter()
-    train.train(task, model, settings, tmp_path)
+    result = train.train(task, model, copy_of(settings, train=dict(record_every=1)), tmp_path)
     whole = time.perf_counter() - begin
-    _, *times = (tmp_path / "timing.csv").read_text().splitlines()
-    assert 0 < sum(float(cell) for line in times for cell in line.split(",")[1:]) < whole
+    header, *lines = (tmp_path / "timing.csv").read_text().splitlines()
+    columns = zip(*(map(float, line.split(",")) for line in lines), strict=True)
+    sums = dict(zip(header.split(","), map(sum, columns), strict=True))
+    del sums["iteration"]
+    found, record, end = dict(result.seconds), result.seconds["record"], result.seconds["end"]
+    assert 0 < sum(sums.values()) < sum(sums.values()) + end < whole
+    assert 0 < record < found["episode"]
+    for name in ("episode", "evaluate", "learn"):
+        assert found[name] == pytest.approx(sums[name], rel=1e-9)
+    assert found["save"] > sums["save"]  # and the last checkpoint
 
 
 def test_equal_seeds_give_equal_runs(task, model, settings, unbroken, tmp_path):
