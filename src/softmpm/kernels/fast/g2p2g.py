@@ -175,8 +175,8 @@ def fused(spec: Spec) -> SimpleNamespace:
         many = size_class is SizeClass.MANY
         bounds = {"launch_bounds": (BLOCK, 3)} if size_class is SizeClass.FEW else {}
         wait, gather = (await_nothing, s.gather_constant) if many else (await_previous, s.gather)
-        plain, recent = (n.read_base, n.read_vec, n.read_mat), (n.load_base, load_vec, load_mat)
-        base_of, vector, matrix = plain if many else recent
+        load = n.plain if many else n.early
+        base_of, vector, matrix = load.base, load.vector, load.matrix
 
         @wp.func
         def copy_unchanged(i: int, now: Packed, then: Packed):

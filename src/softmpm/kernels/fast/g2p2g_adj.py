@@ -43,7 +43,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     aligned, head = s.aligned, s.head
     centre, place_of = fused(spec).centre, fused(spec).place_of
     particle_of, world_of = s.particle_of, s.world_of
-    load_base, store_vec, store_mat = n.load_base, n.store_vec, n.store_mat
+    store_vec, store_mat = n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
     gather, driven = s.gather, spec.driven
@@ -113,7 +113,12 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         """``g2p2g_adj`` for few particles or for many; registers are limited so that ``blocks`` blocks fit. Few do early what many have
         no registers for; these load after the wait, by plain loads, which are faster."""
         blocks = 2 if few else 3
-        vector, matrix = (n.load_vec, n.load_mat) if few else (n.read_vec, n.read_mat)
+        load = n.early if few else n.plain
+        vector, matrix, base_of = (
+            load.vector,
+            load.matrix,
+            n.early.base,
+        )  # with a plain base registers are spilled
 
         @wp.func
         def contribution(
@@ -131,7 +136,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             out = Contribution()
             out.H = matrix(now.rows, i, row_H)
             out.g = centre(vector(now.rows, i, row_fx))
-            base = unpack_base(load_base(now.base, i))
+            base = unpack_base(base_of(now.base, i))
             out.first = world * window.count + first_node(base, window.origin[world], window.shape)
             out.m = inputs.mass[world, p]
             out.Q = rotation(inputs, world, p, out.H)

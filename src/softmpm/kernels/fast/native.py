@@ -74,31 +74,27 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func_native("softmpm::store_node(node.data, i, value);")
     def store_node(node: wp.array(dtype=node_vec), i: int, value: node_vec): ...
 
-    @wp.func_native("return softmpm::recent(base.data + i);")
-    def load_base(base: wp.array(dtype=wp.int32), i: int) -> int: ...
+    def loads(early: bool) -> SimpleNamespace:
+        """Functions that load the base, a vector and a matrix of a packed particle; early ones may do so before the wait."""
+        template = f"softmpm::load_rows<{str(early).lower()}, {rows}"
 
-    @wp.func
-    def read_base(base: wp.array(dtype=wp.int32), i: int) -> int:
-        return base[i]
-
-    def row_loaders(function: str) -> tuple[wp.Function, wp.Function]:
-        """Functions that load a vector and a matrix of a packed particle by this one of scatter.h."""
+        @wp.func_native(f"return {'softmpm::recent(base.data + i)' if early else 'wp::index(base, i)'};")
+        def base(base: wp.array(dtype=wp.int32), i: int) -> int: ...
 
         @wp.func_native(
-            f"wp::vec_t<{dim}, {t.c_name}> value; softmpm::{function}<{rows}, {dim}>(packed.data, i, r, value.c); return value;"
+            f"wp::vec_t<{dim}, {t.c_name}> value; {template}, {dim}>(packed.data, i, r, value.c); return value;"
         )
         def vector(packed: wp.array(dtype=real), i: int, r: int) -> vec: ...
 
         @wp.func_native(
             f"wp::mat_t<{dim}, {dim}, {t.c_name}> value; "
-            f"softmpm::{function}<{rows}, {dim * dim}>(packed.data, i, r, &value.data[0][0]); return value;"
+            f"{template}, {dim * dim}>(packed.data, i, r, &value.data[0][0]); return value;"
         )
         def matrix(packed: wp.array(dtype=real), i: int, r: int) -> mat: ...
 
-        return vector, matrix
+        return SimpleNamespace(base=base, vector=vector, matrix=matrix)
 
-    load_vec, load_mat = row_loaders("load_rows")
-    read_vec, read_mat = row_loaders("read_rows")
+    early, plain = loads(early=True), loads(early=False)
 
     @wp.func_native(f"softmpm::store_rows<{rows}, {dim}>(packed.data, i, r, value.c);")
     def store_vec(packed: wp.array(dtype=real), i: int, r: int, value: vec): ...
@@ -121,12 +117,10 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         load_node=load_node,
         load_constant_node=load_constant_node,
         store_node=store_node,
-        load_base=load_base,
-        load_vec=load_vec,
-        load_mat=load_mat,
-        read_base=read_base,
-        read_vec=read_vec,
-        read_mat=read_mat,
+        early=early,
+        plain=plain,
+        load_vec=early.vector,
+        load_mat=early.matrix,
         store_vec=store_vec,
         store_mat=store_mat,
         spread_vec=spread_vec,

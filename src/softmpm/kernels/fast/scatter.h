@@ -389,19 +389,12 @@ template <typename T> CUDA_CALLABLE inline T recent(const T* p)
 #endif
 }
 
-template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(const T* rows, int i, int r, T* out)
+// Early loads, before the wait for the previous kernel, go past the nearest cache.
+template <bool EARLY, int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void load_rows(const T* rows, int i, int r, T* out)
 {
     const T* at = packed<ROWS>(rows, i, r);
     for (int k = 0; k < COUNT; ++k)
-        out[k] = recent(at + k * LANES);
-}
-
-// The same by plain loads, for use after the wait.
-template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void read_rows(const T* rows, int i, int r, T* out)
-{
-    const T* at = packed<ROWS>(rows, i, r);
-    for (int k = 0; k < COUNT; ++k)
-        out[k] = at[k * LANES];
+        out[k] = EARLY ? recent(at + k * LANES) : at[k * LANES];
 }
 
 template <int ROWS, int COUNT, typename T> CUDA_CALLABLE inline void store_rows(T* rows, int i, int r, const T* in)
