@@ -1,4 +1,4 @@
-"""What a replayed control step of a closed loop consists of, on a GPU: `python bench/control_step.py [--json FILE]`
+"""Parts of a replayed control step of a closed loop, on a GPU: `python bench/control_step.py [--json FILE]`
 
 By the profiler of CUDA, in a replay of some control steps of the standard elephant with their gradient, after four others: launches of
 a control step, and the time in which the GPU works on them. Where kernels overlap, the time counts for the one that began first;
@@ -26,12 +26,10 @@ CASES = {"default": {}, "contact at nodes, elastic": ELASTIC}
 SECONDS = 0.2
 """Duration of the episode: 16 control steps."""
 OF_A_SUBSTEP = {
-    *("grid_velocity", "g2p2g", "grid_and_loads", "press", "push"),
-    *("forces", "advance", "settle", "march"),
+    *("grid_velocity", "g2p2g", "grid_and_loads", "press"),
     *("grid_velocity_adj", "g2p2g_adj", "grid_and_loads_adj", "press_adj"),
-    *("forces_adj", "advance_adj", "settle_adj", "spread_adj", "march_adj"),
 }
-"""Kernels that run in each substep or in its adjoint, or have many of them."""
+"""Kernels of the moving grid that run in each substep or in its adjoint."""
 
 Event = tuple[float, float, str]
 """Begin and end [µs], and the name of what the GPU did."""

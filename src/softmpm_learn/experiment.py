@@ -129,9 +129,12 @@ def run_side_by_side(
     rest = iter(results)
     found = [[next(rest) for _ in share] for share in shares]
     if group.first:
-        logger.info("%s", account(seconds, time.perf_counter() - began))
-        for own, (_, place) in zip(found, jobs, strict=True):
-            logger.info("%s", farewell(own[0], task, place) if alone else farewell_of_seeds(own, place))
+        last = [
+            farewell(own[0], task, place) if alone else farewell_of_seeds(own, place)
+            for own, (_, place) in zip(found, jobs, strict=True)
+        ]
+        for text in (account(seconds, time.perf_counter() - began), *last):
+            logger.info("%s", text)
         signals.advice = f"The run had ended; everything is in {out if len(jobs) == 1 else out.parent}."
     return found
 

@@ -1,4 +1,4 @@
-"""Where the time of a run goes: a row of timing.csv for each iteration, and a line of the log at the end."""
+"""Times of the parts of a run: a row of timing.csv for each iteration, and a line of the log at the end."""
 
 import contextlib
 import time
@@ -21,10 +21,10 @@ PARTS = {
     "learn": "learning",
     "save": "checkpoints",
     "draw": "pictures",
-    "end": "examination of the best",
+    "end": "the best motion",
 }
-"""What :func:`account` calls them. ``end`` is what follows the last iteration: the best motion is evaluated, recorded and examined. The
-recording of episodes, ``record``, is a part of ``episode``."""
+"""Names of the parts in :func:`account`. ``end`` is what follows the last iteration: the best motion is evaluated, recorded and
+examined. The recording of episodes, ``record``, is a part of ``episode``."""
 
 
 @contextlib.contextmanager
@@ -38,12 +38,12 @@ def clock(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def duration(seconds: float) -> str:
-    """In minutes if it is long."""
+    """Seconds as text, in minutes from 90 s on."""
     return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 def account(seconds: Mapping[str, float], whole: float) -> str:
-    """What a run took and what each part of it did, in a sentence; parts below a second are left out.
+    """The time that a run took since it began or was resumed, and that of its parts; parts below a second are left out.
 
     Args:
         seconds: Those of the parts.
@@ -54,4 +54,4 @@ def account(seconds: Mapping[str, float], whole: float) -> str:
     shown = {name: f"{name} {duration(passed)}" for name, passed in parts.items() if passed >= 1}
     if "episodes" in shown and seconds.get("record", 0.0) >= 1:
         shown["episodes"] += f" ({duration(seconds['record'])} of it recording)"
-    return f"It took {duration(whole)}{': ' if shown else ''}{', '.join(shown.values())}."
+    return f"The run took {duration(whole)}{': ' if shown else ''}{', '.join(shown.values())}."

@@ -298,6 +298,7 @@ def test_a_run_leaves_everything(finished):
     assert said.splitlines()[-1].endswith(f"rerun {folder / 'run.rrd'}")
     assert "after 2 of 2 iterations: loss" in said and "mm from the goal" in said
     assert "2 calls of 52 substeps with gradient" in said  # which share the memory
+    assert said.index("after 2 of 2") < said.index("The run took") < said.index("mm from the goal")
     with softmpm.Recording(folder / "run.h5") as recording:
         assert len(recording.episodes) == 3  # both iterations and the best once more
 

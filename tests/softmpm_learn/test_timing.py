@@ -1,4 +1,4 @@
-"""Where the time of a run goes."""
+"""Times of the parts of a run, as the log says them."""
 
 from softmpm_learn.timing import account, duration
 
@@ -14,14 +14,14 @@ def test_the_parts_add_up_to_the_whole():
         "end": 13.0,
     }
     assert account(seconds, 180.0) == (
-        "It took 3.0 min: episodes 45 s (13 s of it recording), evaluations 1.6 min, learning 2 s, pictures 5 s, examination of the "
-        "best 13 s, all else 18 s."
+        "The run took 3.0 min: episodes 45 s (13 s of it recording), evaluations 1.6 min, learning 2 s, pictures 5 s, the best motion "
+        "13 s, all else 18 s."
     )
 
 
 def test_what_took_no_time_is_left_out():
-    assert account({"episode": 3.0, "record": 0.2}, 3.0) == "It took 3 s: episodes 3 s."
-    assert account({}, 0.2) == "It took 0 s."
+    assert account({"episode": 3.0, "record": 0.2}, 3.0) == "The run took 3 s: episodes 3 s."
+    assert account({}, 0.2) == "The run took 0 s."
 
 
 def test_long_durations_are_in_minutes():

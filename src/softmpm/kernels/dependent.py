@@ -6,8 +6,8 @@ it wrote is visible. Elsewhere it does nothing.
 
 Before the call a kernel may read what the previous one does not write: all kernels before that one have ended, since it has waited for
 them. What one of these wrote in the same graph is loaded by :func:`recent`, past the nearest cache, which might hold an older copy. A
-kernel must not write before the call, and nowhere may it load what the previous one writes as read-only memory (``ld.global.nc``): that
-is left to kernels without the call, which begin when the previous one has ended.
+kernel must not write before the call, and nowhere may it load what changes as read-only memory (``ld.global.nc``): that is left to
+kernels without the call, which begin when the previous one has ended.
 tests/softmpm/kernels/test_dependent.py checks this in PTX, with a list of what is read early.
 """
 

@@ -102,7 +102,14 @@ FORMS = {
 @pytest.mark.gpu
 @pytest.mark.parametrize(
     "form, size_class",
-    [*((form, None) for form in FORMS), ("moving, nodes", SizeClass.SOME), ("moving, nodes", SizeClass.MANY)],
+    [
+        *((form, None) for form in FORMS),
+        *(
+            (form, one)
+            for form in ("moving, nodes", "moving, points")
+            for one in (SizeClass.SOME, SizeClass.MANY)
+        ),
+    ],
 )
 def test_results_are_those_of_kernels_that_follow_one_another(form, size_class, monkeypatch):
     """State and gradients, of kernels that begin early and of kernels that do not: the same bits where sums have a fixed order, else

@@ -110,15 +110,12 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         Q: mat
 
     def of_particles(few: bool) -> wp.Kernel:
-        """``g2p2g_adj`` for few particles or for many; registers are limited so that ``blocks`` blocks fit. Few do early what many have
+        """``g2p2g_adj`` for few particles or for more; registers are limited so that ``blocks`` blocks fit. Few do early what more have
         no registers for; these load after the wait, by plain loads, which are faster."""
         blocks = 2 if few else 3
         load = n.early if few else n.plain
-        vector, matrix, base_of = (
-            load.vector,
-            load.matrix,
-            n.early.base,
-        )  # with a plain base registers are spilled
+        vector, matrix = load.vector, load.matrix
+        base_of = n.early.base  # n.plain.base spills registers
 
         @wp.func
         def contribution(

@@ -19,7 +19,7 @@ class LaunchSize:
     On a GPU the lanes of a warp cooperate, so that whole blocks are launched. With few particles each warp has a block of its own and
     the kernels may use more registers; with very few, half of the lanes stay empty, so that twice as many warps share the work, at
     the price of more reductions (docs/decisions/0009-kept-machinery.md). With many particles an early beginning
-    gains nothing (docs/decisions/0018-dependent-launch.md).
+    costs more than it gains (docs/decisions/0018-dependent-launch.md).
     """
 
     def __init__(self, model: Model):
