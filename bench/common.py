@@ -7,6 +7,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -91,14 +92,15 @@ def median_seconds(work, device: torch.device, repeats: int) -> float:
 
 
 def arguments(
-    description: str, schemes: bool = False, formulations: bool = False, threads: bool = False
+    description: str, scenes: Iterable[str] = (), formulations: bool = False, threads: bool = False
 ) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--largest", type=int, default=None, help="skip cases with more particles")
-    if schemes:
+    if scenes:
         parser.add_argument("--scheme", default="auto", choices=["auto", "fast", "plain"])
+        parser.add_argument("--scenes", nargs="+", default=scenes, choices=scenes, help="skip the others")
     if formulations:
         parser.add_argument("--formulation", default="moving", choices=["moving", "reference"])
     if threads:

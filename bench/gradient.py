@@ -60,13 +60,15 @@ def measure(
 
 
 def main():
-    args = arguments(__doc__, schemes=True)
+    args = arguments(__doc__, scenes=GRADIENTS)
     device = torch.device(args.device)
     table = Table("Forward and backward [us/substep], float32", device, args.json)
     for dim, particles, nodes in ON_A_CPU if device.type == "cpu" else CASES:
         if particles > (args.largest or particles):
             continue
         for name, features in GRADIENTS.items():
+            if name not in args.scenes:
+                continue
             scene = cube(dim, particles, nodes, **features)
             row, sizes = {"dim": dim, "particles": None, "nodes": nodes, "scene": name}, None
             for kind, substeps in substeps_of(particles, device).items():

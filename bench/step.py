@@ -38,7 +38,7 @@ def run(model: softmpm.Model, start: softmpm.State, params: softmpm.Params, subs
 
 
 def main():
-    args = arguments(__doc__, schemes=True)
+    args = arguments(__doc__, scenes=VARIANTS)
     device = torch.device(args.device)
     table = Table("Forward, float32", device, args.json)
     for dim, particles, nodes in ON_A_CPU if device.type == "cpu" else CASES:
@@ -46,6 +46,8 @@ def main():
             continue
         substeps = substeps_of(particles, device)
         for name, features in VARIANTS.items():
+            if name not in args.scenes:
+                continue
             model = softmpm.build(cube(dim, particles, nodes, **features), device=device, scheme=args.scheme)
             params = model.params()
             row = {"dim": dim, "particles": model.particle_count, "nodes": nodes, "scene": name}
