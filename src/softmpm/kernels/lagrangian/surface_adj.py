@@ -43,7 +43,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     mirrored, constrained, rough = bool(spec.mirrors), spec.constrained, "friction" in wanted
     sums = surface_sums(dim, spec.dtype)
     Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
-    Touched, touched_of, from_points = sums.Touched, sums.touched_of, sums.from_points
+    Touched, touched_of, both_from_points = sums.Touched, sums.touched_of, sums.both_from_points
     Node, node_of, vecs, reals = nodes(spec).Node, nodes(spec).node_of, one.vecs, one.reals
     back, memory = nodes_adj(spec, wanted), chunk(dim, spec.dtype)
     before, adj_of, complete, moved_adj = back.before, back.adj_of, back.complete, back.moved_adj
@@ -191,8 +191,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         i = entry.i
         was = before(world, i, node, at, s)  # all of it loaded before anything is stored
         adj = adj_of(world, i, bar)
-        adj.u += from_points(body, entry, row(bar.x, world))
-        adj.v += from_points(body, entry, row(bar.free, world))
+        back_x, back_v = both_from_points(body, entry, row(bar.x, world), row(bar.free, world))
+        adj.u += back_x
+        adj.v += back_v
         if lane == 0:
             if wp.static(constrained):
                 row(bar.u, world)[i] = adj.u

@@ -154,6 +154,17 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
         return together(total)
 
     @wp.func
+    def both_from_points(body: Surface, node: Touched, a: wp.array(dtype=vec), b: wp.array(dtype=vec)):
+        """``from_points`` of two fields; entries are read once."""
+        total_a = partly(node.entries, a)
+        total_b = partly(node.entries, b)
+        for m in range(node.first + BATCH * body.lanes, node.last, BATCH * body.lanes):
+            entries = entries_of(body, m, node.last)
+            total_a += partly(entries, a)
+            total_b += partly(entries, b)
+        return together(total_a), together(total_b)
+
+    @wp.func
     def present(point: Point, u: vec) -> exact_vec:
         """x of (K2) without the shift."""
         return point.rest + exact_of(u)
@@ -166,4 +177,5 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
         Touched=Touched,
         touched_of=touched_of,
         from_points=from_points,
+        both_from_points=both_from_points,
     )
