@@ -106,7 +106,7 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
             t.row_low,
             t.row_h,
         )
-        load_vec, load_mat, load_base, rows = n.load_vec, n.load_mat, n.early.base, t.rows
+        load_vec, load_mat, load_base, rows = n.early.vector, n.early.matrix, n.early.base, t.rows
 
         @wp.func
         def point_of(

@@ -19,7 +19,7 @@ def packed_alarms(spec: Spec) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), alarm(spec)
     Constants, Packed, ParticleInputs = t.Constants, t.Packed, input_types(spec).ParticleInputs
     s, n = stencil(spec.dim, spec.dtype), native(spec.dim, spec.dtype)
-    unpack_base, world_of, load_vec, load_mat = s.unpack_base, s.world_of, n.load_vec, n.load_mat
+    unpack_base, world_of, load_vec, load_mat = s.unpack_base, s.world_of, n.early.vector, n.early.matrix
     step_is_stable, near, row_fx, row_H = one.step_is_stable, one.near, t.row_fx, t.row_h
     ran, report = status.report(spec.dim, spec.dtype).ran, status.report(spec.dim, spec.dtype).report
     torn, step = int(Kind.TORN), int(Kind.STEP)

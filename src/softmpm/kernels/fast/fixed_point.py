@@ -21,7 +21,7 @@ def fixed(dim: int) -> SimpleNamespace:
     """Kernels and functions of the fixed-point sums, in single precision: double has more digits than these sums resolve."""
     t, n, s = types(dim, "float32"), native(dim, "float32"), stencil(dim, "float32")
     vec, mat, ivec, node_vec, Packed, Window = t.vec, t.mat, t.ivec, t.aligned, t.Packed, t.Window
-    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    load_vec, load_mat, store_vec, store_mat = n.early.vector, n.early.matrix, n.store_vec, n.store_mat
     store_node = n.store_node
     first_node, unpack_base = s.first_node, s.unpack_base
     row_fx, row_v, row_C = t.row_fx, t.row_v, t.row_c

@@ -42,7 +42,7 @@ def fused(spec: Spec) -> SimpleNamespace:
     first_node, pack_base, unpack_base = s.first_node, s.pack_base, s.unpack_base
     aligned, head, coordinates = s.aligned, s.head, s.coordinates
     particle_of, world_of = s.particle_of, s.world_of
-    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    load_vec, load_mat, store_vec, store_mat = n.early.vector, n.early.matrix, n.store_vec, n.store_mat
     scatter, load_node, store_node = n.scatter, n.load_node, n.store_node
     rotation, moved = one.rotation, one.moved
     linear_momentum, affine_momentum = one.linear_momentum, one.affine_momentum

@@ -119,8 +119,6 @@ def native(dim: int, dtype: str) -> SimpleNamespace:
         store_node=store_node,
         early=early,
         plain=plain,
-        load_vec=early.vector,
-        load_mat=early.matrix,
         store_vec=store_vec,
         store_mat=store_mat,
         spread_vec=spread_vec,

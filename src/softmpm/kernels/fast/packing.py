@@ -23,7 +23,7 @@ def packing(dim: int, dtype: str) -> SimpleNamespace:
     real, vec, mat = t.real, t.vec, t.mat
     Constants, Packed, Window = t.Constants, t.Packed, t.Window
     entered, left = b.entered, b.left
-    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    load_vec, load_mat, store_vec, store_mat = n.early.vector, n.early.matrix, n.store_vec, n.store_mat
     spread_vec, spread_mat = n.spread_vec, n.spread_mat
     pack_base, unpack_base, report = s.pack_base, s.unpack_base, status.report(dim, dtype).report
     row_fx, row_low, row_v, row_H, row_C = t.row_fx, t.row_low, t.row_v, t.row_h, t.row_c

@@ -25,7 +25,7 @@ LINE = 16
 def slabs(dim: int, dtype: str) -> SimpleNamespace:
     t, n, s = types(dim, dtype), native(dim, dtype), stencil(dim, dtype)
     real, vec, mat, node_vec, Packed, Window = t.real, t.vec, t.mat, t.aligned, t.Packed, t.Window
-    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    load_vec, load_mat, store_vec, store_mat = n.early.vector, n.early.matrix, n.store_vec, n.store_mat
     scatter_planes = n.scatter_planes
     first_node, unpack_base = s.first_node, s.unpack_base
     row_fx, row_v, row_C = t.row_fx, t.row_v, t.row_c

@@ -28,7 +28,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
     first_node, coordinates, particle_of = s.first_node, s.coordinates, s.particle_of
     pack_base, unpack_base = s.pack_base, s.unpack_base
     load_node, store_node, aligned, head = n.load_node, n.store_node, s.aligned, s.head
-    load_vec, load_mat, store_vec, store_mat = n.load_vec, n.load_mat, n.store_vec, n.store_mat
+    load_vec, load_mat, store_vec, store_mat = n.early.vector, n.early.matrix, n.store_vec, n.store_mat
 
     @kernel(NATIVE)
     def sums(
