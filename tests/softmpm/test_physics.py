@@ -142,8 +142,8 @@ def test_damping_is_a_rate():
 def test_a_turning_body_gains_no_spin_by_rounding(dim, scheme, device):
     """In float32, 4,000 substeps: within 3e-6. Rounded weights in 3D gave 1.5e-5, a mass of 0.4 kg in 2D 4e-6, always upwards.
 
-    A GPU adds in another order each time, so the limit is on the mean of 16 worlds: single runs on an H200 gained 0.9e-6 ± 1.1e-6 in 2D
-    (30 runs, at most 3.2e-6) and lost 1.9e-6 ± 1.2e-6 in 3D (24 runs of the plain scheme, at most 4.9e-6).
+    A GPU adds in another order each time, so the limit is on the mean of 16 worlds: single runs of the plain scheme on an H200 gained
+    0.9e-6 ± 1.1e-6 in 2D (30 runs, at most 3.2e-6) and lost 1.9e-6 ± 1.2e-6 in 3D (24 runs, at most 4.9e-6).
     """
     spacing = 0.04
     corner = np.full(dim, 4.5 * spacing)
