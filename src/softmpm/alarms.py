@@ -26,9 +26,8 @@ class Alarms:
     4/3 cells spring back, those at 3/2 do not: they break for numerical reasons alone (numerical fracture)."""
     step: float | None = 1.0
     """Largest ratio of dt and the stable step of a particle alone on the grid with its present deformation, material and activation
-    [-], checked at the start of a call and after each chunk, in the reference formulation in every substep. Particles that share
-    nodes bear 1.1 to 1.6 of it."""
-
+    [-], checked at the start of a call and after each chunk, in the reference formulation at every eighth substep of a chunk as well.
+    Particles that share nodes bear 1.1 to 1.6 of it."""
     depth: float | None = 1.0
     """Largest depth of a surface point under a separating wall, over the way of a pressure wave of the scene's material in a substep
     [-], checked in every substep. Contact pushes a point out within one substep, beyond 1 faster than sound. Impacts at half of the

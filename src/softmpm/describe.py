@@ -76,11 +76,14 @@ def _alarms(model) -> str:
         "neighbours at rest farther apart than, in cells,": alarms.gap,
         "dt over its running limit above": alarms.step,
         "points deeper in walls than, in ways of a pressure wave in a substep,": alarms.depth,
+        "another particle within, in sizes of a particle,": alarms.overlap,
     }
     return "; ".join(f"{what} {limit:g}" for what, limit in texts.items() if limit is not None) or "off"
 
 
 def _sums(model) -> str:
+    if model.formulation == "reference":
+        return "in floating point, in a fixed order: the same bits from run to run"
     if model.spec.deterministic:
         return "in fixed point: deterministic, the same bits from run to run"
     if model.device.type == "cpu":

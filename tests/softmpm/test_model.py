@@ -1,9 +1,11 @@
 """A model compiles, stores and passes what its scene requires, and says so."""
 
 import copy
+import dataclasses
 import logging
 import os
 import pickle
+import re
 import subprocess
 import sys
 import threading
@@ -14,6 +16,7 @@ import pytest
 import torch
 import warp as wp
 from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradients
+from surface_scenes import slab
 
 import softmpm
 from softmpm import autograd
@@ -160,6 +163,19 @@ def test_describe_says_what_was_compiled_and_left_out():
         "500 substeps",
     ):
         assert phrase in busy, phrase
+
+
+def test_describe_names_every_alarm_and_the_order_of_sums():
+    """Five alarms with their limits; sums of the reference formulation have one order on a GPU as well."""
+    limits = {"collapse": 0.031, "gap": 1.32, "step": 0.97, "depth": 0.88, "overlap": 0.93}
+    assert set(limits) == {field.name for field in dataclasses.fields(softmpm.Alarms)}
+    alarms, said = softmpm.Alarms(**limits), set()
+    for formulation in ("moving", "reference"):
+        text = softmpm.build(slab(), device="cpu", formulation=formulation, alarms=alarms).describe()
+        (line,) = [line for line in text.splitlines() if "det F below" in line]
+        said |= set(re.findall(r"0\.\d+|1\.\d+", line))
+    assert said == {f"{limit:g}" for limit in limits.values()}
+    assert "in a fixed order" in text
 
 
 def test_build_refuses_what_cannot_work():
