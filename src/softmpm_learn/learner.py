@@ -31,7 +31,7 @@ class Learner:
         self.target = TargetNetwork(autoencoder.encoder) if conf.target_network else None
         self.phases = 0
         self.lockstep: LockStep | None = None
-        """Where this learner and those after it are trained, with the CUDA graph that was captured for them."""
+        """Workspace in which this learner and those after it are trained, with the CUDA graph that was captured for them."""
 
     @property
     def encoder(self) -> nn.Module:
@@ -108,9 +108,16 @@ def make_learner(
     Args:
         control_steps: Decisions in an episode.
         folder: Where the replay buffer lies.
+
+    Raises:
+        TypeError: The observer's encoder is no :class:`softmpm_learn.autoencoder.Autoencoder`.
     """
     conf, worlds, autoencoder = settings.learning, settings.train.worlds, observer.encoder
-    assert isinstance(autoencoder, Autoencoder)
+    if not isinstance(autoencoder, Autoencoder):
+        raise TypeError(
+            f"the encoder of observer {settings.observer.name!r} must be a softmpm_learn.autoencoder.Autoencoder, which learning "
+            f"phases train, got {type(autoencoder).__name__}; derive an observer without learning phases from Observer, not Latent."
+        )
     if not observer.trained:
         conf = dataclasses.replace(conf, epochs=0)
     frames = -(-control_steps // conf.frame_every)

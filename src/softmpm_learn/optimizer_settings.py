@@ -14,8 +14,8 @@ class OptimizerConf:
 
     name: str = "adam"
     """adam or sgd (plain gradient descent)."""
-    policy_rate: float | None = 2e-2
-    """Learning rate of the policy: 2e-2 suits the linear one. null is the task's, for the mlp and adam: 5e-3, of walkers 1e-2."""
+    policy_rate: float | None = None
+    """Learning rate of the policy. null is the task's, for the mlp and adam: 5e-3, of walkers 1e-2."""
     design_rate: float = 3e-2
     """Learning rate of the design, in the unbounded space before the sigmoid."""
     halving: float | None = None

@@ -76,14 +76,14 @@ class Run:
             raise ValueError(
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
-        settings = settings.suited(task)
         self.task, self.model, self.settings, self.out = task, model, settings, out
+        self.learner: Learner | None = None
+        self.observer = self._make_observer(out)
+        self.settings = settings = settings.suited(task, isinstance(self.observer, Latent))
         self.iteration, self.motions = 0, Motions(settings.optimizer)
         self.end: tuple[int, float] | None = None
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = Goals(task, model, settings.train, self.worlds)
-        self.learner: Learner | None = None
-        self.observer = self._make_observer(out)
         self.policy, self.design = self._make_policy("policy"), self._make_design()
         rates = list(self.policy.parameters()), list(self.design.parameters())
         self.optimizer = make_optimizer(settings.optimizer, *rates)

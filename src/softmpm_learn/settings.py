@@ -280,9 +280,13 @@ class Settings:
     learning: LearningConf = field(default_factory=LearningConf)
     train: TrainConf = field(default_factory=TrainConf)
 
-    def suited(self, task: "Task") -> "Settings":
+    def suited(self, task: "Task", encoded: bool) -> "Settings":
         """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``optimizer.restart_above``, ``policy.gain``,
-        ``policy.feature_gain``, ``policy.clock`` and ``train.endurance`` where these leave them to it."""
+        ``policy.feature_gain``, ``policy.clock`` and ``train.endurance`` where these leave them to it.
+
+        Args:
+            encoded: Whether the observer's features are those of an encoder, to which the task's ``feature_gain`` applies.
+        """
         optimizer, policy, train = self.optimizer, self.policy, self.train
         if optimizer.policy_rate is None:
             optimizer = dataclasses.replace(optimizer, policy_rate=task.rate)
@@ -295,7 +299,6 @@ class Settings:
         if policy.clock is None:
             policy = dataclasses.replace(policy, clock=task.clock)
         if policy.feature_gain is None:
-            encoded = self.observer.name in ("latent", "untrained")
             policy = dataclasses.replace(policy, feature_gain=task.feature_gain if encoded else 1.0)
         if train.endurance is None:
             train = dataclasses.replace(train, endurance=task.endurance)

@@ -152,8 +152,13 @@ def test_every_task_has_its_file():
 
 def test_the_learning_rate_is_the_tasks_unless_it_is_chosen():
     """Walkers learn faster than the arm; plain gradient descent has a rate of its own."""
+
+    def rate(*words):
+        conf = to_run(composed(*words))
+        return conf.settings.suited(make_task(conf.task), encoded=False).optimizer.policy_rate
+
     rates = {
-        words: (conf := to_run(composed(*words))).settings.suited(make_task(conf.task)).optimizer.policy_rate
+        words: rate(*words)
         for words in [
             ("task=elephant",),
             ("task=arm",),

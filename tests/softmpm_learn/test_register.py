@@ -1,6 +1,7 @@
 """Robots, observers, policies and optimisers of one's own: written as on docs/robots.md, run by one command, refused in a sentence."""
 
 import csv
+import dataclasses
 import re
 import sys
 from dataclasses import dataclass
@@ -11,11 +12,14 @@ import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
+import softmpm
 from softmpm_learn import app, plugins, register
+from softmpm_learn.observe import Latent, VelocityImage, latent
 from softmpm_learn.policy import make_policy
-from softmpm_learn.register import POLICIES, TABLES
-from softmpm_learn.settings import ObserverConf, PolicyConf
-from softmpm_learn.tasks import TaskConf
+from softmpm_learn.register import POLICIES, TABLES, TASKS
+from softmpm_learn.run import Run
+from softmpm_learn.settings import ObserverConf, OptimizerConf, PolicyConf, Settings
+from softmpm_learn.tasks import TaskConf, make_task
 
 ROOT = Path(__file__).parents[2]
 HOPPER, PARTS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robots.md").read_text(), re.DOTALL)
@@ -93,6 +97,30 @@ def test_a_policy_of_a_stranger_trains_from_their_own_program(folder):
     assert iterations(folder / "run") == 2
     assert "python -m softmpm_learn mine.py resume=run" in refusal(run(folder, "resume=run"))
     assert "spring" in run(folder, "--help", python=("mine.py",)).stdout
+
+
+def test_what_a_stranger_adds_has_the_tasks_hints(tmp_path):
+    """The learning rate of another optimiser and the influence of another learned observer are those of the task."""
+    register.observer("seen")(lambda conf, model, task: latent(conf, model, task))
+    register.optimizer("rmsprop")(lambda groups: torch.optim.RMSprop(groups))
+    task = dataclasses.replace(make_task(TASKS["biped"].kind(seconds=0.05)), rate=0.007, feature_gain=0.4)
+    settings = Settings(observer=ObserverConf(name="seen"), optimizer=OptimizerConf(name="rmsprop"))
+    run = Run(task, softmpm.build(task.scene, device="cpu", **task.build), settings, tmp_path)
+    assert run.settings.policy.feature_gain == 0.4 and run.settings.optimizer.policy_rate == 0.007
+    assert run.optimizer.param_groups[0]["lr"] == 0.007
+
+
+def test_an_encoder_that_learning_phases_cannot_train_is_refused(tmp_path):
+    """It is named before anything runs."""
+    register.observer("odd")(
+        lambda conf, model, task: Latent(VelocityImage(model, conf.nodes), torch.nn.Flatten(), 2)
+    )
+    task = make_task(TASKS["biped"].kind(seconds=0.05))
+    settings = Settings(observer=ObserverConf(name="odd"))
+    with pytest.raises(
+        TypeError, match="encoder of observer 'odd' must be .*Autoencoder.* got Flatten; derive"
+    ):
+        Run(task, softmpm.build(task.scene, device="cpu", **task.build), settings, tmp_path)
 
 
 def test_help_lists_what_files_register(folder):

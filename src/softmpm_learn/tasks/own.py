@@ -37,7 +37,7 @@ class OwnConf(WalkerConf):
     size: float = 0.3
     """Longer side of the robot, its length or its height [m]."""
     cells: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride, reportAssignmentType]
-    """Cells of the grid per metre, any number; null for those of task.resolution. Good value: four cells or more across the thinnest
+    """Cells of the grid per metre, at least 20; null for those of task.resolution. Good value: four cells or more across the thinnest
     limb."""
 
     def __post_init__(self):

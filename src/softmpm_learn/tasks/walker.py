@@ -20,7 +20,7 @@ FAINT = 0.3
 """Influence of an encoder's features on these, in units of the clock's: standardised, the features of a body that shakes would drown
 its rhythm. Of twenty elephants fourteen got under way, with 1 eight (docs/results.md)."""
 BRISK = 1e-2
-"""Learning rate of a walker's policy. With half of it most of ten elephants still stood after 72 iterations (docs/learning.md)."""
+"""Learning rate of a walker's policy. With half of it most of ten elephants still stood after 72 iterations (docs/results.md)."""
 WORTH = -0.1
 """Loss of a walker that is worth going on with, in units of its length: it has come forward by more than it costs."""
 ROOM = 1.0
