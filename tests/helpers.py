@@ -29,6 +29,9 @@ KINDS = {
 }
 """Settings of models that keep things in ways of their own."""
 INPUTS = ("x", "v", "C", "F", "activation", "young", "poisson", "density")
+GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
+WALL_INPUTS = ("wall_offset", "wall_normal", "wall_velocity")
+"""Inputs of which each formulation is compared with the reference, together with the strength and the driven particles."""
 
 
 def busy_scene(

@@ -87,9 +87,11 @@ def check_inputs_bounds(given: dict[str, Tensor]) -> None:
     ends = torch.stack(ends).tolist()
     for (name, value), low, high in zip(given.items(), ends[::2], ends[1::2], strict=True):
         known = QUANTITIES[name]
-        least = math.nextafter(known.low, -math.inf) if known.closed else known.low
-        if not (least < low and high < known.high):
-            demand(f"inputs.{name}", value, (value > least) & (value < known.high), known.rule)
+        least, most = known.low, known.high
+        if known.closed:
+            least, most = math.nextafter(least, -math.inf), math.nextafter(most, math.inf)
+        if not (least < low and high < most):
+            demand(f"inputs.{name}", value, (value > least) & (value < most), known.rule)
     for name in {"wall_normal", "direction"} & given.keys():
         length = given[name].norm(dim=-1)
         demand(f"the length of inputs.{name}", length, length > 0, "> 0")

@@ -69,7 +69,8 @@ class Quantity:
     def rule(self) -> str:
         """The bounds in words."""
         if self.high < math.inf:
-            return f"in ({self.low:g}, {self.high:g})"
+            left, right = "[]" if self.closed else "()"
+            return f"in {left}{self.low:g}, {self.high:g}{right}"
         return "finite" if self.low == -math.inf else f"finite and {'≥' if self.closed else '>'} {self.low:g}"
 
 
@@ -151,6 +152,13 @@ class Input:
     """True if it is passed by value with a launch, as the walls at rest are, so that no kernel waits for memory."""
     branches: Callable[[Any], bool] = lambda spec: False
     """True if it only selects branches, and its gradient is zero: nodes are inside a wall or not, surface points have a gap."""
+
+    def __post_init__(self):
+        if self.per == "particle" and self.rows != (self.kind == "vector"):
+            raise ValueError(
+                f"input {self.name!r}: vectors of particles need rows=True, their scalars and indices rows=False, got "
+                f"kind={self.kind!r} and rows={self.rows}."
+            )
 
     @property
     def sorted(self) -> bool:

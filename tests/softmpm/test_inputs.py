@@ -2,14 +2,23 @@
 
 import pytest
 import torch
-from helpers import assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, given, little_memory
+from helpers import (
+    GIVEN,
+    WALL_INPUTS,
+    assert_relative,
+    busy_inputs,
+    busy_scene,
+    cotangent,
+    dot,
+    full_scene,
+    given,
+    little_memory,
+)
 
 import softmpm
 from softmpm import Inputs, reference
 
-GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
-WALLS = ("wall_offset", "wall_normal", "wall_velocity")
-TIMED = {"activation", "velocity", "position", "force", *WALLS}
+TIMED = {"activation", "velocity", "position", "force", *WALL_INPUTS}
 """Inputs with a first axis of control steps or poses."""
 STEPS = 3
 
@@ -52,7 +61,7 @@ def assert_equal(model: softmpm.Model, names, limit: float, **options) -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_every_input_is_the_references(dim, scheme, device):
     """All inputs at once, other ones in each of two worlds, with muscles and every kind of wall at work: ≤ 1e-10."""
-    names = (*GIVEN, *WALLS)
+    names = (*GIVEN, *WALL_INPUTS)
     model = build(full_scene(dim), device=device, dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
     assert_equal(model, (*names, "strength", "velocity"), 1e-10)
 
@@ -68,14 +77,14 @@ def test_each_input_alone_is_the_references(name, scheme):
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_inputs_in_single_precision(deterministic, device):
     """The fast scheme in float32, in floating and in fixed point: ≤ 5e-4 of every gradient."""
-    names = (*GIVEN, *WALLS)
+    names = (*GIVEN, *WALL_INPUTS)
     model = build(full_scene(2), device=device, worlds=2, inputs=names, deterministic=deterministic)
     assert_equal(model, (*names, "strength", "velocity"), 5e-4)
 
 
 def test_inputs_over_chunks_that_begin_within_a_control_step(scheme):
     """Few states are checkpointed, chunks begin in the middle of control steps: walls are where they are: ≤ 1e-9."""
-    names = (*GIVEN, *WALLS)
+    names = (*GIVEN, *WALL_INPUTS)
     settings = dict(dtype=torch.float64, scheme=scheme, worlds=2, inputs=names)
     model = build(full_scene(2), **settings)
     model = build(full_scene(2), **settings, **little_memory(model))
@@ -113,7 +122,7 @@ def test_gradcheck_of_inputs(dim):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_worlds_equal_single_runs(dtype, scheme):
     """Three worlds, each with inputs of its own, give what each gives alone."""
-    names = (*GIVEN, *WALLS)
+    names = (*GIVEN, *WALL_INPUTS)
     many = build(full_scene(2), dtype=dtype, scheme=scheme, worlds=3, inputs=names)
     one = build(full_scene(2), dtype=dtype, scheme=scheme, inputs=names)
     base, extra = busy_inputs(many, STEPS), given(many, (*names, "strength", "velocity"), STEPS)
@@ -211,7 +220,7 @@ def test_inputs_that_a_model_cannot_take():
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("names", [(*GIVEN, *WALLS), ("friction", "gravity")], ids=["all", "two"])
+@pytest.mark.parametrize("names", [(*GIVEN, *WALL_INPUTS), ("friction", "gravity")], ids=["all", "two"])
 def test_a_graph_takes_inputs(names):
     """Two calls and their gradients, captured and replayed: ≤ 1e-5 of the same calls, also after gravity changed in place."""
     model = build(full_scene(2), device="cuda", worlds=2, inputs=names)

@@ -5,16 +5,24 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, full_scene, little_memory
+from helpers import (
+    GIVEN,
+    LAWS,
+    WALL_INPUTS,
+    assert_relative,
+    busy_inputs,
+    busy_scene,
+    cotangent,
+    dot,
+    full_scene,
+    little_memory,
+)
 from surface_scenes import by_reference, compare
 
 import softmpm
 from softmpm.kernels.lagrangian import bricks
 from softmpm.schemes.lagrangian.frame import quantum
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
-
-WALLS = ("wall_offset", "wall_normal", "wall_velocity")
-GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
 
 
 def build(made: softmpm.Scene, **settings) -> softmpm.Model:
@@ -36,7 +44,7 @@ def test_the_end_and_all_gradients_are_those_of_the_reference(dim, device):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_walls_that_move_nodes(dim, device):
     """Walls of each kind that advance, turn and slide, other ones in each world; the nodes they meet move as well: ≤ 1e-10."""
-    names = ("friction", *WALLS)
+    names = ("friction", *WALL_INPUTS)
     model = build(full_scene(dim, driven=()), device=device, dtype=torch.float64, worlds=2, inputs=names)
     compare(model, names, 1e-10)
 

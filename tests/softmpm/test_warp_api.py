@@ -50,7 +50,7 @@ def test_tape_gives_the_gradients_of_simulate(dim, dtype, limit, device):
     got |= {"x": wp.to_torch(states[0].fx.grad) / dx, "F": wp.to_torch(states[0].H.grad)}
     got |= {"mu": wp.to_torch(solid.mu.grad), "lam": wp.to_torch(solid.lam.grad)}
     got |= {"density": wp.to_torch(solid.mass.grad) * mass / inputs["density"]}
-    got |= {"activation": (wp.to_torch(solid.pull.grad) * model.strength)[None]}
+    got |= {"activation": (wp.to_torch(solid.active_stress.grad) * model.strength)[None]}
     for name, gradient in got.items():
         assert_relative(gradient, want[name], limit, name)
     solid.raise_failure(model, states[-1])

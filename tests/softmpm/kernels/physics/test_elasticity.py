@@ -145,7 +145,7 @@ ROUNDING = {
 """Median relative error of P for stretches (1, 1, J) in float32, times J."""
 
 
-@pytest.mark.parametrize("law", ROUNDING)
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("J", [0.1, 0.01, 0.001])
 def test_rounding_near_collapse(law, J, device):
     """Median relative errors of P = τ F⁻ᵀ and of F̄ from P̄: the second does not grow where P is finite at J = 0."""

@@ -10,7 +10,7 @@ import torch
 from helpers import LAWS, busy_scene
 
 import softmpm
-from softmpm import reference_lagrangian, reference_step, reference_stress
+from softmpm import reference_lagrangian, reference_step_limit, reference_stress
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 MU = 3.0
@@ -66,7 +66,9 @@ def test_no_unstable_step_is_missed(dim, law, load):
         F = deformations(dim, 40)
         one = torch.ones(len(F)).double()
         acting = given | ({"pull": max(given["pull"], 0.0)} if "pull" in given else {})
-        K = reference_step.stiffness(LAWS[law](density=1.0, young=1.0), F, MU * one, lam * one, **acting)
+        K = reference_step_limit.stiffness(
+            LAWS[law](density=1.0, young=1.0), F, MU * one, lam * one, **acting
+        )
         true = largest(law, F, lam, **given)
         assert (true * (1 - 1e-9) <= K).all()
         if load in ("law", "viscosity"):
@@ -120,9 +122,11 @@ def test_the_alarm_is_that_of_the_reference(dim, law, device):
             damping = torch.tensor(4 * viscosity / dt, dtype=torch.float64)
             acting = (max(stresses[0], 0) + max(stresses[1], 0), stresses[2], damping)
             moduli = torch.tensor([mu, lam], dtype=torch.float64)
-            K = reference_step.stiffness(made.bodies[0].material, one, *moduli, *acting)
+            K = reference_step_limit.stiffness(made.bodies[0].material, one, *moduli, *acting)
             density.append(K.item() * dt**2 / 0.1**2)
-            limit = reference_step.running_limit(made, 0, mu, lam, density[-1], one, stresses, viscosity)
+            limit = reference_step_limit.running_limit(
+                made, 0, mu, lam, density[-1], one, stresses, viscosity
+            )
             assert limit == pytest.approx(dt, rel=1e-9)
         rows = torch.full((1, count, 3), activation, device=model.device, dtype=torch.float64)
         inputs = softmpm.Inputs(viscosity=rows.new_full((1, 1), viscosity))
@@ -169,7 +173,7 @@ def above(made, F, activation, dt: float) -> torch.Tensor:
             ]
         )
         damping = 4 * material.viscosity / dt * ones
-        K = reference_step.stiffness(material, F[own.start : own.stop], mu, lam, pull, 0.0, damping)
+        K = reference_step_limit.stiffness(material, F[own.start : own.stop], mu, lam, pull, 0.0, damping)
         found.append(material.density * made.grid.spacing**2 / dt**2 < K)
     return torch.cat(found)
 

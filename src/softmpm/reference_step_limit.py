@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Muscle, Pressure, Scene
+from softmpm.scene.scene import Actuator, Muscle, Pressure, Scene
 
 
 def _no_volume(J: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
@@ -55,6 +55,11 @@ ENERGIES: dict[type[Material], tuple[Callable[..., Tensor], Callable[..., Tensor
     BarrierCorotated: (_corotated, _barrier),
 }
 """g(|F|²) and f(J) of each law [Pa]; both are linear in μ and λ."""
+STIFFENING: dict[type[Actuator], Callable[[float], tuple[float, float]]] = {
+    Muscle: lambda stress: (max(stress, 0.0), 0.0),
+    Pressure: lambda stress: (0.0, stress),
+}
+"""Contribution of an actuator of each kind with an active stress to ``pull`` and to ``pressure`` of :func:`stiffness` [Pa]."""
 
 
 def stiffness(
@@ -137,12 +142,11 @@ def running_limit(
         bodies = [k for k, body in enumerate(scene.bodies) for _ in range(len(body.particles))]
         material = scene.bodies[bodies[particle]].material
         acting = [
-            (muscle, stress)
+            STIFFENING[type(muscle)](stress)
             for muscle, stress in zip(scene.muscles, active_stress, strict=True)
             if particle in muscle.particles
         ]
-        pull = sum(max(stress, 0.0) for muscle, stress in acting if isinstance(muscle, Muscle))
-        pressure = sum(stress for muscle, stress in acting if isinstance(muscle, Pressure))
+        pull, pressure = (sum(terms) for terms in zip((0.0, 0.0), *acting, strict=True))
         if not bool(torch.isfinite(F).all()):
             return math.nan
 

@@ -1,0 +1,56 @@
+"""Every law, actuator and input stands in all tables that docs/extending.md names, so that one that is forgotten is named."""
+
+from pathlib import Path
+
+import pytest
+from helpers import GIVEN, LAWS, WALL_INPUTS
+
+import softmpm
+from softmpm import energy_density, reference_step_limit, reference_stress
+from softmpm.inputs import Input, Inputs
+from softmpm.scene import file
+from softmpm.scene.materials import Material
+from softmpm.scene.scene import Actuator
+
+KERNELS = Path(softmpm.__file__).parent / "kernels" / "physics"
+
+
+def kernel_files(folder: str) -> set[str]:
+    return {path.stem for path in (KERNELS / folder).glob("*.py")} - {"__init__"}
+
+
+def snake(name: str) -> str:
+    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).strip("_")
+
+
+def public(base: type) -> set[type]:
+    """Subclasses under their public names; a class with slots has a second one that nothing refers to."""
+    return {getattr(softmpm, kind.__name__) for kind in base.__subclasses__()}
+
+
+def test_laws():
+    """Reference, energy, energy for the step limit, file of scenes, kernels and tests have the same laws."""
+    laws = public(Material)
+    assert laws == set(LAWS.values()) == set(reference_stress.LAWS) == set(energy_density.DENSITIES)
+    assert laws == set(reference_step_limit.ENERGIES) and laws <= set(file.TYPES.values())
+    assert kernel_files("laws") == set(LAWS) == {snake(law.__name__) for law in laws}
+
+
+def test_actuators():
+    """Reference, step limit, file of scenes and kernels have the same kinds."""
+    kinds = public(Actuator)
+    assert kinds == set(reference_stress.ACTUATORS) == set(reference_step_limit.STIFFENING)
+    assert kinds <= set(file.TYPES.values())
+    assert kernel_files("actuators") == {snake(kind.__name__) for kind in kinds}
+
+
+def test_inputs():
+    """test_inputs.py and test_lagrangian.py compare each of them: what a formulation did not read would have no gradient there."""
+    assert {*GIVEN, *WALL_INPUTS} == set(Inputs._fields) - {"strength", "velocity", "position"}
+
+
+def test_an_input_that_would_be_bound_wrongly_is_refused():
+    """Scalars of particles have no rows, vectors must have them."""
+    for kind, rows in (("scalar", True), ("index", True), ("vector", False)):
+        with pytest.raises(ValueError, match=f"input 'charge'.*got kind='{kind}' and rows={rows}"):
+            Input(name="charge", per="particle", kind=kind, rows=rows)
