@@ -36,9 +36,6 @@ class Exact(NamedTuple):
     C: np.ndarray
     F: np.ndarray
 
-    def is_finite(self) -> bool:
-        return all(bool(np.isfinite(array).all()) for array in self)
-
 
 def exact(state: softmpm.State, world: int = 0) -> Exact:
     arrays = {name: getattr(state, name)[world].detach().cpu().double().numpy() for name in "xvCF"}

@@ -39,7 +39,8 @@ def simulate(
 ) -> State:
     """Advance a soft robot, differentiably.
 
-    Each row of ``activation`` drives ``substeps`` MLS-MPM substeps (Hu et al. 2018, Eq. 29). Second derivatives raise.
+    Each row of ``activation`` drives ``substeps`` substeps of MLS-MPM (Hu et al. 2018, Eq. 29), in the reference formulation of total
+    Lagrangian MPM. Second derivatives raise.
 
     Args:
         model: The model of the scene, from :func:`softmpm.build`.
@@ -60,8 +61,9 @@ def simulate(
     Raises:
         TypeError: ``model`` is not a :class:`softmpm.Model`.
         ValueError: An argument has a wrong shape, precision or device; names the rule and the value received.
-        UnstableError: A particle became non-finite, collapsed or left the grid, numerical fracture occurred, or dt is above the
-            running stable step (:class:`softmpm.Alarms`); names world, particle, substep and limit.
+        UnstableError: A particle became non-finite, collapsed or left the grid, numerical fracture occurred, dt is above the running
+            stable step, a surface point is deep in a wall, or bodies overlap although ``body_contact=False`` (:class:`softmpm.Alarms`);
+            names world, particle, substep and limit.
         torch.OutOfMemoryError: With a note of the estimated requirement. The backward pass may raise it and UnstableError as well.
     """
     return _simulate(model, start, activation, params, substeps, inputs, failures)
@@ -195,7 +197,7 @@ class _Call:
         return 4 if self.model.surface is None else 6
 
     def rounding(self, state: Any) -> tuple:
-        """What is not differentiable of a state: shift and ``low`` of nodes, or low-order parts of particles or None in their place."""
+        """Parts of a state without a gradient: shift and ``low`` of nodes, or low-order parts of particles, or None."""
         return (state.shift, state.low) if isinstance(state, Nodal) else tuple(state.low or (None, None))
 
     def run(self, start: Any, values: Values) -> Any:

@@ -1,4 +1,4 @@
-"""What PyTorch offers besides the gradient and the kernels do not have: batches, forward mode and second derivatives raise an error.
+"""Errors for what PyTorch offers besides the gradient and the kernels do not: batches, forward mode and second derivatives.
 
 Base classes of functions with an explicit adjoint, and the check for tensors that are batches.
 """

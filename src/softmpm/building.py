@@ -34,11 +34,11 @@ def build(
     threads: int | None = None,
     alarms: Alarms | None = None,
 ) -> Model:
-    """Make a scene ready to run.
+    """Compile a scene into a model.
 
     Args:
-        scene: What to simulate.
-        device: Where; None takes CUDA if there is one, and says so in the log.
+        scene: The scene to simulate.
+        device: Device of the simulation; None selects CUDA if there is one, and logs the choice.
         dtype: ``torch.float32`` or ``torch.float64``.
         worlds: Number of independent copies of the scene that run in one launch.
         memory_budget: Upper bound of the states that ``simulate`` may retain for a backward pass, or recompute at a time [bytes].
@@ -47,16 +47,16 @@ def build(
             docs/performance.md.
         formulation: "moving": material point method, whose grid is reset in each substep. "reference": total Lagrangian, with weights
             taken once at rest; see docs/formulations.md. "auto": the reference formulation if the scene states ``body_contact=False``
-            and it has all that is asked for; ``describe`` gives the reason.
-        contact: What meets the separating walls: "nodes", "surface" (the points of the outlines, :class:`softmpm.Outline`), or "auto":
-            the surface if every body has an outline.
+            and leaves ``scheme`` out; ``describe`` gives the reason.
+        contact: Part of the bodies that meets the separating walls: "nodes", "surface" (the points of the outlines,
+            :class:`softmpm.Outline`), or "auto": the surface if every body has an outline.
         contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower, and in the plain scheme
             and ``step`` much slower: float32 and the fast scheme are best. The CPU adds in one order anyway. See docs/conventions.md.
-        calls: How many calls of ``simulate`` one backward pass goes through, the control steps of a closed loop: they share the
-            budget. If there are more, they keep more. With eight or more, the first iterations of small scenes on a GPU are faster.
+        calls: Number of calls of ``simulate`` in one backward pass, the control steps of a closed loop, which share the budget. More
+            calls than stated exceed it. With eight or more, the first iterations of small scenes on a GPU are faster.
         threads: CPU threads that share a simulation; None takes those of PyTorch (``torch.get_num_threads()``) at each call. Results
             have the same bits with any number of them. It has no effect on a GPU, nor in the plain scheme, which has one.
         alarms: Limits beyond which a simulation is stopped by name; None takes those of :class:`softmpm.Alarms`.
@@ -65,8 +65,13 @@ def build(
         The model: immutable, shared by any number of simulations.
 
     Raises:
-        ValueError: The scene breaks a rule, or its dt is above :func:`softmpm.stable_dt`; the message names the rule, the value
-            received and a remedy.
+        TypeError: ``scene`` is no :class:`softmpm.Scene`, or an argument has another type than stated.
+        ValueError: The scene or an argument breaks a rule, or dt is above :func:`softmpm.stable_dt`; the message names the rule, the
+            value received and a remedy.
+        RuntimeError: There is no such device.
+
+    Warns:
+        StabilityWarning: The particles of a body are so far apart that numerical fracture occurs.
     """
     check_scene(scene)
     if dtype not in (torch.float32, torch.float64):
@@ -97,7 +102,7 @@ def build(
         raise ValueError(f"contact_width must be in [0, 1) cells, got {contact_width!r}.")
     surface = on_surface(scene, formulation, contact, contact_width)
     if formulation == "reference":
-        check_reference(scene, scheme)
+        check_reference(scheme)
         scheme, reason = "lagrangian", "formulation='reference'"
         alarms = dataclasses.replace(alarms, gap=None)
     else:
@@ -148,7 +153,7 @@ def choose_formulation(scene: Scene, scheme: str, wanted: str) -> tuple[str, str
     if scene.body_contact:
         return "moving", "the scene does not state body_contact=False"
     try:
-        check_reference(scene, scheme)
+        check_reference(scheme)
     except ValueError as obstacle:
         return "moving", str(obstacle).partition(";")[0]
     return "reference", "bodies meet walls only"
@@ -217,7 +222,7 @@ def check_moving(scene: Scene, surface: bool) -> None:
             )
 
 
-def check_reference(scene: Scene, scheme: str) -> None:
+def check_reference(scheme: str) -> None:
     """Raise ValueError for what the reference formulation cannot do."""
     if scheme != "auto":
         raise ValueError(f"formulation='reference' has one scheme, got scheme={scheme!r}; leave scheme out.")

@@ -149,7 +149,7 @@ class Model:
         return torch.tensor(np.asarray(values, dtype=np.float64), dtype=self.dtype, device=self.device)
 
     def _neighbours(self) -> Tensor:
-        """Neighbours at rest of each particle, -1 for none, shape (particle, dim); without columns if no alarm needs them."""
+        """Neighbours at rest of each particle, -1 for none, shape (particle, at most dim); without columns if no alarm needs them."""
         if self.alarms.gap is None:
             return torch.empty(self.particle_count, 0, dtype=torch.int32, device=self.device)
         longest = self.alarms.gap * self.scene.grid.spacing

@@ -18,7 +18,7 @@ TICKS = 64
 
 
 class OverlapGrid:
-    """What the check of a state needs of the particles, place by place, and sizes of the table of cells in which it finds those nearby.
+    """Data of the particles for the check of a state, place by place, and sizes of the table of cells in which it finds those nearby.
 
     Attributes:
         corners: Entry of :attr:`RestGrid.window`, flat, with the first node around each place, shape (place,), int32.

@@ -1,4 +1,4 @@
-"""What the kernels of a scene are specialised for, and the constants of their launches."""
+"""Features for which the kernels of a scene are specialised, and the constants of their launches."""
 
 import math
 import pkgutil

@@ -67,7 +67,7 @@ class Nodal(NamedTuple):
     """Mean force of clamps and planes of symmetry on each group of nodes that are images of each other, in the last control step [N],
     shape (world, group, dim); see :func:`softmpm.clamp_forces`. A call does not read it."""
     low: Tensor | None = None
-    """What rounding has kept from u [m] and v [m/s] so far, shape (world, 2, node, dim); None is nothing. The next substep adds it. A
+    """Accumulated rounding errors of u [m] and v [m/s], shape (world, 2, node, dim); None is nothing. The next substep adds it. A
     constant of the gradient."""
 
     @staticmethod
@@ -143,7 +143,7 @@ class State(NamedTuple):
     of 1e-5 of a cell survives a division into many calls; they carry no gradient. A state without them stands for exactly its
     four tensors."""
     nodes: Nodal | None = None
-    """What the particles show, in the reference formulation; None in the moving one. A state with nodes continues without loss; for
+    """Nodal state, in the reference formulation; None in the moving one. A state with nodes continues without loss; for
     one without, the nodes are computed from the four tensors."""
     surface: SurfaceState | None = None
     """Surface points in the moving formulation with contact at them, else None. A state with them continues without loss; in one

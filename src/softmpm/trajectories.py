@@ -27,7 +27,7 @@ class Trajectory(NamedTuple):
     end: State
     """State after the last control step, from which a simulation continues."""
     frames: Any
-    """What was observed after each ``every``-th control step, in tensors with a first axis ``frame``. Without ``observe`` a
+    """Observations after each ``every``-th control step, in tensors with a first axis ``frame``. Without ``observe`` a
     :class:`softmpm.State`, whose ``x`` has shape (frame, world, particle, dim)."""
 
 

@@ -62,11 +62,6 @@ class WarpSolid:
             _bind(work, given)
         object.__setattr__(self, "work", work)
 
-    @property
-    def pull(self) -> wp.array | None:
-        """Another name of :attr:`active_stress`."""
-        return self.active_stress
-
     def differentiable(self) -> list[wp.array]:
         arrays = self.arrays()
         return [arrays[one.name] for one in differentiable(self.model.spec)]

@@ -38,7 +38,7 @@ class WarpNodal:
     """Mean force of clamps and planes of symmetry on each group of nodes in the latest step [N], vectors of shape (world, group). Not
     read by a step."""
     low: wp.array
-    """What rounding has kept from u [m] and v [m/s] so far, vectors of shape (world, 2, node)."""
+    """Accumulated rounding errors of u [m] and v [m/s], vectors of shape (world, 2, node)."""
 
     def __post_init__(self):
         model, t = self.model, types(self.model.spec.dim, self.model.spec.dtype)

@@ -34,7 +34,7 @@ def due(run: Run) -> bool:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was found of policy and design of a run."""
+    """Evaluation of the policy and design of a run."""
 
     loss: float
     """Mean over the evaluation goals, ``train.endurance`` times as long as an episode; of several starts the worst; infinite if a

@@ -1,4 +1,4 @@
-"""What a sceptic would ask of a finished run: does the motion last, does it survive a kick and another floor, does a finer grid agree?
+"""Examination of a finished run: does the motion last, survive a kick and another floor, and agree with a finer grid?
 
 Each answer compares the first term of the objective with what it was in the episode, see :meth:`softmpm_learn.objective.Term.verdict`:
 

@@ -140,7 +140,7 @@ def run_side_by_side(
 
 
 def advice(jobs: Sequence[tuple[RunConf, Path]]) -> str:
-    """What to do where a signal ends the program."""
+    """Action where a signal ends the program."""
     if len(jobs) > 1:
         return "Finished iterations are saved; the same command goes on."
     return f"Finished iterations are saved; to go on, or to draw the pictures: resume={jobs[0][1]}"
@@ -158,7 +158,7 @@ def finer(conf: TaskConf) -> Task | None:
 
 
 def need_determinism(needed: bool) -> None:
-    """Whether PyTorch must give the same bits in every run; an operation that cannot then raises a RuntimeError that names it."""
+    """True if PyTorch must give the same bits in every run; an operation that cannot then raises a RuntimeError that names it."""
     if needed:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it is first used
     torch.use_deterministic_algorithms(needed)
@@ -231,13 +231,13 @@ def farewell_of_seeds(results: Sequence[Result], out: Path) -> str:
 
 
 def examined(examination: dict[str, float]) -> str:
-    """What was found at the end of a run; see examination.py."""
+    """Findings at the end of a run; see examination.py."""
     answers = {name: "none" if math.isnan(value) else f"{value:.3g}" for name, value in examination.items()}
     return ", ".join(f"{name} {answer}" for name, answer in answers.items())
 
 
 def outcome(task: Task, out: Path) -> str:
-    """What the robot achieved in the last recorded simulation, in words."""
+    """Achievement of the robot in the last recorded simulation, in words."""
     episode = last_episode(out / "run.h5")
     if episode is None:
         return ""

@@ -90,7 +90,7 @@ def evaluate_ends(runs: Runs) -> dict[int, float]:
 
 
 def _end(run: Run) -> float | None:
-    """What the evaluation at the end of a run said, if it was made."""
+    """Evaluation at the end of a run, if it was made."""
     return run.end[1] if run.end and run.end[0] == run.iteration else None
 
 

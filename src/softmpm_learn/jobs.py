@@ -54,7 +54,7 @@ class Job:
 
     @property
     def about(self) -> dict:
-        """What its outcome says besides the result."""
+        """Its outcome besides the result."""
         return {"job": self.number, "settings": self.settings, "folder": str(self.out)}
 
 

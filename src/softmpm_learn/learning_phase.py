@@ -133,7 +133,7 @@ def _train(learners: "Sequence[Learner]", capture: bool) -> list[EarlyStopping]:
 
 
 def _kind(learner: "Learner") -> tuple:
-    """What learners in lock step have in common."""
+    """Properties that learners in lock step have in common."""
     return learner.conf, learner.replay.shape, [p.shape for p in learner.autoencoder.parameters()]
 
 

@@ -82,7 +82,7 @@ class LockStep:
             }
 
     def _make_minibatches(self, first: "Learner", count: int, dtype: torch.dtype) -> None:
-        """What an epoch reads; random numbers are drawn on the CPU, into pinned memory if it has to be copied to a GPU."""
+        """Inputs of an epoch; random numbers are drawn on the CPU, into pinned memory if it has to be copied to a GPU."""
         batches, batch, on_gpu = self.conf.batches, self.conf.batch, self.device.type == "cuda"
         latent = first.autoencoder.encoder.centre.numel()
         self._drawn_places = torch.zeros(count, batches * batch, dtype=torch.long, pin_memory=on_gpu)

@@ -84,7 +84,7 @@ class Motions:
         return False
 
     def _counted(self, loss: float, lasts: bool) -> dict:
-        """What a motion counts by; one that is not worth going on with does not last."""
+        """Score of a motion; one that is not worth going on with does not last."""
         return {"loss": loss, "lasts": lasts and self._is_worth(loss)}
 
     def _is_worth(self, loss: float) -> bool:

@@ -242,5 +242,5 @@ class Objective:
         }
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
-        """What became of the first term that tells, in words."""
+        """Outcome of the first term that has one, in words."""
         return next(filter(None, (term.outcome(x, body_length) for term in self.terms)), "")

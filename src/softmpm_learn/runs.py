@@ -93,7 +93,7 @@ class Runs:
         return [k for k, run in enumerate(self.all) if run.iteration < last and k not in self.errors]
 
     def name(self, k: int) -> str:
-        """What people call a run: its seed, and its folder where several have that seed."""
+        """Name of a run: its seed, and its folder where several have that seed."""
         run = self.all[k]
         alike = sum(one.settings.train.seed == run.settings.train.seed for one in self.all) > 1
         return f"seed {run.settings.train.seed}" + (f" in {run.out}" if alike else "")

@@ -1,4 +1,4 @@
-"""What the command line says when something goes wrong: one sentence for people in place of a traceback."""
+"""Error messages of the command line: one sentence in place of a traceback."""
 
 import dataclasses
 import sys

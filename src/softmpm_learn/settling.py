@@ -16,7 +16,7 @@ class Settling:
     """Decides in the first of the last iterations whether the run settles in them."""
 
     active: bool = False
-    """What was decided."""
+    """True if the run settles."""
 
     def begins(self, left: int, count: int, worth: bool) -> bool:
         """True in the first iteration in which the run settles.

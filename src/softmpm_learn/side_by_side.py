@@ -169,7 +169,7 @@ class Policies:
 
     @property
     def weights(self) -> list[Tensor]:
-        """What a gradient is taken with respect to; :meth:`split` gives each run its part."""
+        """Parameters with respect to which a gradient is taken; :meth:`split` gives each run its part."""
         return [weight for stack in self.stacks for weight in stack.weights]
 
     def split(self, gradients: Sequence[Tensor]) -> list[list[Tensor]]:

@@ -42,7 +42,7 @@ class Stacked:
 
     @property
     def weights(self) -> list[Tensor]:
-        """What a gradient is taken with respect to; :meth:`split` gives each module its part."""
+        """Parameters with respect to which a gradient is taken; :meth:`split` gives each module its part."""
         if not self.batched:
             return [p for module in self.modules for p in module.parameters()]
         return [self._stacks[name] for name, _ in self.modules[0].named_parameters()]

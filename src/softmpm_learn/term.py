@@ -104,7 +104,7 @@ class Term(Placed, ABC):
         return self.value(path).mean().item()
 
     def verdict(self, own: float, other: float) -> float:
-        """How another :meth:`rate` compares with that of the episode: their quotient, 1 if they agree."""
+        """Quotient of another :meth:`rate` and that of the episode, 1 if they agree."""
         return other / own if own else math.nan
 
     def worst(self, verdicts: Sequence[float]) -> float:
@@ -112,5 +112,5 @@ class Term(Placed, ABC):
         return math.nan if any(math.isnan(one) for one in verdicts) else max(verdicts)
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
-        """What became of it in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
+        """Outcome in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
         return ""

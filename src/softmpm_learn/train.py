@@ -46,7 +46,7 @@ class Result:
     best_loss: float
     best_iteration: int
     examination: dict[str, float]
-    """What :func:`softmpm_learn.examination.examine` found, in the first process once the run is finished."""
+    """Findings of :func:`softmpm_learn.examination.examine`, in the first process once the run is finished."""
     seconds: dict[str, float]
     """Of its parts in this process since it began or was resumed, by the names of :mod:`softmpm_learn.timing`."""
     error: Exception | None = None
@@ -71,7 +71,7 @@ class Plan:
 
 @dataclass
 class _Work:
-    """What the loop works on."""
+    """State of the training loop."""
 
     runs: Runs
     plans: Sequence[Plan]

@@ -53,7 +53,7 @@ class Spec:
 
     @property
     def constrained(self) -> bool:
-        """Whether some nodes of the reference formulation are held or mirrored after the walls acted on them."""
+        """True if some nodes of the reference formulation are held or mirrored after the walls acted on them."""
         return bool(self.mirrors) or self.driven_nodes
 
 

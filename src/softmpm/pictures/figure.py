@@ -95,7 +95,7 @@ def show(
 def _instants(
     model: Model | Scene, state: State | None, activation: Tensor | None, worlds: tuple[int, ...]
 ) -> list[Instant]:
-    """What is drawn of each world."""
+    """Instant of each world that is drawn."""
     if state is None:
         scene = model if isinstance(model, Scene) else model.scene
         return [at_rest(scene)] * len(worlds)

@@ -88,5 +88,5 @@ class Scheme(Protocol):
         ...
 
     def particles(self, state: Any) -> State:
-        """What the particles show of such a state."""
+        """State of the particles that belongs to such a state."""
         ...

@@ -20,7 +20,7 @@ REWARDS = ("dense", "objective")
 
 
 class Costs:
-    """What a control step adds to the loss of an episode."""
+    """Contribution of a control step to the loss of an episode."""
 
     def __init__(self, task: Task, dense: bool):
         self.task, self.count, self.period = task, task.control_steps, task.control_period
@@ -47,14 +47,14 @@ class Costs:
         return alone, (1.0 / (states.stop - states.start) if states.start == 0 else 0.0), share
 
     def first(self, state: State, activation: Tensor, goal: Tensor | None) -> Tensor:
-        """What the initial state adds, shape (world,); ``activation`` gives the shape (world, muscle)."""
+        """Contribution of the initial state, shape (world,); ``activation`` gives the shape (world, muscle)."""
         path = Path([0.0, self.period], [state, state], torch.zeros_like(activation)[None], goal)
         return self._sum(activation, [(term, first) for term, first, _ in self._terms], path)
 
     def cost(
         self, before: State, after: State, activation: Tensor, steps: np.ndarray, goal: Tensor | None
     ) -> Tensor:
-        """What a control step adds, shape (world,).
+        """Contribution of a control step, shape (world,).
 
         Args:
             activation: Activation during the step [-], shape (world, muscle).
@@ -75,7 +75,7 @@ class Costs:
         return total
 
     def standing(self, state: State, activation: Tensor, steps: np.ndarray, goal: Tensor | None) -> Tensor:
-        """What the steps from ``steps`` on add if a world stands still until the horizon, shape (world,)."""
+        """Contribution of the steps from ``steps`` on if a world stands still until the horizon, shape (world,)."""
         nothing = torch.zeros_like(activation)
         path = Path([0.0, self.period], [state, state], nothing[None], goal)
         left = [

@@ -121,7 +121,7 @@ class Loggers:
 
 
 def rows(out: Path, first: int, last: int) -> Iterator[tuple[int, dict[str, float]]]:
-    """What a logger receives in iterations ``first`` to ``last - 1``, from the files of a run."""
+    """Entries that a logger receives in iterations ``first`` to ``last - 1``, from the files of a run."""
     if first >= last:
         return
     seconds = dict(_numbers(out / "timing.csv"))

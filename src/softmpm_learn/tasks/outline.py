@@ -37,7 +37,7 @@ BEVEL = 0.27
 
 
 def foot(outline: np.ndarray, edge: float) -> np.ndarray:
-    """What a closed outline (point, 2) encloses above the floor y = 0, which cuts it once, with a flat sole and bevelled edges.
+    """Region that a closed outline (point, 2) encloses above the floor y = 0, which cuts it once, with a flat sole and bevelled edges.
 
     A sharp edge that pushes the robot off carries the friction of its foot, and tears.
 

@@ -71,7 +71,7 @@ class TaskConf:
     overlap: bool = False
     """reference: whether limbs may pass through each other; else the simulation stops by name where they do."""
     contact: str = "auto"
-    """What meets the walls that separate: the surface of the robot, or the nodes around it. auto is the surface for robots on legs, in
+    """Part that meets separating walls: the surface of the robot, or the nodes around it. auto is the surface for robots on legs, in
     both formulations; the arm meets no such wall. A robot in the reference formulation or with a surface has cut cells."""
     contact_width: float | None = None
     """Distance over which surface contact sets in [cells]; 0 to evaluate. null is 0.01 where the surface meets the floor, with which
@@ -174,7 +174,7 @@ class Task:
     feature_gain: float = 1.0
     """Influence of an encoder's features on them, in units of the clock's; see ``policy.feature_gain``, which goes before."""
     clock: bool = True
-    """Whether policies see the time; see ``policy.clock``, which goes before."""
+    """True if policies see the time; see ``policy.clock``, which goes before."""
     rate: float = 5e-3
     """Learning rate of the policy, for the mlp and adam; see ``optimizer.policy_rate``, which goes before."""
     worth: float = math.inf

@@ -129,7 +129,7 @@ def fused_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             v: vec,
             C: mat,
         ) -> Contribution:
-            """What a particle gave to its nodes (T1)."""
+            """Contribution of a particle to its nodes (T1)."""
             out = Contribution()
             out.H = matrix(now.rows, i, row_H)
             out.g = centre(vector(now.rows, i, row_fx))

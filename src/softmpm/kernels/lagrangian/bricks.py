@@ -33,9 +33,9 @@ class Bricks(NamedTuple):
     parts: int
     """Particles of a cell in a row."""
     lattice: bool = False
-    """Whether all cells have the same ``parts`` places along each axis."""
+    """True if all cells have the same ``parts`` places along each axis."""
     serial: bool = False
-    """Whether one thread has a brick, as on the CPU."""
+    """True if one thread has a brick, as on the CPU."""
     blocks: int = 1
     """Blocks that a multiprocessor is to hold at least: more of them leave fewer registers for each."""
 
@@ -104,7 +104,7 @@ class Bricks(NamedTuple):
 
     @property
     def pairs(self) -> bool:
-        """Whether threads suffice for the components of two fields at once."""
+        """True if threads suffice for the components of two fields at once."""
         return not self.serial and 2 * self.cell_count * self.dim <= self.threads
 
     def terms(self, given: int, fields: int) -> int:

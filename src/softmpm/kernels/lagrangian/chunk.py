@@ -75,7 +75,7 @@ def chunk(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def lost(a: vec, b: vec) -> vec:
-        """What rounding keeps from a + b, where b is small."""
+        """Rounding error of a + b, where b is small."""
         return b - ((a + b) - a)
 
     @wp.func

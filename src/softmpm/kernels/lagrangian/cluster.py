@@ -27,7 +27,7 @@ class Cluster(NamedTuple):
     groups: int
     """Groups of threads in a block; each has a brick."""
     alone: bool = False
-    """Whether no thread has more than one brick, node, surface point and touched node: no code is needed to read others."""
+    """True if no thread has more than one brick, node, surface point and touched node: no code is needed to read others."""
 
     @property
     def group_threads(self) -> int:
@@ -41,7 +41,7 @@ class Cluster(NamedTuple):
 
     @property
     def roomy(self) -> bool:
-        """Whether threads have registers enough to keep a surface point from one substep to the next."""
+        """True if threads have registers enough to keep a surface point from one substep to the next."""
         return self.threads <= 256
 
     @property
@@ -78,7 +78,7 @@ def numbering(cluster: Cluster) -> SimpleNamespace:
 
     @wp.func
     def following(i: int, stride: int, count: int) -> int:
-        """What a thread has after its brick, node or point ``i``; ``count`` if it has no other."""
+        """Brick, node or point of a thread after ``i``; ``count`` if it has no other."""
         if wp.static(alone):
             return count
         else:

@@ -30,7 +30,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
     Constants, dim = t.Constants, spec.dim
     ParticleInputs, forced, given_to = input_types(spec).ParticleInputs, one.forced, one.given_to
-    check_now, sound, memory, mat = one.check_now, one.sound, chunk(dim, spec.dtype), t.mat
+    check_now, is_valid, memory, mat = one.check_now, one.is_valid, chunk(dim, spec.dtype), t.mat
     Chunk, state_of, u_of = memory.Chunk, memory.state_of, memory.u_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage_at, of_v.stage_at, sums(dim, spec.dtype, bricks, False).clear
@@ -87,7 +87,7 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                         if there:
                             check_now(constants, inputs, inside, at.words, world, p, s, Hn)
                     else:
-                        bad = bad or (there and not sound(constants, Hn))
+                        bad = bad or (there and not is_valid(constants, Hn))
             add(A, at.partial, world, brick, corner, layer, lane, lattice)
             if wp.static(not serial):  # here and with H once more, so that the particles do not wait for it
                 if corner >= 0 and (bad or s % CHECKED == 0):

@@ -20,7 +20,7 @@ def gathering(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.func
     def entries_of(inside: Rest, i: int) -> Entries:
-        """Where the partial sums for a node are, or -1."""
+        """Places of the partial sums for a node, or -1."""
         out = Entries()
         for n in range(most):
             out[n] = inside.shares[n, i]

@@ -57,7 +57,7 @@ def nodes(spec: Spec) -> SimpleNamespace:
 
     @wp.struct
     class Node:
-        """What is the same in every substep of a chunk."""
+        """Data of a node that are the same in every substep of a chunk."""
 
         rest: exact_vec  # its position at rest [m]
         m: real

@@ -43,7 +43,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
 
     @wp.struct
     class Given:
-        """What a particle is given for a control step."""
+        """Inputs of a particle for a control step."""
 
         material: Material
         viscosity: real  # [Pa s]
@@ -67,7 +67,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         return -own.volume * P
 
     @wp.func
-    def sound(constants: Constants, H: mat) -> bool:
+    def is_valid(constants: Constants, H: mat) -> bool:
         """True for a particle that ``check`` does not report. A comparison with NaN is false."""
         j = volume_change(H)
         return j > constants.collapse and j < real(largest)
@@ -77,7 +77,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         constants: Constants, words: wp.array(dtype=wp.int64), world: int, p: int, substep: int, H: mat
     ):
         """Report a particle that collapsed or is not finite."""
-        if not sound(constants, H):
+        if not is_valid(constants, H):
             kind = collapsed
             j = volume_change(H)
             if not wp.isfinite(wp.ddot(H, H)) or not j < real(largest):
@@ -120,7 +120,7 @@ def particle_forces(spec: Spec) -> SimpleNamespace:
         Given=Given,
         given_to=given_to,
         forced=forced,
-        sound=sound,
+        is_valid=is_valid,
         check=check,
         check_step=check_step,
         check_now=check_now,

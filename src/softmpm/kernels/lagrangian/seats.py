@@ -1,4 +1,4 @@
-"""What the threads of a brick of particles anywhere read: the same in every substep of a control step."""
+"""Data that the threads of a brick of particles anywhere read: the same in every substep of a control step."""
 
 from types import SimpleNamespace
 

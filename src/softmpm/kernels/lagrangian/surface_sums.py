@@ -66,7 +66,7 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.struct
     class Point:
-        """What is the same in every substep of a chunk."""
+        """Data of a point that are the same in every substep of a chunk."""
 
         rest: exact_vec  # its place at rest [m]
         stencil: numbers

@@ -142,7 +142,7 @@ def total_stress(spec: Spec) -> SimpleNamespace:
 
 @kernel_factory
 def material(spec: Spec) -> SimpleNamespace:
-    """What a particle is made of: its law with the moduli, and its actuators."""
+    """Material of a particle: its law with the moduli, and its actuators."""
     t, ParticleInputs = types(spec.dim, spec.dtype), input_types(spec).ParticleInputs
     real, slots, dim = t.real, spec.muscle_slots, spec.dim
     several_laws, several_kinds = len(spec.laws) > 1, len(spec.actuators) > 1

@@ -34,7 +34,7 @@ from softmpm.state import State
 
 
 def sums_over(model: Model, rows: Callable[[], Tensor], nodes: Sequence[wp.array]) -> NodeSums:
-    """How the particles of a model add to nodes; ``rows`` gives memory for what they contribute, packed as they are."""
+    """Sums of the contributions of a model's particles to nodes; ``rows`` gives memory for what they contribute, packed as they are."""
     if model.spec.deterministic:
         return FixedPointSums(model, view(rows(), wp.float32), nodes)
     return SlabSums(model, rows(), nodes) if model.spec.slabs else NodeSums(nodes)

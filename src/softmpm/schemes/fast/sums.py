@@ -1,4 +1,4 @@
-"""How the contributions of particles reach the nodes: on a GPU particles add to them, a CPU has slabs of nodes for its threads.
+"""Sums of the contributions of particles to nodes: on a GPU particles add to them, a CPU has slabs of nodes for its threads.
 
 A deterministic model has :class:`softmpm.schemes.fast.fixed_point.FixedPointSums` in their place.
 """

@@ -29,7 +29,7 @@ from softmpm.surface_grid import SurfaceGrid
 
 
 def particles_of(model: Model, nodes: Nodal) -> State:
-    """What the particles show of a nodal state (Q5), which the result carries along."""
+    """State of the particles that belongs to a nodal state (Q5), which the result carries along."""
     shown: Any = _Show.apply(model, nodes.u, nodes.v, shift_of(model, nodes))
     return State(*shown, nodes=nodes)
 

@@ -94,7 +94,7 @@ class Substep:
 
     @functools.cached_property
     def gained(self) -> Tensor:
-        """What contact at surface points adds to the adjoints of velocity and mass, (world, node, dim + 1)."""
+        """Contributions of contact at surface points to the adjoints of velocity and mass, (world, node, dim + 1)."""
         return torch.empty_like(self.node)
 
     @property
@@ -155,7 +155,7 @@ class Substep:
         self.p2g_adj(wanted, now, adj_now, adj_particle_inputs, substep)
 
     def _add_loads(self, contact: SurfaceContact, now) -> None:
-        """What contact at surface points begins with: the areas on the nodes, and a copy of their velocity."""
+        """Initial data of contact at surface points: the areas on the nodes, and a copy of their velocity."""
         clear(self.load)
         contact.add_loads(now, self._array("load"), self.launch)
         self.free.copy_(self.velocity)
