@@ -1,6 +1,7 @@
-"""The programs in ``examples/`` with a small budget: each leaves its picture and does what its first line says."""
+"""The programs in ``examples/`` with a small budget, each of which leaves its picture; and the list of benchmarks."""
 
 import ast
+import re
 import runpy
 from pathlib import Path
 
@@ -136,3 +137,14 @@ def test_a_film_is_made(run):
     assert Path("film.mp4").stat().st_size > 5_000 and Path("film.rrd").stat().st_size > 50_000
     with softmpm.Recording("film.h5") as recording:
         assert len(recording.frames(0)["time"]) == round(names["seconds"] / names["period"]) + 1
+
+
+def test_every_benchmark_is_listed():
+    """With its program in a table of ``bench/README.md``; each page that is named there exists."""
+    folder = EXAMPLES.parent / "bench"
+    text = (folder / "README.md").read_text()
+    names = {path.name for path in folder.glob("*.py")}
+    names |= {f"{path.parent.name}/" for path in folder.glob("*/__init__.py")}
+    assert names == set(re.findall(r"`([a-z_]+(?:\.py|/))`", text)) - {"results/"}
+    for page in re.findall(r"\]\((\S+?)(?:#\S+)?\)", text):
+        assert (folder / page).is_file(), page

@@ -34,6 +34,7 @@ SHORT = {
     "BarrierCorotated": "barrier corot.",
     "StableNeoHookean": "stable neo-H.",
 }
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
 LINE, HEAD = 0.235, 0.62
 """Heights of a line of cells and of a row's title [inch]."""
 WIDTH, MARGIN = 10.5, 1.25
@@ -130,9 +131,7 @@ def draw_limit(rows: list[dict], folder: Path) -> None:
         "strip reported / rest": "held strip: reported / that at rest",
     }
     for axes, (column, title) in zip(three, panels.items(), strict=True):
-        for law, colour, marker in zip(
-            LAWS, ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), "osD^", strict=True
-        ):
+        for law, colour, marker in zip(LAWS, LINES, "osD^vP*X", strict=False):
             for dim, style in ((2, "-"), (3, "--")):
                 own = [row for row in rows if row["law"] == law.__name__ and row["dim"] == dim]
                 axes.plot(
