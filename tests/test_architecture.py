@@ -32,7 +32,7 @@ LAYERS = """
     schemes
     schemes.plain schemes.fast schemes.lagrangian recording
     schemes.registry material
-    kernel_inputs
+    kernel_inputs choices
     building runner rasterization cuda_graph
     rollout forces quantities warp_nodal
     autograd warp_particles pictures

@@ -22,9 +22,10 @@ from softmpm_learn import app, checkpoint, experiment
 from softmpm_learn.__main__ import help_text
 from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
+from softmpm_learn.register import CHOICES
 from softmpm_learn.saved import load, save
 from softmpm_learn.sentences import sentence
-from softmpm_learn.tasks import TASKS, ArmConf, Resolution, make_task
+from softmpm_learn.tasks import ArmConf, Resolution, make_task
 
 ROOT = Path(__file__).parents[2]
 TINY = [  # the smallest run that has every phase
@@ -145,9 +146,10 @@ def test_every_choice_composes_and_is_in_the_help(group, option):
         assert getattr(conf, group).name == option
 
 
-def test_every_task_has_its_file():
-    """The table of tasks and ``conf/task/`` have the same names."""
-    assert {path.stem for path in (Path(conf_dir()) / "task").glob("*.yaml")} == set(TASKS)
+@pytest.mark.parametrize("table", CHOICES, ids=lambda table: table.what)
+def test_every_choice_has_its_file(table):
+    """Each table of the package and its folder in ``conf/`` have the same names."""
+    assert {path.stem for path in (Path(conf_dir()) / table.what).glob("*.yaml")} == set(table)
 
 
 def test_the_learning_rate_is_the_tasks_unless_it_is_chosen():

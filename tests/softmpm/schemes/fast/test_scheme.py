@@ -23,7 +23,7 @@ from helpers import (
 )
 
 import softmpm
-from softmpm.building import choose_scheme
+from softmpm.choices import choose_scheme
 from softmpm.kernels.fast.native import WARP
 from softmpm.kernels.structs import BASE_BITS, packed_rows
 from softmpm.material import material

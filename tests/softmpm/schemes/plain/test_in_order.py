@@ -9,7 +9,7 @@ import warp as wp
 from helpers import assert_relative, busy_inputs, busy_scene, cotangent, gradients, run
 
 import softmpm
-from softmpm.building import in_fixed_point
+from softmpm.choices import in_fixed_point
 from softmpm.kernels.structs import types
 from softmpm.schemes.plain.footprint import term_bytes
 
