@@ -2,13 +2,13 @@
 
 Each answer compares the first term of the objective with what it was in the episode, see :meth:`softmpm_learn.objective.Term.verdict`:
 
-    later     three times as long: from T to 3T against from T/2 to T, in closed loop
-    kicked    the worse of two starts with ±0.1 m/s, in closed loop
-    friction  the worse of 0.75 and 1.25 times the friction of every wall, in closed loop
-    finer     the same activations on the next finer grid
-    tilt      largest tilt until 3T [degrees]
-    miss      what should reach a goal: largest distance from it from T − 0.3 s to T + 0.5 s [m]
-    speed     what should come to rest: largest speed in that time [m/s]
+    later          three times as long: from T to 3T against from T/2 to T, in closed loop
+    kicked         the worse of two starts with ±0.1 m/s, in closed loop
+    friction       the worse of 0.75 and 1.25 times the friction of every wall, in closed loop
+    finer          the same activations on the next finer grid
+    largest_tilt   until 3T [degrees]
+    largest_miss   of what should reach a goal: distance from it from T − 0.3 s to T + 0.5 s [m]
+    largest_speed  of what should come to rest: speed in that time [m/s]
 
 Beside them stands ``end``: the loss, or the evaluation, of the best motion, simulated once more, of a walker from other starts.
 
@@ -40,7 +40,7 @@ KICK = 0.1
 FRICTION = 0.75, 1.25
 BEFORE, AFTER = 0.3, 0.5
 """Durations before and after the end of an episode during which a held goal must be kept at rest [s]."""
-NAMES = ["end", "later", "kicked", "friction", "finer", "tilt", "miss", "speed"]
+NAMES = ["end", "later", "kicked", "friction", "finer", "largest_tilt", "largest_miss", "largest_speed"]
 """Columns of metrics.csv."""
 
 logger = logging.getLogger("softmpm_learn")
@@ -100,11 +100,11 @@ def _extremes(task: Task, long: Path) -> dict[str, float]:
     window, found = dict(begin=task.seconds - BEFORE, end=task.seconds + AFTER), {}
     for term in reversed(task.objective.terms):  # of several of a kind the first counts
         if isinstance(term, Tilt):
-            found["tilt"] = term.degrees(long)
+            found["largest_tilt"] = term.degrees(long)
         elif isinstance(term, Reach):
-            found["miss"] = dataclasses.replace(term, **window).farthest(long)
+            found["largest_miss"] = dataclasses.replace(term, **window).farthest(long)
         elif isinstance(term, Still):
-            found["speed"] = dataclasses.replace(term, **window).fastest(long)
+            found["largest_speed"] = dataclasses.replace(term, **window).fastest(long)
     return found
 
 

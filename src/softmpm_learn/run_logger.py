@@ -27,14 +27,22 @@ logger = logging.getLogger("softmpm_learn")
 
 
 def metrics(run: Run) -> list[str]:
-    """Columns of metrics.csv; nothing in it depends on the clock."""
-    return [
-        *("loss", *run.task.objective.names, "evaluation", "lasts", "best", "activation"),
-        *("gradient_policy", "gradient_design", "clipped", "retries", "fallbacks", "restarts"),
-        *(f"{name}_change" for name in run.design.change()),
-        *("epochs", "training_loss", "validation_loss", "replay"),
-        *NAMES,
-    ]
+    """Columns of metrics.csv; nothing in it depends on the clock.
+
+    Raises:
+        ValueError: A term of the objective has the name of another column.
+    """
+    terms, others = run.task.objective.names, ["evaluation", "lasts", "best", "activation"]
+    others += ["gradient_policy", "gradient_design", "clipped", "retries", "fallbacks", "restarts"]
+    others += [f"{name}_change" for name in run.design.change()]
+    others += ["epochs", "training_loss", "validation_loss", "replay", *NAMES]
+    taken = [name for name in terms if name in ("iteration", "loss", *others)]
+    if taken:
+        raise ValueError(
+            f"the objective has a term {taken[0]!r}, but metrics.csv has another column of that name; give the class of the term "
+            "another name."
+        )
+    return ["loss", *terms, *others]
 
 
 class RunLogger:

@@ -43,9 +43,9 @@ class Outcome:
     kicked: float = math.nan
     friction: float = math.nan
     finer: float = math.nan
-    tilt: float = math.nan
-    miss: float = math.nan
-    speed: float = math.nan
+    largest_tilt: float = math.nan
+    largest_miss: float = math.nan
+    largest_speed: float = math.nan
     settings: str
     """Settings of the job, as on the command line."""
     folder: str

@@ -1,9 +1,16 @@
+import dataclasses
 import logging
 import math
 
 import pytest
 
+import softmpm
 from softmpm_learn.csv_log import Table
+from softmpm_learn.objective import Effort, Objective
+from softmpm_learn.register import TASKS
+from softmpm_learn.run import Run
+from softmpm_learn.run_logger import metrics
+from softmpm_learn.tasks import make_task
 
 
 def test_numbers_read_back_to_the_last_bit(tmp_path):
@@ -82,3 +89,20 @@ def test_mistakes_are_named(tmp_path):
     """A column that is not there is an error."""
     with pytest.raises(ValueError, match="no column typo"):
         Table(tmp_path / "t.csv", ["a"]).append(0, {"typo": 1.0})
+
+
+@pytest.mark.parametrize("name", ["elephant", "arm"])
+def test_columns_of_a_run_are_distinct(name, settings, tmp_path):
+    """The tilt of the objective and the largest tilt of the examination were both called tilt."""
+    task = make_task(TASKS[name].kind(seconds=0.05))
+    columns = metrics(Run(task, softmpm.build(task.scene, device="cpu", **task.build), settings, tmp_path))
+    assert len(set(columns)) == len(columns) and set(task.objective.names) < set(columns)
+
+
+@pytest.mark.parametrize("name", ["Loss", "Later", "Iteration"])
+def test_a_term_with_the_name_of_another_column_is_refused(name, task, model, settings, tmp_path):
+    """It would take the place of the other one for whoever reads the file."""
+    kind = dataclasses.make_dataclass(name, [], bases=(Effort,), frozen=True, kw_only=True)
+    task = dataclasses.replace(task, objective=Objective(kind(), Effort()))
+    with pytest.raises(ValueError, match=f"has a term '{name.lower()}', but metrics.csv has another column"):
+        metrics(Run(task, model, settings, tmp_path))

@@ -52,10 +52,10 @@ def make_sweep(folder: Path, groups, *, failing=(), **more) -> Path:
         job = len(rows)
         settings = f"task=elephant {name} train.seed={seed}"
         row = {"job": job, "status": "finished", "settings": settings, "folder": f"/elsewhere/{job}"}
-        row |= {"later": 0.9 + 0.01 * job, "tilt": 5.0 + job, "loss": -9.0, "iterations": 3, **more}
+        row |= {"later": 0.9 + 0.01 * job, "largest_tilt": 5.0 + job, "loss": -9.0, "iterations": 3, **more}
         last = [1.0, 0.5, losses[seed]]
         if job in failing:
-            row |= {"status": "failed", "loss": "inf", "later": "", "tilt": "", "error": "it broke"}
+            row |= {"status": "failed", "loss": "inf", "later": "", "largest_tilt": "", "error": "it broke"}
             last = [1.0]
         metrics(folder / str(job), last, **({} if job in failing else {"later": 0.9}))
         rows.append(row)
@@ -109,7 +109,7 @@ def test_settings_are_compared_seed_by_seed(swept, tmp_path):
     assert float(final["difference"]) == pytest.approx(np.mean(differences))
     assert (final["pairs"], final["first_lower"]) == ("3", "2")
     assert min(differences) <= float(final["low"]) < float(final["high"]) <= max(differences)
-    assert (later["quantity"], tilt["quantity"]) == ("later", "tilt")
+    assert (later["quantity"], tilt["quantity"]) == ("later", "largest_tilt")
     assert float(tilt["difference"]) == float(tilt["low"]) == float(tilt["high"]) == -3.0
 
 
@@ -231,17 +231,28 @@ def summaries(folder: Path) -> list[list[list[str]]]:
     return [table for table in found if table]
 
 
+def test_an_objective_without_a_rule_neither_passes_nor_fails(tmp_path):
+    """Whose first term is neither progress nor reach."""
+    folder = make_sweep(tmp_path, {"observer=latent": LATENT})
+    for job in range(3):
+        path = folder / str(job) / "metrics.csv"
+        path.write_text(path.read_text().replace("progress", "jump"))
+    program.make([folder], tmp_path / "out")
+    ((_, row),) = summaries(tmp_path / "out")
+    assert row[-1] == "–"
+
+
 def test_the_summary_has_a_row_for_each_setting(tmp_path):
     """Medians, failures and runs that stood the examination; differences from the first setting."""
     folder = make_sweep(tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS}, failing=[4])
     rows = read(folder / "sweep.csv")
     for row, later, tilt in zip(rows, (0.7, 0.69, 0.8, 0.9, 0.9, ""), (5, 5, 30, 5, 5, 5), strict=True):
-        row |= {"later": later, "tilt": tilt}
+        row |= {"later": later, "largest_tilt": tilt}
     table(folder / "sweep.csv", COLUMNS, rows)
     program.make([folder], tmp_path / "out")
     medians, differences = summaries(tmp_path / "out")
     assert medians == [
-        ["observer", "loss at 2", "later", "tilt", "failed", "passed"],
+        ["observer", "loss at 2", "later", "largest_tilt", "failed", "passed"],
         ["latent", "-2 [-4, -1]", "0.7", "5", "0 of 3", "1 of 3"],
         ["kmeans", "-0.75 [-1, -0.5]", "0.9 (1)", "5", "1 of 3", "1 of 3"],
     ]
@@ -256,22 +267,34 @@ def test_the_summary_has_a_row_for_each_setting(tmp_path):
         ({"status": "failed"}, False),
         ({"later": 0.69}, False),
         ({"later": math.nan}, False),
-        ({"tilt": 30.0}, False),
-        ({"tilt": math.nan}, False),
+        ({"largest_tilt": 30.0}, False),
+        ({"largest_tilt": math.nan}, False),
         ({"best": 0.01}, False),  # it went backwards
         ({"term": "reach"}, False),
-        ({"term": "reach", "best": 0.01, "tilt": math.nan, "miss": 0.005, "speed": 0.05}, True),
-        ({"term": "reach", "miss": 0.005, "speed": math.nan}, True),  # it need not come to rest
-        ({"term": "reach", "miss": 0.005, "speed": 0.051}, False),
-        ({"term": "reach", "miss": 0.0051, "speed": 0.0}, False),
-        ({"term": "reach", "miss": math.nan, "speed": 0.0}, False),
+        (
+            {
+                "term": "reach",
+                "best": 0.01,
+                "largest_tilt": math.nan,
+                "largest_miss": 0.005,
+                "largest_speed": 0.05,
+            },
+            True,
+        ),
+        (
+            {"term": "reach", "largest_miss": 0.005, "largest_speed": math.nan},
+            True,
+        ),  # it need not come to rest
+        ({"term": "reach", "largest_miss": 0.005, "largest_speed": 0.051}, False),
+        ({"term": "reach", "largest_miss": 0.0051, "largest_speed": 0.0}, False),
+        ({"term": "reach", "largest_miss": math.nan, "largest_speed": 0.0}, False),
         ({"term": "own"}, False),
     ],
 )
 def test_what_passes_the_examination(changes, passed):
     """Walkers go on forward and level, what reaches stays at its goal; without an answer nothing passes."""
-    row = {"status": "finished", "term": "progress", "later": 0.7, "tilt": 29.0, "best": -0.5}
-    row |= {"miss": math.nan, "speed": math.nan}
+    row = {"status": "finished", "term": "progress", "later": 0.7, "largest_tilt": 29.0, "best": -0.5}
+    row |= {"largest_miss": math.nan, "largest_speed": math.nan}
     assert passes(row | changes) == passed
 
 
@@ -286,7 +309,7 @@ def test_earlier_iterations_are_compared_too(tmp_path):
         ("5.0", "10.0", "10.5"),
         ("6.0", "11.0", "11.5"),
     ]
-    assert [row["quantity"] for row in pairs] == ["at_10", "at_20", "final", "later", "tilt"]
+    assert [row["quantity"] for row in pairs] == ["at_10", "at_20", "final", "later", "largest_tilt"]
     assert [row["difference"] for row in pairs[:3]] == ["-3.0"] * 3
     assert summaries(tmp_path / "out")[0][0][1:4] == ["loss at 10", "loss at 20", "loss at 21"]
 

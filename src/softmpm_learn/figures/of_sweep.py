@@ -24,11 +24,15 @@ TITLES = {
     "kicked": "kicked at the start",
     "friction": "friction ± 25 %",
     "finer": "next finer grid",
-    "tilt": "tilt while it continues",
-    "miss": "distance from the goal around the end",
-    "speed": "speed around the end",
+    "largest_tilt": "tilt while it continues",
+    "largest_miss": "distance from the goal around the end",
+    "largest_speed": "speed around the end",
 }
-EXTREMES = {"tilt": "largest tilt [degrees]", "miss": "largest distance [m]", "speed": "largest speed [m/s]"}
+EXTREMES = {
+    "largest_tilt": "largest tilt [degrees]",
+    "largest_miss": "largest distance [m]",
+    "largest_speed": "largest speed [m/s]",
+}
 ANSWERS = {"progress": "speed over that in the episode [1]", "reach": "distance from the goal [m]"}
 """Meaning of the examination, by the first term of the objective."""
 QUOTIENTS = -2.0, 3.0

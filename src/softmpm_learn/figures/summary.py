@@ -21,7 +21,7 @@ NOTE = (
     "Medians over the finished runs, in brackets with their bootstrap interval of 95 %; in parentheses the number of runs with an "
     f"answer, where some have none. Passed: a walker goes forward (a loss below 0), then keeps at least {SHARE:g} of its speed and "
     f"tilts by less than {LEVEL:g}°; what reaches for a goal stays within {1000 * NEAR:g} mm of it from 0.3 s before the end of the "
-    f"episode to 0.5 s after it, and below {RESTING:g} m/s where it should come to rest."
+    f"episode to 0.5 s after it, and below {RESTING:g} m/s where it should come to rest. Other objectives have no such rule."
 )
 DIFFERENCES = (
     "The first setting minus this one, paired by seed: the mean, of the examination the median, with its bootstrap interval of 95 %; "
@@ -29,14 +29,18 @@ DIFFERENCES = (
 )
 
 
+JUDGED = "progress", "reach"
+"""First terms of an objective by which a motion passes or not."""
+
+
 def passes(row: Row) -> bool:
     """True if the best motion of a run stood the examination; a row of jobs.csv."""
     if row["status"] != "finished":
         return False
     if row["term"] == "reach":  # it need not come to rest where the objective does not say so
-        return row["miss"] <= NEAR and not row["speed"] > RESTING
+        return row["largest_miss"] <= NEAR and not row["largest_speed"] > RESTING
     forward = row["term"] == "progress" and row["best"] < 0  # a quotient of two ways back is positive too
-    return forward and row["later"] >= SHARE and row["tilt"] < LEVEL
+    return forward and row["later"] >= SHARE and row["largest_tilt"] < LEVEL
 
 
 def summary(
@@ -56,7 +60,7 @@ def summary(
     heads = [*settings, *(_head(name, first[0]) for name in quantities)]
     rows = [
         [*_named(members, settings), *(_median(members, name, name not in examined) for name in quantities)]
-        + [_count(members, lambda row: row["status"] != "finished"), _count(members, passes)]
+        + [_count(members, lambda row: row["status"] != "finished"), _passed(members)]
         for members in groups.values()
     ]
     text = f"{_table([*heads, 'failed', 'passed'], rows)}\n{NOTE}\n"
@@ -104,6 +108,10 @@ def _difference(row: Mapping[str, Any], members: Sequence[Row]) -> str:
     if row["low"] > 0 or row["high"] < 0:
         text = f"**{text}**"
     return text if row["pairs"] == len(members) else f"{text} ({row['pairs']})"
+
+
+def _passed(members: Sequence[Row]) -> str:
+    return _count(members, passes) if any(row["term"] in JUDGED for row in members) else "–"
 
 
 def _count(members: Sequence[Row], condition) -> str:

@@ -11,7 +11,7 @@ from softmpm_learn import sweep
 SEEDS = "train.seed", "train.seeds"
 INDIFFERENT = *SEEDS, "train.log", "train.record_every", "train.frame_every", "train.examine", "resume"
 """Settings by which runs do not become others, the seed apart."""
-EXAMINED = ["end", "later", "kicked", "friction", "finer", "tilt", "miss", "speed"]
+EXAMINED = ["end", "later", "kicked", "friction", "finer", "largest_tilt", "largest_miss", "largest_speed"]
 """Answers of the examination, as the columns of sweep.csv and of the last row of metrics.csv are called."""
 
 
