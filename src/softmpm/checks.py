@@ -126,6 +126,19 @@ def check_shown(apart: Tensor) -> None:
         )
 
 
+def check_gradients_of_nodes(state: State) -> None:
+    """Raise ValueError if a gradient with respect to the particles of a state would be lost, since a call starts from its nodes."""
+    nodes = state.nodes
+    if nodes is None or not torch.is_grad_enabled() or nodes.u.requires_grad or nodes.v.requires_grad:
+        return
+    for name, tensor in zip("xvCF", state[:4], strict=True):
+        need(
+            not tensor.requires_grad,
+            f"state.{name} requires a gradient, but state.nodes, from which a call continues, does not; take "
+            "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
+        )
+
+
 def check_reflected(apart: Tensor) -> None:
     """Nodes of a state are their own images in clamps and symmetries, from which they differ by this. Reads back once."""
     need(

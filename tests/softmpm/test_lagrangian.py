@@ -225,6 +225,28 @@ def test_a_changed_state_is_not_ignored():
         softmpm.simulate(moving, state, None, moving.params(), substeps=1)
 
 
+def test_a_gradient_that_nodes_would_lose_is_refused():
+    """A kick that is to be optimised and begins at zero changes no value; without nodes its gradient is that of differences."""
+    model = build(busy_scene(2), dtype=torch.float64)
+    params = model.params()
+    warm = softmpm.simulate(model, model.rest(), None, params, substeps=3).detach()
+    kick = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    kicked = warm._replace(v=warm.v + kick)
+    with pytest.raises(ValueError, match=r"state.v requires a gradient, but state.nodes, .*nodes=None"):
+        softmpm.simulate(model, kicked, None, params, substeps=3)
+    with torch.no_grad():
+        softmpm.simulate(model, kicked, None, params, substeps=3)
+
+    def way(by: torch.Tensor) -> torch.Tensor:
+        start = warm._replace(v=warm.v + by, nodes=None)
+        return softmpm.simulate(model, start, None, params, substeps=3).x[..., 0].mean()
+
+    (gradient,) = torch.autograd.grad(way(kick), kick)
+    step = torch.tensor([1e-4, 0.0], dtype=torch.float64)
+    difference = (way(step) - way(-step)) / 2e-4
+    assert gradient[0].item() == pytest.approx(difference.item(), rel=1e-6) and gradient[0] > 0
+
+
 def test_what_the_formulation_lacks_is_refused():
     """By name, before anything is launched."""
     with pytest.raises(ValueError, match="leave scheme out"):

@@ -3,6 +3,7 @@
 Equations: kernels/lagrangian/projection.py. Clamps and planes of symmetry then hold and reflect the nodes by (B1).
 """
 
+import math
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from softmpm.checks import check_reflected, check_shown
+from softmpm.checks import check_gradients_of_nodes, check_reflected, check_shown
 from softmpm.kernels.lagrangian.node_sums import node_sums
 from softmpm.kernels.lagrangian.projection import masses, projection
 from softmpm.kernels.lagrangian.shown import shown as shown_by
@@ -59,20 +60,42 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     """Nodal state that a call starts from, with all parts: that of the state, or :func:`nodes_of` its particles if it has none.
 
     Raises:
-        ValueError: The particles do not show the nodes of the state, or clamps do not allow them; not checked during a capture.
+        ValueError: The particles do not show the nodes of the state, a gradient is asked for that of particles only, or clamps do not
+            allow the nodes; values are not checked during a capture.
     """
     nodes = state.nodes
     if nodes is None:
         nodes = nodes_of(model, state, mass, normals)
-    elif not is_capturing(model):
-        check_shown(_apart(model, state, particles_of(model, nodes.detach())))
-        if model.mirror is not None:
-            check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
+    else:
+        check_gradients_of_nodes(state)
+        if not is_capturing(model):
+            check_shown(_apart(model, state, particles_of(model, nodes.detach())))
+            if model.mirror is not None:
+                check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
     low = nodes.low
     if low is None:
         low = nodes.u.new_zeros(model.worlds, 2, *nodes.u.shape[1:])
     nodes = nodes._replace(shift=shift_of(model, nodes).detach(), low=low.detach())
+    if math.isinf(quantum(model)):
+        nodes = _without_shift(model, nodes, normals)
     return with_reaction(model, nodes, nodes.reaction)
+
+
+def _without_shift(model: Model, nodes: Nodal, normals: Tensor | None) -> Nodal:
+    """The same state with displacements and anchors that contain the shift, for a model whose worlds are not translated."""
+    shift, low = nodes.shift, nodes.low
+    assert shift is not None and low is not None
+    by = shift[:, None].to(nodes.u.dtype)
+    u, before = nodes.u + by, nodes.u.detach()
+    added = u.detach() - before
+    rounded = (before - (u.detach() - added)) + (by - added)  # off the sum (Knuth's exact addition)
+    low = torch.stack([low[:, 0] + rounded, low[:, 1]], dim=1)
+    anchor = nodes.anchor
+    if model.surface is not None:
+        n = _normals(model, normals, shift)
+        across = shift[:, None] - (shift[:, None] * n).sum(-1, keepdim=True) * n
+        anchor = anchor + across[:, :, None].to(anchor.dtype)
+    return nodes._replace(u=u, low=low, anchor=anchor, shift=torch.zeros_like(shift))
 
 
 def _rest_places(model: Model, exact: bool) -> Tensor:
@@ -258,9 +281,13 @@ def _anchors(model: Model, u: Tensor, normals: Tensor | None) -> Tensor:
     if surface is None:
         return u.new_zeros(model.anchor_shape)
     assert isinstance(surface, SurfaceGrid)
-    x = surface.places(u)
-    if normals is None:
-        n = surface.normals.expand(len(u), -1, -1).to(u.dtype)
-    else:
-        n = of_surface_walls(model, normals).to(u.dtype)
+    x, n = surface.places(u), _normals(model, normals, u)
     return x[:, None] - (x[:, None] * n[:, :, None]).sum(-1, keepdim=True) * n[:, :, None]
+
+
+def _normals(model: Model, normals: Tensor | None, like: Tensor) -> Tensor:
+    """Unit normals of the walls that meet surface points, shape (world, wall, dim), from those of all walls or of the scene."""
+    assert isinstance(model.surface, SurfaceGrid)
+    if normals is None:
+        return model.surface.normals.expand(model.worlds, -1, -1).to(like.dtype)
+    return of_surface_walls(model, normals).to(like.dtype)
