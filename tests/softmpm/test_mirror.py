@@ -264,6 +264,43 @@ def test_clamps_that_cannot_be_are_refused(wall, said):
         make()
 
 
+@pytest.mark.parametrize("kind", ["clamp", "symmetry"])
+@pytest.mark.parametrize("offset, reach", [(4, 1.5), (4.5, 1.0)])
+@pytest.mark.parametrize("one_body", [True, False])
+def test_what_lies_close_in_front_of_a_reflection_without_touching_it_is_refused(
+    kind, offset, reach, one_body
+):
+    """A second body, or a recess, that shares nodes with the images behind the plane; it was held there without touching anything."""
+    h = 1 / 16
+    rubber = softmpm.NeoHookean(density=1.0, young=2000.0, poisson=0.3)
+
+    def scene(gap: float) -> softmpm.Scene:
+        low = offset * h
+        lower = softmpm.box((low, 4 * h), (low + 6 * h, 8 * h), spacing=h / 2)
+        upper = softmpm.box(
+            (low + gap * h, (8 if one_body else 12) * h), (low + 6 * h, 16 * h), spacing=h / 2
+        )
+        bodies = [softmpm.Body(part, rubber) for part in (lower, upper)]
+        if one_body:
+            places = np.concatenate([part.positions for part in (lower, upper)])
+            bodies = [softmpm.Body(softmpm.Particles(places, (h / 2) ** 2), rubber)]
+        return softmpm.Scene(
+            grid=softmpm.Grid(shape=(24, 24), spacing=h),
+            bodies=bodies,
+            walls=[softmpm.Wall(normal=(1.0, 0.0), offset=low, contact=kind)],
+            dt=1e-4,
+        )
+
+    for gap in (0.0, reach, 3.0):
+        softmpm.build(scene(gap), device="cpu", formulation="reference")
+    for gap in (0.4, reach - 0.4):  # the nearest particles are about a quarter of a cell farther
+        with pytest.raises(
+            ValueError,
+            match=rf"less than {reach:g} cells in front .*, with nothing between; let the body reach",
+        ):
+            softmpm.build(scene(gap), device="cpu", formulation="reference")
+
+
 def test_walls_that_reflect_leave_room_and_need_the_reference_formulation():
     """Two that face the same way or are too close, and any of them on a moving grid."""
     made = corner(2)

@@ -3,6 +3,7 @@
 Derivation of what they need: docs/math/mirror.md.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +78,7 @@ def check_mirrors(scene: Scene) -> None:
             f"wall {one.wall} is a {kind}, at whose plane a body begins, but the nearest particle is {least:.4g} m in front of the "
             f"plane x[{one.axis}] = {plane:.6g} m, {nearest:.3g} particle spacings; move wall or body so that they touch.",
         )
+        _check_gaps(scene, one)
     for a in mirrors:
         for b in mirrors:
             if a.wall < b.wall and a.axis == b.axis:
@@ -89,3 +91,36 @@ def check_mirrors(scene: Scene) -> None:
                     f"walls {a.wall} and {b.wall} reflect and face each other at {0.5 * abs(b.twice - a.twice):g} cells, and need one "
                     "cell between them; use a finer grid.",
                 )
+
+
+def _check_gaps(scene: Scene, mirror: Mirror) -> None:
+    """Raise ValueError for a particle that shares nodes with the images behind the plane although nothing joins it to the plane."""
+    dx, axis = scene.grid.spacing, mirror.axis
+    reach = (
+        1.5 if mirror.twice % 2 == 0 else 1.0
+    )  # of a particle to the nearest node with an image or on the plane [cells]
+    x = np.concatenate([body.particles.positions for body in scene.bodies]) / dx
+    spacing = np.concatenate(
+        [np.full(len(b.particles), np.mean(b.particles.volume) ** (1 / scene.grid.dim)) for b in scene.bodies]
+    )
+    heights = mirror.side * (x[:, axis] - 0.5 * mirror.twice)
+    near = np.flatnonzero(heights < reach - EXACT)
+    columns = np.floor(np.delete(x[near], axis, axis=1)).astype(int)  # of cells along the normal
+    joined = np.zeros(len(near), bool)
+    at_plane = _numbers(columns[heights[near] < (1.0 - EXACT) * spacing[near] / dx])
+    for step in itertools.product((-1, 0, 1), repeat=columns.shape[1]):
+        joined |= np.isin(_numbers(columns + step), at_plane)
+    apart = near[~joined]
+    if len(apart):
+        p, wall = apart[np.argmin(heights[apart])], scene.walls[mirror.wall]
+        need(
+            False,
+            f"wall {mirror.wall} is a {wall.contact}, which holds what lies less than {reach:g} cells in front of it, but particle {p} "
+            f"lies {heights[p] * dx:.4g} m in front of the plane, with nothing between; let the body reach the plane there, or "
+            f"leave at least {reach * dx:.4g} m.",
+        )
+
+
+def _numbers(columns: np.ndarray) -> np.ndarray:
+    """A number for each column of cells, shape (column,)."""
+    return columns @ (2 ** (20 * np.arange(columns.shape[1])))
