@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from softmpm.inputs import QUANTITIES
 from softmpm.material import material
 from softmpm.model import Model
 from softmpm.planning.chunks import Horizon
@@ -51,7 +52,9 @@ def derive(
 
 
 def expanded(model: Model, name: str, value: Tensor, horizon: Horizon) -> Tensor:
-    """The input expanded to all of its axes; a wall at rest retains its single pose."""
+    """The input expanded to all of its axes, with the numbers of a vector side by side; a wall at rest retains its single pose."""
+    if QUANTITIES[name].axes[-1] == "dim" and value.stride(-1) != 1:
+        value = value.contiguous()
     shape = model.shape_of(name, horizon.control_steps)
     if name in ("wall_offset", "wall_normal") and value.ndim == len(shape):
         shape = (len(value), *shape[1:])

@@ -170,6 +170,38 @@ def test_one_number_serves_every_world_and_control_step():
         torch.testing.assert_close(a, b, rtol=1e-13, atol=0)
 
 
+@pytest.mark.parametrize(
+    "formulation, scheme", [("moving", "plain"), ("moving", "fast"), ("reference", "auto")]
+)
+def test_inputs_of_any_layout(formulation, scheme):
+    """Vectors whose numbers do not lie side by side, as after a transposition, have the values and gradients of copies."""
+    names = ("gravity", "direction", "force", "wall_velocity", "wall_normal")
+    settings = dict(dtype=torch.float64, formulation=formulation, scheme=scheme, inputs=names)
+    model = build(full_scene(2, driven=()), **settings)
+    made = {name: value.detach() for name, value in given(model, names, 1).items()} | {
+        "gravity": torch.full((2,), -1.0).double()
+    }
+    turned = {name: value.mT.contiguous().mT for name, value in made.items() if name != "gravity"}
+    turned["gravity"] = torch.tensor(-1.0, dtype=torch.float64).expand(2)
+    assert all(value.stride(-1) != 1 for value in turned.values())
+    found = []
+    for inputs in (turned, made):
+        leaves = {name: value.detach().requires_grad_() for name, value in inputs.items()}
+        shape = 1, model.worlds, model.muscle_count
+        activation = torch.full(shape, 0.3, dtype=torch.float64)
+        end = softmpm.simulate(
+            model, model.rest(), activation, model.params(), substeps=3, inputs=Inputs(**leaves)
+        )
+        found.append(
+            [
+                end.x.detach(),
+                *torch.autograd.grad((end.x**2).sum() + end.v.sum(), [leaves[name] for name in names]),
+            ]
+        )
+    for name, got, want in zip(("x", *names), *found, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=0, msg=name)
+
+
 def test_inputs_that_a_model_cannot_take():
     """Each message says the rule, what was given and a remedy."""
     model = build(full_scene(2, driven=()), worlds=2, inputs=("friction", "wall_offset"))
