@@ -30,6 +30,8 @@ def check_scene(scene: Scene) -> None:
     _check_bodies(scene)
     _check_outlines(scene)
     _check_distinct(scene)
+    if len(scene.bodies) > 1:
+        _check_apart(scene)
     _check_muscles(scene)
     _check_indices("scene driven", np.asarray(scene.driven), scene)
     _check_walls(scene)
@@ -187,6 +189,26 @@ def _check_distinct(scene: Scene) -> None:
             f"particles {i} (body {bodies[i]}) and {j} (body {bodies[j]}) are at the same place, "
             f"{_tuple(positions[i])} m, and {twice.sum() - 1} more such pairs: bodies must not overlap. "
             "Move one, or keep only the particles that the other has not."
+        )
+
+
+def _check_apart(scene: Scene) -> None:
+    """Raise ValueError for bodies that fill the same space: a box of two cells along each axis, by nine tenths each."""
+    count, edge = len(scene.bodies), 2 * scene.grid.spacing
+    positions = np.concatenate([body.particles.positions for body in scene.bodies])
+    volumes = np.concatenate([np.broadcast_to(b.particles.volume, len(b.particles)) for b in scene.bodies])
+    bodies = np.repeat(np.arange(count), [len(body.particles) for body in scene.bodies])
+    bins = np.floor(positions / edge + 0.381966).astype(np.int64)  # see _check_distinct
+    numbers = np.ravel_multi_index(tuple(bins.T), tuple(bins.max(axis=0) + 1))
+    parts, of_part = np.unique(numbers * count + bodies, return_inverse=True)
+    full = parts[np.bincount(of_part, volumes) >= 0.9 * edge**scene.grid.dim]
+    shared = np.flatnonzero(np.diff(full // count) == 0)
+    if len(shared):
+        one, other = (int(part % count) for part in full[shared[0] : shared[0] + 2])
+        place = positions[np.argmax(numbers == full[shared[0]] // count)]
+        raise ValueError(
+            f"bodies {one} and {other} overlap: both fill the space around {_tuple(place)} m, whose mass would count twice; bodies "
+            "must not overlap. Move one, or keep only the particles of one that lie outside the other."
         )
 
 
