@@ -155,16 +155,31 @@ def check_activation(model: Sizes, activation: Tensor | None) -> None:
     check_tensor(model, "activation", activation)
     want = (model.worlds, model.muscle_count)
     if activation.ndim != 3 or activation.shape[1:] != want:
-        rows = activation.ndim == 2 and model.worlds == 1 and len(activation) > 1
-        hint = "one world is activation[:, None]" if rows else "one control step is activation[None]"
         raise ValueError(
             f"activation must have shape (control_step, world, muscle) = (any, {want[0]}, {want[1]}), "
-            f"got {tuple(activation.shape)}; {hint}."
+            f"got {tuple(activation.shape)}; {_activation_hint(tuple(activation.shape), *want)}."
         )
     need(
         len(activation) > 0,
         "activation needs at least one control step, got none; pass None for no actuation.",
     )
+
+
+def _activation_hint(shape: tuple[int, ...], worlds: int, muscles: int) -> str:
+    """Remedy for an activation of a wrong shape."""
+    if shape == (muscles,):
+        return f"one control step of all worlds is activation.expand(1, {worlds}, -1)"
+    if shape == (worlds, muscles):
+        return "one control step is activation[None]"
+    if len(shape) == 2 and shape[1] == muscles:
+        return "one world is activation[:, None]" + f".expand(-1, {worlds}, -1), the same in each" * (
+            worlds > 1
+        )
+    if len(shape) == 3 and shape[1:] == (1, muscles):
+        return f"the same in each world is activation.expand(-1, {worlds}, -1)"
+    if len(shape) == 3 and shape[1] == worlds:
+        return f"the last axis has a number for each of the scene's {muscles} muscles and pressures"
+    return f"the axes are control steps, {worlds} worlds and {muscles} muscles, in this order"
 
 
 def check_row(model: Sizes, activation: Tensor | None) -> None:

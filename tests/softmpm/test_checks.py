@@ -74,9 +74,18 @@ def test_low_order_parts():
 
 def test_activation_shape():
     """Rows, worlds and muscles are told apart; no row at all is refused."""
-    for bad in (torch.zeros(2, 4), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3), torch.zeros(5, 1, 4)):
-        with pytest.raises(ValueError, match=r"\(any, 2, 4\), got .*activation\[None\]"):
-            check_activation(MODEL, bad)
+    for shape, remedy in {
+        (2, 4): "one control step is activation[None]",
+        (4,): "one control step of all worlds is activation.expand(1, 2, -1)",
+        (5, 4): "one world is activation[:, None].expand(-1, 2, -1), the same in each",
+        (5, 1, 4): "the same in each world is activation.expand(-1, 2, -1)",
+        (5, 2, 3): "a number for each of the scene's 4 muscles and pressures",
+        (5, 4, 2): "the axes are control steps, 2 worlds and 4 muscles, in this order",
+        (): "the axes are control steps",
+        (1, 5, 2, 4): "the axes are control steps",
+    }.items():
+        with pytest.raises(ValueError, match=rf"\(any, 2, 4\), got .*{re.escape(remedy)}"):
+            check_activation(MODEL, torch.zeros(shape))
     with pytest.raises(ValueError, match="at least one control step"):
         check_activation(MODEL, torch.zeros(0, 2, 4))
     with pytest.raises(ValueError, match=r"\(any, 1, 4\), got \(5, 4\); one world is activation\[:, None\]"):

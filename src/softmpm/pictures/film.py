@@ -99,7 +99,15 @@ def _of_recording(
     time = recording.read("time", rows)[1]
     chosen = resampled(time, fps, rate)
     found = dict(zip(np.unique(chosen), recorded(recording, iteration, rows[np.unique(chosen)]), strict=True))
-    return of_recording(recording), [found[k] for k in chosen]
+    return of_recording(recording), _filled([found[k] for k in chosen])
+
+
+def _filled(instants: list[Instant]) -> list[Instant]:
+    """The final state of a simulation has no activation of its own and shows the last one."""
+    for k in range(1, len(instants)):
+        if instants[k].activation is None:
+            instants[k] = replace(instants[k], activation=instants[k - 1].activation)
+    return instants
 
 
 def _of_states(

@@ -89,6 +89,17 @@ def test_a_film_plays_at_its_rate(model, states, tmp_path):
     assert len(pictures(film)) == 5
 
 
+def test_the_end_of_an_episode_shows_the_last_activation(model, states, tmp_path):
+    """Its final state has none, in every recording of the learner; the film had no activations for that."""
+    with softmpm.Recorder(tmp_path / "run.h5", model) as recorder, recorder.episode(0) as episode:
+        for k, state in enumerate(states[:3]):
+            episode.frame(0.1 * k, state, torch.tensor([0.9]) if k < 2 else None)
+    for colour in (None, "activation"):
+        found = pictures(softmpm.to_video(tmp_path / "run.h5", tmp_path / "a.gif", fps=10, colour=colour))
+        red = [(picture[..., 0] > picture[..., 2] + 60)[:, :500].sum() for picture in found]
+        assert len(red) == 3 and min(red) > 1000
+
+
 def test_a_recording_becomes_a_film(recording, tmp_path):
     """The last simulation, or the one that is named; muscles grow red with their activation."""
     whole = pictures(softmpm.to_video(recording, tmp_path / "a.gif", iteration=3, fps=10))
