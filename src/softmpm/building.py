@@ -129,7 +129,7 @@ def build(
 def _check_settings(dtype: torch.dtype, scheme: str, deterministic: bool, contact_width: float) -> None:
     """Raise TypeError or ValueError for a setting that no scene could have."""
     if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}.")
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}.")
     if scheme not in ("auto", "fast", "plain"):
         raise ValueError(f"scheme must be 'auto', 'fast' or 'plain', got {scheme!r}.")
     if not isinstance(deterministic, (bool, np.bool_)):

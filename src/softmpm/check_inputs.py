@@ -43,7 +43,7 @@ def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
                 + (
                     "; give the first two axes both or neither, of size 1 where all share it."
                     if in_doubt
-                    else "."
+                    else "; values of each world that all share along the other axes need an axis of size 1 for each of them."
                 )
             )
     need(

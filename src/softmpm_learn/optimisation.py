@@ -24,7 +24,8 @@ class TrainingError(RuntimeError):
     """A simulation failed or a gradient is not finite; the checkpoint of the iterations before is on the disk."""
 
     def __init__(self, iteration: int, problem: Exception):
-        helps = "a smaller time step (task.safety), smaller learning rates, tighter bounds of the design, or optimizer.max_norm"
+        helps = "weaker muscles (task.strength), a smaller time step (task.safety), smaller learning rates (optimizer.policy_rate), "
+        helps += "or tighter bounds of the design"
         if isinstance(problem, softmpm.UnstableError) and problem.kind == "overlap":
             helps = "task.overlap=true, with which a robot may pass through itself"
         super().__init__(

@@ -642,7 +642,7 @@ def test_an_episode_that_failed_is_no_picture(task, model, settings, tmp_path, m
 @pytest.mark.parametrize("halving, share", [(2.0, 0.25), (None, 1.0)])
 def test_rates_fall_by_half_in_so_many_iterations(task, model, settings, tmp_path, halving, share):
     """A quarter is left after four iterations, also of a run that was stopped after the second."""
-    optimizer = dataclasses.replace(settings.optimizer, halving=halving)
+    optimizer = dataclasses.replace(settings.optimizer, policy_rate=0.02, halving=halving)
     for iterations in (2, 4):
         conf = dataclasses.replace(settings.train, iterations=iterations, examine=False)
         both = dataclasses.replace(settings, optimizer=optimizer, train=conf)

@@ -118,6 +118,10 @@ class Body:
 
     def __post_init__(self):
         need_kind("body particles", self.particles, Particles)
+        if callable(getattr(self.material, "material", None)):
+            raise TypeError(
+                f"body material must be a Material, got a {type(self.material).__name__}; its method material() makes one."
+            )
         need_kind("body material", self.material, Material)
 
 
@@ -181,7 +185,11 @@ def _indices(name: str, particles: object, least: int = 1) -> np.ndarray:
     """Indices of particles, shape (k,), int64, read-only; at least so many, none twice."""
     what = f"{name.removeprefix('a ')} particles"
     index = array(what, particles, "biufO", "whole numbers")
-    need(index.ndim == 1 and index.size >= least, f"{name} needs a list of particle indices, not empty.")
+    need(
+        index.ndim == 1 and index.size >= least,
+        f"{name} needs a list of particle indices{', not empty,' * (least > 0)} got an array of shape {index.shape}; "
+        "np.flatnonzero(mask) makes one.",
+    )
     need(
         np.issubdtype(index.dtype, np.integer),
         f"{what} must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",

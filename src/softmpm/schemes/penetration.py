@@ -65,8 +65,8 @@ class Penetration:
         at = ", ".join(f"{c:.4g}" for c in self._place.tolist())
         value = f"is at ({at}) m, {depth:.4g} m ({depth / dx:.4g} cells) inside wall {self.wall}"
         limit = f"at most {most:.4g} m are allowed, since contact pushes a point out within one substep"
-        advice = (
-            "Place body and wall so that they do not overlap, begin with the pose in which the last call ended, or move the wall more "
-            "slowly; alarms=softmpm.Alarms(depth=None) pushes the point out all the same."
-        )
+        advice = "Place body and wall apart at the start, and take a stiffer material or a weaker load or activation"
+        if self.model.spec.moving:
+            advice += ", begin with the pose in which the last call ended, or move the wall more slowly"
+        advice += "; alarms=softmpm.Alarms(depth=None) pushes the point out all the same."
         return "in_wall", value, limit, advice

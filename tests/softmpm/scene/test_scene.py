@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from softmpm.scene.materials import FixedCorotated, Material, NeoHookean
+from softmpm.scene.presets import ECOFLEX_00_30
 from softmpm.scene.scene import Actuator, Body, Grid, Muscle, Particles, Pressure, Scene, Wall
 
 SOFT = dict(density=1.0, young=10.0)
@@ -54,6 +55,10 @@ def scene(**changes) -> Scene:
         (lambda: Muscle(particles=[2, 1, 2], direction=(1, 0), strength=1), "names a particle twice"),
         (lambda: Actuator(particles=[0], strength=1), "an actuator needs a kind: use Muscle or Pressure"),
         (lambda: pressure(particles=[]), "a pressure needs a list of particle indices, not empty"),
+        (
+            lambda: pressure(particles=np.zeros((5, 2))),
+            r"particle indices, not empty, got an array of shape \(5, 2\); np.flatnonzero\(mask\) makes one",
+        ),
         (lambda: pressure(particles=[1, 1]), "a pressure names a particle twice"),
         (lambda: pressure(strength=np.nan), "pressure strength must be finite"),
         (lambda: Muscle(particles=[0], direction=(0, 0), strength=1), "direction must not be zero"),
@@ -195,3 +200,11 @@ def test_driven_particles():
         made = scene(driven=given)
         assert made.driven.tolist() == [0] and made.driven.dtype == np.int64
     assert "driven: 1 particle" in repr(made)
+
+
+def test_a_preset_is_no_material_yet():
+    """It has to be given a law."""
+    with pytest.raises(
+        TypeError, match=r"must be a Material, got a Preset; its method material\(\) makes one"
+    ):
+        Body(Particles(np.full((1, 2), 0.5), 0.01), ECOFLEX_00_30)
