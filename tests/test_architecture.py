@@ -144,8 +144,6 @@ def test_one_module_per_outside_world():
         own = (
             "autograd",
             "batches",
-            "schemes.lagrangian.nodal",
-            "schemes.lagrangian.driven",
             "reference",
             "reference_step_limit",
             "reference_stress",

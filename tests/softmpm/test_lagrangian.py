@@ -329,3 +329,26 @@ def test_no_numerical_fracture():
     state.x[..., 0] = 0.45 + 2.5 * (state.x[..., 0] - 0.45)
     end = softmpm.simulate(model, state, None, model.params(), substeps=8000)
     torch.testing.assert_close(end.F, model.rest().F, rtol=0, atol=0.02)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:.torch.jit.script. is deprecated:DeprecationWarning"
+)  # of PyTorch's own jvp
+def test_transforms_of_pytorch():
+    """torch.func.grad gives the gradient of autograd; batches, forward mode and second derivatives are refused in a sentence."""
+    model = build(full_scene(2, driven=(3, 4)), dtype=torch.float64)
+    rest, params = model.rest(), model.params()
+
+    def height(v: torch.Tensor) -> torch.Tensor:
+        return softmpm.simulate(model, rest._replace(v=v), None, params, substeps=3).x[..., 1].mean()
+
+    v = rest.v.clone().requires_grad_()
+    (want,) = torch.autograd.grad(height(v), v)
+    torch.testing.assert_close(torch.func.grad(height)(rest.v), want, rtol=0, atol=0)
+    with pytest.raises(RuntimeError, match=r"softmpm: torch.vmap .* build the model with worlds=N"):
+        torch.vmap(height)(torch.stack([rest.v, rest.v]))
+    with pytest.raises(RuntimeError, match=r"softmpm: forward-mode .* use reverse mode"):
+        torch.func.jvp(height, (rest.v,), (rest.v,))
+    (first,) = torch.autograd.grad(height(v), v, create_graph=True)
+    with pytest.raises(RuntimeError, match="softmpm: second derivatives are not available"):
+        torch.autograd.grad(first.sum(), v)

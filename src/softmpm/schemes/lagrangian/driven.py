@@ -6,8 +6,8 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from softmpm.batches import FirstOrder, FirstOrderAdjoint
 from softmpm.driven_grid import DrivenGrid, Sparse
 from softmpm.kernels.lagrangian.driven import driven, driven_adj, spread
 from softmpm.kernels.structs import RequestedGrads, types
@@ -63,19 +63,26 @@ def of_nodes(model: Model, velocity: Tensor) -> Tensor:
     return _Spread.apply(model, velocity)  # pyright: ignore[reportReturnType]
 
 
-class _Spread(torch.autograd.Function):
+class _Spread(FirstOrder):
     """(Q11)"""
 
     @staticmethod
-    def forward(ctx, model: Model, velocity: Tensor) -> Tensor:
-        assert model.driven_grid is not None
-        ctx.model = model
+    def forward(model, velocity):
         return _multiplied(model, model.driven_grid.spread, velocity)
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx, *adj: Tensor):
-        return None, _multiplied(ctx.model, ctx.model.driven_grid.transposed, adj[0])
+    def setup_context(ctx, inputs, output):
+        ctx.model = inputs[0]
+
+    @staticmethod
+    def backward(ctx, *adj):
+        return None, _SpreadAdj.apply(ctx.model, *adj)
+
+
+class _SpreadAdj(FirstOrderAdjoint):
+    @staticmethod
+    def forward(model, adj):
+        return _multiplied(model, model.driven_grid.transposed, adj)
 
 
 @on_its_gpu

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from softmpm.batches import FirstOrder, FirstOrderAdjoint
 from softmpm.checks import check_gradients_of_nodes, check_reflected, check_shown
 from softmpm.kernels.lagrangian.node_sums import node_sums
 from softmpm.kernels.lagrangian.projection import masses, projection
@@ -163,24 +163,29 @@ def launch_masses(
     node_launch(model, launch, node_sums(model.spec.dim, model.spec.dtype).mass, rest, partial, out)
 
 
-class _Show(torch.autograd.Function):
+class _Show(FirstOrder):
     """(Q5)"""
 
     @staticmethod
-    def forward(ctx, model: Model, u: Tensor, v: Tensor, shift: Tensor):
-        found = _show(model, u, v, shift)
-        ctx.model = model
-        ctx.save_for_backward(*found[2:])
-        ctx.set_materialize_grads(False)
-        return found
+    def forward(model, u, v, shift):
+        return _show(model, u, v, shift)
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx, *given):
-        C, F = ctx.saved_tensors
-        pairs = zip(given, (C[..., 0], C[..., 0], C, F), strict=True)
-        adj = [cleared(like) if one is None else one for one, like in pairs]
-        return (None, *_show_adj(ctx.model, C, F, *adj), None)
+    def setup_context(ctx, inputs, output):
+        ctx.model = inputs[0]
+        ctx.save_for_backward(*output[2:])
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx, *adj):
+        return None, *_ShowAdj.apply(ctx.model, *ctx.saved_tensors, *adj), None
+
+
+class _ShowAdj(FirstOrderAdjoint):
+    @staticmethod
+    def forward(model, C, F, *adj):
+        pairs = zip(adj, (C[..., 0], C[..., 0], C, F), strict=True)
+        return tuple(_show_adj(model, C, F, *(cleared(like) if one is None else one for one, like in pairs)))
 
 
 @on_its_gpu
@@ -218,20 +223,27 @@ def _show_adj(model: Model, C: Tensor, F: Tensor, *adj: Tensor) -> list[Tensor]:
     return found
 
 
-class _Project(torch.autograd.Function):
+class _Project(FirstOrder):
     """(Q6)"""
 
     @staticmethod
-    def forward(ctx, model: Model, moved: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor):
-        node_mass, nodal_u, nodal_v = _project(model, moved, v, C, F, mass)
-        ctx.model = model
-        ctx.save_for_backward(moved, v, C, F, mass, node_mass, nodal_u, nodal_v)
-        return node_mass, nodal_u, nodal_v
+    def forward(model, moved, v, C, F, mass):
+        return tuple(_project(model, moved, v, C, F, mass))
 
     @staticmethod
-    @once_differentiable
+    def setup_context(ctx, inputs, output):
+        ctx.model = inputs[0]
+        ctx.save_for_backward(*inputs[1:], *output)
+
+    @staticmethod
     def backward(ctx, *adj):
-        return (None, *_project_adj(ctx.model, *ctx.saved_tensors, *adj))
+        return None, *_ProjectAdj.apply(ctx.model, *ctx.saved_tensors, *adj)
+
+
+class _ProjectAdj(FirstOrderAdjoint):
+    @staticmethod
+    def forward(model, *given):
+        return tuple(_project_adj(model, *given))
 
 
 @on_its_gpu
