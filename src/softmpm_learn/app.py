@@ -4,6 +4,7 @@ import dataclasses
 import logging
 import math
 import os
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,6 +54,7 @@ def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
                 signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
             _load(own)
+            check_words(sys.argv[1:])
             register(group.broadcast(time.time()))
             waiting, failed = list[Job](), dict[int, Path]()
             run = hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
@@ -157,7 +159,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
             if conf.resume is not None:
                 if sweeps:
                     raise ValueError("resume=FOLDER is for one run; the same command goes on with a sweep.")
-                return resumed(conf, [text.lstrip("+~") for text in hydra_config.overrides.task])
+                return resumed(conf, hydra_config.overrides.task)
             if begun and not sweeps:
                 raise RefusedError(
                     f"{out} holds a run already; go on with resume={out}, or choose another folder."
@@ -184,18 +186,29 @@ def _fixed(conf: RunConf) -> dict:
     return flat
 
 
-def resumed(conf: RunConf, overrides: list[str]) -> RunConf:
-    """The configuration of the run to go on with, with what the command line may change of it."""
-    saved = saved_configuration(Path(str(conf.resume)))
-    saved.files = conf.files
-    for key in (text.partition("=")[0] for text in overrides):
-        group, _, name = key.partition(".")
-        if group == "device":
-            saved.device = conf.device
-        elif key in CHANGEABLE:
-            setattr(saved.train, name, getattr(conf.train, name))
-        elif key != "resume":
+def check_words(words: Sequence[str]) -> None:
+    """Raise ValueError for a setting on the command line that the run to resume must not have; before Hydra looks for it in those of
+    the default task.
+    """
+    keys = [_key(text) for text in words if ("=" in text or text[:1] == "~") and text[:1] != "-"]
+    for key in keys if "resume" in keys else ():
+        if key not in (*CHANGEABLE, "resume") and not key.startswith(("device.", "hydra.", "hydra/")):
             raise ValueError(
                 f"a run is resumed with its own settings; only {', '.join(CHANGEABLE)} may change, not {key}."
             )
+
+
+def _key(text: str) -> str:
+    return text.lstrip("+~").partition("=")[0]
+
+
+def resumed(conf: RunConf, overrides: Sequence[str]) -> RunConf:
+    """The configuration of the run to go on with, with what the command line may change of it; see :func:`check_words`."""
+    saved = saved_configuration(Path(str(conf.resume)))
+    saved.files = conf.files
+    for group, _, name in (_key(text).partition(".") for text in overrides):
+        if group == "device":
+            saved.device = conf.device
+        elif group == "train":
+            setattr(saved.train, name, getattr(conf.train, name))
     return saved

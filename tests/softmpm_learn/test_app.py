@@ -266,6 +266,12 @@ def test_a_wrong_value_says_what_must_hold(overrides, message):
         to_run(composed(*overrides))
 
 
+def test_a_setting_that_no_resumed_run_may_have_is_named(monkeypatch, capsys, finished):
+    """Also if the default task has none of this name."""
+    said = refusal(monkeypatch, capsys, f"resume={finished[0]}", "task.file=robot.png")
+    assert said.startswith("a run is resumed with its own settings") and "may change, not task.file." in said
+
+
 def test_a_fault_of_the_program_is_called_so():
     """Errors that are not meant for people give their type; messages of several lines become one, and notes follow."""
     assert sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
@@ -434,7 +440,7 @@ def test_resume_changes_nothing_but_what_may_change(tmp_path):
     assert conf.task == old.task and conf.train.iterations == 7 and conf.device.name == "cpu"
     assert conf.resume is None and conf.train.seed == old.train.seed
     with pytest.raises(ValueError, match="may change, not train.seed"):
-        app.resumed(new, ["train.seed=3"])
+        app.check_words([f"resume={tmp_path}", "train.seed=3"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
