@@ -20,15 +20,20 @@ MAY_CHANGE = (
 )
 """Settings of TrainConf that a resumed run may have different. With more iterations it goes on from where it has settled."""
 
+SOURCE = "source"
+"""Path and digest of the robot's file. They may change, since the scene has the robot; if that is another, the file explains it."""
+
 
 def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object]:
     """Settings, task and scene by name; arrays by a short digest."""
     flat = identity_of_settings(settings)
     for field in dataclasses.fields(task):
-        if field.name not in ("scene", "build"):
+        if field.name not in ("scene", "build", "source"):
             flat |= dict(_described(f"task.{field.name}", getattr(task, field.name)))
     flat["dtype"] = str(model.dtype)
     flat["scene"] = _digest(model)
+    if task.source is not None:
+        flat[SOURCE] = list(task.source)
     return flat | _formulation(model)
 
 

@@ -43,9 +43,7 @@ def _restore(run: Run, content: dict, out: Path) -> dict:
         run.load_state_dict(content)
         return dict(content["seals"])
     except SettingsError as error:
-        raise SettingsError(
-            f"the checkpoint in {out} was {error}; config.yaml and command line must be those of the run."
-        ) from error
+        raise SettingsError(f"the checkpoint in {out} was {error}") from error
     except ReplayError:
         raise
     except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:

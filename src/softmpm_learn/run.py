@@ -16,7 +16,7 @@ from softmpm_learn.design import Design, declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.fallback import Fallback
 from softmpm_learn.goals import Goals
-from softmpm_learn.identity import identity, identity_of_settings
+from softmpm_learn.identity import SOURCE, identity, identity_of_settings
 from softmpm_learn.learner import Learner, make_learner
 from softmpm_learn.motions import Motions
 from softmpm_learn.observe import Latent, Observer, make_observer
@@ -267,10 +267,17 @@ class Run:
         """
         theirs = identity_of_settings(Settings()) | OLDER | json.loads(content["about"])
         ours = json.loads(self.about)
+        before, now = theirs.pop(SOURCE, None), ours.pop(SOURCE, None)
         changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
+        if changed and before and now and before[1] != now[1]:
+            raise SettingsError(
+                f"made with another robot: the file {now[0]} has changed since; restore it, or begin a new run with it."
+            )
         if changed:
             both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
-            raise SettingsError(f"made with other settings: {both}")
+            raise SettingsError(
+                f"made with other settings: {both}; config.yaml and command line must be those of the run."
+            )
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])

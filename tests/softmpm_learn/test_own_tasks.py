@@ -56,7 +56,6 @@ def volumes(task) -> np.ndarray:
 
 @pytest.fixture
 def fresh_hydra(monkeypatch):
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
     GlobalHydra.instance().clear()
     yield
@@ -74,15 +73,62 @@ def fresh_hydra(monkeypatch):
 )
 def test_one_command_trains(folder, monkeypatch, name, words):
     """Two iterations, with pictures, a recording and an examination on a finer grid."""
-    quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.run.dir=run")
-    monkeypatch.setattr(sys, "argv", ["softmpm_learn", f"task={name}", *words, *TINY, *quiet])
-    app.main()
+    command(monkeypatch, f"task={name}", *words, *TINY, "hydra.run.dir=run")
     with open("run/metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["loss"] != "" for row in rows] == [True, True, False]  # the last is the examination
     assert rows[0]["loss"] != rows[1]["loss"] and np.isfinite([float(row["loss"]) for row in rows[:2]]).all()
     for left in ("robot.png", "run.h5", "checkpoint.pt"):
         assert (folder / "run" / left).exists()
+
+
+def command(monkeypatch, *words) -> None:
+    """``python -m softmpm_learn`` in this process."""
+    quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none")
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words, *quiet])
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)  # which the program sets
+    app.main()
+
+
+def refusal(monkeypatch, capsys, *words) -> str:
+    """Message with which the command ends."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        command(monkeypatch, *words)
+    assert stop.value.code == 1
+    said = capsys.readouterr().err
+    assert said.startswith("softmpm_learn: ") and said.count("\n") == 1, said
+    return said
+
+
+@pytest.mark.usefixtures("fresh_hydra")
+def test_a_run_goes_on_from_another_folder(folder, monkeypatch, capsys):
+    """The path of the picture is saved whole. Other bytes with the same pixels are the same robot; a picture that shows another one is
+    named, and so is one that is gone.
+    """
+    words = ("task=image", "task.file=robot.png", "observer=centroids", "task.cells=50", "policy=linear")
+    command(monkeypatch, *words, *TINY, "train.examine=false", "train.pictures=false", "hydra.run.dir=run")
+    file, elsewhere = folder / "robot.png", folder / "elsewhere"
+    assert f"file: {file}\n" in (folder / "run" / "config.yaml").read_text()
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    table().save(file, compress_level=0)
+    command(monkeypatch, "resume=../run", "train.iterations=3")
+    with open("../run/metrics.csv", newline="") as table_file:
+        assert len(list(csv.DictReader(table_file))) == 3
+    painted(c0000ff=(100, 40, 139, 60))
+    Image.open("wrong.png").save(file)
+    said = refusal(monkeypatch, capsys, "resume=../run")
+    assert f"another robot: the file {file} has changed since; restore it" in said and len(said) < 300
+    file.unlink()
+    said = refusal(monkeypatch, capsys, "resume=../run")
+    assert f"task.file = {file}: there is no such file; put it there, or correct the path" in said
+    said = refusal(monkeypatch, capsys, "resume=../run", f"task.file={file}")
+    assert "may change, not task.file." in said
+    table().save("moved.png")
+    config = folder / "run" / "config.yaml"
+    config.write_text(config.read_text().replace(str(file), str(elsewhere / "moved.png")))
+    command(monkeypatch, "resume=../run", "train.iterations=3")
 
 
 def test_a_picture_is_a_robot(folder):
@@ -213,35 +259,35 @@ def painted(**boxes: tuple) -> None:
 
 
 @pytest.mark.parametrize(
-    "make, conf, says",
+    "make, kind, settings, says",
     [
-        (lambda: None, ImageConf(), "task image reads a picture of the robot: task.file=FILE"),
-        (lambda: None, ImageConf(file="none.png"), "task.file = none.png: there is no such file"),
-        (lambda: None, ImageConf(file="robot.npy"), "robot.npy cannot be read as a picture"),
+        (lambda: None, ImageConf, dict(), "task image reads a picture of the robot: task.file=FILE"),
+        (lambda: None, ImageConf, dict(file="none.png"), "task.file = .*/none.png: there is no such file"),
+        (lambda: None, ImageConf, dict(file="robot.npy"), "robot.npy cannot be read as a picture"),
         (
             lambda: painted(c8b4513=(30, 30, 49, 44)),
-            ImageConf(file="wrong.png"),
+            ImageConf, dict(file="wrong.png"),
             r"has 2[0-9]{2} pixels of the colour #8b4513, which the legend lacks.*'\+task.legend.NAME=\{colour:\"#8b4513\"",
         ),
-        (lambda: Image.new("RGB", (30, 30), "white").save("wrong.png"), ImageConf(file="wrong.png"), "is empty"),
-        (lambda: painted(cffffff=(0, 78, 239, 84)), ImageConf(file="wrong.png"), "in 3 pieces.*fall apart"),
-        (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf(file="wrong.png"), "no muscle"),
-        (lambda: None, ImageConf(file="robot.png", size=2.0), "is 2 m long and 1 m high; the track of 7 m has room for"),
-        (lambda: None, ImageConf(file="robot.png", size=0.02), "too small for cells of 0.0125 m"),
-        (lambda: painted(c0000ff=(30, 30, 33, 33)), ImageConf(file="wrong.png", cells=20), "muscle blue .* is smaller than a particle"),
-        (lambda: np.save("wrong.npy", WALKER + 3), VoxelsConf(file="wrong.npy"), "7 voxels other than 0 empty.*the first is 6"),
-        (lambda: np.save("wrong.npy", np.zeros((2, 2))), VoxelsConf(file="wrong.npy"), "is empty"),
-        (lambda: np.save("wrong.npy", np.zeros(3)), VoxelsConf(file="wrong.npy"), "of shape .row, column"),
-        (lambda: None, VoxelsConf(file="robot.png"), "cannot be read as an array"),
-        (lambda: None, MeshConf(file="robot.png"), "cannot be read as a mesh"),
-        (lambda: trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export("open.stl"), MeshConf(file="open.stl"), "the mesh is not closed"),
+        (lambda: Image.new("RGB", (30, 30), "white").save("wrong.png"), ImageConf, dict(file="wrong.png"), "is empty"),
+        (lambda: painted(cffffff=(0, 78, 239, 84)), ImageConf, dict(file="wrong.png"), "in 3 pieces.*fall apart"),
+        (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf, dict(file="wrong.png"), "no muscle"),
+        (lambda: None, ImageConf, dict(file="robot.png", size=2.0), "is 2 m long and 1 m high; the track of 7 m has room for"),
+        (lambda: None, ImageConf, dict(file="robot.png", size=0.02), "too small for cells of 0.0125 m"),
+        (lambda: painted(c0000ff=(30, 30, 33, 33)), ImageConf, dict(file="wrong.png", cells=20), "blue .* is smaller than a particle"),
+        (lambda: np.save("wrong.npy", WALKER + 3), VoxelsConf, dict(file="wrong.npy"), "7 voxels other than 0 empty.*the first is 6"),
+        (lambda: np.save("wrong.npy", np.zeros((2, 2))), VoxelsConf, dict(file="wrong.npy"), "is empty"),
+        (lambda: np.save("wrong.npy", np.zeros(3)), VoxelsConf, dict(file="wrong.npy"), "of shape .row, column"),
+        (lambda: None, VoxelsConf, dict(file="robot.png"), "cannot be read as an array"),
+        (lambda: None, MeshConf, dict(file="robot.png"), "cannot be read as a mesh"),
+        (lambda: trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export("open.stl"), MeshConf, dict(file="open.stl"), "the mesh is not closed"),
     ],
 )  # fmt: skip
-def test_what_is_no_robot_is_refused(folder, make, conf, says):
+def test_what_is_no_robot_is_refused(folder, make, kind, settings, says):
     """Files that cannot be read, unknown colours and their count; what is empty, in pieces, without muscles, too large or small."""
     make()
     with pytest.raises(ValueError, match=says):
-        make_task(conf)
+        make_task(kind(**settings))
 
 
 @pytest.mark.parametrize(

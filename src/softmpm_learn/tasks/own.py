@@ -4,6 +4,7 @@ Positions begin at the lower corner of the robot, x forward and y up; in 3D z is
 """
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.tasks.task import Task, neo_hookean
+from softmpm_learn.tasks.task import Source, Task, neo_hookean
 from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 START = 0.2
@@ -33,7 +34,7 @@ class OwnConf(WalkerConf):
     """Settings of a walker that is read from a file."""
 
     file: str = ""
-    """File of the robot, relative to where the program runs."""
+    """File of the robot. A relative path begins where the program runs; it becomes absolute, so that a run is resumed from anywhere."""
     size: float = 0.3
     """Longer side of the robot, its length or its height [m]."""
     cells: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride, reportAssignmentType]
@@ -42,6 +43,8 @@ class OwnConf(WalkerConf):
 
     def __post_init__(self):
         super().__post_init__()
+        if self.file:
+            self.file = str(Path(self.file).absolute())
         if self.cells is None:
             self.cells = self.resolution.value
         for name in ("size", "cells"):
@@ -65,7 +68,9 @@ class OwnConf(WalkerConf):
             raise ValueError(f"task {self.name} reads {what}: task.file=FILE.")
         path = Path(self.file)
         if not path.is_file():
-            raise ValueError(f"task.file = {self.file}: there is no such file in {Path.cwd()}.")
+            raise ValueError(
+                f"task.file = {self.file}: there is no such file; put it there, or correct the path, of a run in its config.yaml."
+            )
         return path
 
 
@@ -116,7 +121,7 @@ def walker(
     passive = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
     if len(passive):
         regions["body"] = passive
-    return walker_task(
+    task = walker_task(
         conf,
         grid,
         walls,
@@ -129,6 +134,8 @@ def walker(
         regions=regions,
         torso=np.flatnonzero(rest[:, 1] >= np.median(rest[:, 1])),
     )
+    digest = hashlib.sha256(Path(conf.file).read_bytes()).hexdigest()
+    return dataclasses.replace(task, source=Source(conf.file, digest))
 
 
 def longer_axis(points: np.ndarray, piece: np.ndarray | None = None) -> tuple[float, ...]:

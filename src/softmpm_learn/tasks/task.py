@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -23,6 +23,14 @@ LASTING = 3
 STRETCH = 1.6
 """Stretch of neighbouring particles of a robot that costs nothing. Those on the lattice part for good at 2.8, with 1.4 cells between
 them (:class:`softmpm.Alarms`)."""
+
+
+class Source(NamedTuple):
+    """A file that a robot was read from."""
+
+    path: str
+    digest: str
+    """SHA-256 of its bytes."""
 
 
 class Resolution(Enum):
@@ -186,6 +194,8 @@ class Task:
     """Decides in those that are longer than an episode whether a motion lasts; that is better than one that does not."""
     build: dict[str, Any] = field(default_factory=dict)
     """Arguments of :func:`softmpm.build` that the task decides: formulation and contact."""
+    source: Source | None = None
+    """File of the robot, None if it is made by code."""
 
     @property
     def seconds(self) -> float:
