@@ -6,6 +6,7 @@ from typing import NoReturn
 
 import torch
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
@@ -16,6 +17,7 @@ from omegaconf.errors import (
 from softmpm_learn import plugins
 from softmpm_learn.config import unknown_key
 from softmpm_learn.distributed import in_full
+from softmpm_learn.tasks.image import unknown_colour
 
 EXPECTED = (
     ValueError,
@@ -43,6 +45,9 @@ def sentence(error: BaseException) -> str:
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             return unknown_key(str(error.full_key), kind)
         if kind is dict:
+            group, _, name = str(error.full_key).rpartition(".")
+            if group == "task.legend" and isinstance(error.parent_node, DictConfig):
+                return unknown_colour(name, map(str, error.parent_node))
             return f"{error.full_key} is not set yet: write +{error.full_key}=VALUE to add it."
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"

@@ -189,6 +189,27 @@ def test_the_legend_decides(folder):
     assert len(places(task)[task.scene.muscles[1].particles]) == len(task.scene.bodies[1].particles)
 
 
+@pytest.mark.usefixtures("fresh_hydra")
+@pytest.mark.parametrize(
+    "word, says",
+    [
+        ("task.legend.rot.angle=90", "task.legend has no rot; known are passive, stiff, red, "),
+        ("+task.legend.rot.angle=90", """purple. Add one with '+task.legend.rot={colour:"#rrggbb",muscle:true}'."""),
+        ("+task.legend.rot=90", "task.legend has no rot; known are passive, stiff, red, "),
+        ('+task.legend.brown={color:"#8b4513"}', "task.legend.brown has no color; known are colour, muscle, angle, stiffness."),
+        ("+task.legend.brown={colour:5}", "a colour of task.legend must be #rrggbb, got 5."),
+        ('+task.legend.brown={colour:"#8b 4513"}', "a colour of task.legend must be #rrggbb, got '#8b 4513'."),
+        ('+task.legend.brown={colour:"#8b4513",muscle:9}', "muscle in task.legend must be true or false, got 9."),
+        ('+task.legend.brown={colour:"#8b4513",angle:up}', "angle in task.legend must be a number of degrees or null, got 'up'."),
+        ('+task.legend.brown={colour:"#8b4513",stiffness:x}', "stiffness in task.legend must be a number > 0, got 'x'."),
+        ("task.legend.red.angel=90", "there is no setting task.legend.red.angel; did you mean task.legend.red.angle?"),
+    ],
+)  # fmt: skip
+def test_what_is_no_colour_of_the_legend_is_refused(folder, monkeypatch, capsys, word, says):
+    """Misspelt names and fields, and values of other types; the sentence names what is known."""
+    assert says in refusal(monkeypatch, capsys, "task=image", "task.file=robot.png", word)
+
+
 def test_voxels_are_those_of_evolution_gym(folder):
     """Each voxel has its material, each actuator its own muscle and direction; lists are read as well."""
     (folder / "robot.json").write_text(json.dumps(WALKER.tolist()))

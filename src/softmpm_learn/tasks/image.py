@@ -1,7 +1,9 @@
 """A flat robot from a picture, in which each colour is a material or a muscle."""
 
 import math
+import re
 import struct
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -31,21 +33,23 @@ class Colour:
     """Young's modulus in units of task.young."""
 
     def __post_init__(self):
-        if not (len(self.colour) == 7 and self.colour[0] == "#"):
+        if not (isinstance(self.colour, str) and re.fullmatch("#[0-9a-fA-F]{6}", self.colour)):
             raise ValueError(f"a colour of task.legend must be #rrggbb, got {self.colour!r}.")
-        try:
-            bytes.fromhex(self.colour[1:])
-        except ValueError as error:
-            raise ValueError(f"a colour of task.legend must be #rrggbb, got {self.colour!r}.") from error
-        if not (math.isfinite(self.stiffness) and self.stiffness > 0):
-            raise ValueError(f"stiffness in task.legend must be > 0, got {self.stiffness}.")
-        if self.angle is not None and not math.isfinite(self.angle):
-            raise ValueError(f"angle in task.legend must be finite, got {self.angle}.")
+        if not isinstance(self.muscle, bool):
+            raise ValueError(f"muscle in task.legend must be true or false, got {self.muscle!r}.")
+        if not (_is_finite(self.stiffness) and self.stiffness > 0):
+            raise ValueError(f"stiffness in task.legend must be a number > 0, got {self.stiffness!r}.")
+        if not (self.angle is None or _is_finite(self.angle)):
+            raise ValueError(f"angle in task.legend must be a number of degrees or null, got {self.angle!r}.")
 
     @property
     def rgb(self) -> np.ndarray:
         """Red, green and blue, 0 to 255."""
         return np.array(list(bytes.fromhex(self.colour[1:])))
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def _legend() -> dict[str, Any]:
@@ -58,14 +62,27 @@ def _legend() -> dict[str, Any]:
     }
 
 
-def _colour(name: str, entry: Any) -> Colour:
+def unknown_colour(name: str, legend: Iterable[str]) -> str:
+    """The sentence for a name that the legend lacks."""
+    known = ", ".join(one for one in legend if one != name)
+    return f"task.legend has no {name}; known are {known}. Add one with {_addition(name)}."
+
+
+def _addition(name: str, colour: str = "#rrggbb") -> str:
+    """Word of the command line that adds a colour to the legend."""
+    return f"'+task.legend.{name}={{colour:\"{colour}\",muscle:true}}'"
+
+
+def _colour(name: str, entry: Any, legend: Iterable[str]) -> Colour:
     if isinstance(entry, Colour):
         return entry
-    try:
-        return Colour(**entry)
-    except TypeError as error:
-        known = ", ".join(one.name for one in fields(Colour))
-        raise ValueError(f"task.legend.{name} must have the fields {known}: {error}.") from error
+    known = [one.name for one in fields(Colour)]
+    wrong = [key for key in entry if key not in known] if isinstance(entry, Mapping) else []
+    if wrong:
+        raise ValueError(f"task.legend.{name} has no {wrong[0]}; known are {', '.join(known)}.")
+    if not (isinstance(entry, Mapping) and "colour" in entry):
+        raise ValueError(unknown_colour(name, legend))
+    return Colour(**entry)
 
 
 @dataclass(kw_only=True)
@@ -81,7 +98,7 @@ class ImageConf(OwnConf):
     def __post_init__(self):
         super().__post_init__()
         self.need_not_negative("tolerance")
-        self.legend = {name: _colour(name, entry) for name, entry in self.legend.items()}
+        self.legend = {name: _colour(name, entry, self.legend) for name, entry in self.legend.items()}
 
 
 def image(conf: ImageConf) -> Task:
@@ -115,7 +132,7 @@ def _labels(conf: ImageConf, pixels: np.ndarray) -> np.ndarray:
         listed = ", ".join(f"{name} {colour.colour}" for name, colour in conf.legend.items())
         raise ValueError(
             f"{conf.file} has {count.max()} pixels of the colour {code}, which the legend lacks; it has {listed}. Repaint them, or add "
-            f"it: '+task.legend.NAME={{colour:\"{code}\",muscle:true}}'."
+            f"it: {_addition('NAME', code)}."
         )
     return label
 
