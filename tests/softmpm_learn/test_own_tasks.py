@@ -279,6 +279,11 @@ def painted(**boxes: tuple) -> None:
     picture.save("wrong.png")
 
 
+def squeezed(kind: str) -> None:
+    """The robot in a small picture of a lossy format, whatever the name of the file says."""
+    table().resize((60, 35)).save("wrong.png", format=kind, quality=5)
+
+
 @pytest.mark.parametrize(
     "make, kind, settings, says",
     [
@@ -290,6 +295,9 @@ def painted(**boxes: tuple) -> None:
             ImageConf, dict(file="wrong.png"),
             r"has 2[0-9]{2} pixels of the colour #8b4513, which the legend lacks.*'\+task.legend.NAME=\{colour:\"#8b4513\"",
         ),
+        (lambda: painted(c8b4513=(50, 50, 52, 52)), ImageConf, dict(file="wrong.png"), "has 1 pixel of the colour"),
+        (lambda: squeezed("JPEG"), ImageConf, dict(file="wrong.png"), "lacks; JPEG changes colours .*: save the drawing itself as PNG"),
+        (lambda: squeezed("WEBP"), ImageConf, dict(file="wrong.png"), "lacks; WEBP changes colours .*: save the drawing itself as PNG"),
         (lambda: Image.new("RGB", (30, 30), "white").save("wrong.png"), ImageConf, dict(file="wrong.png"), "is empty"),
         (lambda: painted(cffffff=(0, 78, 239, 84)), ImageConf, dict(file="wrong.png"), "in 3 pieces.*fall apart"),
         (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf, dict(file="wrong.png"), "no muscle"),

@@ -15,6 +15,8 @@ from softmpm_learn.tasks.own import OwnConf
 from softmpm_learn.tasks.task import Task
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "WEBP")
+LOSSY = ("JPEG", "WEBP")
+"""Formats that change colours as they compress; WEBP can also be lossless."""
 MOST_PIXELS = 2**22
 PAPER = np.array([255, 255, 255])
 
@@ -107,8 +109,8 @@ def image(conf: ImageConf) -> Task:
     Raises:
         ValueError: The picture cannot be read, has an unknown colour, shows nothing, or a robot that does not fit.
     """
-    pixels = _read(conf.path("a picture of the robot"))
-    label = _labels(conf, pixels)
+    pixels, kind = _read(conf.path("a picture of the robot"))
+    label = _labels(conf, pixels, kind)
     parts = []
     for k, (name, colour) in enumerate(conf.legend.items()):
         angle = None if colour.angle is None else math.radians(colour.angle)
@@ -117,8 +119,8 @@ def image(conf: ImageConf) -> Task:
     return drawn(conf, parts)
 
 
-def _labels(conf: ImageConf, pixels: np.ndarray) -> np.ndarray:
-    """Number in the legend of each pixel, or the legend's length for paper."""
+def _labels(conf: ImageConf, pixels: np.ndarray, kind: str) -> np.ndarray:
+    """Number in the legend of each pixel, or the legend's length for paper; ``kind`` is the format of the file."""
     known = np.array([*(colour.rgb for colour in conf.legend.values()), PAPER], dtype=float)
     packed = pixels.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     codes, index = np.unique(packed, return_inverse=True)
@@ -129,11 +131,15 @@ def _labels(conf: ImageConf, pixels: np.ndarray) -> np.ndarray:
     if (label < 0).any():
         found, count = np.unique(packed[label < 0], return_counts=True)
         code = f"#{found[count.argmax()]:06x}"
+        pixel = "pixel" if count.max() == 1 else "pixels"
+        has = f"{conf.file} has {count.max()} {pixel} of the colour {code}, which the legend lacks"
+        if kind in LOSSY:
+            raise ValueError(
+                f"{has}; {kind} changes colours as it compresses: save the drawing itself as PNG, since a {kind} that is converted "
+                "keeps the changed colours."
+            )
         listed = ", ".join(f"{name} {colour.colour}" for name, colour in conf.legend.items())
-        raise ValueError(
-            f"{conf.file} has {count.max()} pixels of the colour {code}, which the legend lacks; it has {listed}. Repaint them, or add "
-            f"it: {_addition('NAME', code)}."
-        )
+        raise ValueError(f"{has}; it has {listed}. Repaint, or add the colour: {_addition('NAME', code)}.")
     return label
 
 
@@ -149,8 +155,8 @@ def _blended(label: np.ndarray, pixels: np.ndarray, known: np.ndarray) -> np.nda
     return label
 
 
-def _read(path: Path) -> np.ndarray:
-    """Colours on white paper, shape (row, column, 3)."""
+def _read(path: Path) -> tuple[np.ndarray, str]:
+    """Colours on white paper, shape (row, column, 3), and the format of the file."""
     import PIL.Image
 
     damaged = (
@@ -167,7 +173,8 @@ def _read(path: Path) -> np.ndarray:
         with PIL.Image.open(path, formats=FORMATS) as picture:
             if picture.width * picture.height <= MOST_PIXELS:
                 paper = PIL.Image.new("RGBA", picture.size, "white")
-                return np.asarray(PIL.Image.alpha_composite(paper, picture.convert("RGBA")).convert("RGB"))
+                flat = PIL.Image.alpha_composite(paper, picture.convert("RGBA")).convert("RGB")
+                return np.asarray(flat), str(picture.format)
             size = f"{picture.width} x {picture.height}"
     except (*damaged, PIL.Image.DecompressionBombError) as error:
         raise ValueError(f"{path} cannot be read as a picture ({', '.join(FORMATS)}): {error}") from error
