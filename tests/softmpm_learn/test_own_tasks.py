@@ -4,6 +4,7 @@ import csv
 import json
 import logging
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -307,7 +308,9 @@ def squeezed(kind: str) -> None:
         (lambda: np.save("wrong.npy", WALKER + 3), VoxelsConf, dict(file="wrong.npy"), "7 voxels other than 0 empty.*the first is 6"),
         (lambda: np.save("wrong.npy", np.zeros((2, 2))), VoxelsConf, dict(file="wrong.npy"), "is empty"),
         (lambda: np.save("wrong.npy", np.zeros(3)), VoxelsConf, dict(file="wrong.npy"), "of shape .row, column"),
-        (lambda: None, VoxelsConf, dict(file="robot.png"), "cannot be read as an array"),
+        (lambda: None, VoxelsConf, dict(file="robot.png"), "robot.png must be an array .* .npy file.*task=image reads pictures.$"),
+        (lambda: Path("wrong.json").write_text("[[1"), VoxelsConf, dict(file="wrong.json"), "cannot be read as lists.*line 1 column 4"),
+        (lambda: Path("wrong.npy").write_bytes(b"PK\3\4"), VoxelsConf, dict(file="wrong.npy"), "wrong.npy must be an array"),
         (lambda: None, MeshConf, dict(file="robot.png"), "cannot be read as a mesh"),
         (lambda: trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export("open.stl"), MeshConf, dict(file="open.stl"), "the mesh is not closed"),
     ],

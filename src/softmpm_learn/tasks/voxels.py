@@ -2,6 +2,7 @@
 
 import json
 import math
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,21 +52,33 @@ def voxels(conf: VoxelsConf) -> Task:
 
 
 def _read(path: Path) -> np.ndarray:
-    try:
-        if path.suffix == ".json":
+    if path.suffix == ".json":
+        try:
             array = np.array(json.loads(path.read_text()))
-        else:
-            array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path} cannot be read as an array, .npy or .json: {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be read as lists of numbers: {error}") from error
+    else:
+        try:
+            with path.open("rb") as file:
+                array = np.load(file, allow_pickle=False)
+        except (
+            ValueError,
+            EOFError,
+            zipfile.BadZipFile,
+        ) as error:  # NumPy's message recommends to unpickle the file
+            raise ValueError(
+                f"{path} must be an array of numbers in a .npy file, as numpy.save writes it, or lists in a .json file; "
+                "task=image reads pictures."
+            ) from error
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "iuf":
         raise ValueError(f"{path} must hold an array of numbers of shape (row, column).")
     if max(array.shape) > MOST:
         raise ValueError(f"{path} must have at most {MOST} voxels along an axis, got {array.shape}.")
     wrong = array[~np.isin(array, range(5))]
     if len(wrong):
+        count = "1 voxel" if len(wrong) == 1 else f"{len(wrong)} voxels"
         raise ValueError(
-            f"{path} has {len(wrong)} voxels other than 0 empty, 1 rigid, 2 soft, 3 horizontal and 4 vertical actuator; "
+            f"{path} has {count} other than 0 empty, 1 rigid, 2 soft, 3 horizontal and 4 vertical actuator; "
             f"the first is {wrong[0]}."
         )
     return array.astype(int)
