@@ -131,7 +131,9 @@ def _run_dir(resume: str | None, fresh: str) -> str:
     if resume is None:
         return fresh
     if not (Path(resume) / "config.yaml").is_file():
-        raise ValueError(f"there is no run to resume in {resume}: it has no config.yaml.")
+        inside = sorted(Path(resume).glob("*/config.yaml"), key=lambda path: path.stat().st_mtime)
+        latest = f"; the latest run in it: resume={inside[-1].parent}" if inside else ""
+        raise ValueError(f"there is no run to resume in {resume}: it has no config.yaml{latest}.")
     return resume
 
 

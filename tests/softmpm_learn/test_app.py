@@ -325,6 +325,19 @@ def test_a_folder_with_a_run_is_not_overwritten(monkeypatch, capsys, finished):
     assert (folder / "metrics.csv").read_bytes() == before
 
 
+def test_the_latest_run_in_a_folder_is_named(monkeypatch, capsys, tmp_path):
+    """Where a folder of runs is to be resumed in place of one of them."""
+    for name in ("2026-01-02_09-00-00", "2026-01-03_09-00-00", "notes"):
+        (tmp_path / name).mkdir()
+    for name, when in (("2026-01-02_09-00-00", 2e9), ("2026-01-03_09-00-00", 1e9)):
+        (tmp_path / name / "config.yaml").touch()
+        os.utime(tmp_path / name / "config.yaml", (when, when))
+    said = refusal(monkeypatch, capsys, f"resume={tmp_path}")
+    assert said.endswith(
+        f"it has no config.yaml; the latest run in it: resume={tmp_path}/2026-01-02_09-00-00."
+    )
+
+
 def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finished):
     """Two iterations and one more give the metrics of three in one go, to the last bit."""
     shutil.copytree(finished[0], tmp_path / "run")
