@@ -1,5 +1,6 @@
 """The bridge from Hydra to plain objects: command line and ``conf/`` in, a run in its folder out."""
 
+import argparse
 import dataclasses
 import logging
 import math
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -54,6 +56,7 @@ def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
                 signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
             _load(own)
+            check_flags(sys.argv[1:])
             check_words(sys.argv[1:])
             register(group.broadcast(time.time()))
             waiting, failed = list[Job](), dict[int, Path]()
@@ -184,6 +187,23 @@ def _fixed(conf: RunConf) -> dict:
         group, _, name = key.partition(".")
         del (flat[group] if name else flat)[name or group]
     return flat
+
+
+def check_flags(words: Sequence[str]) -> None:
+    """Raise ValueError for flags that Hydra does not have, for which it would print the usage of all that it has."""
+    parser = get_args_parser()
+    parser.exit_on_error = False
+    try:
+        _, unknown = parser.parse_known_args(words)
+    except argparse.ArgumentError as error:
+        raise ValueError(f"{error}; --hydra-help explains the flags.") from error
+    flags = [word for word in unknown if word[:1] == "-"]
+    if flags:
+        raise ValueError(
+            f"there is no flag {flags[0]}: settings are words such as train.iterations=5; --help lists them."
+        )
+    if unknown:
+        raise ValueError(f"settings must follow each other: write {unknown[0]} before the flags.")
 
 
 def check_words(words: Sequence[str]) -> None:

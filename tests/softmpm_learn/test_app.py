@@ -236,6 +236,24 @@ def test_a_wrong_word_ends_in_one_sentence(monkeypatch, capsys, tmp_path, overri
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("--iterations 5", "there is no flag --iterations: settings are words such as train.iterations=5; --help lists them."),
+        ("task=arm --train.iterations=5", "there is no flag --train.iterations=5: settings are words"),
+        ("task=arm --cfg job train.seed=1", "settings must follow each other: write train.seed=1 before the flags."),
+        ("--cfg every", "argument --cfg/-c: invalid choice: 'every'"),
+    ],
+)  # fmt: skip
+def test_a_flag_that_hydra_lacks_ends_in_one_sentence(monkeypatch, capsys, words, sentence):
+    """In place of Hydra's usage."""
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words.split()])
+    with pytest.raises(SystemExit) as stop:
+        app.main()
+    said = capsys.readouterr().err
+    assert stop.value.code == 1 and said.startswith(f"softmpm_learn: {sentence}") and said.count("\n") == 1
+
+
 @pytest.mark.parametrize("key", ["foo", "task.foo", "train.foo", "policy.foo.bar"])
 def test_a_key_that_is_not_in_the_schema_is_refused(key):
     """Hydra lets ``+key=value`` pass; the schema does not."""
