@@ -194,6 +194,7 @@ def test_help_is_worth_reading(monkeypatch, capsys):
     text = capsys.readouterr().out
     for word in ("python -m softmpm_learn task=arm", "resume=", "-m train.seed=0,1,2", *LEFT):
         assert word in text
+    assert "src/" not in text and text.strip().endswith("python -m softmpm_learn task=elephant --cfg job")
     assert "_schema" not in text and max(map(len, text.splitlines())) <= 110
     assert text.strip() == help_text().strip()
 
