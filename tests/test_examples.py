@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 import warp
+from helpers import bar
 from PIL import Image, ImageSequence
 
 import softmpm
@@ -88,6 +89,27 @@ def test_the_code_on_quantities_runs():
     frames = names["way"].frames
     assert frames.shape == (10, 1, 2)
     assert abs(frames[-1] - softmpm.center_of_mass(model, end, names["params"])).max() < 1e-6
+
+
+def test_the_code_on_shapes_runs(capsys):
+    """The particles of a disc and of a leg, and the outline of the whole robot."""
+    names: dict = {}
+    text = (README.parent / "docs" / "shapes.md").read_text()
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(code, names)
+    assert [f"{float(line):.4f}" for line in capsys.readouterr().out.splitlines()] == ["0.0320", "0.0314"]
+    assert 0 < len(names["muscular"]) < len(names["robot"]) and names["robot"].outline is not None
+
+
+def test_the_code_on_graphs_runs():
+    """With a scene, a policy and a loop of one's own, here one without a simulation."""
+    text = (README.parent / "docs" / "performance.md").read_text()
+    (code,) = re.findall(r"## Your own loop as one graph\n```python\n(.*?)```", text, re.DOTALL)
+    policy = torch.nn.Linear(1, 1, bias=False, device=softmpm.build(bar()).device)
+    names: dict = {"scene": bar(), "policy": policy, "closed_loop": lambda own: own.weight.square().sum()}
+    exec(code, names)
+    assert names["loss"] == policy.weight.square()
+    assert names["gradients"][0] == 2 * policy.weight
 
 
 def test_the_code_on_objectives_runs():

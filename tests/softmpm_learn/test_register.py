@@ -6,6 +6,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import dedent
 
 import forked
 import pytest
@@ -22,7 +23,9 @@ from softmpm_learn.settings import ObserverConf, OptimizerConf, PolicyConf, Sett
 from softmpm_learn.tasks import TaskConf, make_task
 
 ROOT = Path(__file__).parents[2]
-HOPPER, PARTS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robots.md").read_text(), re.DOTALL)
+PAGE = (ROOT / "docs" / "robots.md").read_text()
+HOPPER, PARTS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+(END,) = (dedent(text) for text in re.findall(r"^    if __name__.*?(?=^\S)", PAGE, re.DOTALL | re.MULTILINE))
 TINY = [
     *("experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
     *("learning.epochs=1", "train.iterations=2", "train.record_every=0", "train.examine=false"),
@@ -89,8 +92,7 @@ def test_an_observer_and_an_optimiser_of_a_stranger_train(folder):
 
 def test_a_policy_of_a_stranger_trains_from_their_own_program(folder):
     """``softmpm_learn.main()`` is the command line; names of the program are resumed with it as a file."""
-    program = f'{PARTS}\n\nif __name__ == "__main__":\n    import softmpm_learn\n\n    softmpm_learn.main()\n'
-    (folder / "mine.py").write_text(program)
+    (folder / "mine.py").write_text(f"{PARTS}\n\n{END}")
     words = ("task=biped", "observer=centroids", "policy=spring", "policy.options.gain=0.3", *TINY)
     done = run(folder, *words, "hydra.run.dir=run", python=("mine.py",))
     assert done.returncode == 0, done.stderr
