@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from softmpm_learn import app, plugins
 from softmpm_learn.experiment import finer
 from softmpm_learn.tasks import ImageConf, MeshConf, Resolution, VoxelsConf, make_task
+from softmpm_learn.tasks.drawing import thinnest
 from softmpm_learn.tasks.own import longer_axis
 
 trimesh = pytest.importorskip("trimesh")
@@ -150,6 +151,37 @@ def test_a_picture_is_a_robot(folder):
     assert len(np.concatenate(list(task.regions.values()))) == len(x)
     lowest = min(body.particles.outline.points[:, 1].min() for body in task.scene.bodies)
     assert lowest == pytest.approx(task.scene.walls[0].offset, abs=1e-9)
+
+
+def test_a_limb_thinner_than_two_cells_is_named(folder, caplog):
+    """Legs of 30 mm on cells of 12.5 mm are not; others are, with their width and the cells of which it has four."""
+    for conf in (ImageConf(file="robot.png", size=0.2), VoxelsConf(file="robot.npy")):
+        make_task(conf)
+    assert not caplog.records
+    painted(cffffff=(50, 80, 189, 119))  # leaves 10 mm of each leg
+    make_task(ImageConf(file="wrong.png", size=0.2))
+    np.save("long.npy", np.concatenate([WALKER, WALKER[-1:]]))
+    make_task(VoxelsConf(file="long.npy", size=0.08))
+    for record, width, cells in zip(caplog.records, ("0.01", "0.02"), ("0.8", "1.6"), strict=True):
+        assert f"at most {width} m thick, {cells} cells of" in record.getMessage()
+    assert "such as task.cells=400." in caplog.records[0].getMessage()
+
+
+@pytest.mark.parametrize("width", [2, 4, 8, 12])
+def test_the_thinnest_limb_is_found(width):
+    """Below 16 pixels: a leg, and a neck between two discs; what is wider has none, whatever its corners."""
+    body = np.zeros((140, 200), dtype=bool)
+    body[:60] = True
+    leg = body.copy()
+    leg[:, 20 : 20 + width] = leg[:, 150:180] = True
+    y, x = np.mgrid[:200, :200]
+    discs = np.hypot(x - 40, y - 100) < 30
+    discs |= np.hypot(x - 160, y - 100) < 30
+    neck = discs | ((abs(y - 99.5) < width / 2) & (abs(x - 100) < 60))
+    for mask in (leg, neck):
+        assert thinnest(mask, 0.001, 0.016) == pytest.approx(0.001 * width)
+    for mask in (body, discs, np.tri(200, dtype=bool)):
+        assert thinnest(mask, 0.001, 0.016) is None
 
 
 def test_blurred_edges_belong_to_the_nearest_part(folder):
