@@ -23,7 +23,10 @@ WIDTH, TALLEST = 7.0, 6.0
 NARROWEST, LOWEST = 3.6, 1.6
 """Least width of a figure, and least height of its panels together [inch]."""
 LABELS = (1.55, 0.45)
-"""Room for the labels of the axes and the colours [inch], across and above each other."""
+"""Room for the labels of the axes and the names of the colours [inch], across and above each other."""
+COLOUR_BAR = 0.35
+"""Further room across for a colour bar with numbers of six digits and a label [inch]; without it the layout cuts off the label of the y
+axis."""
 
 
 def show(
@@ -159,7 +162,7 @@ def panels_of(
         width, height = corners[1] - corners[0]
         rows, columns = _grid(count, float(height / width))
         figure = Picture(
-            figsize=_size(float(rows * height), float(columns * width), rows, columns),
+            figsize=_size(float(rows * height), float(columns * width), rows, columns, not colouring.names),
             layout="constrained",
             facecolor="white",
         )
@@ -185,9 +188,9 @@ def _grid(count: int, ratio: float) -> tuple[int, int]:
     return math.ceil(count / columns), columns
 
 
-def _size(height: float, width: float, rows: int, columns: int) -> tuple[float, float]:
-    """Size of a figure [inch] whose panels, of these sizes together in any unit, leave no empty space."""
-    across, above = LABELS[0] + 0.1 * columns, LABELS[1] + 0.25 * rows
+def _size(height: float, width: float, rows: int, columns: int, bar: bool) -> tuple[float, float]:
+    """Size of a figure [inch] whose panels, of these sizes together in any unit, leave no empty space; with room for a colour bar."""
+    across, above = LABELS[0] + COLOUR_BAR * bar + 0.1 * columns, LABELS[1] + 0.25 * rows
     scale = min((WIDTH - across) / width, TALLEST / height)
     return max(scale * width + across, NARROWEST), max(scale * height, LOWEST) + above
 

@@ -76,6 +76,22 @@ def test_bodies_and_walls_are_where_they_are_in_metres():
     assert columns.min() - np.median(side) == pytest.approx((0.15 - out) * scale, abs=slack)
 
 
+@pytest.mark.parametrize(
+    ("height", "width", "young"), [(0.2, 0.1, 1e4), (0.3, 0.2, 3e5), (0.6, 0.15, 3e5), (0.3, 0.3, 1e4)]
+)
+def test_labels_are_within_the_picture(height, width, young):
+    """Of an upright body with numbers of up to six digits at the colours: nothing touches an edge."""
+    block = softmpm.box((0.4, FLOOR), (0.4 + width, FLOOR + height), width / 8)
+    floor = softmpm.Wall(normal=(0.0, 1.0), offset=FLOOR)
+    scene = scene_of(bodies=[softmpm.Body(block, RUBBER)], walls=[floor], muscles=[])
+    values = young * (1.0 + block.positions[:, 1])
+    png = io.BytesIO()
+    softmpm.show(scene, colour=values, label="young [Pa]").savefig(png, dpi=100)
+    image = np.asarray(Image.open(png).convert("L"))
+    for edge in (image[0], image[-1], image[:, 0], image[:, -1]):
+        assert edge.min() > 250
+
+
 def test_hatching_is_below_the_floor():
     """Pixels between white and the wall's colour are on the solid side."""
     image = pixels(
