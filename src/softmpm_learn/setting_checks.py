@@ -1,6 +1,8 @@
 """Checks that settings share: a wrong value fails where the settings are made, in a sentence."""
 
 import math
+from collections.abc import Iterable
+from numbers import Real
 
 
 def one_of(name: str, value: str, known: tuple[str, ...]) -> None:
@@ -23,3 +25,13 @@ def share(group: str, settings, *names: str) -> None:
         value = getattr(settings, name)
         if not 0.0 < value <= 1.0:
             raise ValueError(f"{group}.{name} must lie in (0, 1], got {value}.")
+
+
+def lengths(name: str, values) -> None:
+    """Raise ValueError unless a setting is a list of lengths."""
+    is_list = isinstance(values, Iterable) and not isinstance(values, str)
+    if not (is_list and all(isinstance(one, Real) and math.isfinite(one) and one >= 0 for one in values)):
+        shown = list(values) if is_list else values
+        raise ValueError(
+            f"{name} must be a list of lengths ≥ 0 [m], one for each axis, such as [0.05, 0.05], got {shown!r}."
+        )

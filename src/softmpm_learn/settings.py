@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
-from softmpm_learn.setting_checks import one_of, positive, share
+from softmpm_learn.setting_checks import lengths, one_of, positive, share
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
@@ -265,8 +265,7 @@ class TrainConf:
             positive("train", self, "endurance")
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
-        if any(not (math.isfinite(s) and s >= 0) for s in self.goal_spread):
-            raise ValueError(f"train.goal_spread must be lengths ≥ 0, got {list(self.goal_spread)}.")
+        lengths("train.goal_spread", self.goal_spread)
 
 
 @dataclass(kw_only=True)

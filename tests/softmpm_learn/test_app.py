@@ -225,6 +225,8 @@ def test_help_does_not_wait_for_pytorch():
         ("train.iterations=1.5", "train.iterations: Value '1.5' of type 'float' could not be converted"),
         ("design.young=perhaps", "design.young: Value 'perhaps' is not a valid bool"),
         ("task.resolution=huge", "task.resolution: Invalid value 'huge', expected one of [draft, standard, fine]."),
+        ("train.goal_spread=0.05", "train.goal_spread must be a list, got 0.05: write 'train.goal_spread=[0.05]', with a"),
+        ("train.log=wandb", "train.log must be a list, got wandb: write 'train.log=[wandb]', with a comma between"),
         ("task.goal=[1", "cannot read 'task.goal=[1': write key=value"),
         ("resume=nowhere", "there is no run to resume in nowhere"),
         ("experiment=nope", "there is no experiment called nope; choose one of comparison, smoke."),

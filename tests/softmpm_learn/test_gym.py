@@ -225,7 +225,9 @@ def test_any_observer_takes_the_place_of_the_centroids():
     [
         ({"sceonds": 1.0}, "there is no setting sceonds; known are render_mode, observer, reward"),
         ({"reward": "sparse"}, "reward must be one of dense, objective"),
-        ({"kick": -1.0}, "kick and goal_spread must be ≥ 0"),
+        ({"kick": -1.0}, "kick must be ≥ 0, got -1"),
+        ({"goal_spread": 0.05}, r"goal_spread must be a list of lengths .* such as \[0.05, 0.05\], got 0.05"),
+        ({"goal_spread": (0.1, -0.1)}, r"goal_spread must be a list of lengths .* got \[0.1, -0.1\]"),
         ({"dtype": "float16"}, "dtype must be 'float32' or 'float64'"),
         ({"render_mode": "human"}, "render_mode must be one of rgb_array or None"),
         ({"goal_spread": (0.1, 0.1)}, "goal_spread needs a task with a goal"),

@@ -17,6 +17,7 @@ import softmpm
 from softmpm import Failures, Model, State, UnstableError
 from softmpm_learn.gym.rewards import REWARDS, Costs
 from softmpm_learn.observe import Centroids, Observer
+from softmpm_learn.setting_checks import lengths
 from softmpm_learn.tasks import Task
 
 Tree = TypeVar("Tree")
@@ -44,10 +45,9 @@ class EnvConf:
             raise ValueError(f"reward must be one of {', '.join(REWARDS)}, got {self.reward!r}.")
         if self.dtype not in ("float32", "float64"):
             raise ValueError(f"dtype must be 'float32' or 'float64', got {self.dtype!r}.")
-        if not all(math.isfinite(value) and value >= 0 for value in (self.kick, *self.goal_spread)):
-            raise ValueError(
-                f"kick and goal_spread must be ≥ 0, got {self.kick} and {list(self.goal_spread)}."
-            )
+        if not (math.isfinite(self.kick) and self.kick >= 0):
+            raise ValueError(f"kick must be ≥ 0, got {self.kick}.")
+        lengths("goal_spread", self.goal_spread)
 
 
 class Outcome(NamedTuple):
@@ -96,7 +96,7 @@ class Worlds:
         self._costs, self._losses = Costs(task, conf.reward == "dense"), Costs(task, dense=False)
         self._spread = self._tensor(self._checked_spread())
         self._centre = self._tensor([] if task.goal is None else task.goal)
-        self.goal = self._centre.expand(count, -1).clone() if conf.goal_spread else None
+        self.goal = self._centre.expand(count, -1).clone() if len(self._spread) else None
         self.size = self.observer.size + len(self._spread)
         self.origin: State = self.model.rest()
         self.state: State = self.model.rest()
