@@ -239,6 +239,31 @@ def test_a_wrong_setting_says_what_must_hold(settings, message):
         softmpm_learn.gym.registration.make_single("biped", **(SHORT | settings))
 
 
+@pytest.mark.parametrize("worlds", [None, 2])
+def test_a_wrong_action_says_what_must_hold(worlds):
+    """The shape in the message is the one to pass, of one environment and of many; step_torch takes tensors."""
+    env = make("arm", **SHORT) if worlds is None else make_vec("arm", worlds, **SHORT)
+    env.reset()
+    shape = (6,) if worlds is None else (2, 6)
+    text = re.escape(f"the action must have shape {shape}, that of action_space, got (3,).")
+    with pytest.raises(ValueError, match=text):
+        env.step(np.zeros(3))
+    with pytest.raises(ValueError, match=text):
+        env.step_torch(torch.zeros(3))
+    with pytest.raises(TypeError, match=r"step_torch takes a torch.Tensor, got ndarray; step takes arrays"):
+        env.step_torch(np.zeros(shape))
+    with pytest.raises(TypeError, match="the action must be an array of real numbers, got 'pull'"):
+        env.step("pull")
+    env.step(np.zeros(shape))
+    env.step_torch(torch.zeros(shape))
+
+
+def test_a_wrong_autoreset_mode_is_answered_with_the_modes():
+    """Their names are those of gymnasium."""
+    with pytest.raises(ValueError, match="one of NextStep, SameStep, Disabled, got 'same'"):
+        make_vec("arm", 2, autoreset_mode="same", **SHORT)
+
+
 def test_the_learner_needs_no_gymnasium():
     """Every module outside of the package ``gym`` is imported without gymnasium and the libraries of reinforcement learning."""
     root = ROOT / "src" / "softmpm_learn"

@@ -76,6 +76,7 @@ class SoftRobotEnv(gymnasium.Env):
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, dict[str, Any]]:
         if not self._begun or self.terminated or self.truncated:
             raise ResetNeeded("the episode has not begun or has ended; call reset() before the next step.")
+        need_action(action, self.action_space)
         outcome = self.worlds.step(action[None])
         self.terminated, self.truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = ending(self.worlds, 0, outcome.failures.get(0)) if outcome.ended[0] else {}
@@ -125,7 +126,22 @@ def render(worlds: Worlds, world: int) -> np.ndarray:
 
 def tensor(worlds: Worlds, action: Any) -> Tensor:
     """Actions on the device of the model, in its precision."""
-    return torch.as_tensor(np.asarray(action), device=worlds.model.device).to(worlds.model.dtype)
+    values = np.asarray(action)
+    if values.dtype.kind not in "biuf":
+        raise TypeError(f"the action must be an array of real numbers, got {action!r}.")
+    return torch.as_tensor(values, device=worlds.model.device).to(worlds.model.dtype)
+
+
+def need_action(action: Any, space: Box) -> None:
+    """Raise TypeError unless it is a tensor, and ValueError unless it has the shape of the action space."""
+    if not isinstance(action, Tensor):
+        raise TypeError(
+            f"step_torch takes a torch.Tensor, got {type(action).__name__}; step takes arrays, without a gradient."
+        )
+    if action.shape != space.shape:
+        raise ValueError(
+            f"the action must have shape {space.shape}, that of action_space, got {tuple(action.shape)}."
+        )
 
 
 def array(values: Tensor) -> np.ndarray:

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from softmpm_learn.gym.env import array, ending, metadata_of, render, spaces, tensor
+from softmpm_learn.gym.env import array, ending, metadata_of, need_action, render, spaces, tensor
 from softmpm_learn.gym.worlds import EnvConf, Outcome, Worlds
 from softmpm_learn.tasks import Task
 
@@ -40,9 +40,12 @@ class SoftRobotVectorEnv(VectorEnv):
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ):
+        known = [mode.value for mode in AutoresetMode]
+        if autoreset_mode not in (*AutoresetMode, *known):
+            raise ValueError(f"autoreset_mode must be one of {', '.join(known)}, got {autoreset_mode!r}.")
+        self.mode = AutoresetMode(autoreset_mode)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.worlds = Worlds(task, num_envs, conf or EnvConf())
-        self.mode = AutoresetMode(autoreset_mode)
         self.metadata = metadata_of(task, render_mode) | {"autoreset_mode": self.mode}
         self.single_observation_space, self.single_action_space = spaces(self.worlds)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -115,6 +118,7 @@ class SoftRobotVectorEnv(VectorEnv):
     def _advance(self, actions: Tensor) -> Outcome:
         if not self._generators:
             raise ResetNeeded("no episode has begun; call reset() before the first step.")
+        need_action(actions, self.action_space)
         ended = self.terminated | self.truncated
         if self.mode is AutoresetMode.DISABLED and ended.any():
             raise ResetNeeded(

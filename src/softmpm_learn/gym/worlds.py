@@ -167,11 +167,6 @@ class Worlds:
             activation: Activation [-], shape (world, muscle). Differentiable.
             moving: Worlds that take part, shape (world,); the others stay as they are, with a reward of 0.
         """
-        shape = self.count, self.model.muscle_count
-        if tuple(activation.shape) != shape:
-            raise ValueError(
-                f"the action must have shape {shape}, one number per muscle, got {tuple(activation.shape)}."
-            )
         moving = np.ones(self.count, dtype=bool) if moving is None else moving
         before = self.shown
         failures = self._simulate(activation, moving) if moving.any() else {}
