@@ -13,9 +13,11 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 
+import softmpm
 import softmpm_learn.gym
 from softmpm_learn.episode import run_episode
 from softmpm_learn.gym import EnvConf, SoftRobotEnv, SoftRobotVectorEnv, make, make_vec
+from softmpm_learn.gym.picture import picture
 from softmpm_learn.objective import Path as Motion
 from softmpm_learn.observe import Centroids
 
@@ -201,17 +203,45 @@ def test_windows_and_episodes_cut_the_gradient(task):
 
 
 def test_pictures_show_the_robot():
-    """One per world, as wide as the grid; the robot, its activation and the goal are in them."""
+    """One per world; the robot, its activation and the goal are in them."""
     env = make_vec("arm", 2, render_mode="rgb_array", goal_spread=(0.1, 0.1), **SHORT)
     env.reset(seed=0)
     before = env.render()
     env.step(np.stack([np.zeros(6), np.ones(6)]))
     after = env.render()
     assert before is not None and after is not None and len(after) == 2
-    assert after[0].shape[1:] == (480, 3) and after[0].dtype == np.uint8
+    assert after[0].shape == (320, 480, 3) and after[0].dtype == np.uint8
     changed = [np.mean(one != two) for one, two in zip(before, after, strict=True)]
     assert changed[0] < 1e-3 < 0.01 < changed[1]
     assert (before[0] != before[1]).any()  # their goals
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_picture_follows_the_robot(dim):
+    """On a track of 3 m a block of 0.3 m takes a third of the width, in the middle and above the floor; where it has moved, it is at the
+    same place of the picture, and the lines are not."""
+    low, high = (0.3, 0.1, 0.1), (0.6, 0.25, 0.3)
+    block = softmpm.box(low[:dim], high[:dim], 0.02)
+    muscle = softmpm.Muscle(particles=np.arange(len(block)), direction=(1.0, 0.0, 0.0)[:dim], strength=1.0)
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(76, 21, 11)[:dim], spacing=0.04),
+        bodies=[softmpm.Body(block, softmpm.NeoHookean(density=1.0, young=10.0))],
+        muscles=[muscle],
+        walls=[softmpm.Wall(normal=(0.0, 1.0, 0.0)[:dim], offset=0.1)],
+        dt=1e-3,
+    )
+    shown, found = [], []
+    for moved in (0.0, 1.037):
+        x = block.positions + np.eye(dim)[0] * moved
+        shown.append(picture(scene, x, np.ones(1), None).astype(int))
+        rows, columns = np.nonzero(shown[-1][..., 0] - shown[-1][..., 2] > 100)
+        found.append((rows.min(), rows.max(), columns.min(), columns.max()))
+    top, bottom, left, right = found[0]
+    assert shown[0].shape == (320, 480, 3) and np.abs(np.subtract(*found)).max() <= 1
+    assert right - left == pytest.approx(160, rel=0.1) and (left + right) / 2 == pytest.approx(240, abs=3)
+    assert bottom == pytest.approx(0.8 * 320, abs=4) and bottom - top == pytest.approx(80, rel=0.15)
+    sky = [image[5] for image in shown]
+    assert np.any(sky[0] != sky[1])
 
 
 def test_any_observer_takes_the_place_of_the_centroids():
