@@ -32,7 +32,7 @@ DESIGN = {
 """Title and unit of each quantity in robot.png."""
 CURVES = {
     "loss": "loss",
-    "evaluation": "loss at the evaluation goals",
+    "evaluation": "loss in evaluations",
     "validation_loss": "validation loss of the autoencoder",
     "activation": "activation, root mean square",
     "young_change": "mean change of Young's modulus",

@@ -10,6 +10,7 @@ from PIL import Image
 
 import softmpm
 from softmpm_learn.figures import VALUES, canvas, latent_figure, loss_figure, robot_figure
+from softmpm_learn.pictures import curves
 from softmpm_learn.progress import ProgressBar
 
 
@@ -93,6 +94,24 @@ def test_loss_figure_draws_what_has_numbers(tmp_path):
     two, one, none = (pixels(tmp_path / f"{name}.png") for name in ("two", "one", "none"))
     assert two.shape[0] > one.shape[0] >= none.shape[0]
     assert colour_count(one, -60) > 100
+
+
+def test_the_loss_and_its_lowest_value_are_both_seen(tmp_path, monkeypatch):
+    """Of a loss that falls all the time, where they are the same curve, and each has its name."""
+    drawn, save = [], canvas.save
+    monkeypatch.setattr(canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi))
+    loss_figure(tmp_path / "loss.png", {"loss": ([0, 1, 2, 3], [4.0, 3.0, 2.0, 1.0])})
+    legend = drawn[0].axes[0].get_legend()
+    assert {text.get_text() for text in legend.get_texts()} == {"loss", "lowest so far"}
+    image = pixels(tmp_path / "loss.png")[:, : pixels(tmp_path / "loss.png").shape[1] * 2 // 3]  # without the legend
+    assert colour_count(image, 60) > 1000 and colour_count(image, -60) > 500
+
+
+def test_evaluations_have_a_title_that_needs_no_goals(tmp_path):
+    """A walker is evaluated too, over a longer motion."""
+    (tmp_path / "metrics.csv").write_text("iteration,loss,evaluation\n0,1.0,2.0\n1,0.5,\n")
+    found = curves(tmp_path / "metrics.csv")
+    assert found["loss in evaluations"] == ([0], [2.0]) and found["loss"] == ([0, 1], [1.0, 0.5])
 
 
 def test_losses_over_decades_are_drawn_as_logarithms(tmp_path):

@@ -21,9 +21,9 @@ SIGNED = "RdBu"
 
 
 def loss_figure(
-    path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, best: str = "loss"
+    path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, lowest: str = "loss"
 ) -> None:
-    """Draw curves over the iterations, one panel each; ``best`` also shows the best value so far.
+    """Draw curves over the iterations, one panel each; ``lowest`` names one that also shows its lowest value so far.
 
     Args:
         curves: For each name the iterations and the values; values that are not finite leave gaps.
@@ -36,9 +36,11 @@ def loss_figure(
         iteration, value = (np.asarray(array, dtype=float) for array in curves[name])
         axes = figure.add_subplot(len(names), 1, place + 1, sharex=first)
         first = first or axes
-        axes.plot(iteration, value, color="#1f5fa8", marker="o" if len(value) < 3 else None, markersize=4)
-        if name == best:
-            axes.plot(iteration, np.fmin.accumulate(value), color="0.6", linestyle="--", label="best so far")
+        if name == lowest:  # wide and below, since it is the curve itself where that falls
+            axes.plot(iteration, np.fmin.accumulate(value), color="#f2bd6b", linewidth=6, label="lowest so far")
+        marker = "o" if len(value) < 3 else None
+        axes.plot(iteration, value, color="#1f5fa8", marker=marker, markersize=4, label=name)
+        if name == lowest:
             axes.legend(frameon=False)
         axes.set_title(name, fontsize=9, loc="left")
         axes.set_yscale(canvas.scale(value))
