@@ -305,6 +305,20 @@ def test_the_learner_needs_no_gymnasium():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT / "src", timeout=120)
 
 
+def test_the_sentence_of_the_page_silences_warp():
+    """A program that follows docs/gym.md prints no module that Warp loads; one that does not prints many."""
+    (line,) = re.findall(r"`import warp as wp` and `(.*?)`", (ROOT / "docs" / "gym.md").read_text())
+    code = (
+        "import softmpm_learn.gym\n"
+        f"env = softmpm_learn.gym.make('arm', **{SHORT})\nenv.reset()\nenv.step(env.action_space.sample())"
+    )
+    loud, quiet = (
+        subprocess.run([sys.executable, "-c", f"{first}\n{code}"], check=True, capture_output=True, text=True)
+        for first in ("", f"import warp as wp\n{line}")
+    )
+    assert "Module" in loud.stdout and "Module" not in quiet.stdout + quiet.stderr
+
+
 def test_the_code_of_the_page_runs():
     """Each example of docs/gym.md runs alone and does what it says: the last one improves its return."""
     for code in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "gym.md").read_text(), re.DOTALL):
