@@ -1,10 +1,16 @@
 """softmpm_learn: controller and body of a soft robot optimised together, through an observer that is learned during the optimisation.
 
 ``python -m softmpm_learn --help`` for experiments; :mod:`softmpm_learn.register` for robots, observers and policies of one's own;
-:func:`softmpm_learn.train.train` for the loop in a program of one's own.
+:func:`softmpm_learn.train.train` for the loop in a program of one's own; :func:`softmpm_learn.load` for a policy that was trained.
 """
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from softmpm_learn import register
+
+if TYPE_CHECKING:
+    from softmpm_learn.run import Run
 
 
 def main() -> None:
@@ -14,4 +20,11 @@ def main() -> None:
     run()
 
 
-__all__ = ["main", "register"]
+def load(folder: str | Path, device: str | None = None) -> "Run":
+    """Load the run of a folder at its best, see :func:`softmpm_learn.loading.load`."""
+    from softmpm_learn.loading import load as load_run
+
+    return load_run(folder, device)
+
+
+__all__ = ["load", "main", "register"]

@@ -31,12 +31,18 @@ def resume(run: Run, out: Path) -> dict:
     if content is None:
         return {}
     with group.fail_together():
-        seals = _restore(run, content, out)
+        seals = restore(run, content, out)
     logger.info("Going on after iteration %d of %s.", run.iteration, out)
     return seals
 
 
-def _restore(run: Run, content: dict, out: Path) -> dict:
+def restore(run: Run, content: dict, out: Path) -> dict:
+    """Set a run to the checkpoint of a folder; gives what the checkpoint knows of the other files.
+
+    Raises:
+        SettingsError: It was made with other settings.
+        CheckpointError: It does not hold this run.
+    """
     try:
         if content["learner"] and not run.group.first:
             content["learner"]["replay"] = {}

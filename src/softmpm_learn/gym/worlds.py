@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import softmpm
-from softmpm import Failures, Model, State, UnstableError
+from softmpm import Failures, Inputs, Model, Params, State, UnstableError
 from softmpm_learn.gym.rewards import REWARDS, Costs
 from softmpm_learn.observe import Centroids, Observer
 from softmpm_learn.setting_checks import lengths
@@ -35,6 +35,9 @@ class EnvConf:
     """Standard deviation of each component of the robot's velocity when an episode begins [m/s]; 0 starts at rest."""
     goal_spread: Sequence[float] = ()
     """Half widths [m] of the box around the task's goal from which each episode draws its own; empty: fixed goal."""
+    body: tuple[Params, Inputs] | None = None
+    """Material and inputs of the robot, such as ``run.design()`` of a run from :func:`softmpm_learn.load`; None are the scene's. They
+    have no gradient."""
     device: str | None = None
     """Device of the simulation, None for CUDA if there is one."""
     dtype: Literal["float32", "float64"] = "float32"
@@ -83,15 +86,19 @@ class Worlds:
     def __init__(self, task: Task, count: int, conf: EnvConf):
         self.task, self.count, self.conf = task, count, conf
         dtype = torch.float64 if conf.dtype == "float64" else torch.float32
+        inputs = {} if conf.body is None else conf.body[1]._asdict()
         self.model = softmpm.build(
             task.scene,
             device=conf.device,
             dtype=dtype,
             worlds=count,
             calls=task.control_steps,
+            inputs=[name for name, value in inputs.items() if value is not None],
             **task.build,
         )
-        self.params = self.model.params()
+        params, place = self.model.params() if conf.body is None else conf.body[0], self.model.device
+        self.params = Params(*(value.detach().to(place) for value in params))
+        self.inputs = Inputs(**{k: v.detach().to(place) for k, v in inputs.items() if v is not None})
         self.observer = (conf.observer or centroids)(task, self.model)
         self._costs, self._losses = Costs(task, conf.reward == "dense"), Costs(task, dense=False)
         self._spread = self._tensor(self._checked_spread())
@@ -187,7 +194,13 @@ class Worlds:
             mask, failures = self._mask(group), Failures("freeze")
             driven = select(mask, activation, torch.zeros_like(activation))
             end = softmpm.simulate(
-                self.model, start, driven[None], self.params, substeps=self.task.substeps, failures=failures
+                self.model,
+                start,
+                driven[None],
+                self.params,
+                substeps=self.task.substeps,
+                inputs=self.inputs,
+                failures=failures,
             )
             others = bool((~group & ~self._fresh).any())
             self.state = select(mask, end, self.state) if others else end
