@@ -113,9 +113,15 @@ def test_the_code_on_graphs_runs():
 
 
 def test_the_code_on_objectives_runs():
-    """Three terms by name, the constraint among them."""
+    """Three terms by name, the constraint among them; the term of the page has the value that it is said to have."""
     text = (README.parent / "docs" / "learning.md").read_text()
     code, *_ = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict = {}
     exec(code, names)
     assert names["objective"].names == ["progress", "effort", "spread_beyond"]
+    x = torch.rand(5, 2, 7, 3)
+    empty = torch.zeros(2, 7, 3, 3)
+    states = [softmpm.State(one, torch.zeros(2, 7, 3), empty, empty) for one in x]
+    path = names["Path"]([0.1 * k for k in range(5)], states, torch.zeros(4, 2, 1))
+    want = x[2:, :, :, 0].var(dim=2).mean(dim=0)
+    torch.testing.assert_close(names["Spread"](begin=0.2).value(path), want)

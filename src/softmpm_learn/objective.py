@@ -11,7 +11,8 @@ A term of one's own is a frozen dataclass, so that a resumed run can tell whethe
 @dataclass(frozen=True, kw_only=True)
 class Spread(Term):
     def value(self, path: Path) -> Tensor:
-        return path.x[self.window(path)][..., 0].var(dim=-1).mean(dim=0)
+        x = path.x[self.window(path)]                    # (state, world, particle, dim)
+        return x[..., 0].var(dim=-1).mean(dim=0)         # (world,)
 """
 
 import dataclasses
@@ -37,6 +38,7 @@ class Progress(Term):
     """Indices of the particles that count, None for all."""
 
     def value(self, path: Path) -> Tensor:
+        """Minus the distance along the axis from the first state of the window to the last one [m], shape (world,)."""
         states = self.window(path)
         moved = (path.states[states.stop - 1].x - path.states[states.start].x)[..., self.axis]
         return -(moved if self.particles is None else moved[:, self.on("particles", moved)]).mean(dim=-1)
@@ -68,6 +70,7 @@ class Reach(Term):
     """Target position [m], shape (dim,); the goal of an episode, if it has one, takes its place."""
 
     def value(self, path: Path) -> Tensor:
+        """Squared distance from the place [m²], mean over the states of the window, shape (world,)."""
         return self._away(path).square().sum(dim=-1).mean(dim=0)
 
     def verdict(self, own: float, other: float) -> float:
@@ -97,6 +100,7 @@ class Still(Term):
     """Indices of the particles."""
 
     def value(self, path: Path) -> Tensor:
+        """Squared speed [m²/s²], mean over the states of the window, shape (world,)."""
         return self._velocity(path).square().sum(dim=-1).mean(dim=0)
 
     def fastest(self, path: Path) -> float:
@@ -116,6 +120,7 @@ class Effort(Term):
     adds_up: ClassVar[Literal["states", "steps", "way"]] = "steps"
 
     def value(self, path: Path) -> Tensor:
+        """Squared activation [-], mean over the control steps of the window and the muscles, shape (world,)."""
         return path.activation[self.steps(path)].square().mean(dim=(0, -1))
 
 
@@ -129,6 +134,7 @@ class Low(Term):
     """Vertical axis."""
 
     def value(self, path: Path) -> Tensor:
+        """Squared height that is missing [m²], mean over the states of the window, shape (world,)."""
         height = path.x[self.window(path)][..., self.up].mean(dim=-1)
         return (self.lowest - height).clamp(min=0.0).square().mean(dim=0)
 
@@ -156,6 +162,7 @@ class Tilt(Term):
         return share / (share @ self.rest[:, self.along])
 
     def value(self, path: Path) -> Tensor:
+        """Squared change of the slope [-], mean over the states of the window, shape (world,)."""
         return self.slope(path).square().mean(dim=0)
 
     def degrees(self, path: Path) -> float:
@@ -187,6 +194,7 @@ class Stretch(Term):
             raise ValueError("Stretch needs pairs of particles, got none: leave the term out.")
 
     def value(self, path: Path) -> Tensor:
+        """Squared stretch beyond ``most`` [-], mean over the states of the window and the pairs, shape (world,)."""
         x = path.x[self.window(path)]
         one, other = self.on("pairs", x).unbind(dim=1)
         stretch = (x[..., one, :] - x[..., other, :]).norm(dim=-1) / self.on("lengths", x)
@@ -208,6 +216,7 @@ class AtMost(Term):
     most: float
 
     def value(self, path: Path) -> Tensor:
+        """Squared excess of the other term's value, shape (world,), in the square of its unit."""
         term = dataclasses.replace(self.term, begin=self.begin, end=self.end)
         return (term.value(path) - self.most).clamp(min=0.0).square()
 

@@ -15,11 +15,16 @@ from softmpm import State
 
 
 class Path:
-    """Motion in an episode, as terms see it: states at the beginning and at the end of every control step.
+    """Motion in an episode, as terms see it: states at the beginning and at the end of every control step, one more than steps.
+
+    A term has a window of time: :meth:`Term.window` gives the states that lie in it, as in ``path.x[self.window(path)]``, and
+    :meth:`Term.steps` the control steps, as in ``path.activation[self.steps(path)]``.
 
     Attributes:
-        times: Of the states [s].
-        states: The states. Differentiable.
+        x: Positions [m], shape (state, world, particle, dim). Differentiable.
+        v: Velocities [m/s], shape (state, world, particle, dim). Differentiable.
+        times: Times of the states [s], a list: 0, the control period, and so on.
+        states: The states themselves, a list of :class:`softmpm.State`, whose tensors have no axis ``state``. Differentiable.
         activation: Activations during the control steps [-], shape (step, world, muscle). Differentiable.
         goal: Goal of each world [m], shape (world, dim), or None if it is the task's own.
     """
@@ -31,12 +36,12 @@ class Path:
 
     @functools.cached_property
     def x(self) -> Tensor:
-        """Positions [m], shape (state, world, particle, dim)."""
+        """Positions [m], shape (state, world, particle, dim). Differentiable."""
         return torch.stack([state.x for state in self.states])
 
     @functools.cached_property
     def v(self) -> Tensor:
-        """Velocities [m/s], shape (state, world, particle, dim)."""
+        """Velocities [m/s], shape (state, world, particle, dim). Differentiable."""
         return torch.stack([state.v for state in self.states])
 
 
@@ -71,7 +76,11 @@ class Term(Placed, ABC):
 
     @abstractmethod
     def value(self, path: Path) -> Tensor:
-        """Value of each world, shape (world,). Differentiable."""
+        """Value of each world without the weight, shape (world,), in a unit of the term's own. Differentiable.
+
+        Args:
+            path: All of the episode; the term counts what lies in its :meth:`window`.
+        """
 
     @property
     def name(self) -> str:
@@ -79,7 +88,7 @@ class Term(Placed, ABC):
         return type(self).__name__.lower()
 
     def window(self, path: Path) -> slice:
-        """The states of the window.
+        """The states of the window, for the axis ``state`` of :class:`Path`.
 
         Raises:
             ValueError: There is none.
@@ -94,7 +103,7 @@ class Term(Placed, ABC):
         return slice(inside[0], inside[-1] + 1)
 
     def steps(self, path: Path) -> slice:
-        """The control steps between these states, or the one that ends in a single state."""
+        """The control steps between these states, or the one that ends in a single state; for the axis ``step`` of the activation."""
         states = self.window(path)
         stop = max(states.stop - 1, 1)
         return slice(min(states.start, stop - 1), stop)

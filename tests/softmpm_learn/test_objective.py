@@ -58,6 +58,14 @@ def test_reach_is_the_mean_squared_distance_in_the_window(path):
     torch.testing.assert_close(last.value(there), torch.full((2,), 0.25))
 
 
+@pytest.mark.parametrize("term", [Progress, Reach, Still, Effort, Low, Tilt, Stretch, AtMost, Term])
+def test_values_are_documented_with_their_shape(term):
+    """Of every term, and of the motion that it sees, for those who write their own."""
+    assert "shape (world,)" in str(vars(term)["value"].__doc__)
+    text = " ".join(str(Path.__doc__).split())
+    assert "x: Positions [m], shape (state, world, particle, dim)" in text and "self.window(path)" in text
+
+
 def test_still_is_the_mean_squared_speed_of_the_mean(path):
     """Particles that move against each other are still."""
     still = Still(particles=np.array([1, 4]), begin=1.5)
