@@ -30,7 +30,7 @@ def share(group: str, settings, *names: str) -> None:
 def lengths(name: str, values) -> None:
     """Raise ValueError unless a setting is a list of lengths."""
     is_list = isinstance(values, Iterable) and not isinstance(values, str)
-    if not (is_list and all(isinstance(one, Real) and math.isfinite(one) and one >= 0 for one in values)):
+    if not (is_list and all(isinstance(one, Real) and 0.0 <= float(one) < math.inf for one in values)):
         shown = list(values) if is_list else values
         raise ValueError(
             f"{name} must be a list of lengths ≥ 0 [m], one for each axis, such as [0.05, 0.05], got {shown!r}."

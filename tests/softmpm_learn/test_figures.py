@@ -99,11 +99,15 @@ def test_loss_figure_draws_what_has_numbers(tmp_path):
 def test_the_loss_and_its_lowest_value_are_both_seen(tmp_path, monkeypatch):
     """Of a loss that falls all the time, where they are the same curve, and each has its name."""
     drawn, save = [], canvas.save
-    monkeypatch.setattr(canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi))
+    monkeypatch.setattr(
+        canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi)
+    )
     loss_figure(tmp_path / "loss.png", {"loss": ([0, 1, 2, 3], [4.0, 3.0, 2.0, 1.0])})
     legend = drawn[0].axes[0].get_legend()
     assert {text.get_text() for text in legend.get_texts()} == {"loss", "lowest so far"}
-    image = pixels(tmp_path / "loss.png")[:, : pixels(tmp_path / "loss.png").shape[1] * 2 // 3]  # without the legend
+    image = pixels(tmp_path / "loss.png")[
+        :, : pixels(tmp_path / "loss.png").shape[1] * 2 // 3
+    ]  # without the legend
     assert colour_count(image, 60) > 1000 and colour_count(image, -60) > 500
 
 

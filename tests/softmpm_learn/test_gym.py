@@ -218,8 +218,8 @@ def test_pictures_show_the_robot():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_picture_follows_the_robot(dim):
-    """On a track of 3 m a block of 0.3 m takes a third of the width, in the middle and above the floor; where it has moved, it is at the
-    same place of the picture, and the lines are not."""
+    """On a track of 3 m a block of 0.3 m takes a third of the width, in the middle and above the floor; where it has moved, it is at
+    the same place of the picture, and the lines are not."""
     low, high = (0.3, 0.1, 0.1), (0.6, 0.25, 0.3)
     block = softmpm.box(low[:dim], high[:dim], 0.02)
     muscle = softmpm.Muscle(particles=np.arange(len(block)), direction=(1.0, 0.0, 0.0)[:dim], strength=1.0)

@@ -34,7 +34,11 @@ from softmpm_learn import settings
         ("TrainConf", {"evaluate_every": 0}, "evaluate_every"),
         ("TrainConf", {"evaluation_goals": 0}, "evaluation_goals"),
         ("TrainConf", {"goal_spread": [0.1, -0.1]}, "goal_spread"),
-        ("TrainConf", {"goal_spread": 0.05}, r"goal_spread must be a list of lengths .*\[0.05, 0.05\], got 0.05"),
+        (
+            "TrainConf",
+            {"goal_spread": 0.05},
+            r"goal_spread must be a list of lengths .*\[0.05, 0.05\], got 0.05",
+        ),
         ("TrainConf", {"goal_spread": ["a"]}, r"goal_spread must be a list of lengths .* got \['a'\]"),
     ],
 )

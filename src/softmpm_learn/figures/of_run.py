@@ -37,7 +37,9 @@ def loss_figure(
         axes = figure.add_subplot(len(names), 1, place + 1, sharex=first)
         first = first or axes
         if name == lowest:  # wide and below, since it is the curve itself where that falls
-            axes.plot(iteration, np.fmin.accumulate(value), color="#f2bd6b", linewidth=6, label="lowest so far")
+            axes.plot(
+                iteration, np.fmin.accumulate(value), color="#f2bd6b", linewidth=6, label="lowest so far"
+            )
         marker = "o" if len(value) < 3 else None
         axes.plot(iteration, value, color="#1f5fa8", marker=marker, markersize=4, label=name)
         if name == lowest:

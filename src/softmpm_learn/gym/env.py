@@ -76,7 +76,7 @@ class SoftRobotEnv(gymnasium.Env):
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, dict[str, Any]]:
         if not self._begun or self.terminated or self.truncated:
             raise ResetNeeded("the episode has not begun or has ended; call reset() before the next step.")
-        need_action(action, self.action_space)
+        need_action(action, self.action_space.shape)
         outcome = self.worlds.step(action[None])
         self.terminated, self.truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = ending(self.worlds, 0, outcome.failures.get(0)) if outcome.ended[0] else {}
@@ -132,15 +132,15 @@ def tensor(worlds: Worlds, action: Any) -> Tensor:
     return torch.as_tensor(values, device=worlds.model.device).to(worlds.model.dtype)
 
 
-def need_action(action: Any, space: Box) -> None:
-    """Raise TypeError unless it is a tensor, and ValueError unless it has the shape of the action space."""
+def need_action(action: Any, shape: tuple[int, ...] | None) -> None:
+    """Raise TypeError unless it is a tensor, and ValueError unless it has this shape, that of the action space."""
     if not isinstance(action, Tensor):
         raise TypeError(
             f"step_torch takes a torch.Tensor, got {type(action).__name__}; step takes arrays, without a gradient."
         )
-    if action.shape != space.shape:
+    if action.shape != shape:
         raise ValueError(
-            f"the action must have shape {space.shape}, that of action_space, got {tuple(action.shape)}."
+            f"the action must have shape {shape}, that of action_space, got {tuple(action.shape)}."
         )
 
 

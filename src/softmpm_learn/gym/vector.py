@@ -118,7 +118,7 @@ class SoftRobotVectorEnv(VectorEnv):
     def _advance(self, actions: Tensor) -> Outcome:
         if not self._generators:
             raise ResetNeeded("no episode has begun; call reset() before the first step.")
-        need_action(actions, self.action_space)
+        need_action(actions, self.action_space.shape)
         ended = self.terminated | self.truncated
         if self.mode is AutoresetMode.DISABLED and ended.any():
             raise ResetNeeded(
