@@ -75,7 +75,7 @@ def test_an_environment_has_the_trained_body(finished):
 
 
 def test_what_is_no_run_is_refused(finished, tmp_path):
-    """An empty folder, one without a checkpoint, one of several seeds, and a damaged checkpoint."""
+    """An empty folder, one without a checkpoint, one of several seeds, one of a robot that is not registered, a damaged checkpoint."""
     out, _ = finished
     with pytest.raises(ValueError, match="there is no config.yaml in it"):
         softmpm_learn.load(tmp_path)
@@ -86,6 +86,13 @@ def test_what_is_no_run_is_refused(finished, tmp_path):
     (tmp_path / "config.yaml").write_text(text.replace("seeds: 1", "seeds: 2"))
     with pytest.raises(ValueError, match=r"each seed has one: load .*seed_…"):
         softmpm_learn.load(tmp_path)
+    own = text.replace("name: biped", "name: hopper").replace("files: []", "files: [/robots/hopper.py]")
+    (tmp_path / "config.yaml").write_text(own)
+    with pytest.raises(
+        ValueError, match=r"'hopper' .* registered by a file: .*hopper.py .* program imports that file before"
+    ):
+        softmpm_learn.load(tmp_path)
+    (tmp_path / "config.yaml").write_text(text)
     (tmp_path / "checkpoint.pt").write_bytes(b"nothing")
     with pytest.raises(checkpoint.CheckpointError, match="is damaged"):
         softmpm_learn.load(tmp_path)
