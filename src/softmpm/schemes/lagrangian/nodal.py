@@ -3,7 +3,6 @@
 Equations: kernels/lagrangian/projection.py. Clamps and planes of symmetry then hold and reflect the nodes by (B1).
 """
 
-import math
 from typing import Any
 
 import torch
@@ -76,7 +75,7 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     if low is None:
         low = nodes.u.new_zeros(model.worlds, 2, *nodes.u.shape[1:])
     nodes = nodes._replace(shift=shift_of(model, nodes).detach(), low=low.detach())
-    if math.isinf(quantum(model)):
+    if model.spec.moving and model.mirror is None:  # clamps and planes of symmetry are of the scene: no model of it has a shift
         nodes = _without_shift(model, nodes, normals)
     return with_reaction(model, nodes, nodes.reaction)
 
