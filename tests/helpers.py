@@ -42,7 +42,8 @@ def busy_scene(
     bodies = []
     for law in laws:
         positions = rng.uniform(0.3, 0.62, (per_law, dim))
-        particles = softmpm.Particles(positions, rng.uniform(0.5, 1.5, per_law) * 0.05**dim)
+        volume = 0.05**dim * min(1.0, 30 / per_law)  # bodies share the space, which none of them may fill
+        particles = softmpm.Particles(positions, rng.uniform(0.5, 1.5, per_law) * volume)
         bodies.append(softmpm.Body(particles, LAWS[law](density=1.2, young=80.0, poisson=0.3)))
     count = per_law * len(laws)
     up = (0.0, 1.0) + (0.0,) * (dim - 2)

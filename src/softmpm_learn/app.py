@@ -208,10 +208,11 @@ def check_flags(words: Sequence[str]) -> None:
 
 def check_words(words: Sequence[str]) -> None:
     """Raise ValueError for a setting on the command line that the run to resume must not have; before Hydra looks for it in those of
-    the default task.
+    the default task. A sweep refuses ``resume`` itself.
     """
     keys = [_key(text) for text in words if ("=" in text or text[:1] == "~") and text[:1] != "-"]
-    for key in keys if "resume" in keys else ():
+    one = "resume" in keys and not {"-m", "--multirun"} & set(words)
+    for key in keys if one else ():
         if key not in (*CHANGEABLE, "resume") and not key.startswith(("device.", "hydra.", "hydra/")):
             raise ValueError(
                 f"a run is resumed with its own settings; only {', '.join(CHANGEABLE)} may change, not {key}."
