@@ -93,7 +93,8 @@ def _without_shift(model: Model, nodes: Nodal, normals: Tensor | None) -> Nodal:
     low = torch.stack([low[:, 0] + rounded, low[:, 1]], dim=1)
     anchor = nodes.anchor
     if model.surface is not None:
-        n = _normals(model, normals, shift)
+        # Where the points adhere does not depend on the walls to come:
+        n = _normals(model, normals, shift).detach()
         across = shift[:, None] - (shift[:, None] * n).sum(-1, keepdim=True) * n
         anchor = anchor + across[:, :, None].to(anchor.dtype)
     return nodes._replace(u=u, low=low, anchor=anchor, shift=torch.zeros_like(shift))
