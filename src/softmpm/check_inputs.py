@@ -43,7 +43,7 @@ def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
                 + (
                     "; give the first two axes both or neither, of size 1 where all share it."
                     if in_doubt
-                    else "; values of each world that all share along the other axes need an axis of size 1 for each of them."
+                    else f"; one value for each world has shape {_one_each(axes, want)}."
                 )
             )
     need(
@@ -76,6 +76,11 @@ def control_steps(activation: Tensor | None, given: dict[str, Tensor]) -> int:
         + "; one row serves all of them but in activation.",
     )
     return next(iter(told.values()), 1)
+
+
+def _one_each(axes: tuple[str, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Shape of an input that differs between worlds and along no other axis."""
+    return tuple(n if axis in ("world", "dim") else 1 for axis, n in zip(axes, shape, strict=True))
 
 
 def check_inputs_bounds(given: dict[str, Tensor]) -> None:

@@ -218,7 +218,7 @@ def test_inputs_that_a_model_cannot_take():
         ),
         (
             {"friction": torch.zeros(2, wall + 1)},
-            r"must broadcast to \(world, wall\) = \(2, 3\), got shape \(2, 4\)",
+            r"must broadcast to \(world, wall\) = \(2, 3\), got shape \(2, 4\); one value for each world has shape \(2, 1\)",
         ),
         (
             {"friction": -torch.ones(wall)},

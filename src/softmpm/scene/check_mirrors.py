@@ -96,9 +96,8 @@ def check_mirrors(scene: Scene) -> None:
 def _check_gaps(scene: Scene, mirror: Mirror) -> None:
     """Raise ValueError for a particle that shares nodes with the images behind the plane although nothing joins it to the plane."""
     dx, axis = scene.grid.spacing, mirror.axis
-    reach = (
-        1.5 if mirror.twice % 2 == 0 else 1.0
-    )  # of a particle to the nearest node with an image or on the plane [cells]
+    # Distance from which on a particle reaches no node on the plane or with an image behind it [cells]:
+    reach = 1.5 if mirror.twice % 2 == 0 else 1.0
     x = np.concatenate([body.particles.positions for body in scene.bodies]) / dx
     spacing = np.concatenate(
         [np.full(len(b.particles), np.mean(b.particles.volume) ** (1 / scene.grid.dim)) for b in scene.bodies]

@@ -75,9 +75,8 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     if low is None:
         low = nodes.u.new_zeros(model.worlds, 2, *nodes.u.shape[1:])
     nodes = nodes._replace(shift=shift_of(model, nodes).detach(), low=low.detach())
-    if (
-        model.spec.moving and model.mirror is None
-    ):  # clamps and planes of symmetry are of the scene: no model of it has a shift
+    # Clamps and planes of symmetry are of the scene, so that no model of it gives a state a shift; moving walls are of the model.
+    if model.spec.moving and model.mirror is None:
         nodes = _without_shift(model, nodes, normals)
     return with_reaction(model, nodes, nodes.reaction)
 
