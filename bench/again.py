@@ -22,12 +22,14 @@ import torch
 import tqdm
 
 import softmpm
-from softmpm_learn import checkpoint, experiment, saved, seeds
+from softmpm_learn.command import experiment, seeds
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import Frame, run_episode
 from softmpm_learn.lasting import STARTS
-from softmpm_learn.run import Run
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs import saved
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.runs import Runs
+from softmpm_learn.storage import checkpoint
 from softmpm_learn.tasks import make_task
 
 

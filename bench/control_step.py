@@ -16,8 +16,8 @@ from episode import ELASTIC
 from kernels import NAME
 
 import softmpm
-from softmpm_learn.run import Run
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.runs import Runs
 from softmpm_learn.settings import Settings
 from softmpm_learn.tasks.elephant import ElephantConf, elephant
 from softmpm_learn.tasks.task import Resolution

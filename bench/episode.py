@@ -16,8 +16,8 @@ import torch
 from common import Table, arguments, median_seconds
 
 import softmpm
-from softmpm_learn.run import Run
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.runs import Runs
 from softmpm_learn.settings import Settings
 from softmpm_learn.tasks.biped import BipedConf, biped
 from softmpm_learn.tasks.elephant import ElephantConf, elephant

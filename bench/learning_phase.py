@@ -19,10 +19,10 @@ from torch.nn import functional
 
 import softmpm
 from softmpm_learn.autoencoder import Autoencoder
-from softmpm_learn.learner import Learner
-from softmpm_learn.learning_phase import learn_together
+from softmpm_learn.learning.learner import Learner
+from softmpm_learn.learning.phase import learn_together
+from softmpm_learn.learning.replay import Replay
 from softmpm_learn.observe import VelocityImage
-from softmpm_learn.replay import Replay
 from softmpm_learn.seeding import seeded
 from softmpm_learn.settings import LearningConf, ObserverConf
 from softmpm_learn.tasks.elephant import ElephantConf, elephant

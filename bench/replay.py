@@ -24,14 +24,14 @@ from gait import SHIFTS
 from scipy.spatial import cKDTree
 
 import softmpm
-from softmpm_learn import checkpoint
+from softmpm_learn.command.experiment import make_model
 from softmpm_learn.config import RunConf
 from softmpm_learn.design import declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.episode import run_episode
-from softmpm_learn.experiment import make_model
-from softmpm_learn.run import Run
-from softmpm_learn.saved import load
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.saved import load
+from softmpm_learn.storage import checkpoint
 from softmpm_learn.tasks import Resolution, Task, make_task
 from softmpm_learn.tasks.task import FORMULATIONS
 

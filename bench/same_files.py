@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import softmpm
-from softmpm_learn import checkpoint
+from softmpm_learn.storage import checkpoint
 
 LEFT_OUT = ("timing.csv", "softmpm_learn.log", "run.rrd", "*.png")
 

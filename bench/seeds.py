@@ -18,8 +18,8 @@ import torch
 from common import Table
 
 import softmpm
+from softmpm_learn.command.seeds import split
 from softmpm_learn.design import declared_inputs
-from softmpm_learn.seeds import split
 from softmpm_learn.settings import Settings, TrainConf
 from softmpm_learn.tasks import ElephantConf, Resolution, Task, make_task
 from softmpm_learn.train import Plan, train_side_by_side

@@ -27,8 +27,8 @@ import torch
 from common import Table
 from same_files import compared, differences
 
-from softmpm_learn import checkpoint
-from softmpm_learn.sweep import OUTCOME, TABLE
+from softmpm_learn.storage import checkpoint
+from softmpm_learn.storage.sweep import OUTCOME, TABLE
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMON = ["experiment=smoke", "task=biped,arm", "device=cpu", "task.strength=1.5e4", "optimizer.retries=0"]

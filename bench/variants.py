@@ -35,8 +35,8 @@ from softmpm.scene.neighbours import rest_neighbours
 from softmpm_learn import objective
 from softmpm_learn.design import Design
 from softmpm_learn.episode import Frame, run_episode
-from softmpm_learn.loops import ClosedLoop
 from softmpm_learn.observe import Centroids
+from softmpm_learn.runs.loops import ClosedLoop
 from softmpm_learn.settings import DesignConf
 from softmpm_learn.tasks import BipedConf, ElephantConf, Task, make_task
 

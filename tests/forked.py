@@ -20,8 +20,8 @@ METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods()
 SERVER = multiprocessing.get_context(METHOD)
 IMPORTED = [
     "pytest",
-    "softmpm_learn.app",
-    "softmpm_learn.experiment",
+    "softmpm_learn.command.app",
+    "softmpm_learn.command.experiment",
     "torch._dynamo",
     "torch.distributed.run",
 ]
@@ -37,7 +37,7 @@ def ensure_server() -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("PYTHONPATH", PATH, prepend=os.pathsep)
             patch.setenv("OMP_NUM_THREADS", "1")
-            patch.delenv("HYDRA_FULL_ERROR", raising=False)  # which softmpm_learn.app.main sets
+            patch.delenv("HYDRA_FULL_ERROR", raising=False)  # which softmpm_learn.command.app.main sets
             forkserver.ensure_running()
 
 

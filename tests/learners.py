@@ -7,8 +7,9 @@ from pathlib import Path
 import torch
 
 from softmpm_learn.autoencoder import Autoencoder
-from softmpm_learn.learner import Learner
-from softmpm_learn.replay import Replay
+from softmpm_learn.learning.learner import Learner
+from softmpm_learn.learning.phase import learn_together
+from softmpm_learn.learning.replay import Replay
 from softmpm_learn.seeding import seeded
 from softmpm_learn.settings import LearningConf
 
@@ -62,3 +63,8 @@ def viscous(task):
     (body,) = task.scene.bodies
     body = dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=0.1))
     return dataclasses.replace(task, scene=dataclasses.replace(task.scene, bodies=[body]))
+
+
+def learn(learner: Learner) -> dict[str, float]:
+    """One learning phase of a learner alone; its figures."""
+    return learn_together([learner])[0]

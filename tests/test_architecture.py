@@ -1,4 +1,4 @@
-"""The layers of the simulator: a module imports only from layers above its own."""
+"""The layers of the simulator and of the learner: a module imports only from layers above its own."""
 
 import ast
 import graphlib
@@ -6,6 +6,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import softmpm
 
@@ -40,6 +42,22 @@ LAYERS = """
     warp_api __main__
 """
 """From the ground up. Each word is a module or a package; those of one line do not import each other."""
+LEARNER_LAYERS = """
+    distributed seeding setting_checks storage autoencoder term fading
+    objective
+    lasting
+    tasks.task figures
+    register
+    plugins optimizer_settings tasks loggers
+    settings optimizers
+    config design observe policy recovery
+    episode learning gym
+    runs
+    training
+    train
+    command
+    __main__
+"""
 ENTRIES = {"schemes.plain.chunk", "schemes.fast.scheme", "schemes.lagrangian.scheme"}
 """Module of each scheme that the registry imports."""
 KNOWN = {
@@ -79,9 +97,9 @@ def modules(package: str) -> dict[str, Path]:
     return {".".join(path.relative_to(root).with_suffix("").parts): path for path in paths}
 
 
-def layer_of(module: str) -> tuple[int, str]:
-    """Line of a module in LAYERS, and its word there: the longest one that it stands under."""
-    lines = [line.split() for line in LAYERS.strip().splitlines()]
+def layer_of(module: str, layers: str = LAYERS) -> tuple[int, str]:
+    """Line of a module in these layers, and its word there: the longest one that it stands under."""
+    lines = [line.split() for line in layers.strip().splitlines()]
     found = [
         (len(word), line, word)
         for line, words in enumerate(lines)
@@ -93,21 +111,31 @@ def layer_of(module: str) -> tuple[int, str]:
     return line, word
 
 
-def arrows(found: dict[str, Path]) -> dict[str, set[str]]:
-    """Modules of softmpm that each of its modules imports."""
-    inner = {name: {i.removeprefix("softmpm.") for i in imports(path)} for name, path in found.items()}
-    return {name: {i for i in names if i in found} for name, names in inner.items()}
+def arrows(package: str) -> dict[str, set[str]]:
+    """Modules and packages of a package that each of its modules imports."""
+    found = modules(package)
+    known = {".".join(name.split(".")[:depth]) for name in found for depth in range(1, name.count(".") + 2)}
+    inner = {name: {i.removeprefix(f"{package}.") for i in imports(path)} for name, path in found.items()}
+    return {
+        name: {i for i in names & known if not _leads_to(i, names & known)} for name, names in inner.items()
+    }
 
 
-def test_the_simulator_imports_in_one_direction():
-    """Every module of softmpm has a layer and imports only from those above, or from its own package without a circle."""
+def _leads_to(package: str, names: set[str]) -> bool:
+    """True for the package in ``from package import module``."""
+    return any(name.startswith(f"{package}.") for name in names)
+
+
+@pytest.mark.parametrize(("package", "layers"), [("softmpm", LAYERS), ("softmpm_learn", LEARNER_LAYERS)])
+def test_imports_go_in_one_direction(package, layers):
+    """Every module has a layer and imports only from those above, or from its own package without a circle."""
     within = {}
-    for name, imported in arrows(modules("softmpm")).items():
-        own, word = layer_of(name)
+    for name, imported in arrows(package).items():
+        own, word = layer_of(name, layers)
         for other in imported:
-            line, their = layer_of(other)
+            line, their = layer_of(other, layers)
             assert line < own or their == word, f"{name} imports {other}, which is not above it"
-        within[name] = {other for other in imported if layer_of(other)[1] == word}
+        within[name] = {other for other in imported if layer_of(other, layers)[1] == word}
     graphlib.TopologicalSorter(within).prepare()  # raises CycleError
 
 
@@ -115,7 +143,7 @@ def test_nothing_above_the_schemes_knows_one():
     """Whoever drives a scheme imports the interface and the registry. The Warp-native API launches substeps itself; states with nodes
     and the velocities of driven nodes belong to a call, not to a chunk."""
     schemes = {scheme.rpartition(".")[0] for scheme in ENTRIES}
-    for name, imported in arrows(modules("softmpm")).items():
+    for name, imported in arrows("softmpm").items():
         inside = {
             other for other in imported if other.rpartition(".")[0] in schemes - {name.rpartition(".")[0]}
         }
@@ -158,7 +186,7 @@ def test_the_learner_uses_public_names_only():
         for imported in imports(path):
             if imported.startswith("softmpm."):
                 assert imported.removeprefix("softmpm.") in softmpm.__all__, f"{name} imports {imported}"
-        if name not in ("app", "sentences", "config", "__main__"):
+        if name not in ("command.app", "command.sentences", "config", "__main__"):
             assert "hydra" not in {imported.split(".")[0] for imported in imports(path)}, name
 
 

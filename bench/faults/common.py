@@ -26,11 +26,12 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.command import app, experiment
+from softmpm_learn.command.sentences import sentence
+from softmpm_learn.command.stop import SIGNALS, Signals
 from softmpm_learn.config import RunConf, conf_dir, to_run
-from softmpm_learn.log_file import log_file
-from softmpm_learn.sentences import sentence
-from softmpm_learn.stop import SIGNALS, Signals
+from softmpm_learn.storage import checkpoint
+from softmpm_learn.storage.log_file import log_file
 
 TINY = [
     *("task=arm", "experiment=smoke", "task.seconds=0.025", "task.control_period=0.0125", "device=cpu"),
@@ -137,7 +138,7 @@ def _composed(*overrides: str) -> RunConf:
 
 
 def _training(conf: Callable[[], RunConf], folder: Path) -> Callable[[], None]:
-    """As :func:`softmpm_learn.app.job`, without pictures."""
+    """As :func:`softmpm_learn.command.app.job`, without pictures."""
 
     def work() -> None:
         experiment.draw, experiment.convert = lambda *_: None, lambda *_: "nothing"

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from bench.faults import common
 
-from softmpm_learn import checkpoint
+from softmpm_learn.storage import checkpoint
 
 SECRET = "a-secret-of-the-environment"
 MEMORY = 600.0

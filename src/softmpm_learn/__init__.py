@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from softmpm_learn import register
 
 if TYPE_CHECKING:
-    from softmpm_learn.run import Run
+    from softmpm_learn.runs.run import Run
 
 
 def main() -> None:
@@ -21,8 +21,8 @@ def main() -> None:
 
 
 def load(folder: str | Path, device: str | None = None) -> "Run":
-    """Load the run of a folder at its best, see :func:`softmpm_learn.loading.load`."""
-    from softmpm_learn.loading import load as load_run
+    """Load the run of a folder at its best, see :func:`softmpm_learn.runs.loading.load`."""
+    from softmpm_learn.runs.loading import load as load_run
 
     return load_run(folder, device)
 

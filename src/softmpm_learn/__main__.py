@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from softmpm_learn import plugins, register
-from softmpm_learn.stop import Signals
+from softmpm_learn.command.stop import Signals
 
 
 def main() -> None:
@@ -17,7 +17,7 @@ def main() -> None:
         print(help_text())
         return
 
-    from softmpm_learn import app
+    from softmpm_learn.command import app
 
     sys.argv[1:] = words
     if asked:

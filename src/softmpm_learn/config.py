@@ -13,7 +13,6 @@ from pathlib import Path
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from softmpm_learn import sweep
 from softmpm_learn.register import CHOICES
 from softmpm_learn.settings import (
     DesignConf,
@@ -24,6 +23,7 @@ from softmpm_learn.settings import (
     Settings,
     TrainConf,
 )
+from softmpm_learn.storage import sweep
 from softmpm_learn.tasks import TASKS, TaskConf
 
 DEVICES = ("auto", "cpu", "cuda")

@@ -7,7 +7,7 @@ for each iteration:
                and let the target network, which the policy uses, follow it
     save       metrics, recording, and every so many iterations a checkpoint
 
-Runs with different seeds may go side by side in one simulation (see :mod:`softmpm_learn.runs`). Or several processes may share the
+Runs with different seeds may go side by side in one simulation (see :mod:`softmpm_learn.runs.runs`). Or several processes may share the
 worlds of one run (see :mod:`softmpm_learn.distributed`); the first of them alone learns, from the pictures of all, and saves. To learn
 the same everywhere would take a replay buffer in each process, and bits that agree between GPUs.
 """
@@ -22,17 +22,17 @@ from torch import Tensor
 
 from softmpm import Model
 from softmpm_learn.distributed import Group
-from softmpm_learn.finishing import evaluate_ends, finish
-from softmpm_learn.learning_phase import learn_side_by_side
+from softmpm_learn.learning.phase import learn_side_by_side
 from softmpm_learn.loggers import Loggers
-from softmpm_learn.optimisation import optimise
-from softmpm_learn.resuming import entered, resume
-from softmpm_learn.run import Run
-from softmpm_learn.run_logger import RunLogger
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs.resuming import entered, resume
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.runs import Runs
 from softmpm_learn.settings import Settings
-from softmpm_learn.threads import at_once
-from softmpm_learn.timing import TIMING, clock
+from softmpm_learn.training.finishing import evaluate_ends, finish
+from softmpm_learn.training.optimisation import optimise
+from softmpm_learn.training.run_logger import RunLogger
+from softmpm_learn.training.threads import at_once
+from softmpm_learn.training.timing import TIMING, clock
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Result:
     best_loss: float
     best_iteration: int
     examination: dict[str, float]
-    """Findings of :func:`softmpm_learn.examination.examine`, in the first process once the run is finished."""
+    """Findings of :func:`softmpm_learn.training.examination.examine`, in the first process once the run is finished."""
     seconds: dict[str, float]
-    """Of its parts in this process since it began or was resumed, by the names of :mod:`softmpm_learn.timing`."""
+    """Of its parts in this process since it began or was resumed, by the names of :mod:`softmpm_learn.training.timing`."""
     error: Exception | None = None
-    """Why it failed: a :class:`softmpm_learn.optimisation.TrainingError`."""
+    """Why it failed: a :class:`softmpm_learn.training.optimisation.TrainingError`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,12 +111,12 @@ def train(
         finer: The task on the next finer grid, on which the motion is examined; None leaves that out.
 
     Raises:
-        softmpm_learn.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
+        softmpm_learn.training.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
         softmpm_learn.distributed.OtherProcessError: The first process cannot go on, and says why.
         ValueError: Settings that do not go together, or with the checkpoint; a file in ``out`` that is a link, damaged or of another
             run.
-        softmpm_learn.checkpoint.CheckpointError: Every checkpoint in ``out`` is damaged.
-        softmpm_learn.checkpoint.LockedError: Another run writes to ``out``.
+        softmpm_learn.storage.checkpoint.CheckpointError: Every checkpoint in ``out`` is damaged.
+        softmpm_learn.storage.checkpoint.LockedError: Another run writes to ``out``.
     """
     plan = Plan(settings=settings, out=Path(out), begin=begin, sketch=sketch)
     shown = (lambda rows: [progress(*row) for row in rows.values()]) if progress else None
@@ -142,14 +142,14 @@ def train_side_by_side(
 
     Args:
         model: Built with ``settings.train.worlds`` worlds for each plan.
-        plans: Their settings differ only in what :class:`softmpm_learn.runs.Runs` allows.
+        plans: Their settings differ only in what :class:`softmpm_learn.runs.runs.Runs` allows.
         progress: Called after each iteration with (iteration, metrics) of each run that goes on, by its number.
         group: Of several processes only if there is one plan.
     """
     group = group or Group()
     if any(plan.settings.train.seeds != 1 for plan in plans):
         raise ValueError(
-            "train.seeds must be 1 in the settings of a run; softmpm_learn.seeds.split gives those of each seed."
+            "train.seeds must be 1 in the settings of a run; softmpm_learn.command.seeds.split gives those of each seed."
         )
     if len(plans) > 1 and group.size > 1:
         raise ValueError(

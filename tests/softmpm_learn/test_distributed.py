@@ -16,11 +16,12 @@ import pytest
 import torch
 
 import softmpm
-from softmpm_learn import checkpoint, distributed, train
+from softmpm_learn import distributed, train
+from softmpm_learn.command.experiment import make_model
 from softmpm_learn.distributed import Group, OtherProcessError
-from softmpm_learn.experiment import make_model
-from softmpm_learn.saved import load
+from softmpm_learn.runs.saved import load
 from softmpm_learn.settings import Settings
+from softmpm_learn.storage import checkpoint
 from softmpm_learn.tasks import make_task
 
 SAME, SMALL = 1e-5, 1e-8

@@ -11,10 +11,11 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, checkpoint, experiment
+from softmpm_learn.command import app, experiment
 from softmpm_learn.config import RunConf, conf_dir, to_run
-from softmpm_learn.run import SettingsError
-from softmpm_learn.saved import load
+from softmpm_learn.runs.run import SettingsError
+from softmpm_learn.runs.saved import load
+from softmpm_learn.storage import checkpoint
 
 SETTINGS = [
     *("experiment=smoke", "device=cpu", "task.seconds=0.05", "task.control_period=0.025"),

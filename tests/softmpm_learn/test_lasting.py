@@ -11,14 +11,14 @@ import torch
 
 import softmpm
 from softmpm_learn.episode import run_episode
-from softmpm_learn.evaluation import evaluate
 from softmpm_learn.lasting import Lasting
-from softmpm_learn.loops import Evaluator
 from softmpm_learn.objective import Path, Progress, Tilt
-from softmpm_learn.run import Run
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs.loops import Evaluator
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.runs import Runs
 from softmpm_learn.tasks import ArmConf, BipedConf, ElephantConf, make_task
 from softmpm_learn.train import train
+from softmpm_learn.training.evaluation import evaluate
 
 T, PERIOD = 2.0, 0.25
 """Length of an episode and time between two states [s]."""

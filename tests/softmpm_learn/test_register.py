@@ -14,11 +14,12 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn import app, plugins, register
+from softmpm_learn import plugins, register
+from softmpm_learn.command import app
 from softmpm_learn.observe import Latent, VelocityImage, latent
 from softmpm_learn.policy import make_policy
 from softmpm_learn.register import POLICIES, TABLES, TASKS
-from softmpm_learn.run import Run
+from softmpm_learn.runs.run import Run
 from softmpm_learn.settings import ObserverConf, OptimizerConf, PolicyConf, Settings
 from softmpm_learn.tasks import TaskConf, make_task
 

@@ -6,8 +6,8 @@ import itertools
 import pytest
 import torch
 
-from softmpm_learn.goals import Goals
-from softmpm_learn.run import Run
+from softmpm_learn.runs.goals import Goals
+from softmpm_learn.runs.run import Run
 from softmpm_learn.seeding import seeded, stream, stream_seed
 from softmpm_learn.train import train
 
@@ -64,7 +64,7 @@ def test_another_part_leaves_the_minibatches_as_they_are(task, model, settings, 
         drawn.append(real(*args, **kwargs))
         return drawn[-1]
 
-    monkeypatch.setattr("softmpm_learn.replay.torch.randint", recorded)
+    monkeypatch.setattr("softmpm_learn.learning.replay.torch.randint", recorded)
     settings, counts = changed(settings, train=dict(iterations=2), learning=dict(early_stopping=False)), []
     goals = dict(goal_spread=[0.1, 0.1], evaluation_goals=1)
     for number, groups in enumerate(({}, dict(train=goals), dict(learning=dict(variational=False)))):

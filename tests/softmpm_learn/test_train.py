@@ -16,15 +16,16 @@ import pytest
 import torch
 
 import softmpm
-from softmpm_learn import checkpoint, train
-from softmpm_learn.csv_log import Table
+from softmpm_learn import train
+from softmpm_learn.command.pictures import design
 from softmpm_learn.objective import Effort, Objective, Progress
-from softmpm_learn.optimisation import TrainingError
-from softmpm_learn.pictures import design
-from softmpm_learn.run import Run
-from softmpm_learn.runs import Runs
+from softmpm_learn.runs.run import Run
+from softmpm_learn.runs.runs import Runs
 from softmpm_learn.settings import DesignConf, ObserverConf, Settings
-from softmpm_learn.timing import clock
+from softmpm_learn.storage import checkpoint
+from softmpm_learn.storage.csv_log import Table
+from softmpm_learn.training.optimisation import TrainingError
+from softmpm_learn.training.timing import clock
 
 
 def copy_of(settings: Settings, **changes) -> Settings:

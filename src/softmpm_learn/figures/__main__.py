@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from softmpm_learn import files
 from softmpm_learn.figures import sweeps, tables
 from softmpm_learn.figures.intervals import interval, pairs
 from softmpm_learn.figures.of_sweep import curves_figure, grouped, pairs_figure, values, values_figure
 from softmpm_learn.figures.summary import summary
 from softmpm_learn.figures.sweeps import EXAMINED, SweptRun
+from softmpm_learn.storage import files
 
 CURVES, VALUES, PAIRS, SUMMARY = "curves.png", "values.png", "pairs.png", "summary.md"
 HELP = """Tables and figures of sweeps.

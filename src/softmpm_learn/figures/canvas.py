@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from softmpm_learn.files import replace
+from softmpm_learn.storage.files import replace
 
 COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
 """Colours that people with any colour vision tell apart (Okabe and Ito 2008)."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from softmpm_learn import sweep
+from softmpm_learn.storage import sweep
 
 SEEDS = "train.seed", "train.seeds"
 INDIFFERENT = *SEEDS, "train.log", "train.record_every", "train.frame_every", "train.examine", "resume"

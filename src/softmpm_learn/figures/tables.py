@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softmpm_learn.figures.sweeps import EXAMINED, SweptRun
-from softmpm_learn.files import replace
+from softmpm_learn.storage.files import replace
 
 RUNS, JOBS, PAIRS = "runs.csv", "jobs.csv", "pairs.csv"
 Row = dict[str, Any]

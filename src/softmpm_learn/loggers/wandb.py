@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from softmpm_learn import files, register
+from softmpm_learn import register
 from softmpm_learn.loggers.logger import rows
+from softmpm_learn.storage import files
 
 STATE, PROJECT = "wandb.json", "softmpm"
 PICTURES = ["robot", "loss", "latent"]

@@ -1,0 +1,171 @@
+"""Jobs: a run, or seeds of it side by side, in a folder, with an outcome. Jobs of a sweep go one after another or side by side.
+
+A job that fails is a row of the sweep's table, and the next ones run. The same command goes on: it finds the outcomes in the folders.
+"""
+
+import dataclasses
+import gc
+import logging
+import math
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from softmpm_learn.command import seeds
+from softmpm_learn.command.experiment import run_experiment, run_side_by_side
+from softmpm_learn.command.sentences import EXPECTED, end, give_up, sentence
+from softmpm_learn.command.stop import Signals
+from softmpm_learn.config import RunConf
+from softmpm_learn.distributed import Group, OtherProcessError
+from softmpm_learn.runs.runs import shared
+from softmpm_learn.storage import files, sweep
+from softmpm_learn.storage.checkpoint import LockedError
+from softmpm_learn.storage.log_file import log_file
+from softmpm_learn.train import Result
+from softmpm_learn.training.optimisation import TrainingError
+
+logger = logging.getLogger("softmpm_learn")
+
+
+class JobError(Exception):
+    """A run that failed: the sentence for people, empty where another process has it, and the iterations done before."""
+
+    def __init__(self, text: str = "", iterations: int = 0):
+        super().__init__(text)
+        self.iterations = iterations
+
+
+class RefusedError(JobError):
+    """A run that is another's: its folder is left as it is."""
+
+
+@dataclass(kw_only=True)
+class Job:
+    """A job of a sweep."""
+
+    number: int
+    settings: str
+    """Its settings, as on the command line."""
+    out: Path
+    table: Path
+    """Table of the sweep."""
+    conf: RunConf = dataclasses.field(default_factory=RunConf)
+
+    @property
+    def about(self) -> dict:
+        """Its outcome besides the result."""
+        return {"job": self.number, "settings": self.settings, "folder": str(self.out)}
+
+
+def side_by_side(jobs: Sequence[Job]) -> list[list[Job]]:
+    """Jobs of one simulation each: with one task on one device and equal in what :func:`softmpm_learn.runs.runs.shared` names."""
+    together: list[list[Job]] = []
+    for one in jobs:
+        room = (
+            group
+            for group in together
+            if _common(group[0]) == _common(one) and len(group) < one.conf.train.side_by_side
+        )
+        if (group := next(room, None)) is None:
+            together.append([one])
+        else:
+            group.append(one)
+    return together
+
+
+def _common(one: Job) -> tuple:
+    return one.conf.task, one.conf.device, shared(one.conf.settings)
+
+
+def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[int, Path]) -> list[float]:
+    """Jobs of a sweep, side by side if there are several; gives their losses. Only a failure of their own lets the next ones run. If
+    several fail together, such as for the settings of one or for want of memory, they go on one after another.
+    """
+    try:
+        results = experiments([(one.conf, one.out) for one in jobs], group, signals)
+    except JobError as failure:
+        if len(jobs) == 1 or isinstance(failure, RefusedError) or group.size > 1:
+            return fail(jobs, failure, group, failed)
+        problem = str(failure)
+    except (ValueError, OSError) as error:
+        give_up(error)
+    else:
+        losses = [_judged(one, own, group, failed) for one, own in zip(jobs, results, strict=True)]
+        if None in losses:
+            logger.info("The same command goes on with the sweep.")
+            raise SystemExit(0)
+        return [loss for loss in losses if loss is not None]
+    logger.warning("Jobs %s failed side by side and go on one after another: %s", _numbers(jobs), problem)
+    gc.collect()  # the error and what it came through, the model among it, refer to each other
+    return [run_jobs([one], group, signals, failed)[0] for one in jobs]
+
+
+def _judged(mine: Job, results: Sequence[Result], group: Group, failed: dict[int, Path]) -> float | None:
+    """Write the outcome of a job, unless it was stopped; gives its loss."""
+    if mine.conf.train.seeds > 1:
+        found = seeds.record(mine.conf, mine.out, results, group, mine.about)
+    else:
+        done = results[0].finished or results[0].error
+        found = seeds.outcome(results[0], mine.about) if done else None
+    if found is None:
+        return None
+    if found.status == "failed":
+        return fail([mine], JobError(found.error, found.iterations), group, failed)[0]
+    _tabulate(mine, found, group)
+    return found.loss
+
+
+def _numbers(jobs: Sequence[Job]) -> str:
+    return ", ".join(str(one.number) for one in jobs)
+
+
+def fail(jobs: Sequence[Job], failure: JobError, group: Group, failed: dict[int, Path]) -> list[float]:
+    """Jobs that failed have a row too; gives their losses, which are infinite."""
+    if isinstance(failure, RefusedError):
+        end(1, str(failure))
+    if str(failure):
+        print(f"softmpm_learn: job {_numbers(jobs)}: {failure}", file=sys.stderr)
+    for mine in jobs:
+        failed[mine.number] = mine.table
+        found = sweep.Outcome(
+            status="failed", error=str(failure), iterations=failure.iterations, **mine.about
+        )
+        _tabulate(mine, found, group)
+    if group.size > 1:
+        raise SystemExit(1)  # the processes may no longer be in step; the same command goes on
+    return [math.inf] * len(jobs)
+
+
+def _tabulate(mine: Job, found: sweep.Outcome, group: Group) -> None:
+    if group.first:
+        sweep.record(mine.out, found)
+        sweep.tabulate(mine.table.parent)
+
+
+def experiments(jobs: Sequence[tuple[RunConf, Path]], group: Group, signals: Signals) -> list[list[Result]]:
+    """The runs of each job; an error leaves its traceback in the folder of the first, from where it happened, and so does the log."""
+    out = jobs[0][1]
+    with log_file() as begin_log:
+        try:
+            about = group, signals, lambda: begin_log(out / "softmpm_learn.log")
+            return [run_experiment(*jobs[0], *about)] if len(jobs) == 1 else run_side_by_side(jobs, *about)
+        except Exception as error:
+            if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
+                raise JobError from None
+            kind = RefusedError if isinstance(error, LockedError) else JobError
+            done = error.iteration if isinstance(error, TrainingError) else 0
+            raise kind(f"{sentence(error)}{_left(error, out, group)}", done) from error
+
+
+def _left(error: Exception, out: Path, group: Group) -> str:
+    """Leave the traceback in the folder of the run, unless that is another's; gives a note on where it is, if people need it."""
+    place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
+    if isinstance(error, LockedError):
+        return ""
+    try:
+        files.replace(place, "".join(traceback.format_exception(error)).encode())
+    except OSError as other:
+        return "" if isinstance(error, EXPECTED) else f" The traceback could not be saved: {other}"
+    return "" if isinstance(error, EXPECTED) else f" The traceback is in {place}."

@@ -1,0 +1,52 @@
+"""Progress report of a run: a bar with loss and remaining time on a terminal, a few log lines elsewhere."""
+
+import logging
+import statistics
+import sys
+import time
+from types import TracebackType
+
+from tqdm import tqdm
+
+from softmpm_learn.training.timing import duration
+
+logger = logging.getLogger("softmpm_learn")
+
+
+class ProgressBar:
+    """Call it after each iteration; the first call tells where a resumed run began. Use as a context manager."""
+
+    def __init__(self, total: int, *, lines: int = 20):
+        """Count to ``total`` iterations; without a terminal, write about ``lines`` lines."""
+        self.total, self.every = total, max(1, round(total / lines))
+        self.lowest = float("inf")
+        self._first: int | None = None
+        self._began = time.monotonic()
+        self._bar = tqdm(total=total, dynamic_ncols=True, smoothing=0.1) if sys.stderr.isatty() else None
+
+    def __call__(self, iteration: int, *losses: float) -> None:
+        """Iteration number ``iteration``, counted from 0, has ended with these losses, one for each run side by side."""
+        if self._first is None:
+            self._first = iteration
+            if self._bar is not None:
+                self._bar.initial = self._bar.n = self._bar.last_print_n = iteration
+        self.lowest = min(self.lowest, *losses)
+        done, loss = iteration + 1, statistics.median(losses)
+        all_of = f" ({min(losses):.5g} to {max(losses):.5g})" if len(losses) > 1 else ""
+        text = f"loss {loss:.5g}{all_of}, lowest {self.lowest:.5g}"
+        if self._bar is not None:
+            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.update(1)
+        elif done % self.every == 0 or done == self.total or iteration == self._first:
+            left = self._left(done - self._first, self.total - done)
+            logger.info("after %d of %d iterations: %s, %s left", done, self.total, text, left)
+
+    def _left(self, done: int, missing: int) -> str:
+        return duration((time.monotonic() - self._began) / done * missing)
+
+    def __enter__(self) -> "ProgressBar":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._bar is not None:
+            self._bar.close()

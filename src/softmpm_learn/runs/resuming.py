@@ -1,0 +1,59 @@
+"""Folders of runs: entered by one run at a time, which goes on where the checkpoint in it ends."""
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+from softmpm_learn.learning.replay import ReplayError
+from softmpm_learn.runs.run import Run, SettingsError
+from softmpm_learn.storage import checkpoint, files
+
+logger = logging.getLogger("softmpm_learn")
+
+
+@contextlib.contextmanager
+def entered(out: Path) -> Iterator[None]:
+    """The folder is there, has no links in it, and no other run writes to it."""
+    with files.named("make the folder", out):
+        out.mkdir(parents=True, exist_ok=True)
+    files.check_folder(out)
+    with checkpoint.locked(out):
+        yield
+
+
+def resume(run: Run, out: Path) -> dict:
+    """Go on where the checkpoint ends, if there is one; the replay buffer is for the first process. Gives what the checkpoint knows of
+    the other files.
+    """
+    group = run.group
+    content = group.broadcast(group.once(lambda: checkpoint.load(out) if checkpoint.exists(out) else None))
+    if content is None:
+        return {}
+    with group.fail_together():
+        seals = restore(run, content, out)
+    logger.info("Going on after iteration %d of %s.", run.iteration, out)
+    return seals
+
+
+def restore(run: Run, content: dict, out: Path) -> dict:
+    """Set a run to the checkpoint of a folder; gives what the checkpoint knows of the other files.
+
+    Raises:
+        SettingsError: It was made with other settings.
+        CheckpointError: It does not hold this run.
+    """
+    try:
+        if content["learner"] and not run.group.first:
+            content["learner"]["replay"] = {}
+        run.load_state_dict(content)
+        return dict(content["seals"])
+    except SettingsError as error:
+        raise SettingsError(f"the checkpoint in {out} was {error}") from error
+    except ReplayError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+        text = " ".join(str(error).split())
+        raise checkpoint.CheckpointError(
+            f"the checkpoint in {out} does not hold this run: {text}."
+        ) from error

@@ -1,0 +1,205 @@
+"""The pictures of a run: they are made, they have the right size and colours, and they tell their arrays."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+import softmpm
+from softmpm_learn.command.pictures import curves
+from softmpm_learn.command.progress import ProgressBar
+from softmpm_learn.figures import VALUES, canvas, latent_figure, loss_figure, robot_figure
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A block with one muscle on a floor."""
+    block = softmpm.box((0.3, 0.1), (0.6, 0.3), 0.02)
+    muscle = softmpm.Muscle(particles=np.arange(20), direction=(0.0, 1.0), strength=1.0)
+    return softmpm.Scene(
+        grid=softmpm.Grid(shape=(26, 14), spacing=0.04),
+        bodies=[softmpm.Body(block, softmpm.NeoHookean(density=1.0, young=10.0))],
+        muscles=[muscle],
+        walls=[softmpm.Wall(normal=(0.0, 1.0), offset=0.08)],
+        dt=1e-3,
+    )
+
+
+def pixels(path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def colour_count(image: np.ndarray, red_over_blue: int) -> int:
+    """Pixels whose red is above their blue by more than so much (below, if negative)."""
+    difference = image[..., 0] - image[..., 2]
+    return int(
+        (difference > red_over_blue).sum() if red_over_blue > 0 else (difference < red_over_blue).sum()
+    )
+
+
+def test_latent_figure_paints_negative_red_and_positive_blue(tmp_path):
+    """A feature that only moves things to the left gives a picture with red and no blue, and the other way round."""
+    for sign, name in ((-1.0, "red"), (1.0, "blue")):
+        fields = np.zeros((2, len(VALUES), 12, 6, 2))
+        fields[..., 0] = sign
+        latent_figure(tmp_path / f"{name}.png", fields)
+        image = pixels(tmp_path / f"{name}.png")
+        some, none = (60, -60) if sign < 0 else (-60, 60)
+        assert colour_count(image, some) > 1000
+        assert colour_count(image, none) < 20
+
+
+def test_latent_figure_has_a_row_for_each_feature(tmp_path):
+    """More features make the picture higher and no wider; a 3D field gives its middle slice, the same picture."""
+    rng = np.random.default_rng(0)
+    fields = rng.standard_normal((6, len(VALUES), 10, 8, 2))
+    latent_figure(tmp_path / "six.png", fields)
+    latent_figure(tmp_path / "two.png", fields[:2])
+    six, two = (pixels(tmp_path / f"{name}.png").shape for name in ("six", "two"))
+    assert six[0] > 2 * two[0] and six[1] == two[1]
+    solid = np.zeros((2, len(VALUES), 10, 8, 5, 3))
+    solid[..., 2, :2] = fields[:2]
+    latent_figure(tmp_path / "solid.png", solid)
+    assert (pixels(tmp_path / "solid.png") == pixels(tmp_path / "two.png")).all()
+
+
+def test_latent_figure_has_everything_in_its_place(tmp_path):
+    """The first feature has a node in the upper right that moves upwards for its last value, and one in the opposite corner that hardly
+    moves: blue is in the first row, in the last column, in its upper right quarter."""
+    fields = np.zeros((3, len(VALUES), 12, 8, 2))
+    fields[0, -1, 10, 6, 1], fields[0, :, 1, 1, 0] = 1.0, 0.2
+    latent_figure(tmp_path / "place.png", fields)
+    image = pixels(tmp_path / "place.png")
+    y, x = np.argwhere(image[..., 2] - image[..., 0] > 90).mean(axis=0) / image.shape[:2]
+    assert 0 < y < 0.25 and 0.95 < x < 1
+
+
+def test_latent_figure_leaves_out_where_nothing_moves(tmp_path):
+    """The frame is cut to the nodes that move, so that a small robot on a large grid fills the picture."""
+    fields = np.zeros((1, len(VALUES), 60, 40, 2))
+    fields[:, :, 20:30, 10:20, 0] = 1.0
+    latent_figure(tmp_path / "large.png", fields)
+    image = pixels(tmp_path / "large.png")
+    assert colour_count(image, -60) > 0.15 * image.shape[0] * image.shape[1]
+
+
+def test_loss_figure_draws_what_has_numbers(tmp_path):
+    """A curve without a finite number is left out; gaps and a single point do no harm."""
+    loss_figure(tmp_path / "two.png", {"loss": ([0, 1, 2], [3.0, np.nan, 1.0]), "validation": ([2], [0.5])})
+    loss_figure(tmp_path / "one.png", {"loss": ([0, 1, 2], [3.0, 2.0, 1.0]), "validation": ([], [])})
+    loss_figure(tmp_path / "none.png", {"loss": ([], [])})
+    two, one, none = (pixels(tmp_path / f"{name}.png") for name in ("two", "one", "none"))
+    assert two.shape[0] > one.shape[0] >= none.shape[0]
+    assert colour_count(one, -60) > 100
+
+
+def test_the_loss_and_its_lowest_value_are_both_seen(tmp_path, monkeypatch):
+    """Of a loss that falls all the time, where they are the same curve, and each has its name."""
+    drawn, save = [], canvas.save
+    monkeypatch.setattr(
+        canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi)
+    )
+    loss_figure(tmp_path / "loss.png", {"loss": ([0, 1, 2, 3], [4.0, 3.0, 2.0, 1.0])})
+    legend = drawn[0].axes[0].get_legend()
+    assert {text.get_text() for text in legend.get_texts()} == {"loss", "lowest so far"}
+    image = pixels(tmp_path / "loss.png")[
+        :, : pixels(tmp_path / "loss.png").shape[1] * 2 // 3
+    ]  # without the legend
+    assert colour_count(image, 60) > 1000 and colour_count(image, -60) > 500
+
+
+def test_evaluations_have_a_title_that_needs_no_goals(tmp_path):
+    """A walker is evaluated too, over a longer motion."""
+    (tmp_path / "metrics.csv").write_text("iteration,loss,evaluation\n0,1.0,2.0\n1,0.5,\n")
+    found = curves(tmp_path / "metrics.csv")
+    assert found["loss in evaluations"] == ([0], [2.0]) and found["loss"] == ([0, 1], [1.0, 0.5])
+
+
+def test_losses_over_decades_are_drawn_as_logarithms(tmp_path):
+    """Where all are positive; a loss of both signs and one of a single decade are not."""
+    assert [
+        canvas.scale(v) for v in ([1.0, np.nan, 200.0], [1.0, 50.0], [-1.0, 200.0], [0.0, 200.0], [])
+    ] == [*("log", "linear", "linear", "linear", "linear")]
+
+
+def test_robot_figure_shows_activation_and_design(tmp_path, scene):
+    """A muscle that pulls is red, one that pushes is blue, a row is added for each frame and one for the design."""
+    rest = scene.bodies[0].particles.positions
+    sizes = {}
+    for name, activation, some in (("pull", 1.0, 60), ("push", -1.0, -60)):
+        frames = [("start", rest, None), ("end", rest + (0.1, 0.05), np.array([activation]))]
+        robot_figure(tmp_path / f"{name}.png", scene, frames, {})
+        image = pixels(tmp_path / f"{name}.png")
+        sizes[name] = image.shape
+        assert colour_count(image, some) > 100 and colour_count(image, -some) < 30
+    design = {"young": (np.linspace(5.0, 20.0, len(rest)), "Pa"), "poisson": (np.full(len(rest), 0.3), "")}
+    robot_figure(
+        tmp_path / "design.png", scene, [("start", rest, None)] * 2, design, goal=np.array([0.7, 0.3])
+    )
+    assert pixels(tmp_path / "design.png").shape[0] > sizes["pull"][0] + 150
+
+
+def test_a_goal_is_drawn_as_a_red_cross(tmp_path, scene):
+    """Without a muscle at work the only red is the goal."""
+    rest = scene.bodies[0].particles.positions
+    robot_figure(tmp_path / "with.png", scene, [("", rest, None)], {}, goal=np.array([0.8, 0.3]))
+    robot_figure(tmp_path / "without.png", scene, [("", rest, None)], {})
+    assert colour_count(pixels(tmp_path / "with.png"), 100) > 20
+    assert colour_count(pixels(tmp_path / "without.png"), 100) == 0
+
+
+def test_figures_do_not_import_matplotlib_until_they_draw():
+    """Importing the module is cheap and touches no global state of matplotlib."""
+    code = "import sys, softmpm_learn.figures; sys.exit('matplotlib' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-c", code], env={"PYTHONPATH": ":".join(sys.path)}).returncode == 0
+    )
+
+
+def test_progress_without_a_terminal_writes_a_few_lines(caplog):
+    """The first and the last iteration and every so many in between, with the loss, the lowest one and the time left."""
+    with caplog.at_level("INFO", logger="softmpm_learn"), ProgressBar(40, lines=4) as progress:
+        for k in range(40):
+            progress(k, float((k - 30) ** 2))
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == 5
+    assert lines[0].startswith("after 1 of 40 iterations: loss 900") and " left" in lines[0]
+    assert lines[-1].startswith("after 40 of 40 iterations: loss 81, lowest 0")
+
+
+def test_progress_of_runs_side_by_side_is_their_median_and_range(caplog):
+    """And the lowest of all of them."""
+    with caplog.at_level("INFO", logger="softmpm_learn"), ProgressBar(2) as progress:
+        progress(0, 3.0, 1.0, 2.5)
+        progress(1, 4.0, 2.0, 3.5)
+    last = caplog.records[-1].getMessage()
+    assert last.startswith("after 2 of 2 iterations: loss 3.5 (2 to 4), lowest 1")
+
+
+def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
+    """It shows how many iterations of how many are done, and the loss; a resumed run starts where it is."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with ProgressBar(10) as progress:
+        for k in range(4, 10):
+            progress(k, 1.5)
+    shown = capsys.readouterr().err
+    assert "10/10" in shown and "loss 1.5" in shown
+
+
+def test_a_picture_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+    """A run that ends while it draws leaves the picture before, and no half of one."""
+    path = tmp_path / "loss.png"
+    loss_figure(path, {"loss": ([0, 1], [2.0, 1.0])})
+    before = path.read_bytes()
+
+    def broken(self, target, **_):
+        target.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Figure, "savefig", broken)
+    with pytest.raises(KeyboardInterrupt):
+        loss_figure(path, {"loss": ([0, 1, 2], [2.0, 1.0, 0.5])})
+    assert path.read_bytes() == before and [entry.name for entry in tmp_path.iterdir()] == ["loss.png"]

@@ -1,0 +1,114 @@
+"""A run that is loaded from its folder moves as it did, in an episode and in an environment; the blocks of docs/learning.md run."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import softmpm_learn
+from softmpm_learn.command import experiment
+from softmpm_learn.config import DeviceConf, RunConf
+from softmpm_learn.episode import run_episode
+from softmpm_learn.gym import EnvConf, SoftRobotEnv
+from softmpm_learn.settings import DesignConf, LearningConf, ObserverConf, PolicyConf, TrainConf
+from softmpm_learn.storage import checkpoint
+from softmpm_learn.tasks import BipedConf
+
+PAGE = Path(__file__).parents[3] / "docs" / "learning.md"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with a short run of a biped that learned a latent and designed its muscles too, and its result."""
+    out = tmp_path_factory.mktemp("loading") / "walk"
+    conf = RunConf(
+        task=BipedConf(name="biped", seconds=0.1, control_period=0.025, lead=0.0),
+        observer=ObserverConf(latent_size=3, channels=[4, 4]),
+        policy=PolicyConf(hidden=[8]),
+        design=DesignConf(strength=True),
+        learning=LearningConf(every=2, epochs=1, batches=1, batch=4),
+        train=TrainConf(iterations=3, record_every=0, examine=False, pictures=False, endurance=1),
+        device=DeviceConf(name="cpu"),
+    )
+    (result,) = experiment.run_experiment(conf, out)
+    return out, result
+
+
+def losses(run) -> torch.Tensor:
+    params, inputs = run.design()
+    with torch.no_grad():
+        return run_episode(run.task, run.model, run.observer, run.policy, params, inputs=inputs).loss
+
+
+def test_a_loaded_run_is_at_its_best(finished, tmp_path):
+    """Without its replay buffer, from a copy in which nothing changes; the motion is that of the best, to the last bit."""
+    out, result = finished
+    copy = tmp_path / "copy"
+    shutil.copytree(out, copy, ignore=shutil.ignore_patterns("replay", "*.csv", ".lock"))
+    before = {path: path.read_bytes() for path in copy.rglob("*")}
+    run = softmpm_learn.load(copy, device="cpu")
+    assert {path: path.read_bytes() for path in copy.rglob("*")} == before and run.out == copy
+    result.run.load_policy(result.run.best)
+    assert losses(run).item() == losses(result.run).item()
+    first = run.settings.suited(run.task, encoded=True)
+    assert first == run.settings and run.best["iteration"] == result.best_iteration
+
+
+def test_an_environment_has_the_trained_body(finished):
+    """With observer and body of the run, the policy has the loss of the episode; the scene's body has another."""
+    out, _ = finished
+    run, found = softmpm_learn.load(out, device="cpu"), []
+    for body in (run.design(), None):
+        env = SoftRobotEnv(
+            run.task, EnvConf(observer=lambda task, model: run.observer, body=body, device="cpu")
+        )
+        features, info = env.reset()
+        for step in range(run.task.control_steps):
+            time = torch.tensor(step * run.task.control_period)
+            with torch.no_grad():
+                (action,) = run.policy(torch.as_tensor(features)[None], time, None)
+            features, *_, info = env.step(action.numpy())
+        found.append(info["loss"])
+    want = losses(run).item()
+    assert found[0] == pytest.approx(want, rel=1e-5) and abs(found[1] - want) > 1e-4 * abs(want)
+
+
+def test_what_is_no_run_is_refused(finished, tmp_path):
+    """An empty folder, one without a checkpoint, one of several seeds, one of a robot that is not registered, a damaged checkpoint."""
+    out, _ = finished
+    with pytest.raises(ValueError, match="there is no config.yaml in it"):
+        softmpm_learn.load(tmp_path)
+    text = (out / "config.yaml").read_text()
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"must have a checkpoint.pt, and has none\.$"):
+        softmpm_learn.load(tmp_path)
+    (tmp_path / "config.yaml").write_text(text.replace("seeds: 1", "seeds: 2"))
+    with pytest.raises(ValueError, match=r"each seed has one: load .*seed_…"):
+        softmpm_learn.load(tmp_path)
+    own = text.replace("name: biped", "name: hopper").replace("files: []", "files: [/robots/hopper.py]")
+    (tmp_path / "config.yaml").write_text(own)
+    with pytest.raises(
+        ValueError, match=r"'hopper' .* registered by a file: .*hopper.py .* program imports that file before"
+    ):
+        softmpm_learn.load(tmp_path)
+    (tmp_path / "config.yaml").write_text(text)
+    (tmp_path / "checkpoint.pt").write_bytes(b"nothing")
+    with pytest.raises(checkpoint.CheckpointError, match="is damaged"):
+        softmpm_learn.load(tmp_path)
+
+
+def test_the_code_of_the_page_runs(finished, tmp_path, monkeypatch, capsys):
+    """Each block alone: the first one leaves a film, the second one ends with the loss of the episode."""
+    out, _ = finished
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(out, "outputs/walk")
+    blocks = [
+        b for b in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if "learn.load(" in b
+    ]
+    for code in blocks:
+        exec(code, {})
+    assert len(blocks) == 2 and Path("walk.gif").stat().st_size > 1000
+    said = capsys.readouterr().out
+    assert f"loss {losses(softmpm_learn.load(out, device='cpu')).item():.4f}" in said

@@ -1,0 +1,252 @@
+"""Sweeps: a row for each job, whatever becomes of it, and the same command again."""
+
+import contextlib
+import csv
+import json
+import logging
+import math
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+import softmpm
+from softmpm_learn import train
+from softmpm_learn.command import app, jobs
+from softmpm_learn.runs.saved import load
+from softmpm_learn.storage import checkpoint, sweep
+from softmpm_learn.training import optimisation
+
+TINY = [
+    *("task=arm", "observer=centroids", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
+    *(
+        "policy=linear",
+        "train.iterations=2",
+        "train.examine=false",
+        "train.record_every=0",
+        "train.pictures=false",
+    ),
+]
+FAILS, WORKS = "task.poisson=0.45", "task.poisson=0.3"
+"""The design's bounds of Poisson's ratio end at 0.4."""
+INVERTED = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
+
+
+@pytest.fixture(autouse=True)
+def fresh_hydra(monkeypatch, tmp_path):
+    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
+    monkeypatch.chdir(tmp_path)
+    GlobalHydra.instance().clear()
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Runs a sweep in this process; gives the exit code and the numbers that Hydra's sweeper got."""
+    real = app.job
+
+    def go(*words: str) -> tuple[int, list[float]]:
+        objectives = []
+        monkeypatch.setattr(app, "job", lambda *args: objectives.append(real(*args)) or objectives[-1])
+        quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+        monkeypatch.setattr(sys, "argv", ["softmpm_learn", "-m", *TINY, *words, *quiet])
+        GlobalHydra.instance().clear()
+        try:
+            app.main()
+        except SystemExit as stop:
+            return stop.code, objectives
+        return 0, objectives
+
+    return go
+
+
+def table() -> list[dict[str, str]]:
+    (path,) = Path("outputs/sweep").glob("*/sweep.csv")
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def losses(folder: Path) -> list[float]:
+    with open(folder / "metrics.csv", newline="") as file:
+        return [float(row["loss"]) for row in csv.DictReader(file)]
+
+
+def evaluations(folder: Path) -> list[float]:
+    """Those of a run, which choose the best."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [float(row["evaluation"]) for row in csv.DictReader(file) if row["evaluation"]]
+
+
+def test_a_failed_job_is_a_row_and_the_next_one_runs(run, capsys):
+    """Its objective is infinite, the reason is in the table and on stderr, and the exit code tells that something failed."""
+    code, objectives = run(f"task.poisson={FAILS[-4:]},{WORKS[-3:]}")
+    failed, finished = table()
+    assert (
+        code == 1
+        and objectives[0] == math.inf
+        and objectives[1] == min(evaluations(Path(finished["folder"])))
+    )
+    assert (failed["status"], failed["loss"], failed["job"]) == ("failed", "inf", "0")
+    assert "design.poisson_range" in failed["error"] and FAILS in failed["settings"]
+    assert (finished["status"], finished["iterations"], finished["error"]) == ("finished", "2", "")
+    assert float(finished["loss"]) == objectives[1] and WORKS in finished["settings"]
+    said = capsys.readouterr().err
+    assert "softmpm_learn: job 0: " in said and "failed: 0; the same command tries them again." in said
+    assert "Traceback" in (Path(failed["folder"]) / "error.txt").read_text()
+
+
+def test_a_failed_job_says_how_many_iterations_it_has_done(run, monkeypatch):
+    """Those in metrics.csv, before the one in which its simulation failed; tried again, it gives the same row."""
+    real, words = optimisation.attempt, ("train.seed=0", "optimizer.retries=0")
+
+    def fails(runs, *args):
+        if runs.all[0].iteration == 1:
+            raise softmpm.UnstableError("particle 3 is inverted.", **INVERTED)
+        return real(runs, *args)
+
+    monkeypatch.setattr(optimisation, "attempt", fails)
+    for _ in range(2):
+        assert run(*words)[0] == 1
+        (row,) = table()
+        assert (row["status"], row["iterations"]) == ("failed", "1") and len(losses(Path(row["folder"]))) == 1
+        assert row["error"].startswith("iteration 1: particle 3 is inverted.")
+
+
+def test_a_setting_that_no_run_accepts_is_a_row_too(run):
+    """It fails before the run begins, in the schema."""
+    assert run("task.seconds=-1,0.05")[0] == 1
+    failed, finished = table()
+    assert "task.seconds must be > 0" in failed["error"] and finished["status"] == "finished"
+
+
+def test_the_same_command_skips_what_has_finished(run, monkeypatch):
+    """Finished jobs give their objective again without a run; a failed one is tried again, and its row replaced."""
+    real, ran = jobs.run_experiment, []
+
+    def fails_at_first(conf, out, *args):
+        ran.append(conf.train.seed)
+        if conf.train.seed == 1 and ran.count(1) == 1:
+            raise RuntimeError("no memory just now.")
+        return real(conf, out, *args)
+
+    monkeypatch.setattr(jobs, "run_experiment", fails_at_first)
+    (code, first), (again, second) = run("train.seed=0,1,2"), run("train.seed=0,1,2")
+    assert (code, again) == (1, 0) and ran == [0, 1, 2, 1]
+    assert first[1] == math.inf and second == [first[0], float(table()[1]["loss"]), first[2]]
+    assert [row["status"] for row in table()] == ["finished"] * 3
+    assert [row["job"] for row in table()] == ["0", "1", "2"]
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing of ours catches it."""
+
+
+@pytest.mark.parametrize("where", ["first step", "second step", "before the outcome", "before the table"])
+def test_the_same_command_goes_on_after_a_kill(run, monkeypatch, where):
+    """The job that was killed is resumed from its checkpoint and ends as one that was not; those before are not run again."""
+    run("train.seed=0,1", "hydra.sweep.dir=whole")
+    owner, name, nth = {
+        "first step": (train, "optimise", 2),
+        "second step": (train, "optimise", 3),
+        "before the outcome": (sweep, "record", 1),
+        "before the table": (sweep, "tabulate", 1),
+    }[where]
+    real, calls = getattr(owner, name), []
+
+    def dies(*args, **kwargs):
+        calls.append(1)
+        if len(calls) == nth + 1:
+            raise Killed
+        return real(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, dies)
+        with pytest.raises(Killed):
+            run("train.seed=0,1")
+    steps, step = [], optimisation.attempt
+    monkeypatch.setattr(
+        optimisation, "attempt", lambda runs, *args: steps.append(runs.all[0].iteration) or step(runs, *args)
+    )
+    assert run("train.seed=0,1")[0] == 0
+    assert steps == {"first step": [0, 1], "second step": [1]}.get(where, [])
+    rows = table()
+    assert [row["status"] for row in rows] == ["finished"] * 2
+    for row in rows:
+        other = Path("whole") / row["job"]
+        assert losses(Path(row["folder"])) == losses(other)
+        assert float(row["loss"]) == sweep.outcome(other).loss
+
+
+def test_a_wish_to_stop_ends_the_sweep(run, monkeypatch):
+    """The job in progress is saved and has no row; the next ones do not begin; the same command goes on."""
+    real = jobs.run_experiment
+
+    def stopped(conf, out, group, signals, begin):
+        signals.awaited = lambda **_: contextlib.nullcontext(lambda: conf.train.seed == 1)
+        return real(conf, out, group, signals, begin)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs, "run_experiment", stopped)
+        code, objectives = run("train.seed=0,1,2")
+    assert code == 0 and len(objectives) == 1 and [row["job"] for row in table()] == ["0"]
+    (folder,) = Path("outputs/sweep").iterdir()
+    assert checkpoint.load(folder / "1")["iteration"] == 0 and not (folder / "2").exists()
+    assert run("train.seed=0,1,2")[0] == 0
+    assert [row["status"] for row in table()] == ["finished"] * 3
+
+
+def test_more_iterations_go_on_with_every_job(run):
+    """What a resumed run may change, a sweep that goes on may too; other settings are refused, and nothing is touched."""
+    into = "hydra.sweep.dir=outputs/sweep/all"
+    run("train.seed=0,1", into)
+    assert run("train.seed=0,1", "train.iterations=3", into)[0] == 0
+    assert [row["iterations"] for row in table()] == ["3", "3"]
+    assert load(Path("outputs/sweep/all/0")).train.iterations == 3
+    before = {
+        path: path.read_bytes() for path in Path("outputs").rglob("*.*") if path.name != "multirun.yaml"
+    }
+    code, objectives = run("train.seed=5,6", into)
+    assert code == 1 and objectives == []
+    assert before == {path: path.read_bytes() for path in before}
+
+
+def test_a_run_in_progress_is_left_alone(run, capsys):
+    """Another process that works on a job keeps it: the sweep ends, and no outcome is written over it."""
+    run("train.seed=0")
+    (path,) = Path("outputs/sweep").glob("*/0/outcome.json")
+    path.unlink()
+    with checkpoint.locked(path.parent):
+        code, _ = run("train.seed=0")
+    assert code == 1 and not path.exists() and "another run is writing" in capsys.readouterr().err
+
+
+def test_a_sweep_does_not_resume_folders(run):
+    """``resume`` is for one run: as a job it fails in a sentence."""
+    run("train.seed=0")
+    assert run("resume=outputs", "hydra.sweep.dir=other")[0] == 1
+    assert "resume=FOLDER is for one run" in sweep.outcome(Path("other/0")).error
+
+
+def test_a_spoilt_outcome_is_named(run, capsys):
+    """Not taken for a finished job, and not written over."""
+    run("train.seed=0")
+    (path,) = Path("outputs/sweep").glob("*/0/outcome.json")
+    content = json.loads(path.read_text())
+    for spoilt in ("{", "[]", json.dumps(content | {"status": "well"}), json.dumps(content | {"more": 1})):
+        path.write_text(spoilt)
+        assert run("train.seed=0")[0] == 1
+        assert "outcome.json is no outcome of a job" in capsys.readouterr().err and path.read_text() == spoilt
+
+
+def test_folders_are_named_by_the_command():
+    """The same words, the same folder; others, another; never a name that a file system or a person stumbles over."""
+    name = sweep.folder_name
+    assert name(["task=arm", "train.seed=0,1,2"]) == "task=arm,train.seed=0,1,2"
+    lists = [name([f"task.goal=[0.5,{y}]"]) for y in ("0.3", "0.4")]
+    assert lists[0] != lists[1] and lists[0].startswith("task.goal=_0.5,0.3_-")
+    assert len(name(["train.seed=" + ",".join(map(str, range(99)))])) == sweep.LONGEST + 9
+    assert not {"/", " ", "$"} & set(name(["a=${b}", "../c= d"])) and name([".."]) != ".." and name([])
