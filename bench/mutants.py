@@ -32,7 +32,7 @@ TESTS = (
     "tests/softmpm/test_inputs.py",
     "tests/softmpm/test_surface_contact.py",
     "tests/softmpm/test_surface_walls.py",
-    "tests/softmpm/test_moving_contact.py",
+    "tests/softmpm/test_surface_contact_moving.py",
     "tests/softmpm/test_lagrangian.py",
     "tests/softmpm/test_mirror.py",
     "tests/softmpm/test_driven.py",

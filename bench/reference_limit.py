@@ -17,7 +17,7 @@ from extremes.laws import LAWS
 from scipy.sparse.linalg import LinearOperator, eigs
 
 import softmpm
-from softmpm.reference_step_limit import running_limit
+from softmpm.oracle.step_limit import running_limit
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 STRETCHES = (0.3, 0.5, 0.7, 1.0, 1.4, 2.0)

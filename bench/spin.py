@@ -19,7 +19,7 @@ from extremes.judges import DENSITIES, Exact, Matter, exact, stretches
 from extremes.laws import LAWS
 
 import softmpm
-from softmpm.reference_lagrangian import quadrature
+from softmpm.oracle.lagrangian import quadrature
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of
 
 SUBSTEPS = 10_000

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 import softmpm
-from softmpm import autograd, reference_contact, rollout, runner
+from softmpm import autograd, rollout, runner
+from softmpm.oracle import contact
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
 from softmpm.schemes import graph_cache
@@ -31,7 +32,7 @@ KINDS = {
 INPUTS = ("x", "v", "C", "F", "activation", "young", "poisson", "density")
 GIVEN = ("gravity", "damping", "friction", "direction", "viscosity", "force")
 WALL_INPUTS = ("wall_offset", "wall_normal", "wall_velocity")
-"""Inputs of which each formulation is compared with the reference, together with the strength and the driven particles."""
+"""Inputs of which each formulation is compared with the oracle, together with the strength and the driven particles."""
 
 
 def busy_scene(
@@ -152,18 +153,18 @@ def given(model: softmpm.Model, names, steps: int, seed=7) -> dict[str, torch.Te
 
 
 def run(simulate, model_or_scene, inputs: dict[str, torch.Tensor], substeps: int) -> softmpm.State:
-    """``simulate`` (softmpm's or the reference's) on inputs given by name."""
+    """``simulate`` (softmpm's or the oracle's) on inputs given by name."""
     start = softmpm.State(*(inputs[name] for name in "xvCF"))
     params = softmpm.Params(*(inputs[name] for name in softmpm.Params._fields))
     return simulate(model_or_scene, start, inputs.get("activation"), params, substeps=substeps)
 
 
-def surface_of(model: softmpm.Model) -> reference_contact.Surface:
-    """The model's surface points for the reference, which does not compute weights."""
+def surface_of(model: softmpm.Model) -> contact.Surface:
+    """The model's surface points for the oracle, which does not compute weights."""
     points, rest = model.surface, model.rest_grid
     assert points is not None
     node = rest.index.cpu()[points.stencil.cpu().long()]
-    return reference_contact.Surface(
+    return contact.Surface(
         points.points.cpu(), node, points.weights.cpu(), points.areas.cpu(), points.stiffness.cpu()
     )
 

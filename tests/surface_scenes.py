@@ -1,11 +1,12 @@
-"""Scenes and models of the reference formulation with contact at surface points, and their comparison with the float64 reference."""
+"""Scenes and models of the reference formulation with contact at surface points, and their comparison with the float64 oracle."""
 
 import numpy as np
 import torch
 from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
 
 import softmpm
-from softmpm import Inputs, reference_contact, reference_lagrangian
+from softmpm import Inputs
+from softmpm.oracle import contact, lagrangian
 
 G = 9.81
 
@@ -47,19 +48,19 @@ def by_kernels(model: softmpm.Model, *arguments, **call) -> tuple[softmpm.State,
 def by_reference(
     model: softmpm.Model, start, activation, params, **call
 ) -> tuple[softmpm.State, torch.Tensor]:
-    """The same by the float64 reference, with contact at surface points if the model has it."""
+    """The same by the float64 oracle, with contact at surface points if the model has it."""
     made, settings = model.scene, {}
-    u, v = reference_lagrangian.project(made, start, params)
+    u, v = lagrangian.project(made, start, params)
     if model.surface is not None:
         surface, width = surface_of(model), model.contact_width * made.grid.spacing
-        anchor = reference_contact.start_anchor(made, surface, u)
+        anchor = contact.start_anchor(made, surface, u)
         settings = dict(surface=surface, anchor=anchor, smoothing=width)
-    u, v, *others = reference_lagrangian.simulate(made, u, v, activation, params, **call, **settings)
-    return reference_lagrangian.evaluate(made, u, v), torch.zeros(0) if model.mirror is None else others[-1]
+    u, v, *others = lagrangian.simulate(made, u, v, activation, params, **call, **settings)
+    return lagrangian.evaluate(made, u, v), torch.zeros(0) if model.mirror is None else others[-1]
 
 
 def compare(model: softmpm.Model, names, limit: float, steps=3) -> None:
-    """Assert that the end of a call of ``steps`` control steps, the forces of clamps and all gradients are those of the reference.
+    """Assert that the end of a call of ``steps`` control steps, the forces of clamps and all gradients are those of the oracle.
 
     Args:
         names: Inputs that the call gives.

@@ -19,10 +19,10 @@ LAYERS = """
     scene planning alarms kernels.structs
     checks
     check_inputs
-    energy_density reference_stress reference_transfer reference_walls
-    reference reference_step_limit kernels.physics
-    reference_contact reference_driven reference_overlap reference_mirror
-    stability kernels.convert reference_lagrangian reference_moving_contact
+    energy_density oracle.stress oracle.transfer oracle.walls
+    oracle.moving oracle.step_limit kernels.physics
+    oracle.contact oracle.driven oracle.overlap oracle.mirror
+    stability kernels.convert oracle.lagrangian oracle.moving_contact
     kernels.material kernels.rasterize kernels.plain kernels.fast kernels.lagrangian
     kernels.carried
     rest_grid
@@ -172,9 +172,9 @@ def test_one_module_per_outside_world():
         own = (
             "autograd",
             "batches",
-            "reference",
-            "reference_step_limit",
-            "reference_stress",
+            "oracle.moving",
+            "oracle.step_limit",
+            "oracle.stress",
         )
         if name not in own:
             assert "torch.autograd" not in path.read_text(), name

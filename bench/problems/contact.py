@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import softmpm
-from softmpm import reference, reference_contact, reference_lagrangian
+from softmpm.oracle import contact, lagrangian, moving
 from softmpm.surface_grid import SurfaceGrid
 
 from . import exact
@@ -17,7 +17,7 @@ YOUNG, POISSON, DENSITY, GRAVITY = 2e5, 0.3, 1000.0, 9.81
 
 def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Places of the surface points in the present state [m], and the pressure of the first wall on each [Pa]: in the reference
-    formulation that of the next substep by the float64 reference, on the moving grid the mean over the last call.
+    formulation that of the next substep by the float64 oracle, on the moving grid the mean over the last call.
     """
     model, scene, nodes = one.model, one.model.scene, one.state.nodes
     normal = torch.tensor(scene.walls[0].normal, dtype=torch.float64)
@@ -29,7 +29,7 @@ def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
         return forces.points[0].numpy(), (forces.traction[0, 0] @ normal / decay).numpy()
     assert isinstance(model.surface, SurfaceGrid) and nodes is not None
     points, index = model.surface, model.rest_grid.index.cpu()
-    surface = reference_contact.Surface(
+    surface = contact.Surface(
         points.points.cpu(),
         index[points.stencil.cpu().long()],
         points.weights.cpu(),
@@ -38,15 +38,13 @@ def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
     )
     u, v = (torch.zeros(1, model.node_count, model.dim, dtype=torch.float64) for _ in range(2))
     u[:, index], v[:, index] = nodes.u.cpu(), nodes.v.cpu()
-    rest = reference_lagrangian.quadrature(scene)
+    rest = lagrangian.quadrature(scene)
     params = softmpm.Params(*(value.cpu()[None] for value in model.params()))
-    mass = reference_lagrangian.node_mass(scene, rest, model.mass.cpu()[None])
-    force = reference_lagrangian.node_force(
-        scene, rest, u, v, None, *reference.lame(params.young, params.poisson)
-    )
-    free = reference.grid_velocity(scene, mass, mass[..., None] * v + scene.dt * force, contacts=())
-    _, _, impulses = reference_contact.contact(scene, surface, u, free, nodes.anchor.cpu(), mass)
-    places = surface.X + reference_contact.gather(surface, u)[0]
+    mass = lagrangian.node_mass(scene, rest, model.mass.cpu()[None])
+    force = lagrangian.node_force(scene, rest, u, v, None, *moving.lame(params.young, params.poisson))
+    free = moving.grid_velocity(scene, mass, mass[..., None] * v + scene.dt * force, contacts=())
+    _, _, impulses = contact.contact(scene, surface, u, free, nodes.anchor.cpu(), mass)
+    places = surface.X + contact.gather(surface, u)[0]
     return places.numpy(), (impulses[0, 0] @ normal / scene.dt / decay).numpy()
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from softmpm.checks import check_params, check_state, check_tensor
 from softmpm.energy_density import DENSITIES
 from softmpm.model import Model, check_model
-from softmpm.reference_stress import lame
+from softmpm.oracle.stress import lame
 from softmpm.rest_grid import nodes_around
 from softmpm.state import Params, State
 from softmpm.validate import need

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.reference import actuator_tangent, lame, tangent, viscous_tangent
+from softmpm.oracle.moving import actuator_tangent, lame, tangent, viscous_tangent
 from softmpm.scene.check_scene import check_scene
 from softmpm.scene.scene import Scene
 from softmpm.state import Params

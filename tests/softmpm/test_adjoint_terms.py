@@ -1,4 +1,4 @@
-"""Every term of every adjoint against the float64 reference, in scenes so small that bench/mutants.py can run them for each."""
+"""Every term of every adjoint against the float64 oracle, in scenes so small that bench/mutants.py can run them for each."""
 
 import dataclasses
 
@@ -9,8 +9,8 @@ import warp as wp
 from helpers import LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, little_memory
 
 import softmpm
-from softmpm import reference
 from softmpm.kernels.physics.slot_sum import COLLECTORS
+from softmpm.oracle import moving
 
 
 def walled_scene(dim: int) -> softmpm.Scene:
@@ -34,7 +34,7 @@ def assert_gradients_are_the_references(model, inputs, substeps: int, limit: flo
     copies = {name: t.detach().double().requires_grad_() for name, t in inputs.items()}
     weights = cotangent(softmpm.State(*(copies[name] for name in "xvCF")))
     found = gradients(softmpm.simulate, model, inputs, substeps, [w.to(model.dtype) for w in weights[:4]])
-    wanted = gradients(reference.simulate, model.scene, copies, substeps, weights)
+    wanted = gradients(moving.simulate, model.scene, copies, substeps, weights)
     for name in inputs:
         assert wanted[name].abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(found[name].double(), wanted[name], limit, name)
@@ -55,7 +55,7 @@ def test_rasterize_is_the_references(dim):
     inputs = busy_inputs(model)
     leaves = [inputs[name] for name in "xvC"]
     state = softmpm.State(*leaves, inputs["F"])
-    fields = softmpm.rasterize(model, state), reference.rasterize(scene, state, model.params().density)
+    fields = softmpm.rasterize(model, state), moving.rasterize(scene, state, model.params().density)
     generator = torch.Generator().manual_seed(5)
     weights = [torch.randn(t.shape, generator=generator, dtype=t.dtype) for t in fields[0]]
     found, wanted = (torch.autograd.grad(dot(weights, field), leaves) for field in fields)

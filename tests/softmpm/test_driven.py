@@ -1,4 +1,4 @@
-"""Driven particles in the reference formulation: every value and gradient against the float64 reference, and what they promise."""
+"""Driven particles in the reference formulation: every value and gradient against the float64 oracle, and what they promise."""
 
 import dataclasses
 
@@ -10,7 +10,9 @@ from helpers import busy_inputs, cotangent, dot, given
 from surface_scenes import block, build, compare
 
 import softmpm
-from softmpm import Inputs, reference_driven, reference_lagrangian
+from softmpm import Inputs
+from softmpm.oracle import driven as oracle_driven
+from softmpm.oracle import lagrangian
 from softmpm.schemes.lagrangian.driven import of_nodes
 
 STEPS = 3
@@ -116,7 +118,7 @@ def test_worlds_on_two_devices_have_the_bits_of_one(devices):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_affine_velocities_are_fitted_exactly(dim):
-    """Σ a = 1 and Σ a X = X_i for a handle of several layers, as the reference has it; a single layer is constant across."""
+    """Σ a = 1 and Σ a X = X_i for a handle of several layers, as the oracle has it; a single layer is constant across."""
     for positions in (block(dim).bodies[0].particles.positions, single_layer(dim)):
         body = softmpm.Body(
             softmpm.Particles(positions, 0.05**dim), softmpm.NeoHookean(density=1.0, young=80.0)
@@ -141,10 +143,10 @@ def test_affine_velocities_are_fitted_exactly(dim):
             reached[:, flat], torch.full_like(reached[:, flat], 0.5), rtol=0, atol=1e-12
         )
         assert bool(flat.any()) == (len(positions) == 4 ** (dim - 1))
-        points = reference_lagrangian.quadrature(made)
+        points = lagrangian.quadrature(made)
         index = model.rest_grid.index[grid.nodes.long()]
-        assert torch.equal(index, reference_driven.held(made, points.node, points.N))
-        torch.testing.assert_close(a, reference_driven.fit(made, points.X, index), rtol=0, atol=1e-12)
+        assert torch.equal(index, oracle_driven.held(made, points.node, points.N))
+        torch.testing.assert_close(a, oracle_driven.fit(made, points.X, index), rtol=0, atol=1e-12)
 
 
 def single_layer(dim: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Inputs of a call besides state, activation and material: every value and gradient against the float64 reference."""
+"""Inputs of a call besides state, activation and material: every value and gradient against the float64 oracle."""
 
 import pytest
 import torch
@@ -16,7 +16,8 @@ from helpers import (
 )
 
 import softmpm
-from softmpm import Inputs, reference
+from softmpm import Inputs
+from softmpm.oracle import moving
 
 TIMED = {"activation", "velocity", "position", "force", *WALL_INPUTS}
 """Inputs with a first axis of control steps or poses."""
@@ -29,7 +30,7 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
 
 
 def both(model: softmpm.Model, names, substeps=2, steps=STEPS):
-    """Ends and gradients of ⟨weights, end⟩ by the model and by the reference, with the leaves they belong to."""
+    """Ends and gradients of ⟨weights, end⟩ by the model and by the oracle, with the leaves they belong to."""
     base, extra = busy_inputs(model, control_steps=steps), given(model, names, steps)
     leaves = base | extra
     copies = {name: t.detach().cpu().double().requires_grad_() for name, t in leaves.items()}
@@ -37,7 +38,7 @@ def both(model: softmpm.Model, names, substeps=2, steps=STEPS):
     found = []
     for simulate, on, tensors in (
         (softmpm.simulate, model, leaves),
-        (reference.simulate, model.scene, copies),
+        (moving.simulate, model.scene, copies),
     ):
         start = softmpm.State(*(tensors[name] for name in "xvCF"))
         params = softmpm.Params(*(tensors[name] for name in softmpm.Params._fields))

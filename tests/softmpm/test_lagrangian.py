@@ -1,4 +1,4 @@
-"""The reference formulation: every value and gradient against the float64 reference, and what it promises."""
+"""The reference formulation: every value and gradient against the float64 oracle, and what it promises."""
 
 import dataclasses
 

@@ -10,7 +10,7 @@ from helpers import assert_relative, cotangent, dot
 from surface_scenes import slab
 
 import softmpm
-from softmpm import reference_contact, reference_lagrangian
+from softmpm.oracle import contact, lagrangian
 from softmpm.schemes.lagrangian.nodal import particles_of, quantum
 
 DX = 1 / 25
@@ -99,16 +99,16 @@ def test_values_and_gradients_are_those_of_the_reference(device):
     own = softmpm.Params(*(t.cpu() for t in params))
     points = model.surface
     assert points is not None
-    surface = reference_contact.Surface(
+    surface = contact.Surface(
         points.points.cpu(),
         model.rest_grid.index.cpu()[points.stencil.cpu().long()],
         points.weights.cpu(),
         points.areas.cpu(),
         points.stiffness.cpu(),
     )
-    u, v = reference_lagrangian.project(made, softmpm.State(*copies), own)
-    u, v, anchor, _ = reference_lagrangian.simulate(made, u, v, None, own, substeps=40, surface=surface)
-    shown = reference_lagrangian.evaluate(made, u, v)
+    u, v = lagrangian.project(made, softmpm.State(*copies), own)
+    u, v, anchor, _ = lagrangian.simulate(made, u, v, None, own, substeps=40, surface=surface)
+    shown = lagrangian.evaluate(made, u, v)
     wanted = [*shown[:4], *torch.autograd.grad(dot(cotangent(shown), shown), copies)]
     for name, got, want in zip([*"xvCF", "adj_x", "adj_v", "adj_C", "adj_F"], found, wanted, strict=True):
         assert want.abs().max() > 0

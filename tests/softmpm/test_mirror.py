@@ -1,4 +1,4 @@
-"""Clamps and planes of symmetry: every value and gradient against the float64 reference, and what they promise."""
+"""Clamps and planes of symmetry: every value and gradient against the float64 oracle, and what they promise."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from helpers import assert_relative, busy_inputs, cotangent, dot, little_memory,
 from surface_scenes import build, compare
 
 import softmpm
-from softmpm import reference_lagrangian
+from softmpm.oracle import lagrangian
 from softmpm.schemes.lagrangian.nodal import particles_of
 
 NAMES = ("gravity", "damping", "friction", "viscosity", "force")
@@ -62,15 +62,13 @@ def test_the_reference_agrees_with_central_differences(dim):
     generator = torch.Generator().manual_seed(3)
     state = model.rest()
     state = state._replace(v=torch.randn(state.v.shape, generator=generator, dtype=torch.float64))
-    u, v = reference_lagrangian.project(made, state, params)
+    u, v = lagrangian.project(made, state, params)
     ways = [torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in (v, params.density)]
-    mass = reference_lagrangian.node_mass(
-        made, reference_lagrangian.quadrature(made), params.density * model.volume[None]
-    )
+    mass = lagrangian.node_mass(made, lagrangian.quadrature(made), params.density * model.volume[None])
     ways[0] *= (mass > 0)[..., None]
 
     def loss(v, density):
-        end = reference_lagrangian.simulate(
+        end = lagrangian.simulate(
             made, u, v, None, params._replace(density=density), substeps=4, surface=surface
         )
         forces = (torch.arange(1.0, 1 + end[-1].numel()).view_as(end[-1]) * end[-1]).sum()

@@ -1,4 +1,4 @@
-"""Whole rollouts against the float64 reference, finite differences and themselves."""
+"""Whole rollouts against the float64 oracle, finite differences and themselves."""
 
 import itertools
 import math
@@ -8,7 +8,7 @@ import torch
 from helpers import INPUTS, LAWS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 import softmpm
-from softmpm import reference
+from softmpm.oracle import moving
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import plan
 
@@ -21,12 +21,12 @@ def test_state_and_every_gradient_are_the_references(dim, laws, device, scheme):
     model = softmpm.build(scene, device=device, dtype=torch.float64, scheme=scheme, worlds=2)
     inputs = busy_inputs(model)
     copies = {name: tensor.detach().cpu().requires_grad_() for name, tensor in inputs.items()}
-    got, want = run(softmpm.simulate, model, inputs, 10), run(reference.simulate, scene, copies, 10)
+    got, want = run(softmpm.simulate, model, inputs, 10), run(moving.simulate, scene, copies, 10)
     for name, a, b in zip("xvCF", got[:4], want[:4], strict=True):
         assert_relative(a.cpu(), b, 1e-12, name)
     weights = cotangent(want)
     found = gradients(softmpm.simulate, model, inputs, 10, weights.to(model.device))
-    wanted = gradients(reference.simulate, scene, copies, 10, weights)
+    wanted = gradients(moving.simulate, scene, copies, 10, weights)
     for name in INPUTS:
         assert wanted[name].abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(found[name].cpu(), wanted[name], 1e-10, name)
@@ -86,7 +86,7 @@ def test_gradients_at_special_points(dim, law, kind, device, scheme):
     inputs = special_start(softmpm.build(scene, device="cpu", dtype=torch.float64), kind)
     there = {name: tensor.detach().to(model.device).requires_grad_() for name, tensor in inputs.items()}
     weights = cotangent(softmpm.State(*(inputs[n] for n in "xvCF")))
-    want = gradients(reference.simulate, scene, inputs, 3, weights)
+    want = gradients(moving.simulate, scene, inputs, 3, weights)
     got = gradients(softmpm.simulate, model, there, 3, weights.to(model.device))
     for name in INPUTS:
         assert torch.isfinite(want[name]).all() and want[name].abs().max() > 0, name
@@ -153,12 +153,12 @@ STEPS = (2.0**-13, 2.0**-14, 2.0**-15)  # below the distance to the next kink of
 
 
 def test_dot_product(device, scheme):
-    """⟨J a, b⟩ = ⟨a, Jᵀ b⟩ with J a from the reference by differentiating its backward pass: ≤ 1e-12."""
+    """⟨J a, b⟩ = ⟨a, Jᵀ b⟩ with J a from the oracle by differentiating its backward pass: ≤ 1e-12."""
     scene = busy_scene(2)
     model = softmpm.build(scene, device=device, dtype=torch.float64, scheme=scheme)
     inputs = busy_inputs(model)
     copies = {name: tensor.detach().cpu().requires_grad_() for name, tensor in inputs.items()}
-    end = run(reference.simulate, scene, copies, 5)
+    end = run(moving.simulate, scene, copies, 5)
     b = cotangent(end, seed=11)
     a = {
         n: torch.randn(t.shape, generator=torch.Generator().manual_seed(12), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Contact of surface points in the reference formulation: every value and gradient against the float64 reference, and facts."""
+"""Contact of surface points in the reference formulation: every value and gradient against the float64 oracle, and facts."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def test_the_end_and_all_gradients_are_those_of_the_reference(dim, width, device
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_velocities_are_stored_where_points_act_only(dim, device):
-    """Without damping and other walls, w is stored only at nodes on which surface points act; gradients are those of the reference."""
+    """Without damping and other walls, w is stored only at nodes on which surface points act; gradients are those of the oracle."""
     made = block(dim, damping=0.0, walls=block(dim).walls[:2])
     model = build(made, device=device, dtype=torch.float64, worlds=2, inputs=("friction",))
     assert isinstance(model.surface, SurfaceGrid) and not stores_all(model.spec)
@@ -48,7 +48,7 @@ STORED = {
 
 @pytest.mark.parametrize("what", STORED)
 def test_velocities_are_stored_where_anything_acts(what, device):
-    """At all nodes; gradients are those of the reference. Of walls at nodes only friction tells w from the new velocity."""
+    """At all nodes; gradients are those of the oracle. Of walls at nodes only friction tells w from the new velocity."""
     changes, settings = STORED[what]
     names = ("friction",) if changes.get("walls") != [] else ("gravity",)
     model = build(block(2, **changes), device=device, dtype=torch.float64, worlds=2, inputs=names, **settings)

@@ -1,4 +1,4 @@
-"""Moving walls and forces at surface points: every value and gradient against the float64 reference, and mechanics."""
+"""Moving walls and forces at surface points: every value and gradient against the float64 oracle, and mechanics."""
 
 import math
 
@@ -8,7 +8,8 @@ from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface
 from surface_scenes import G, block, build, made, settled, slab, velocity
 
 import softmpm
-from softmpm import Inputs, reference_lagrangian
+from softmpm import Inputs
+from softmpm.oracle import lagrangian
 
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
 NAMES = ("gravity", "friction", "viscosity", *WALLS)
@@ -45,7 +46,7 @@ def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:
 
 
 def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=False):
-    """End and mean forces on the points by the model or by the reference."""
+    """End and mean forces on the points by the model or by the oracle."""
     start = softmpm.State(*(leaves[name] for name in "xvCF"))
     params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
     inputs, activation = Inputs(**{name: leaves[name] for name in NAMES}), leaves["activation"]
@@ -55,11 +56,11 @@ def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=Fals
         return end, end.nodes.force
     made = model.scene
     settings = dict(surface=surface_of(model), smoothing=model.contact_width * made.grid.spacing)
-    u, v = reference_lagrangian.project(made, start, params)
-    u, v, _, force = reference_lagrangian.simulate(
+    u, v = lagrangian.project(made, start, params)
+    u, v, _, force = lagrangian.simulate(
         made, u, v, activation, params, substeps=SUBSTEPS, inputs=inputs, **settings
     )
-    return reference_lagrangian.evaluate(made, u, v), force
+    return lagrangian.evaluate(made, u, v), force
 
 
 @pytest.mark.parametrize(

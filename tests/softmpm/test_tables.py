@@ -6,8 +6,9 @@ import pytest
 from helpers import GIVEN, LAWS, WALL_INPUTS
 
 import softmpm
-from softmpm import energy_density, reference_step_limit, reference_stress
+from softmpm import energy_density
 from softmpm.inputs import Input, Inputs
+from softmpm.oracle import step_limit, stress
 from softmpm.scene import file
 from softmpm.scene.materials import Material
 from softmpm.scene.scene import Actuator
@@ -29,17 +30,17 @@ def public(base: type) -> set[type]:
 
 
 def test_laws():
-    """Reference, energy, energy for the step limit, file of scenes, kernels and tests have the same laws."""
+    """Oracle, energy, energy for the step limit, file of scenes, kernels and tests have the same laws."""
     laws = public(Material)
-    assert laws == set(LAWS.values()) == set(reference_stress.LAWS) == set(energy_density.DENSITIES)
-    assert laws == set(reference_step_limit.ENERGIES) and laws <= set(file.TYPES.values())
+    assert laws == set(LAWS.values()) == set(stress.LAWS) == set(energy_density.DENSITIES)
+    assert laws == set(step_limit.ENERGIES) and laws <= set(file.TYPES.values())
     assert kernel_files("laws") == set(LAWS) == {snake(law.__name__) for law in laws}
 
 
 def test_actuators():
-    """Reference, step limit, file of scenes and kernels have the same kinds."""
+    """Oracle, step limit, file of scenes and kernels have the same kinds."""
     kinds = public(Actuator)
-    assert kinds == set(reference_stress.ACTUATORS) == set(reference_step_limit.STIFFENING)
+    assert kinds == set(stress.ACTUATORS) == set(step_limit.STIFFENING)
     assert kinds <= set(file.TYPES.values())
     assert kernel_files("actuators") == {snake(kind.__name__) for kind in kinds}
 

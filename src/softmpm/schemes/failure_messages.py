@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from softmpm import reference_step_limit
 from softmpm.errors import Kind
 from softmpm.model import Model
+from softmpm.oracle import step_limit
 from softmpm.schemes.inputs import Values
 from softmpm.stability import running_limit
 from softmpm.state import State
@@ -174,7 +174,7 @@ class Case:
         F = self.end.F[self.world, p]
         about = (model.scene, p, mu, lam, density, F, active_stress, self._viscosity())
         if model.formulation == "reference":
-            return reference_step_limit.running_limit(*about)
+            return step_limit.running_limit(*about)
         return running_limit(*about, directions=values["fibre"][self.world] if "fibre" in values else None)
 
     def _viscosity(self) -> float:

@@ -1,8 +1,8 @@
 """Failure of bodies that pass through themselves or each other, in words; as those of particles in failure_messages.py."""
 
 from softmpm.model import Model
+from softmpm.oracle.overlap import intrusion
 from softmpm.overlap_grid import FAR
-from softmpm.reference_overlap import intrusion
 from softmpm.state import State
 
 REMEDY = (

@@ -11,7 +11,7 @@ import torch
 from helpers import LAWS
 
 import softmpm
-from softmpm import reference_stress
+from softmpm.oracle import stress as oracle_stress
 from softmpm.scene.presets import Preset
 
 PAGE = (Path(__file__).parents[3] / "docs" / "materials.md").read_text()
@@ -60,11 +60,11 @@ def gent(shore: int) -> float:
 def uniaxial_stress(material: softmpm.NeoHookean, stretch: float) -> float:
     """Engineering stress [Pa] of a bar whose sides are free, by bisection for their stretch."""
     young, poisson = (torch.tensor(v, dtype=torch.float64) for v in (material.young, material.poisson))
-    law = reference_stress.law_of(material)
+    law = oracle_stress.law_of(material)
 
     def tau(side: float) -> torch.Tensor:
         F = torch.diag(torch.tensor([stretch, side, side], dtype=torch.float64))
-        return law(F, *reference_stress.lame(young, poisson))
+        return law(F, *oracle_stress.lame(young, poisson))
 
     low, high = 0.3, 1.0
     for _ in range(60):

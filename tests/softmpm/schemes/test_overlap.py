@@ -12,7 +12,7 @@ import warp as wp
 import softmpm
 from softmpm.errors import NEVER, Kind, decode
 from softmpm.kernels.structs import types
-from softmpm.reference_overlap import intrusion
+from softmpm.oracle.overlap import intrusion
 from softmpm.schemes.buffers import view
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.lagrangian.nodal import particles_of
@@ -49,7 +49,7 @@ def run(model: softmpm.Model, start: softmpm.State, substeps: int, **settings) -
 
 
 def touching(model: softmpm.Model, state: softmpm.State) -> bool:
-    """True if a particle of the first body is in the volume of one of another, or the other way round, by the reference."""
+    """True if a particle of the first body is in the volume of one of another, or the other way round, by the oracle."""
     x, F = state.x[0], state.F[0]
     return any(intrusion(model.scene, x, F, p).min().item() <= 1.0 for p in range(model.particle_count))
 

@@ -7,12 +7,13 @@ import warp as wp
 from blocks import apply, special_deformations, svd_rotation
 from helpers import LAWS as LAW_CLASSES
 
-from softmpm import reference, reference_stress
 from softmpm.kernels.physics.actuators import actuator
 from softmpm.kernels.physics.kinematics import kinematics
 from softmpm.kernels.physics.laws import law as law_of
 from softmpm.kernels.physics.viscosity import viscosity
 from softmpm.kernels.structs import types
+from softmpm.oracle import moving
+from softmpm.oracle import stress as oracle_stress
 
 MU, LAM = 3.0, 5.0
 
@@ -241,7 +242,7 @@ def test_the_first_piola_kirchhoff_stress_of_viscosity(dim, device):
 
     def P_of(F, rate, eta):
         inverse = torch.linalg.inv(F)
-        return reference_stress.viscous_stress(F, rate @ inverse, eta) @ inverse.mT
+        return oracle_stress.viscous_stress(F, rate @ inverse, eta) @ inverse.mT
 
     got = apply(blocks.viscous_piola, t.mat, (dim, dim), *given).cpu()
     torch.testing.assert_close(got, P_of(F, rate, eta), rtol=1e-10, atol=1e-10)
@@ -275,7 +276,7 @@ def test_the_bound_of_the_stiffness(law, dim, lam, device):
     stretch = np.concatenate([np.ones((1, dim)), np.exp(rng.uniform(np.log(0.1), np.log(5.0), (400, dim)))])
     F = torch.from_numpy(stretch[..., None] * np.eye(dim))
     moduli = [torch.full((len(F),), value, dtype=torch.float64) for value in (MU, lam)]
-    K = torch.linalg.eigvalsh(reference.tangent(material(density=1.0, young=1.0), F, *moduli))[:, -1].clamp(
+    K = torch.linalg.eigvalsh(moving.tangent(material(density=1.0, young=1.0), F, *moduli))[:, -1].clamp(
         min=0.0
     )
     square, j = torch.from_numpy((stretch**2).max(1)), torch.from_numpy(stretch.prod(1) - 1.0)

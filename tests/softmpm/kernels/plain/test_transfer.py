@@ -1,4 +1,4 @@
-"""Each kernel of the plain scheme and its adjoint against the reference, one at a time, for random cotangents."""
+"""Each kernel of the plain scheme and its adjoint against the oracle, one at a time, for random cotangents."""
 
 import pytest
 import torch
@@ -6,10 +6,10 @@ import warp as wp
 from helpers import assert_relative, busy_inputs, busy_scene
 
 import softmpm
-from softmpm import reference
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.physics.slot_sum import COLLECTORS, collect_slots, collectors
 from softmpm.kernels.structs import RequestedGrads
+from softmpm.oracle import moving
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.buffers import Motion, MotionAdj
 from softmpm.schemes.device import stream_of
@@ -22,7 +22,7 @@ EVERYTHING = RequestedGrads(("material", "activation"))
 
 
 class Bench:
-    """One substep taken apart: the model, its inputs on the device, and the reference's copies on the CPU."""
+    """One substep taken apart: the model, its inputs on the device, and the oracle's copies on the CPU."""
 
     def __init__(self, dim: int, device: str, **changes):
         self.scene = busy_scene(dim, **changes)
@@ -46,13 +46,13 @@ class Bench:
 
     def reference_p2g(self):
         c, volume = self.cpu, self.model.specific_volume.cpu()
-        mu, lam = reference.lame(c["young"], c["poisson"])
+        mu, lam = moving.lame(c["young"], c["poisson"])
         mass = c["density"] * volume
-        tau = reference.stress(self.scene, c["F"], mu, lam, c["activation"][0])
+        tau = moving.stress(self.scene, c["F"], mu, lam, c["activation"][0])
         affine = (
             mass[..., None, None] * c["C"] - (4 * self.scene.dt / self.dx**2 * volume)[:, None, None] * tau
         )
-        return reference.p2g(self.scene, c["x"], mass, mass[..., None] * c["v"], affine)
+        return moving.p2g(self.scene, c["x"], mass, mass[..., None] * c["v"], affine)
 
 
 @pytest.fixture(params=[2, 3], ids=["2D", "3D"])
@@ -92,16 +92,14 @@ def test_grid_velocity(walled):
     """Gravity, damping and walls (G2)."""
     bench = walled
     bench.step.to_grid(bench.now)
-    want = reference.grid_velocity(bench.scene, *bench.reference_p2g())
+    want = moving.grid_velocity(bench.scene, *bench.reference_p2g())
     assert_relative(bench.step.velocity.cpu(), want.detach(), 1e-12, "velocity")
 
 
 def test_g2p(bench):
     """v, C, x and F after the substep (T2, T3)."""
     bench.step.advance(bench.now, bench.then, 0)
-    v, C = reference.g2p(
-        bench.scene, bench.cpu["x"], reference.grid_velocity(bench.scene, *bench.reference_p2g())
-    )
+    v, C = moving.g2p(bench.scene, bench.cpu["x"], moving.grid_velocity(bench.scene, *bench.reference_p2g()))
     end = bench.step.leave(bench.then)
     dt, F = bench.scene.dt, bench.cpu["F"]
     for name, got, want in zip("xvCF", end[:4], (bench.cpu["x"] + dt * v, v, C, F + dt * C @ F), strict=True):
@@ -113,7 +111,7 @@ def test_g2p_adj(bench):
     model, c, dt = bench.model, bench.cpu, bench.scene.dt
     bench.step.advance(bench.now, bench.then, 0)
     velocity = bench.step.velocity.cpu().requires_grad_()
-    v, C = reference.g2p(bench.scene, c["x"], velocity)
+    v, C = moving.g2p(bench.scene, c["x"], velocity)
     end = (c["x"] + dt * v, v, C, c["F"] + dt * C @ c["F"])
     weights = [bench.random(tensor, n) for n, tensor in enumerate(end)]
     loss = sum((w * t).sum() for w, t in zip(weights, end, strict=True))
@@ -137,7 +135,7 @@ def test_grid_velocity_adj(walled):
     bench = walled
     bench.step.to_grid(bench.now)
     mass, momentum = (tensor.detach().requires_grad_() for tensor in bench.reference_p2g())
-    velocity = reference.grid_velocity(bench.scene, mass, momentum)
+    velocity = moving.grid_velocity(bench.scene, mass, momentum)
     weight = bench.random(velocity, 3)
     adj_momentum, adj_mass = torch.autograd.grad((weight * velocity).sum(), (momentum, mass))
     bench.step.adj_velocity.copy_(weight)
@@ -171,7 +169,7 @@ def test_p2g_adj(bench):
     assert_relative(adj.H.cpu(), want["F"], LIMIT, "F")
     assert_relative(adj_mass * model.specific_volume.cpu(), want["density"], LIMIT, "density")
     young, poisson = (c[n].detach().requires_grad_() for n in ("young", "poisson"))
-    by_lame = torch.autograd.grad(reference.lame(young, poisson), (young, poisson), (adj_mu, adj_lam))
+    by_lame = torch.autograd.grad(moving.lame(young, poisson), (young, poisson), (adj_mu, adj_lam))
     assert_relative(by_lame[0], want["young"], LIMIT, "young")
     assert_relative(by_lame[1], want["poisson"], LIMIT, "poisson")
     adj_active = adj_inputs.tensors["active_stress"]
@@ -211,10 +209,10 @@ def test_adjoints_add_into_their_outputs(bench):
 
 
 def test_raster_and_its_twin(bench):
-    """Mass and velocity on the nodes, and their adjoint, are the reference's (O1)."""
+    """Mass and velocity on the nodes, and their adjoint, are the oracle's (O1)."""
     model, c = bench.model, bench.cpu
     density = model.params().density.cpu()
-    want = reference.rasterize(bench.scene, softmpm.State(*(c[n] for n in "xvCF")), density)
+    want = moving.rasterize(bench.scene, softmpm.State(*(c[n] for n in "xvCF")), density)
     there = {n: c[n].detach().to(model.device).requires_grad_() for n in "xvCF"}
     got = softmpm.rasterize(model, softmpm.State(**there))
     weights = [bench.random(tensor, n) for n, tensor in enumerate(want)]

@@ -8,7 +8,7 @@ import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 
 import softmpm
-from softmpm import reference
+from softmpm.oracle import moving
 from softmpm.schemes.fast.particle_order import ParticleLayout
 
 
@@ -40,9 +40,9 @@ def test_state_and_every_gradient_are_the_references(dim, device):
     model = build(dim, device=device)
     inputs = busy_inputs(model)
     copies = {name: t.detach().cpu().double().requires_grad_() for name, t in inputs.items()}
-    want_end = run(reference.simulate, model.scene, copies, 10)
+    want_end = run(moving.simulate, model.scene, copies, 10)
     weights = cotangent(want_end)
-    want = gradients(reference.simulate, model.scene, copies, 10, weights)
+    want = gradients(moving.simulate, model.scene, copies, 10, weights)
     got = everything(model, inputs, weights=weights.to(model.device, model.dtype))
     for name, end in zip("xvCF", want_end[:4], strict=True):
         assert_relative(got[f"end.{name}"].cpu(), end, 2e-6, name)

@@ -1,4 +1,4 @@
-"""The float64 reference against laws of physics and central differences: it leans on no kernel."""
+"""The float64 oracle against laws of physics and central differences: it leans on no kernel."""
 
 import dataclasses
 import math
@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from reference_scenes import DIMS, DX, f64, full, masses, randn, rest, shaken, slopes, tiny
+from oracle_scenes import DIMS, DX, f64, full, masses, randn, rest, shaken, slopes, tiny
 
-from softmpm import reference
 from softmpm.inputs import Inputs
+from softmpm.oracle import moving
 from softmpm.scene.materials import NeoHookean
 from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Wall
 from softmpm.state import Params, State
@@ -21,7 +21,7 @@ def test_weights_are_quadratic_b_splines(dim):
     scene = tiny(dim)
     edge = f64([[0.45, 0.5, 0.55][:dim], [0.4, 0.35, 0.6][:dim]])
     x = torch.cat([edge, shaken(scene)[0].x[0]])[None].requires_grad_()
-    nodes = reference.stencil(scene, x)
+    nodes = moving.stencil(scene, x)
     w, r = torch.stack([n[1] for n in nodes], -1), torch.stack([n[2] for n in nodes], -2)
     eye = torch.eye(dim, dtype=torch.float64)
 
@@ -46,10 +46,8 @@ def test_transfer_keeps_mass_momentum_and_spin(dim):
     scene = tiny(dim)
     state, params = shaken(scene)
     mass = masses(scene, params)[..., None]
-    node_mass, momentum = reference.p2g(
-        scene, state.x, mass[..., 0], mass * state.v, mass[..., None] * state.C
-    )
-    v, C = reference.g2p(scene, state.x, reference.grid_velocity(scene, node_mass, momentum))
+    node_mass, momentum = moving.p2g(scene, state.x, mass[..., 0], mass * state.v, mass[..., None] * state.C)
+    v, C = moving.g2p(scene, state.x, moving.grid_velocity(scene, node_mass, momentum))
 
     def spin(v, C):
         A = (mass[..., None] * (state.x[..., :, None] * v[..., None, :] + DX**2 / 4 * C.mT)).sum(1)
@@ -66,7 +64,7 @@ def test_an_affine_flow_is_seen_and_kept_exactly(dim):
     scene, a, B = tiny(dim), randn(dim, seed=50), randn(dim, dim, seed=51)
     state, params = rest(scene)
     state = state._replace(v=a + state.x @ B.T, C=B.expand_as(state.F))
-    field = reference.rasterize(scene, state, params.density)
+    field = moving.rasterize(scene, state, params.density)
     nodes = torch.stack(
         torch.meshgrid(*(DX * torch.arange(n).double() for n in scene.grid.shape), indexing="ij"), -1
     )
@@ -75,7 +73,7 @@ def test_an_affine_flow_is_seen_and_kept_exactly(dim):
     assert (field.mass == 0).any()
     torch.testing.assert_close(field.velocity, want, rtol=0, atol=1e-12)
     torch.testing.assert_close(field.mass.sum(), masses(scene, params).sum(), rtol=1e-14, atol=0)
-    v, C = reference.g2p(scene, state.x, field.velocity.view(1, -1, dim))
+    v, C = moving.g2p(scene, state.x, field.velocity.view(1, -1, dim))
     torch.testing.assert_close(v, state.v, rtol=0, atol=1e-12)
     torch.testing.assert_close(C, state.C, rtol=0, atol=1e-12)
 
@@ -86,7 +84,7 @@ def test_free_fall_with_damping(dim):
     gravity = (0.4, -9.8, 0.2)[:dim]
     scene = tiny(dim, gravity=gravity, damping=3.0)
     start, params = rest(scene)
-    end = reference.simulate(scene, start, None, params, substeps=20)
+    end = moving.simulate(scene, start, None, params, substeps=20)
     v, fallen, g = torch.zeros(dim).double(), torch.zeros(dim).double(), f64(gravity)
     for _ in range(20):
         v = math.exp(-3.0 * scene.dt) * (v + scene.dt * g)
@@ -102,7 +100,7 @@ def test_free_motion_keeps_momentum_and_spin(dim):
     scene = tiny(dim, muscles=full(dim).muscles)
     start, params = shaken(scene)
     mass = masses(scene, params)[..., None]
-    end = reference.simulate(scene, start, randn(2, 1, 2, seed=60), params, substeps=10)
+    end = moving.simulate(scene, start, randn(2, 1, 2, seed=60), params, substeps=10)
 
     def spin(s):
         A = (mass[..., None] * (s.x[..., :, None] * s.v[..., None, :] + DX**2 / 4 * s.C.mT)).sum(1)
@@ -130,15 +128,15 @@ def test_viscosity_dissipates_and_keeps_spin(dim):
         for body in scene.bodies
     ]
     viscous = dataclasses.replace(scene, bodies=bodies)
-    end = reference.simulate(viscous, start, None, params, substeps=30)
+    end = moving.simulate(viscous, start, None, params, substeps=30)
     scale = (mass * start.v.abs()).sum()
     assert (mass * (end.v - start.v)).sum(1).abs().max() <= 1e-13 * scale
     assert (spin(end) - spin(start)).abs().max() <= 1e-13 * scale
     eta = torch.full((1, count), 0.5).double()
-    given = reference.simulate(scene, start, None, params, substeps=30, inputs=Inputs(viscosity=eta))
+    given = moving.simulate(scene, start, None, params, substeps=30, inputs=Inputs(viscosity=eta))
     assert all(torch.equal(a, b) for a, b in zip(given[:4], end[:4], strict=True))
-    none = reference.simulate(viscous, start, None, params, substeps=30, inputs=Inputs(viscosity=0 * eta))
-    elastic = reference.simulate(scene, start, None, params, substeps=30)
+    none = moving.simulate(viscous, start, None, params, substeps=30, inputs=Inputs(viscosity=0 * eta))
+    elastic = moving.simulate(scene, start, None, params, substeps=30)
     assert all(torch.equal(a, b) for a, b in zip(none[:4], elastic[:4], strict=True))
 
     def relative_speed(s):
@@ -157,8 +155,8 @@ def test_a_quarter_turn_of_the_scene_turns_the_result():
     def turn(s):
         return State(s.x @ Q.T + L, s.v @ Q.T, Q @ s.C @ Q.T, Q @ s.F)
 
-    got = reference.simulate(scene, turn(start), None, params, substeps=10)
-    want = turn(reference.simulate(scene, start, None, params, substeps=10))
+    got = moving.simulate(scene, turn(start), None, params, substeps=10)
+    want = turn(moving.simulate(scene, start, None, params, substeps=10))
     for a, b in zip(got[:4], want[:4], strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
@@ -167,10 +165,10 @@ def test_stress_of_each_particle():
     """Every body has its law, every muscle its activation, fibre and particles; overlapping muscles add."""
     scene, activation = full(2), f64([[0.5, -2.0]])
     start, params = shaken(scene)
-    mu, lam = (term[0] for term in reference.lame(params.young, params.poisson))
-    got = reference.stress(scene, start.F, mu[None], lam[None], activation)[0]
+    mu, lam = (term[0] for term in moving.lame(params.young, params.poisson))
+    got = moving.stress(scene, start.F, mu[None], lam[None], activation)[0]
     for p, F in enumerate(start.F[0]):
-        law = reference.neo_hookean if p < 6 else reference.fixed_corotated
+        law = moving.neo_hookean if p < 6 else moving.fixed_corotated
         want = law(F, mu[p], lam[p])
         for muscle, a in zip(scene.muscles, activation[0], strict=True):
             if p in muscle.particles:
@@ -185,7 +183,7 @@ def test_a_muscle_contracts_along_its_fibre():
     scene = tiny(2, muscles=[muscle])
     start, params = rest(scene)
     for sign in (1.0, -1.0):
-        end = reference.simulate(scene, start, torch.full((1, 1, 1), sign).double(), params, substeps=15)
+        end = moving.simulate(scene, start, torch.full((1, 1, 1), sign).double(), params, substeps=15)
         strain = end.F[0].diagonal(dim1=-2, dim2=-1).mean(0) - 1
         assert sign * strain[1] < -1e-3
         assert sign * strain[0] > 0
@@ -211,7 +209,7 @@ def test_contact_of_a_node(wall, v, want):
     v, want = f64(v), f64(want)
     for Q in (f64([[1.0, 0.0], [0.0, 1.0]]), f64([[0.8, 0.6], [-0.6, 0.8]])):
         normal = tuple(Q[:, 1].tolist())
-        got = reference.respond(Wall(normal=normal, offset=0.0, **wall), Q @ v)
+        got = moving.respond(Wall(normal=normal, offset=0.0, **wall), Q @ v)
         torch.testing.assert_close(got, Q @ want, rtol=0, atol=1e-15)
 
 
@@ -221,10 +219,10 @@ def test_friction_never_gives_nan(dim):
     n = torch.eye(dim, dtype=torch.float64)[1]
     for friction, want in ((0.5, torch.zeros(dim, dim)), (0.0, torch.eye(dim) - torch.outer(n, n).float())):
         wall = Wall(normal=tuple(n.tolist()), offset=0.0, friction=friction)
-        jacobian = torch.autograd.functional.jacobian(lambda v: reference.respond(wall, v), -n)  # noqa: B023
+        jacobian = torch.autograd.functional.jacobian(lambda v: moving.respond(wall, v), -n)  # noqa: B023
         torch.testing.assert_close(jacobian, want.double(), rtol=0, atol=0)
         still = torch.autograd.functional.jacobian(
-            lambda v: reference.respond(wall, v),  # noqa: B023
+            lambda v: moving.respond(wall, v),  # noqa: B023
             torch.zeros_like(n),
         )
         torch.testing.assert_close(still, torch.eye(dim).double(), rtol=0, atol=0)  # v·n < 0 does not hold
@@ -238,7 +236,7 @@ def test_contact_derivative(dim):
         wall = Wall(normal=normal, offset=0.0, contact=contact, friction=friction)
         for up in (-1.0, 1.0):
             v = f64((0.7, up, 0.4)[:dim]).requires_grad_()
-            assert torch.autograd.gradcheck(lambda v: reference.respond(wall, v), v)  # noqa: B023
+            assert torch.autograd.gradcheck(lambda v: moving.respond(wall, v), v)  # noqa: B023
 
 
 def test_walls_act_on_their_nodes_in_order():
@@ -252,7 +250,7 @@ def test_walls_act_on_their_nodes_in_order():
 
     def go(*walls, gravity=None):
         scene = tiny(2, grid=grid, walls=walls, gravity=gravity)
-        return reference.grid_velocity(scene, mass, mass[..., None] * velocity).view(5, 4, 2)
+        return moving.grid_velocity(scene, mass, mass[..., None] * velocity).view(5, 4, 2)
 
     assert (go(floor)[0, :3] == torch.tensor([1.0, 0.0])).all()  # 2 · 0.125 = 0.25 is inside
     assert (go(floor)[0, 3] == velocity).all()
@@ -280,7 +278,7 @@ def test_gradient_of_a_rollout(dim, laws):
 
     def losses(values):
         s, p = State(*(values[k] for k in "xvCF")), Params(*(values[k] for k in Params._fields))
-        end = reference.simulate(scene, s, values["activation"], p, substeps=4)
+        end = moving.simulate(scene, s, values["activation"], p, substeps=4)
         return sum(
             (w * t.unflatten(0, (-1, 2))).flatten(1).sum(1) for w, t in zip(weights, end[:4], strict=True)
         )
@@ -304,10 +302,10 @@ def test_worlds_do_not_touch():
     scene = full(2)
     start, params = shaken(scene, worlds=2)
     activation, before = randn(2, 2, 2, seed=61), start.clone()
-    both = reference.simulate(scene, start, activation, params, substeps=3)
+    both = moving.simulate(scene, start, activation, params, substeps=3)
     for w in range(2):
         part = slice(w, w + 1)
-        alone = reference.simulate(
+        alone = moving.simulate(
             scene,
             State(*(t[part] for t in start[:4])),
             activation[:, part],
@@ -323,12 +321,12 @@ def test_each_row_drives_its_substeps():
     """Rows of activation are control steps in order; no activation is one control step of zeros."""
     scene, (start, params) = full(2), shaken(full(2))
     rows = randn(2, 1, 2, seed=62)
-    first = reference.simulate(scene, start, rows[:1], params, substeps=3)
-    second = reference.simulate(scene, first, rows[1:], params, substeps=3)
-    for a, b in zip(reference.simulate(scene, start, rows, params, substeps=3)[:4], second[:4], strict=True):
+    first = moving.simulate(scene, start, rows[:1], params, substeps=3)
+    second = moving.simulate(scene, first, rows[1:], params, substeps=3)
+    for a, b in zip(moving.simulate(scene, start, rows, params, substeps=3)[:4], second[:4], strict=True):
         assert torch.equal(a, b)
-    idle = reference.simulate(scene, start, torch.zeros_like(rows[:1]), params, substeps=3)
-    for a, b in zip(reference.simulate(scene, start, None, params, substeps=3)[:4], idle[:4], strict=True):
+    idle = moving.simulate(scene, start, torch.zeros_like(rows[:1]), params, substeps=3)
+    for a, b in zip(moving.simulate(scene, start, None, params, substeps=3)[:4], idle[:4], strict=True):
         assert torch.equal(a, b)
 
 
@@ -339,7 +337,7 @@ def test_a_particle_outside_the_grid_is_an_error(where):
     x = start.x.clone()
     x[1, 5, 1] = where
     with pytest.raises(ValueError, match="particle 5 of world 1 must stay half a cell inside the grid"):
-        reference.simulate(scene, start._replace(x=x), None, params, substeps=1)
+        moving.simulate(scene, start._replace(x=x), None, params, substeps=1)
 
 
 @DIMS
@@ -351,11 +349,11 @@ def test_pressure_expands_a_free_body_alike_in_all_directions(dim, strength):
     chamber = Pressure(particles=[0], strength=strength)
     scene = tiny(dim, bodies=[body], muscles=[chamber], damping=60.0)
     start, params = rest(scene)
-    end = reference.simulate(scene, start, f64([[[1.0]]]), params, substeps=600)
+    end = moving.simulate(scene, start, f64([[[1.0]]]), params, substeps=600)
     F = end.F[0, 0]
     stretch = F[0, 0]
     torch.testing.assert_close(F, stretch * torch.eye(dim).double(), rtol=0, atol=1e-10)
-    mu, lam = reference.lame(params.young, params.poisson)
+    mu, lam = moving.lame(params.young, params.poisson)
     J = stretch**dim
     assert abs(mu[0] * (stretch**2 - 1) + lam[0] * J.log() - strength * J) < 1e-6
     assert (stretch > 1.02) if strength > 0 else (stretch < 0.98)

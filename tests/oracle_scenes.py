@@ -1,4 +1,4 @@
-"""Scenes, random states and differences for the tests of the float64 reference."""
+"""Scenes, random states and differences for the tests of the float64 oracle."""
 
 import itertools
 

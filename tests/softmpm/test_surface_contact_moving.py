@@ -1,4 +1,4 @@
-"""Contact at surface points on the moving grid: every value and gradient against the float64 reference, state, and mechanics."""
+"""Contact at surface points on the moving grid: every value and gradient against the float64 oracle, state, and mechanics."""
 
 import dataclasses
 import itertools
@@ -11,11 +11,12 @@ from helpers import assert_relative, busy_inputs, cotangent, dot, given, little_
 from surface_scenes import G, block, slab, velocity
 
 import softmpm
-from softmpm import Inputs, reference_moving_contact
+from softmpm import Inputs
 from softmpm.errors import NEVER, Kind, decode
 from softmpm.inputs import QUANTITIES
 from softmpm.kernels.physics import lanes
 from softmpm.kernels.structs import types
+from softmpm.oracle import moving_contact
 from softmpm.planning import memory
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.carried import check_start
@@ -80,21 +81,21 @@ def start_of(leaves: dict[str, torch.Tensor]) -> softmpm.State:
 
 
 def run(model: softmpm.Model, leaves: dict[str, torch.Tensor], by_reference=False) -> list[torch.Tensor]:
-    """x, v, C, F, anchors and forces at the end, by the model or by the reference."""
+    """x, v, C, F, anchors and forces at the end, by the model or by the oracle."""
     start = start_of(leaves)
     params = softmpm.Params(*(leaves[name] for name in softmpm.Params._fields))
     inputs, activation = Inputs(**{name: leaves[name] for name in NAMES}), leaves["activation"]
     if not by_reference:
         end = softmpm.simulate(model, start, activation, params, substeps=SUBSTEPS, inputs=inputs)
         return list(end.differentiable())
-    end, *surface = reference_moving_contact.simulate(
+    end, *surface = moving_contact.simulate(
         model.scene,
         start,
         activation,
         params,
         substeps=SUBSTEPS,
         inputs=inputs,
-        points=reference_moving_contact.surface_points(model.scene),
+        points=moving_contact.surface_points(model.scene),
         anchor=leaves.get("anchor"),
         smoothing=model.contact_width * model.scene.grid.spacing,
     )

@@ -1,4 +1,4 @@
-"""Driven particles of the total Lagrangian reference in plain float64 PyTorch. Part of :mod:`softmpm.reference_lagrangian`.
+"""Driven particles of total Lagrangian MPM in plain float64 PyTorch. Part of :mod:`softmpm.oracle.lagrangian`.
 
 The nodes of a driven particle have the velocity of an affine field, fitted to the driven particles near them. Derivation:
 docs/math/lagrangian.md.
@@ -10,7 +10,7 @@ docs/math/lagrangian.md.
 import torch
 from torch import Tensor
 
-from softmpm.reference_walls import nodes as nodes_of
+from softmpm.oracle.walls import nodes as nodes_of
 from softmpm.scene.scene import Scene
 
 

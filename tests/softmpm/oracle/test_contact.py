@@ -7,11 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from reference_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, tiny
+from oracle_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, tiny
 
-from softmpm import reference, reference_contact, reference_lagrangian, reference_walls
 from softmpm.inputs import Inputs
-from softmpm.reference_contact import Surface
+from softmpm.oracle import contact as oracle_contact
+from softmpm.oracle import lagrangian, moving
+from softmpm.oracle import walls as oracle_walls
+from softmpm.oracle.contact import Surface
 from softmpm.scene.materials import NeoHookean
 from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 
@@ -19,15 +21,15 @@ from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 def surface_at(scene: Scene, positions, area, stiffness) -> Surface:
     """Points with the B-spline weights of the grid."""
     X = torch.as_tensor(positions)
-    nodes = reference.stencil(scene, X[None])
+    nodes = moving.stencil(scene, X[None])
     node, w = (torch.stack([part[k][0] for part in nodes], 1) for k in range(2))
     area, stiffness = (torch.as_tensor(value).double().expand(len(X)) for value in (area, stiffness))
     return Surface(X, node, w, area, stiffness)
 
 
 def nodal_mass(scene: Scene) -> torch.Tensor:
-    points = reference_lagrangian.quadrature(scene)
-    return reference_lagrangian.node_mass(scene, points, masses(scene, rest(scene)[1])[None])
+    points = lagrangian.quadrature(scene)
+    return lagrangian.node_mass(scene, points, masses(scene, rest(scene)[1])[None])
 
 
 def touching(dim: int) -> tuple[Scene, Surface]:
@@ -38,7 +40,7 @@ def touching(dim: int) -> tuple[Scene, Surface]:
         Wall(normal=(-0.8, 0.5, 0.3)[:dim], offset=0.14 * dim - 0.41, friction=0.6),
     ]
     scene = tiny(dim, walls=walls)
-    X = reference_lagrangian.quadrature(scene).X
+    X = lagrangian.quadrature(scene).X
     area = DX ** (dim - 1) * (0.2 + randn(len(X), seed=1).abs())
     return scene, surface_at(scene, X, area, 4e5 * (0.5 + randn(len(X), seed=2).abs()))
 
@@ -49,7 +51,7 @@ def pushed(scene: Scene, surface: Surface, worlds: int = 1) -> tuple[torch.Tenso
     present = (mass > 0)[..., None]
     u, v = (present * randn(*mass.shape, scene.grid.dim, seed=3 + k) for k in range(2))
     noise = 2e-2 * randn(worlds, *surface.X.shape, seed=5)
-    anchor = reference_contact.start_anchor(scene, surface._replace(X=surface.X + noise), 4e-3 * u)
+    anchor = oracle_contact.start_anchor(scene, surface._replace(X=surface.X + noise), 4e-3 * u)
     return 4e-3 * u, 2.0 * v, anchor, mass
 
 
@@ -58,10 +60,10 @@ def test_linear_fields_reach_the_points(dim):
     """Weights of B-splines reproduce u = A X + b, and the start of an anchor has no part along its normal: ≤ 1e-14."""
     scene, surface = touching(dim)
     A, b = randn(dim, dim, seed=1), randn(dim, seed=2)
-    u = (reference_walls.nodes(scene) @ A.T + b)[None]
-    got = reference_contact.gather(surface, u)[0]
+    u = (oracle_walls.nodes(scene) @ A.T + b)[None]
+    got = oracle_contact.gather(surface, u)[0]
     torch.testing.assert_close(got, surface.X @ A.T + b, rtol=0, atol=1e-14)
-    anchor = reference_contact.start_anchor(scene, surface, u)
+    anchor = oracle_contact.start_anchor(scene, surface, u)
     assert anchor.shape == (1, 2, len(surface.X), dim)
     for k, wall in enumerate(scene.walls[::2]):
         assert (anchor[:, k] @ f64(wall.normal)).abs().max() <= 1e-14
@@ -82,7 +84,7 @@ def test_one_pass_does_not_overshoot(dim, noise):
     surface = surface._replace(w=surface.w + noise * randn(*surface.w.shape, seed=1) * (surface.w > 0.02))
     assert (surface.w < 0).any() == (noise > 0)
     mass = nodal_mass(scene)
-    D = reference_contact.delassus(scene, surface, mass)[0]
+    D = oracle_contact.delassus(scene, surface, mass)[0]
     W, inverse, A = operator(scene, surface, mass)
     values = torch.linalg.eigvals((W @ inverse @ W.T @ A) / D[:, None])
     assert values.imag.abs().max() <= 1e-6 and values.real.min() >= -1e-6
@@ -96,7 +98,7 @@ def test_step_limit_of_the_bound_points(dim):
     scene, surface = touching(dim)
     mass = nodal_mass(scene)
     W, inverse, A = operator(scene, surface, mass)
-    D = reference_contact.delassus(scene, surface, mass)[0]
+    D = oracle_contact.delassus(scene, surface, mass)[0]
     root = inverse.sqrt()
     bound = root @ W.T @ (A / D[:, None]) @ W @ root
     count = len(bound)
@@ -119,7 +121,7 @@ def test_impulses_change_the_momentum(dim):
     """Σ m (v' − v*) = Σ A J, and a node without mass keeps the velocity zero."""
     scene, surface = touching(dim)
     u, v, anchor, mass = pushed(scene, surface, worlds=2)
-    after, _, J = reference_contact.contact(scene, surface, u, v, anchor, mass)
+    after, _, J = oracle_contact.contact(scene, surface, u, v, anchor, mass)
     gained, given = (mass[..., None] * (after - v)).sum(1), (surface.area[:, None] * J).sum((1, 2))
     assert given.abs().max() > 1e-3
     torch.testing.assert_close(gained, given, rtol=0, atol=1e-13)
@@ -136,10 +138,10 @@ def test_one_point_is_stopped_exactly():
         u = torch.zeros_like(v)
         for w in range(2):  # the walls alone
             one = dataclasses.replace(scene, walls=[scene.walls[2 * w]])
-            after, _, J = reference_contact.contact(
+            after, _, J = oracle_contact.contact(
                 one, surface, u, v, anchor[:, w : w + 1], mass, Inputs(), smoothing
             )
-            n, at = f64(one.walls[0].normal), surface.X + one.dt * reference_contact.gather(surface, after)
+            n, at = f64(one.walls[0].normal), surface.X + one.dt * oracle_contact.gather(surface, after)
             assert (J @ n > 0).all()
             assert (at[0, 0] @ n).item() == pytest.approx(one.walls[0].offset - depth, abs=1e-13)
 
@@ -149,7 +151,7 @@ def test_a_uniform_pressure_is_found_in_one_pass(dim):
     """Points on the wall with nodes that a uniform impulse per area brings to rest get that impulse: ≤ 1e-12."""
     scene = tiny(dim, walls=[Wall(normal=(0.0, 1.0, 0.0)[:dim], offset=0.4)])
     X, mass, n = (
-        reference_lagrangian.quadrature(scene).X.clone(),
+        lagrangian.quadrature(scene).X.clone(),
         nodal_mass(scene),
         f64(scene.walls[0].normal),
     )
@@ -160,8 +162,8 @@ def test_a_uniform_pressure_is_found_in_one_pass(dim):
         0, surface.node.flatten(), (0.02 * surface.area[:, None] * surface.w).flatten()
     )
     v = -(load / torch.where(mass > 0, mass, 1.0))[..., None] * n
-    anchor = reference_contact.start_anchor(scene, surface, 0 * v)
-    after, _, J = reference_contact.contact(scene, surface, 0 * v, v, anchor, mass)
+    anchor = oracle_contact.start_anchor(scene, surface, 0 * v)
+    after, _, J = oracle_contact.contact(scene, surface, 0 * v, v, anchor, mass)
     torch.testing.assert_close(J, (0.02 * n).expand_as(J), rtol=1e-12, atol=0)
     assert v.abs().max() > 0.1 and after.abs().max() <= 1e-12
 
@@ -176,11 +178,11 @@ def test_contact_takes_energy(dim, smoothing):
     ]
     scene = dataclasses.replace(scene, walls=walls)
     u, _, _, mass = pushed(scene, surface)
-    anchor = reference_contact.start_anchor(scene, surface, 0 * u)
+    anchor = oracle_contact.start_anchor(scene, surface, 0 * u)
     n = f64(walls[0].normal) + f64(walls[1].normal)
     for seed in range(4):
         v = (mass > 0)[..., None] * 30.0 * (randn(*u.shape, seed=seed) - n)
-        after, _, J = reference_contact.contact(scene, surface, 0 * u, v, anchor, mass, smoothing=smoothing)
+        after, _, J = oracle_contact.contact(scene, surface, 0 * u, v, anchor, mass, smoothing=smoothing)
         taken = (mass[..., None] * (v**2 - after**2)).sum() / 2
         assert (J != 0).any(-1).any(-1).all() and taken > 0
 
@@ -222,18 +224,18 @@ def adjoint(
 ) -> tuple[dict, set]:
     """docs/math/contact.md line by line, from the cotangents of v', a' and J, and the branches that were taken."""
     dt, k, A = scene.dt, surface.stiffness[:, None], surface.area[:, None]
-    D, present = reference_contact.delassus(scene, surface, mass)[..., None], mass > 0
+    D, present = oracle_contact.delassus(scene, surface, mass)[..., None], mass > 0
     one, branches = torch.where(present, mass, 1.0), set()
     about = (inputs, smoothing, TIME, DURATION)
-    after, _, J = reference_contact.contact(scene, surface, u, v, anchor, mass, *about)
-    x = surface.X + reference_contact.gather(surface, u)
-    walls = reference_contact.separating(scene)
-    before = [reference_contact.gather(surface, v)]
+    after, _, J = oracle_contact.contact(scene, surface, u, v, anchor, mass, *about)
+    x = surface.X + oracle_contact.gather(surface, u)
+    walls = oracle_contact.separating(scene)
+    before = [oracle_contact.gather(surface, v)]
     for number in range(len(walls)):
         before.append(before[-1] + D * J[:, number])
 
     bar_m = -(bar_v * (after - v)).sum(-1) / one * present  # (K5.adj)
-    bar_J_nodes = A * reference_contact.gather(surface, present[..., None] * bar_v / one[..., None])
+    bar_J_nodes = A * oracle_contact.gather(surface, present[..., None] * bar_v / one[..., None])
     bar_x, bar_vs, bar_D = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(D)
     given = ("friction", "wall_offset", "wall_normal", "wall_velocity")
     got = {name: torch.zeros_like(getattr(inputs, name)) for name in given}
@@ -251,7 +253,7 @@ def adjoint(
         v_n, v_t, x_t = dot(n, v_s), v_s - dot(n, v_s) * n, x - dot(n, x) * n
         d = -(dot(n, x) - offset + dt * (v_n - dot(n, slide)))
         slope = (d > 0).double() if smoothing == 0 else (d / (2 * smoothing)).clamp(0.0, 1.0)
-        P = reference_contact.hinge(d, smoothing) / (dt * D)
+        P = oracle_contact.hinge(d, smoothing) / (dt * D)
         e, c = x_t + dt * v_t - a, k * dt / (1 + D * k * dt**2)
         size = torch.linalg.vector_norm(-c * e, dim=-1, keepdim=True)
         free, slip = P <= 0, ((size > mu * P) | (mu == 0)) & (P > 0)
@@ -331,7 +333,7 @@ def test_adjoint_of_contact(dim, smoothing, friction, poses):
     values = {"u": u, "v": v, "anchor": anchor, "mass": mass, **given}
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     inputs = Inputs(**{name: leaves[name] for name in given})
-    end = reference_contact.contact(
+    end = oracle_contact.contact(
         scene,
         surface,
         *(leaves[k] for k in ("u", "v", "anchor", "mass")),
@@ -362,19 +364,19 @@ def test_friction_and_onset_are_continuous(dim):
     scene = dataclasses.replace(scene, walls=scene.walls[:1])
     surface = Surface(*(part[:1] for part in surface[:5]))
     u, v, _, mass = pushed(scene, surface)
-    anchor = reference_contact.start_anchor(scene, surface, u) + 1e-3
+    anchor = oracle_contact.start_anchor(scene, surface, u) + 1e-3
     anchor[..., 1] = 0.0
 
     def go(friction, offset):
         inputs = Inputs(friction=f64([[friction]]), wall_offset=f64([[[offset]]]))
-        return reference_contact.contact(scene, surface, u, v, anchor, mass, inputs)
+        return oracle_contact.contact(scene, surface, u, v, anchor, mass, inputs)
 
     J = go(1e6, 0.47)[2]
     edge = (J[0, 0, 0].norm() ** 2 - J[0, 0, 0, 1] ** 2).sqrt().item() / J[0, 0, 0, 1].item()
     below, above = go(edge * (1 - 1e-9), 0.47), go(edge * (1 + 1e-9), 0.47)
     for p, q in zip(below, above, strict=True):
         assert not torch.equal(p, q) and (p - q).abs().max() <= 1e-8
-    x = surface.X + reference_contact.gather(surface, u + scene.dt * v)
+    x = surface.X + oracle_contact.gather(surface, u + scene.dt * v)
     touch = x[0, 0, 1].item()
     apart, onset, smooth, rough = (
         go(0.3, touch - 1e-12),
@@ -394,7 +396,7 @@ def test_walls_of_other_kinds_act_on_nodes(contact):
     scene = tiny(2, walls=[Wall(normal=(0.0, 1.0), offset=0.45, contact=contact)])
     surface = Surface(*(part[:0] for part in touching(2)[1][:5]))
     v = (nodal_mass(scene) > 0)[..., None] * f64([0.0, -1.0])
-    go = functools.partial(reference_lagrangian.simulate, scene, 0 * v, v, None, rest(scene)[1], substeps=1)
+    go = functools.partial(lagrangian.simulate, scene, 0 * v, v, None, rest(scene)[1], substeps=1)
     end, nodes = go(surface=surface), go()
     assert end[2].shape == end[3].shape == (1, contact == "separate", 0, 2) and not torch.equal(nodes[1], v)
     torch.testing.assert_close(end[1], v if contact == "separate" else nodes[1], rtol=0, atol=1e-9)
@@ -406,7 +408,7 @@ def test_gradient_of_a_rollout(dim):
     scene = full(dim)
     params, surface = rest(scene)[1], touching(dim)[1]
     u, v, _, mass = pushed(scene, surface)
-    anchor = reference_contact.start_anchor(scene, surface, 0.2 * u)
+    anchor = oracle_contact.start_anchor(scene, surface, 0.2 * u)
     given = {
         "u": 0.2 * u,
         "v": 0.2 * v - (mass > 0)[..., None] * f64((2.0, 0.5, 0.0)[:dim]),
@@ -421,7 +423,7 @@ def test_gradient_of_a_rollout(dim):
     def loss(values):
         names = ("friction", "wall_offset", "wall_normal", "wall_velocity")
         inputs = Inputs(**{name: values[name] for name in names})
-        end = reference_lagrangian.simulate(
+        end = lagrangian.simulate(
             scene,
             values["u"],
             values["v"],
@@ -467,23 +469,21 @@ def advance(scene, surface, substeps, u=None, v=None, anchor=None):
     params = rest(scene)[1]
     zero = torch.zeros(1, math.prod(scene.grid.shape), scene.grid.dim).double()
     u, v = zero if u is None else u, zero if v is None else v
-    return reference_lagrangian.simulate(
-        scene, u, v, None, params, substeps=substeps, surface=surface, anchor=anchor
-    )
+    return lagrangian.simulate(scene, u, v, None, params, substeps=substeps, surface=surface, anchor=anchor)
 
 
 def test_a_block_rests_on_the_floor():
     """Impulses balance its weight to 1e-6, along the floor to 1e-9, and no point is further than 1e-4 dx from the surface."""
     scene, surface, mass = slope(0.0)
     u, v, anchor, _ = advance(scene, surface, 400)
-    params, points = rest(scene)[1], reference_lagrangian.quadrature(scene)
-    mu, lam = (value[None] for value in reference.lame(params.young, params.poisson))
-    impulse = scene.dt * reference_lagrangian.node_force(scene, points, u, v, None, mu, lam)
-    star = reference.grid_velocity(scene, mass, mass[..., None] * v + impulse, contacts=())
-    _, _, J = reference_contact.contact(scene, surface, u, star, anchor, mass)
+    params, points = rest(scene)[1], lagrangian.quadrature(scene)
+    mu, lam = (value[None] for value in moving.lame(params.young, params.poisson))
+    impulse = scene.dt * lagrangian.node_force(scene, points, u, v, None, mu, lam)
+    star = moving.grid_velocity(scene, mass, mass[..., None] * v + impulse, contacts=())
+    _, _, J = oracle_contact.contact(scene, surface, u, star, anchor, mass)
     load, weight = (surface.area[:, None] * J).sum((0, 1, 2)) / scene.dt, 9.8 * mass.sum().item()
     assert load[1].item() == pytest.approx(weight, rel=1e-6) and abs(load[0].item()) <= 1e-9 * weight
-    height = (surface.X + reference_contact.gather(surface, u))[..., 1] - scene.walls[0].offset
+    height = (surface.X + oracle_contact.gather(surface, u))[..., 1] - scene.walls[0].offset
     assert height.abs().max() <= 1e-4 * scene.grid.spacing
 
 

@@ -1,11 +1,11 @@
-"""Moving walls of the float64 reference: kinematics, bodies that they push and carry, and the adjoint of docs/math/grid.md."""
+"""Moving walls of the float64 oracle: kinematics, bodies that they push and carry, and the adjoint of docs/math/grid.md."""
 
 import pytest
 import torch
-from reference_scenes import DIMS, f64, full, randn, rest, shaken, tiny
+from oracle_scenes import DIMS, f64, full, randn, rest, shaken, tiny
 
-from softmpm import reference, reference_walls
 from softmpm.inputs import Inputs
+from softmpm.oracle import moving, walls
 from softmpm.scene.scene import Grid, Scene, Wall
 from softmpm.state import Params, State
 
@@ -30,7 +30,7 @@ def test_walls_at_rest_are_the_scenes(dim):
     activation = randn(2, 2, 2, seed=61)
 
     def go(**given):
-        return reference.simulate(scene, start, activation, params, substeps=2, inputs=Inputs(**given))
+        return moving.simulate(scene, start, activation, params, substeps=2, inputs=Inputs(**given))
 
     want, (offset, normal) = go(), poses(scene)
     still = torch.zeros(2, 2, 3, dim, dtype=torch.float64)
@@ -55,7 +55,7 @@ def test_a_wall_takes_a_resting_body_along(dim, contact, friction):
     start, params = rest(scene)
     for speed in (0.3, -0.3):
         moved = f64([3.0, 3.0 + speed * 5 * scene.dt])[:, None, None]
-        end = reference.simulate(scene, start, None, params, substeps=5, inputs=Inputs(wall_offset=moved))
+        end = moving.simulate(scene, start, None, params, substeps=5, inputs=Inputs(wall_offset=moved))
         want = 0.0 * n if contact == "separate" and speed < 0 else speed * n
         torch.testing.assert_close(end.v, want.expand_as(end.v), rtol=0, atol=1e-12)
         torch.testing.assert_close(
@@ -71,7 +71,7 @@ def test_a_conveyor_belt_carries_what_lies_on_it():
     inputs = Inputs(wall_velocity=f64([0.02, 0.0]).expand(1, 1, 1, 2))
 
     def speed(substeps):
-        end = reference.simulate(scene, start, None, params, substeps=substeps, inputs=inputs)
+        end = moving.simulate(scene, start, None, params, substeps=substeps, inputs=inputs)
         return end.v[0].mean(0)
 
     torch.testing.assert_close(speed(2), f64([2 * scene.dt * 0.5 * 10.0, 0.0]), rtol=0, atol=1e-12)
@@ -87,14 +87,14 @@ def test_kinematics_of_a_turning_wall(dim):
     length = torch.linalg.vector_norm(normal, dim=-1)
 
     def at(time):
-        return reference.surface(scene, 0, inputs, like, time, 0.5)
+        return moving.surface(scene, 0, inputs, like, time, 0.5)
 
     torch.testing.assert_close(at(0.0).normal, normal[0, 0] / length[0])
     torch.testing.assert_close(at(0.5).normal, normal[1, 0] / length[1])
     torch.testing.assert_close(at(0.5).offset, offset[1, 0] / length[1, 0])
     now, h = at(0.2), 1e-4
     a, o = now.normal[0], now.offset[0]
-    x = reference_walls.nodes(scene)
+    x = walls.nodes(scene)
     x = x - ((x @ a - o) / (a @ a))[:, None] * a  # projected onto the surface
 
     def distance(wall):
@@ -103,7 +103,7 @@ def test_kinematics_of_a_turning_wall(dim):
     want = -(distance(at(0.2 + h)) - distance(at(0.2 - h))) / (2 * h)
     got = (now.offset_rate[0] - x @ now.normal_rate[0]) / torch.linalg.vector_norm(a)
     torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-7)
-    u, at_nodes = reference.wall_velocity(scene, now)[0], reference_walls.nodes(scene)
+    u, at_nodes = moving.wall_velocity(scene, now)[0], walls.nodes(scene)
     speed = (now.offset_rate[0] - at_nodes @ now.normal_rate[0]) / torch.linalg.vector_norm(a)
     torch.testing.assert_close(u, speed[:, None] * now.unit[0], rtol=1e-13, atol=1e-13)
 
@@ -116,7 +116,7 @@ def test_nodes_inside_a_moving_wall():
     mass = torch.ones(1, 30, dtype=torch.float64)
     momentum = torch.ones(1, 30, 2, dtype=torch.float64)
     for time, row in ((0.0, 2), (0.125, 2), (0.5, 3), (0.75, 3), (1.0, 4)):
-        v = reference.grid_velocity(scene, mass, momentum, inputs, time, 1.0).view(5, 6, 2)
+        v = moving.grid_velocity(scene, mass, momentum, inputs, time, 1.0).view(5, 6, 2)
         torch.testing.assert_close(v[:, : row + 1], f64([0.0, 0.25]).expand(5, row + 1, 2))
         assert (v[:, row + 1 :] == 1.0).all()
 
@@ -137,7 +137,7 @@ def test_control_steps_and_worlds_of_moving_walls(dim):
             wall_normal=normal[rows.start : rows.stop + 1, worlds],
             wall_velocity=slide[rows, worlds],
         )
-        return reference.simulate(scene, state, None, p, substeps=3, inputs=inputs)
+        return moving.simulate(scene, state, None, p, substeps=3, inputs=inputs)
 
     every = slice(0, 2)
     both = go(start, params, every, every)
@@ -145,7 +145,7 @@ def test_control_steps_and_worlds_of_moving_walls(dim):
     for w in (slice(0, 1), slice(1, 2)):
         alone = go(State(*(t[w] for t in start[:4])), Params(*(p[w] for p in params)), every, w)
         assert_same(alone, State(*(t[w] for t in both[:4])), 1e-13)
-    assert (both.v - reference.simulate(scene, start, None, params, substeps=6).v).abs().max() > 1e-3
+    assert (both.v - moving.simulate(scene, start, None, params, substeps=6).v).abs().max() > 1e-3
 
 
 def test_the_offset_of_a_wall_at_rest_has_no_gradient():
@@ -154,7 +154,7 @@ def test_the_offset_of_a_wall_at_rest_has_no_gradient():
     start, params = shaken(scene)
     offset, normal = (pose.requires_grad_() for pose in poses(scene))
     inputs = Inputs(wall_offset=offset, wall_normal=normal)
-    end = reference.simulate(scene, start, None, params, substeps=3, inputs=inputs)
+    end = moving.simulate(scene, start, None, params, substeps=3, inputs=inputs)
     slopes = torch.autograd.grad(
         end.v.square().sum(), (offset, normal), allow_unused=True, materialize_grads=True
     )
@@ -167,20 +167,20 @@ def test_adjoint_of_a_moving_wall(dim, contact, friction):
     """(C4.adj), (C5.adj) of docs/math/grid.md equal autograd through the grid stage: ≤ 1e-11, and 1e-12 of the largest."""
     wall = Wall(normal=(0.3, 1.0, -0.2)[:dim], offset=0.5, contact=contact, friction=friction)
     scene = tiny(dim, walls=[wall])
-    count, time, T = len(reference_walls.nodes(scene)), 0.3, 0.8
+    count, time, T = len(walls.nodes(scene)), 0.3, 0.8
     N = (f64(wall.normal) * 1.7 + 0.1 * randn(2, 1, 1, dim, seed=1)).requires_grad_()
     O = (1.7 * wall.offset + 0.1 * randn(2, 1, 1, seed=2)).requires_grad_()
     w = randn(1, 1, dim, seed=3).requires_grad_()
     v = randn(1, count, dim, seed=4).requires_grad_()
     adj = randn(1, count, dim, seed=5)
     inputs = Inputs(wall_normal=N, wall_offset=O, wall_velocity=w)
-    out = reference.grid_velocity(scene, torch.ones(1, count).double(), v, inputs, time, T)
+    out = moving.grid_velocity(scene, torch.ones(1, count).double(), v, inputs, time, T)
     want = torch.autograd.grad(out, (v, w, N, O), adj)
 
     with torch.no_grad():
-        s = reference.surface(scene, 0, inputs, v, time, T)
-        here = reference.inside(scene, s)[0]
-        x, q = reference_walls.nodes(scene)[here], (v - reference.wall_velocity(scene, s))[0, here]
+        s = moving.surface(scene, 0, inputs, v, time, T)
+        here = moving.inside(scene, s)[0]
+        x, q = walls.nodes(scene)[here], (v - moving.wall_velocity(scene, s))[0, here]
         n, size, g = s.unit[0], torch.linalg.vector_norm(s.normal[0]), adj[0, here]
         P = torch.eye(dim).double() - torch.outer(n, n)
         q_n, q_t = (q @ n)[:, None], q @ P

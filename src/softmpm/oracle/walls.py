@@ -1,4 +1,4 @@
-"""Walls in plain float64 PyTorch: poses that move, the nodes inside, their response. Part of :mod:`softmpm.reference`.
+"""Walls in plain float64 PyTorch: poses that move, the nodes inside, their response. Part of :mod:`softmpm.oracle.moving`.
 
 Derivations and labels: docs/math/grid.md.
 """
@@ -105,7 +105,7 @@ def respond(wall: Wall, v: Tensor, friction: Tensor | None = None, normal: Tenso
     if wall.contact == "slip":
         return v_t
     if wall.contact != "separate":
-        raise ValueError(f"the reference has no contact {wall.contact!r}; add it to respond.")
+        raise ValueError(f"the oracle has no contact {wall.contact!r}; add it to respond.")
     c = torch.tensor(wall.friction, dtype=v.dtype) if friction is None else friction
     squared = (v_t**2).sum(-1, keepdim=True)
     sliding = squared > (c * v_n) ** 2

@@ -1,16 +1,16 @@
-"""The float64 reference of contact at surface points on the moving grid: weights, momentum, energy, places and the adjoint."""
+"""The float64 oracle of contact at surface points on the moving grid: weights, momentum, energy, places and the adjoint."""
 
 import dataclasses
 
 import pytest
 import torch
-from reference_scenes import DX, f64, masses, randn, rest, shaken
+from oracle_scenes import DX, f64, masses, randn, rest, shaken
 
-from softmpm import reference
 from softmpm.inputs import Inputs
-from softmpm.reference_contact import across_walls, meet_walls
-from softmpm.reference_moving_contact import Points, meet, places, surface_points, weights
-from softmpm.reference_walls import nodes
+from softmpm.oracle import moving
+from softmpm.oracle.contact import across_walls, meet_walls
+from softmpm.oracle.moving_contact import Points, meet, places, surface_points, weights
+from softmpm.oracle.walls import nodes
 from softmpm.scene.materials import NeoHookean
 from softmpm.scene.scene import Body, Grid, Scene, Wall
 from softmpm.scene.shapes import box
@@ -32,7 +32,7 @@ def floor(dim: int, friction=0.5, **changes) -> Scene:
 def on_grid(scene: Scene, state: State, mass: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Masses and velocities of the nodes after P2G without stress."""
     affine = mass[..., None, None] * state.C
-    of_nodes, momentum = reference.p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
+    of_nodes, momentum = moving.p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
     return of_nodes, momentum / torch.where(of_nodes > 0, of_nodes, 1.0)[..., None]
 
 
@@ -79,7 +79,7 @@ def response(dim: int, fraction: float) -> list[torch.Tensor]:
     state = State(leaves[0], v, C, leaves[1])
     of_nodes, star = on_grid(scene, state, leaves[2])
     grid, _, J = meet(scene, points, state, across_walls(scene, places(points, state)), of_nodes, star)
-    after = reference.from_grid(scene, state, grid, Inputs())
+    after = moving.from_grid(scene, state, grid, Inputs())
     end = places(points, after)[0, 0, 1].item()
     assert end == pytest.approx(wall.offset, abs=1e-14) and (J[0, 0, 0, 1] > 0)
     value = sum((randn(*one.shape, seed=k) * one).sum() for k, one in enumerate((after.v, after.C, J)))
@@ -156,9 +156,9 @@ def test_points_move_with_the_velocity_of_the_contact(dim):
     scene = floor(dim, driven=range(0, count, 3))
     (state, _), points = shaken(scene, worlds=2), surface_points(scene)
     v, given = randn(2, len(nodes(scene)), dim, seed=5), randn(2, len(scene.driven), dim, seed=6)
-    after = reference.from_grid(scene, state, v, Inputs(velocity=given))
+    after = moving.from_grid(scene, state, v, Inputs(velocity=given))
     want = places(points, state) + scene.dt * at_points(scene, points, state, v)
-    carried, _ = reference.g2p(scene, state.x, v)
+    carried, _ = moving.g2p(scene, state.x, v)
     driven = torch.isin(points.particle, torch.tensor(scene.driven))
     assert driven.any() and not driven.all()
     torch.testing.assert_close(places(points, after)[:, ~driven], want[:, ~driven], rtol=0, atol=1e-14)
@@ -175,14 +175,14 @@ def test_points_stay_at_their_body():
     spin = f64([[0.5, -4.0], [7.0, -0.5]])
     state = state._replace(v=shape @ spin.T - f64([1.0, 1.0]), C=spin.expand_as(state.F))
     mass = masses(scene, params)[None]
-    mu, lam = (one[None] for one in reference.lame(params.young, params.poisson))
+    mu, lam = (one[None] for one in moving.lame(params.young, params.poisson))
     x = places(points, state)
     anchor, worst, touched = across_walls(scene, x), 0.0, 0
     for _ in range(500):
-        of_nodes, v = reference.to_grid(scene, state, None, mu, lam, mass, Inputs(), 0.0, 1.0, ())
+        of_nodes, v = moving.to_grid(scene, state, None, mu, lam, mass, Inputs(), 0.0, 1.0, ())
         v, anchor, J = meet(scene, points, state, anchor, of_nodes, v)
         x = x + scene.dt * at_points(scene, points, state, v)
-        state = reference.from_grid(scene, state, v, Inputs())
+        state = moving.from_grid(scene, state, v, Inputs())
         worst, touched = max(worst, (state.F - torch.eye(2)).abs().max().item()), touched + J.any().item()
     assert worst > 0.2 and touched > 100
     torch.testing.assert_close(x, places(points, state), rtol=0, atol=1e-12)

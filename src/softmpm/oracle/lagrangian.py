@@ -2,7 +2,7 @@
 
 The weights are those of the particles at rest, the nodes carry displacement and velocity, and the particles are quadrature points.
 Source: de Vaucorbeil et al. 2020, "A Total-Lagrangian Material Point Method for solid mechanics problems involving large
-deformations". Stress and walls are those of :mod:`softmpm.reference`, and so is the order of the nodes: row by row over
+deformations". Stress and walls are those of :mod:`softmpm.oracle.moving`, and so is the order of the nodes: row by row over
 ``scene.grid.shape``. Everything is differentiated by PyTorch. Derivations: docs/math/lagrangian.md.
 
     F_p = I + Σ u_i ⊗ g_ip,   Ḟ_p = Σ v_i ⊗ g_ip,   L = Ḟ F⁻¹            (Q1)
@@ -23,7 +23,10 @@ import torch
 from torch import Tensor
 
 from softmpm.inputs import Inputs
-from softmpm.reference import (
+from softmpm.oracle.contact import Surface, contact, start_anchor
+from softmpm.oracle.driven import fit, held
+from softmpm.oracle.mirror import pull, reflected
+from softmpm.oracle.moving import (
     SCENE,
     control_steps,
     grid_velocity,
@@ -33,9 +36,6 @@ from softmpm.reference import (
     stencil,
     stress,
 )
-from softmpm.reference_contact import Surface, contact, start_anchor
-from softmpm.reference_driven import fit, held
-from softmpm.reference_mirror import pull, reflected
 from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
@@ -128,7 +128,7 @@ def step(
     ``drive`` are the nodes of driven particles and their velocities (Q10), shape (world, node, dim).
 
     Returns:
-        u and v, with a surface also the anchors and the impulses per area J of :func:`softmpm.reference_contact.contact`, and with
+        u and v, with a surface also the anchors and the impulses per area J of :func:`softmpm.oracle.contact.contact`, and with
         clamps or planes of symmetry at last the impulse of each.
     """
     impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
@@ -168,7 +168,7 @@ def simulate(
     anchor: Tensor | None = None,
     smoothing: float = 0.0,
 ) -> tuple[Tensor, ...]:
-    """Advance the nodes; arguments and number of control steps as for :func:`softmpm.reference.simulate`.
+    """Advance the nodes; arguments and number of control steps as for :func:`softmpm.oracle.moving.simulate`.
 
     Args:
         u: Displacement of every node of the grid [m], shape (world, node, dim).
@@ -184,7 +184,7 @@ def simulate(
     """
     if inputs.position is not None:
         raise NotImplementedError(
-            "the total Lagrangian reference takes velocities of driven particles, no positions."
+            "the total Lagrangian oracle takes velocities of driven particles, no positions."
         )
     points = quadrature(scene)
     young, poisson, density = (value.expand(len(u), len(points.X)) for value in params)

@@ -1,4 +1,4 @@
-"""The total Lagrangian reference against laws of physics, energies and the adjoint of docs/math/lagrangian.md."""
+"""The total Lagrangian oracle against laws of physics, energies and the adjoint of docs/math/lagrangian.md."""
 
 import dataclasses
 import math
@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from reference_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, shaken, tiny
+from oracle_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, shaken, tiny
 
-from softmpm import reference, reference_lagrangian, reference_walls
 from softmpm.inputs import Inputs
+from softmpm.oracle import lagrangian, moving, walls
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Body, Muscle, Particles, Pressure, Scene, Wall
 from softmpm.state import State
@@ -19,11 +19,11 @@ LAWS = (NeoHookean, StableNeoHookean, FixedCorotated, BarrierCorotated)
 
 def nodal(scene: Scene, params) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Mass of the nodes, (1, node), and the material (μ, λ) of the particles, (1, particle)."""
-    points = reference_lagrangian.quadrature(scene)
+    points = lagrangian.quadrature(scene)
     count = len(points.X)
-    mu, lam = (value.expand(1, count) for value in reference.lame(params.young, params.poisson))
+    mu, lam = (value.expand(1, count) for value in moving.lame(params.young, params.poisson))
     mass = masses(scene, params).expand(1, count)
-    return reference_lagrangian.node_mass(scene, points, mass), mu, lam
+    return lagrangian.node_mass(scene, points, mass), mu, lam
 
 
 def moved(scene: Scene, params, seed=1) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,10 +51,10 @@ def with_material(scene: Scene, law, **constants) -> Scene:
 def test_weights_and_their_gradient(dim):
     """Σ N = 1, Σ N r = 0, Σ g = 0, Σ X_i ⊗ g = I, and N is that of the moving formulation: ≤ 1e-13."""
     scene = tiny(dim)
-    points = reference_lagrangian.quadrature(scene)
-    for k, (node, N, _) in enumerate(reference.stencil(scene, points.X[None])):
+    points = lagrangian.quadrature(scene)
+    for k, (node, N, _) in enumerate(moving.stencil(scene, points.X[None])):
         assert torch.equal(node[0], points.node[:, k]) and torch.equal(N[0], points.N[:, k])
-    places = reference_walls.nodes(scene)[points.node]
+    places = walls.nodes(scene)[points.node]
 
     def close(got, want):
         torch.testing.assert_close(got, torch.as_tensor(want).double().expand_as(got), rtol=0, atol=1e-13)
@@ -74,10 +74,10 @@ def test_affine_fields_are_projected_and_evaluated_exactly(dim):
     a, b, B = randn(dim, seed=51), randn(dim, seed=52), 3.0 * randn(dim, dim, seed=53)
     x = a + X @ F.T
     state = State(x, b + x @ B.T, B.expand_as(start.F), F.expand_as(start.F))
-    u, v = reference_lagrangian.project(scene, state, params)
-    for got, want in zip(reference_lagrangian.evaluate(scene, u, v)[:4], state[:4], strict=True):
+    u, v = lagrangian.project(scene, state, params)
+    for got, want in zip(lagrangian.evaluate(scene, u, v)[:4], state[:4], strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-12)
-    present, places = (nodal(scene, params)[0] > 0)[..., None], reference_walls.nodes(scene)
+    present, places = (nodal(scene, params)[0] > 0)[..., None], walls.nodes(scene)
     there = a + places @ F.T
     torch.testing.assert_close(u, torch.where(present, there - places, 0.0), rtol=0, atol=1e-12)
     torch.testing.assert_close(v, torch.where(present, b + there @ B.T, 0.0), rtol=0, atol=1e-12)
@@ -88,7 +88,7 @@ def test_projection_keeps_momentum(dim):
     """Σ m_i v_i = Σ m_p v_p and Σ m_i u_i = Σ m_p (x_p − X_p), whatever the state."""
     scene = tiny(dim)
     state, params = shaken(scene)
-    u, v = reference_lagrangian.project(scene, state, params)
+    u, v = lagrangian.project(scene, state, params)
     of_nodes, mass = nodal(scene, params)[0][..., None], masses(scene, params)[..., None]
     torch.testing.assert_close((of_nodes * v).sum(1), (mass * state.v).sum(1), rtol=0, atol=1e-14)
     way = state.x - rest(scene)[0].x
@@ -100,17 +100,17 @@ def test_projection_keeps_momentum(dim):
 def test_a_rigid_motion_gives_no_force(dim, law):
     """u = (R − I) X + a with a spin about any point: F = R, and neither the law nor viscosity gives a force ≤ 1e-13 N."""
     scene = with_material(tiny(dim), law, viscosity=0.5)
-    params, points = rest(scene)[1], reference_lagrangian.quadrature(scene)
-    R, places = turned(dim), reference_walls.nodes(scene)
+    params, points = rest(scene)[1], lagrangian.quadrature(scene)
+    R, places = turned(dim), walls.nodes(scene)
     u = (places @ (R - torch.eye(dim)).T + randn(dim, seed=1))[None]
     W = randn(dim, dim, seed=2)
     v = (places + u) @ (W - W.T) + randn(dim, seed=3)
     _, mu, lam = nodal(scene, params)
-    force = reference_lagrangian.node_force(scene, points, u, v, None, mu, lam)
-    F = reference_lagrangian.evaluate(scene, u, v).F
+    force = lagrangian.node_force(scene, points, u, v, None, mu, lam)
+    F = lagrangian.evaluate(scene, u, v).F
     torch.testing.assert_close(F, R.expand_as(F), rtol=0, atol=1e-13)
     assert force.abs().max() <= 1e-13
-    stretched = reference_lagrangian.node_force(scene, points, 1.1 * u, v, None, mu, lam)
+    stretched = lagrangian.node_force(scene, points, 1.1 * u, v, None, mu, lam)
     assert stretched.abs().max() > 1e-3, "the test has no power"
 
 
@@ -121,9 +121,9 @@ def test_a_scene_at_rest_stays_at_rest(dim):
         scene = with_material(full(dim), law)
         scene = dataclasses.replace(scene, gravity=None)
         start, params = rest(scene)
-        u, v = reference_lagrangian.project(scene, start, params)
+        u, v = lagrangian.project(scene, start, params)
         assert (u == 0).all() and (v == 0).all()
-        u, v = reference_lagrangian.simulate(scene, u, v, None, params, substeps=5)
+        u, v = lagrangian.simulate(scene, u, v, None, params, substeps=5)
         assert v.abs().max() <= (0.0 if law is NeoHookean else 1e-13)
 
 
@@ -131,7 +131,7 @@ def energy(scene: Scene, F: torch.Tensor, mu: torch.Tensor, lam: torch.Tensor, a
     """Energy of the particles [J] in closed form: that of the law, and the work of the actuators."""
     law, volume = type(scene.bodies[0].material), masses(scene, rest(scene)[1]) / 1.2
     squared, J = (F**2).sum((-2, -1)), torch.linalg.det(F)
-    corotated = mu * ((F - reference.polar(F)) ** 2).sum((-2, -1))
+    corotated = mu * ((F - moving.polar(F)) ** 2).sum((-2, -1))
     if law is NeoHookean:
         density = mu / 2 * (squared - 2 * J.log()) + lam / 2 * J.log() ** 2
     elif law is StableNeoHookean:
@@ -159,15 +159,15 @@ def test_force_is_minus_the_gradient_of_the_energy(dim, law):
     """f = −∂E/∂u of every law, with muscles and a pressure, by autograd of an energy in closed form: ≤ 1e-12 of the largest."""
     chamber = Pressure(particles=np.arange(5), strength=4.0)
     scene = with_material(tiny(dim, muscles=[*full(dim).muscles, chamber]), law)
-    params, points = rest(scene)[1], reference_lagrangian.quadrature(scene)
+    params, points = rest(scene)[1], lagrangian.quadrature(scene)
     u, v = moved(scene, params)
-    u = (u + 0.2 * reference_walls.nodes(scene) @ randn(dim, dim, seed=5)).requires_grad_()
+    u = (u + 0.2 * walls.nodes(scene) @ randn(dim, dim, seed=5)).requires_grad_()
     _, mu, lam = nodal(scene, params)
     activation = f64([[0.5, -0.4, 0.7]])
-    F = torch.eye(dim, dtype=torch.float64) + reference_lagrangian.gather(points, u)[1]
+    F = torch.eye(dim, dtype=torch.float64) + lagrangian.gather(points, u)[1]
     assert torch.linalg.det(F).min() > 0.2
     (want,) = torch.autograd.grad(-energy(scene, F, mu, lam, activation), u)
-    got = reference_lagrangian.node_force(scene, points, u, v, activation, mu, lam)
+    got = lagrangian.node_force(scene, points, u, v, activation, mu, lam)
     assert (got - want).abs().max() <= 1e-12 * want.abs().max()
 
 
@@ -175,15 +175,14 @@ def test_force_is_minus_the_gradient_of_the_energy(dim, law):
 def test_viscosity_dissipates(dim):
     """Its power Σ f·v is −Σ V 2η |Ė|² with Ė = sym(FᵀḞ)."""
     scene = with_material(tiny(dim), NeoHookean, viscosity=0.5)
-    params, points = rest(scene)[1], reference_lagrangian.quadrature(scene)
+    params, points = rest(scene)[1], lagrangian.quadrature(scene)
     (u, v), (_, mu, lam) = moved(scene, params), nodal(scene, params)
     none = Inputs(viscosity=f64([0.0]))
     both, elastic = (
-        reference_lagrangian.node_force(scene, points, u, v, None, mu, lam, given)
-        for given in (Inputs(), none)
+        lagrangian.node_force(scene, points, u, v, None, mu, lam, given) for given in (Inputs(), none)
     )
-    F = torch.eye(dim) + reference_lagrangian.gather(points, u)[1]
-    rate = F.mT @ reference_lagrangian.gather(points, v)[1]
+    F = torch.eye(dim) + lagrangian.gather(points, u)[1]
+    rate = F.mT @ lagrangian.gather(points, v)[1]
     strain_rate = (rate + rate.mT) / 2
     want = -(masses(scene, params) / 1.2 * 2 * 0.5 * (strain_rate**2).sum((-2, -1))).sum()
     torch.testing.assert_close(((both - elastic) * v).sum(), want, rtol=1e-11, atol=0)
@@ -195,8 +194,8 @@ def test_free_motion_keeps_momentum_and_spin(dim):
     scene = with_material(tiny(dim, muscles=full(dim).muscles), FixedCorotated, viscosity=0.05)
     params = rest(scene)[1]
     (u, v), mass = moved(scene, params), nodal(scene, params)[0][..., None]
-    places = reference_walls.nodes(scene)
-    end = reference_lagrangian.simulate(scene, u, v, randn(2, 1, 2, seed=60), params, substeps=10)
+    places = walls.nodes(scene)
+    end = lagrangian.simulate(scene, u, v, randn(2, 1, 2, seed=60), params, substeps=10)
 
     def spin(u, v):
         A = ((mass * (places + u))[..., :, None] * v[..., None, :]).sum(1)
@@ -205,7 +204,7 @@ def test_free_motion_keeps_momentum_and_spin(dim):
     scale = (mass * v.abs()).sum()
     assert (mass * (end[1] - v)).sum(1).abs().max() <= 1e-13 * scale
     assert (spin(*end) - spin(u, v)).abs().max() <= 1e-13 * scale
-    of_particles = reference_lagrangian.evaluate(scene, *end)
+    of_particles = lagrangian.evaluate(scene, *end)
     momentum = (masses(scene, params)[..., None] * of_particles.v).sum(1)
     torch.testing.assert_close(momentum, (mass * v).sum(1), rtol=0, atol=1e-13 * scale.item())
     assert (mass * (end[1] - v).abs()).sum() > 0.1 * scale, "nothing happened"
@@ -217,10 +216,8 @@ def test_free_fall_with_damping(dim):
     gravity = (0.4, -9.8, 0.2)[:dim]
     scene = tiny(dim, gravity=gravity, damping=3.0)
     start, params = rest(scene)
-    u, v = reference_lagrangian.project(scene, start, params)
-    end = reference_lagrangian.evaluate(
-        scene, *reference_lagrangian.simulate(scene, u, v, None, params, substeps=20)
-    )
+    u, v = lagrangian.project(scene, start, params)
+    end = lagrangian.evaluate(scene, *lagrangian.simulate(scene, u, v, None, params, substeps=20))
     v, fallen, g = torch.zeros(dim).double(), torch.zeros(dim).double(), f64(gravity)
     for _ in range(20):
         v = math.exp(-3.0 * scene.dt) * (v + scene.dt * g)
@@ -237,7 +234,7 @@ def test_forces_give_their_impulse(dim):
     params = rest(scene)[1]
     (u, v), mass = moved(scene, params), nodal(scene, params)[0][..., None]
     force = 1e-3 * randn(2, *rest(scene)[0].x.shape, seed=1)
-    end = reference_lagrangian.simulate(scene, u, v, None, params, substeps=7, inputs=Inputs(force=force))
+    end = lagrangian.simulate(scene, u, v, None, params, substeps=7, inputs=Inputs(force=force))
     gained = (mass * (end[1] - v)).sum(1)
     torch.testing.assert_close(gained, 7 * scene.dt * force.sum((0, 2)), rtol=1e-11, atol=1e-16)
 
@@ -247,12 +244,12 @@ def test_walls_meet_the_nodes_where_they_are():
     floor = Wall(normal=(0.0, 1.0), offset=0.15, contact="stick")
     scene = tiny(2, walls=[floor])
     start, params = rest(scene)
-    u, v = reference_lagrangian.project(scene, start._replace(v=start.v - f64([0.0, 1.0])), params)
+    u, v = lagrangian.project(scene, start._replace(v=start.v - f64([0.0, 1.0])), params)
     assert u.abs().max() == 0 and v[..., 1].min() < -0.999
-    present, y = nodal(scene, params)[0] > 0, reference_walls.nodes(scene)[:, 1]
+    present, y = nodal(scene, params)[0] > 0, walls.nodes(scene)[:, 1]
     for below in (0.0, 0.5, 1.0):
         shifted = u - f64([0.0, y[present[0]].min() - 0.15 + (below - 0.5) * DX])
-        _, after = reference_lagrangian.simulate(scene, shifted, v, None, params, substeps=1)
+        _, after = lagrangian.simulate(scene, shifted, v, None, params, substeps=1)
         held = (y + shifted[..., 1] <= 0.15) & present
         assert (after[held] == 0).all() and (after[present & ~held][:, 1] < -0.9).all()
         assert held.any() == (below >= 0.5) and (present & ~held).any()
@@ -277,13 +274,13 @@ def test_worlds_and_control_steps(dim):
         "viscosity": 0.05 * randn(2, n, seed=75).abs(),
         "force": 0.01 * randn(2, 2, n, dim, seed=80),
     }
-    both = reference_lagrangian.simulate(scene, u, v, activation, params, substeps=3, inputs=Inputs(**given))
+    both = lagrangian.simulate(scene, u, v, activation, params, substeps=3, inputs=Inputs(**given))
     for w in range(2):
         part, at = slice(w, w + 1), (u[w : w + 1], v[w : w + 1])
         for c in range(2):
             own = {k: value[part] for k, value in given.items() if k != "force"}
             inputs = Inputs(**own, force=given["force"][c : c + 1, part])
-            at = reference_lagrangian.simulate(
+            at = lagrangian.simulate(
                 scene,
                 *at,
                 activation[c : c + 1, part],
@@ -300,15 +297,15 @@ def test_driven_particles_have_their_velocities(dim):
     """Exactly where these are affine in X, whatever forces act; the gradient of a loss on the others is a central difference."""
     scene = dataclasses.replace(full(dim), walls=[], driven=[4, 1, 0, 2, 3, 5, *range(6, 6 * (dim - 1))])
     start, params = rest(scene)
-    u, v = reference_lagrangian.project(scene, start, params)
+    u, v = lagrangian.project(scene, start, params)
     places = start.x[0, list(scene.driven)]
     V = f64([0.3, -0.2, 0.1][:dim]) + places @ randn(dim, dim, seed=3)
 
     def end(velocity):
         given = Inputs(velocity=velocity)
-        return reference_lagrangian.simulate(scene, u, v, None, params, substeps=6, inputs=given)
+        return lagrangian.simulate(scene, u, v, None, params, substeps=6, inputs=given)
 
-    shown = reference_lagrangian.evaluate(scene, *end(V))
+    shown = lagrangian.evaluate(scene, *end(V))
     torch.testing.assert_close(shown.v[0, list(scene.driven)], V, rtol=0, atol=1e-12)
     torch.testing.assert_close(shown.x[0, list(scene.driven)], places + 6 * scene.dt * V, rtol=0, atol=1e-13)
     weights = [randn(*u.shape, seed=k) for k in (4, 5)]
@@ -348,10 +345,10 @@ def test_gradient_of_a_rollout(dim):
     def loss(values):
         own = {name: values[name] for name in list(given)[6:]}
         material = type(params)(*(values[name] for name in params._fields))
-        end = reference_lagrangian.simulate(
+        end = lagrangian.simulate(
             scene, values["u"], values["v"], values["activation"], material, substeps=3, inputs=Inputs(**own)
         )
-        state = reference_lagrangian.evaluate(scene, *end)
+        state = lagrangian.evaluate(scene, *end)
         return sum((w * t).sum() for w, t in zip(weights, state[:4], strict=True))
 
     leaves = {name: value.clone().requires_grad_() for name, value in given.items()}
@@ -369,7 +366,7 @@ def test_gradient_of_a_rollout(dim):
 def test_adjoint_of_a_substep(dim):
     """(Q4.adj) to (Q1.adj) as docs/math/lagrangian.md has them, from arbitrary cotangents, against autograd: ≤ 1e-12."""
     scene = with_material(tiny(dim, gravity=(0.3, -9.8, 0.2)[:dim], damping=2.0), NeoHookean)
-    params, points = rest(scene)[1], reference_lagrangian.quadrature(scene)
+    params, points = rest(scene)[1], lagrangian.quadrature(scene)
     of_nodes, mu, lam = nodal(scene, params)
     u, v = moved(scene, params)
     eta, force = f64([[0.7]]).expand_as(mu), 0.1 * randn(*points.X[None].shape, seed=7)
@@ -379,21 +376,19 @@ def test_adjoint_of_a_substep(dim):
 
     def go(u, v, mu, lam, m, eta, force, g, gamma):
         inputs = Inputs(viscosity=eta, force=force, gravity=g, damping=gamma)
-        return reference_lagrangian.step(scene, points, u, v, None, mu, lam, m, inputs)
+        return lagrangian.step(scene, points, u, v, None, mu, lam, m, inputs)
 
     bar_u, bar_v = randn(*u.shape, seed=8), randn(*u.shape, seed=9)
     want = dict(zip(names, torch.autograd.grad(go(*leaves), leaves, (bar_u, bar_v)), strict=True))
 
-    dt, V, present = scene.dt, reference.rest_volume(scene, u.dtype)[:, None, None], m > 0
+    dt, V, present = scene.dt, moving.rest_volume(scene, u.dtype)[:, None, None], m > 0
     decay, one = math.exp(-2.0 * dt), torch.where(present, m, 1.0)
-    F = torch.eye(dim) + reference_lagrangian.gather(points, u)[1]
+    F = torch.eye(dim) + lagrangian.gather(points, u)[1]
     inverse = torch.linalg.inv(F)
-    L = reference_lagrangian.gather(points, v)[1] @ inverse
-    tau = reference.neo_hookean(F, mu, lam) + reference.viscous_stress(F, L, eta)
+    L = lagrangian.gather(points, v)[1] @ inverse
+    tau = moving.neo_hookean(F, mu, lam) + moving.viscous_stress(F, L, eta)
     P = tau @ inverse.mT
-    f = reference_lagrangian.node_force(
-        scene, points, u, v, None, mu, lam, Inputs(viscosity=eta, force=force)
-    )
+    f = lagrangian.node_force(scene, points, u, v, None, mu, lam, Inputs(viscosity=eta, force=force))
     v_star = torch.where(present, decay * (v + dt * (f / one + g[:, None])), 0.0)
 
     got = {}
@@ -402,7 +397,7 @@ def test_adjoint_of_a_substep(dim):
     got["m"] = -((bar_f * f).sum(-1) / one[..., 0])
     got["g"] = dt * decay * bar_star.sum(1)
     got["gamma"] = -dt * (bar_star * v_star).sum((1, 2))
-    at_particles, slope = reference_lagrangian.gather(points, bar_f)
+    at_particles, slope = lagrangian.gather(points, bar_f)
     got["force"] = at_particles  # (Q2.adj)
     bar_P = -V * slope
     bar_tau = bar_P @ inverse
@@ -419,7 +414,7 @@ def test_adjoint_of_a_substep(dim):
     bar_rate = bar_L @ inverse.mT
 
     def spread(M):
-        return reference_lagrangian.scatter(scene, points, torch.einsum("wpij,pkj->wpki", M, points.slope))
+        return lagrangian.scatter(scene, points, torch.einsum("wpij,pkj->wpki", M, points.slope))
 
     got["u"] = bar_u + spread(bar_F)
     got["v"] = decay * bar_star + spread(bar_rate)
@@ -433,9 +428,9 @@ def test_adjoint_of_the_projection(dim):
     """(Q6.adj) and (Q5.adj) as docs/math/lagrangian.md has them against autograd: ≤ 1e-12."""
     scene = tiny(dim)
     state, params = shaken(scene)
-    points, mass = reference_lagrangian.quadrature(scene), masses(scene, params)
+    points, mass = lagrangian.quadrature(scene), masses(scene, params)
     leaves = [t.clone().requires_grad_() for t in (*state[:4], params.density)]
-    u, v = reference_lagrangian.project(scene, State(*leaves[:4]), params._replace(density=leaves[4]))
+    u, v = lagrangian.project(scene, State(*leaves[:4]), params._replace(density=leaves[4]))
     bar_u, bar_v = randn(*u.shape, seed=8), randn(*u.shape, seed=9)
     want = torch.autograd.grad((u, v), leaves, (bar_u, bar_v))
     m = nodal(scene, params)[0][..., None]
@@ -454,13 +449,13 @@ def test_adjoint_of_the_projection(dim):
         sums[..., dim:],
         bar_A @ F.mT,
         turns[..., :dim, :] + C.mT @ bar_A,
-        bar_mass * reference.rest_volume(scene, x.dtype),
+        bar_mass * moving.rest_volume(scene, x.dtype),
     )
     for a, b in zip(got, want, strict=True):
         assert (a - b).abs().max() <= 1e-12 * b.abs().max()
 
     u, v = (t.clone().requires_grad_() for t in moved(scene, params))
-    end = reference_lagrangian.evaluate(scene, u, v)
+    end = lagrangian.evaluate(scene, u, v)
     bars = [randn(*t.shape, seed=10 + k) for k, t in enumerate(end[:4])]
     want = torch.autograd.grad(end[:4], (u, v), bars)
     inverse = torch.linalg.inv(end.F.detach())
@@ -468,7 +463,7 @@ def test_adjoint_of_the_projection(dim):
     bar_F = bars[3] - end.C.mT @ bars[2] @ inverse.mT
     for bar, M, expected in ((bars[0], bar_F, want[0]), (bars[1], bar_rate, want[1])):
         share = points.N[..., None] * bar[:, :, None] + torch.einsum("wpij,pkj->wpki", M, points.slope)
-        got = reference_lagrangian.scatter(scene, points, share)
+        got = lagrangian.scatter(scene, points, share)
         assert (got - expected).abs().max() <= 1e-12 * expected.abs().max()
 
 
@@ -478,12 +473,12 @@ def test_fastest_oscillation(dim):
 
     def fastest(scene):
         params = rest(scene)[1]
-        points, (of_nodes, mu, lam) = reference_lagrangian.quadrature(scene), nodal(scene, params)
+        points, (of_nodes, mu, lam) = lagrangian.quadrature(scene), nodal(scene, params)
         present = of_nodes[0] > 0
         zero = torch.zeros(1, *of_nodes.shape[1:], dim).double()
         stiffness = (
             -torch.autograd.functional.jacobian(
-                lambda u: reference_lagrangian.node_force(scene, points, u, zero, None, mu, lam)[0, present],
+                lambda u: lagrangian.node_force(scene, points, u, zero, None, mu, lam)[0, present],
                 zero,
             )[:, :, 0, present]
             .flatten(0, 1)
@@ -491,7 +486,7 @@ def test_fastest_oscillation(dim):
         )
         root = of_nodes[0, present].rsqrt().repeat_interleave(dim)
         tangent = torch.autograd.functional.jacobian(
-            lambda F: reference.neo_hookean(F, mu[0, 0], lam[0, 0]) @ torch.linalg.inv(F).mT,
+            lambda F: moving.neo_hookean(F, mu[0, 0], lam[0, 0]) @ torch.linalg.inv(F).mT,
             torch.eye(dim).double(),
         ).view(dim, dim, dim, dim)
         bound = torch.linalg.eigvalsh(tangent.reshape(dim * dim, dim * dim))[-1] * 4 / DX**2 / 1.2

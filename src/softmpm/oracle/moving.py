@@ -1,8 +1,8 @@
-"""The whole method again in plain PyTorch: slow, readable, the truth in tests; no code shared with kernels.
+"""The moving grid once more in plain PyTorch: slow, readable, the truth in tests; no code shared with kernels.
 
 Every function takes tensors with any leading axes and is differentiated by torch.autograd; meant for float64.
-The stress of a particle stands in ``reference_stress.py``, transfers in ``reference_transfer.py``, walls in ``reference_walls.py``, the
-total Lagrangian formulation in ``reference_lagrangian.py``. Derivations and labels: docs/math/.
+The stress of a particle stands in ``stress.py``, transfers in ``transfer.py``, walls in ``walls.py``, the total Lagrangian
+formulation in ``lagrangian.py``. Derivations and labels: docs/math/.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from softmpm.inputs import QUANTITIES, Inputs
-from softmpm.reference_stress import (
+from softmpm.oracle.stress import (
     LAWS,
     actuator_stress,
     actuator_tangent,
@@ -28,8 +28,8 @@ from softmpm.reference_stress import (
     viscous_stress,
     viscous_tangent,
 )
-from softmpm.reference_transfer import g2p, p2g, stencil
-from softmpm.reference_walls import inside, respond, surface, wall_velocity
+from softmpm.oracle.transfer import g2p, p2g, stencil
+from softmpm.oracle.walls import inside, respond, surface, wall_velocity
 from softmpm.scene.scene import CONTACTS, Actuator, Scene
 from softmpm.state import GridField, Params, State
 

@@ -1,4 +1,4 @@
-"""Contact with friction at surface points in plain float64 PyTorch. Part of :mod:`softmpm.reference_lagrangian`.
+"""Contact with friction at surface points in plain float64 PyTorch. Part of :mod:`softmpm.oracle.lagrangian`.
 
 The outline of a body at rest has points with an area and constant weights on the nodes. One pass over the separating walls finds an
 impulse per area at each point from the predicted penetration, with an anchored friction, and the nodes gather it. A wall that moves
@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from softmpm.inputs import Inputs
-from softmpm.reference import SCENE
-from softmpm.reference_walls import Surface as Wall
-from softmpm.reference_walls import surface as wall_at
+from softmpm.oracle.moving import SCENE
+from softmpm.oracle.walls import Surface as Wall
+from softmpm.oracle.walls import surface as wall_at
 from softmpm.scene.scene import Scene
 
 

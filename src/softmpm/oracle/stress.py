@@ -1,4 +1,4 @@
-"""Stress of a particle in plain float64 PyTorch, and its tangents: the part of :mod:`softmpm.reference` that knows no grid.
+"""Stress of a particle in plain float64 PyTorch, and its tangents: the part of :mod:`softmpm.oracle.moving` that knows no grid.
 
 Derivations and labels: docs/math/elasticity.md, docs/math/alarms.md.
 """
@@ -104,7 +104,7 @@ LAWS = {
 
 def law_of(material: Material) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
     if type(material) not in LAWS:
-        raise TypeError(f"the reference has no law {type(material).__name__}; add its stress to LAWS.")
+        raise TypeError(f"the oracle has no law {type(material).__name__}; add its stress to LAWS.")
     return LAWS[type(material)]
 
 
@@ -199,5 +199,5 @@ def actuator_tangent(actuator: Actuator, F: Tensor, direction: Tensor | None = N
 
 def _kind(actuator: Actuator) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
     if type(actuator) not in ACTUATORS:
-        raise TypeError(f"the reference has no actuator {type(actuator).__name__}; add it to ACTUATORS.")
+        raise TypeError(f"the oracle has no actuator {type(actuator).__name__}; add it to ACTUATORS.")
     return ACTUATORS[type(actuator)]

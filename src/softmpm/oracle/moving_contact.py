@@ -1,4 +1,4 @@
-"""Contact at surface points on the moving grid in plain float64 PyTorch, beside :mod:`softmpm.reference_contact`.
+"""Contact at surface points on the moving grid in plain float64 PyTorch, beside :mod:`softmpm.oracle.contact`.
 
 A point of the outline belongs to the particle of the same body that is nearest at rest. It is where x and F of that particle show it
 and moves with its affine velocity: (K1), (K2) and (K5) with the weights of each substep. Derivations: docs/math/contact.md.
@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from softmpm.inputs import Inputs
-from softmpm.reference import (
+from softmpm.oracle.contact import across_walls, meet_walls, per_mass
+from softmpm.oracle.moving import (
     SCENE,
     control_steps,
     from_grid,
@@ -25,7 +26,6 @@ from softmpm.reference import (
     stencil,
     to_grid,
 )
-from softmpm.reference_contact import across_walls, meet_walls, per_mass
 from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
@@ -88,7 +88,7 @@ def meet(
     time: float = 0.0,
     duration: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Response of the separating walls to one substep (K8) to (K10), arguments as for :func:`softmpm.reference_contact.contact`.
+    """Response of the separating walls to one substep (K8) to (K10), arguments as for :func:`softmpm.oracle.contact.contact`.
 
     Args:
         state: Of the particles at the beginning of the substep.
@@ -134,7 +134,7 @@ def simulate(
     anchor: Tensor | None = None,
     smoothing: float = 0.0,
 ) -> tuple[State, Tensor, Tensor]:
-    """Arguments and number of control steps as for :func:`softmpm.reference.simulate`.
+    """Arguments and number of control steps as for :func:`softmpm.oracle.moving.simulate`.
 
     Args:
         points: That the separating walls act on, in place of the nodes.

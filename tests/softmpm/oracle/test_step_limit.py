@@ -10,7 +10,7 @@ import torch
 from helpers import LAWS, busy_scene
 
 import softmpm
-from softmpm import reference_lagrangian, reference_step_limit, reference_stress
+from softmpm.oracle import lagrangian, step_limit, stress
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 MU = 3.0
@@ -33,9 +33,9 @@ def largest(law: str, F, lam: float, pull=0.0, pressure=0.0, damping=0.0) -> tor
     fibre = torch.nn.functional.normalize(torch.arange(1.0, dim + 1).double(), dim=0).expand(count, dim)
     mu, one = torch.full((count,), MU, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
     F = F.clone().requires_grad_()
-    tau = reference_stress.LAWS[LAWS[law]](F, mu, lam * one)
-    tau = tau + pull * reference_stress.muscle_stress(F, fibre, one)
-    tau = tau + reference_stress.pressure_stress(F, None, pressure * one)
+    tau = stress.LAWS[LAWS[law]](F, mu, lam * one)
+    tau = tau + pull * stress.muscle_stress(F, fibre, one)
+    tau = tau + stress.pressure_stress(F, None, pressure * one)
     piola = (tau @ torch.linalg.inv(F).mT).flatten(1)
     rows = [torch.autograd.grad(row.sum(), F, retain_graph=True)[0] for row in piola.T]
     with torch.no_grad():
@@ -66,9 +66,7 @@ def test_no_unstable_step_is_missed(dim, law, load):
         F = deformations(dim, 40)
         one = torch.ones(len(F)).double()
         acting = given | ({"pull": max(given["pull"], 0.0)} if "pull" in given else {})
-        K = reference_step_limit.stiffness(
-            LAWS[law](density=1.0, young=1.0), F, MU * one, lam * one, **acting
-        )
+        K = step_limit.stiffness(LAWS[law](density=1.0, young=1.0), F, MU * one, lam * one, **acting)
         true = largest(law, F, lam, **given)
         assert (true * (1 - 1e-9) <= K).all()
         if load in ("law", "viscosity"):
@@ -122,11 +120,9 @@ def test_the_alarm_is_that_of_the_reference(dim, law, device):
             damping = torch.tensor(4 * viscosity / dt, dtype=torch.float64)
             acting = (max(stresses[0], 0) + max(stresses[1], 0), stresses[2], damping)
             moduli = torch.tensor([mu, lam], dtype=torch.float64)
-            K = reference_step_limit.stiffness(made.bodies[0].material, one, *moduli, *acting)
+            K = step_limit.stiffness(made.bodies[0].material, one, *moduli, *acting)
             density.append(K.item() * dt**2 / 0.1**2)
-            limit = reference_step_limit.running_limit(
-                made, 0, mu, lam, density[-1], one, stresses, viscosity
-            )
+            limit = step_limit.running_limit(made, 0, mu, lam, density[-1], one, stresses, viscosity)
             assert limit == pytest.approx(dt, rel=1e-9)
         rows = torch.full((1, count, 3), activation, device=model.device, dtype=torch.float64)
         inputs = softmpm.Inputs(viscosity=rows.new_full((1, 1), viscosity))
@@ -165,7 +161,7 @@ def above(made, F, activation, dt: float) -> torch.Tensor:
         own, material = range(first, first + len(body.particles)), body.material
         first = own.stop
         ones = torch.ones(len(own), dtype=torch.float64)
-        mu, lam = reference_stress.lame(material.young * ones, material.poisson * ones)
+        mu, lam = stress.lame(material.young * ones, material.poisson * ones)
         pull = torch.tensor(
             [
                 sum(max(p, 0.0) for p, one in zip(stresses, made.muscles, strict=True) if k in one.particles)
@@ -173,7 +169,7 @@ def above(made, F, activation, dt: float) -> torch.Tensor:
             ]
         )
         damping = 4 * material.viscosity / dt * ones
-        K = reference_step_limit.stiffness(material, F[own.start : own.stop], mu, lam, pull, 0.0, damping)
+        K = step_limit.stiffness(material, F[own.start : own.stop], mu, lam, pull, 0.0, damping)
         found.append(material.density * made.grid.spacing**2 / dt**2 < K)
     return torch.cat(found)
 
@@ -190,12 +186,12 @@ def test_it_fires_at_the_substep_and_particle_of_the_reference(device):
     error = caught.value
     assert error.kind == "step" and 1 <= error.substep < 8, error
     own, given = (softmpm.Params(*(t.cpu() for t in params)), softmpm.State(*(t.cpu() for t in start[:4])))
-    u, v = reference_lagrangian.project(made, given, own)
+    u, v = lagrangian.project(made, given, own)
     for s in range(error.substep + 1):
         row = rows[s // 4].cpu()
-        named = above(made, reference_lagrangian.evaluate(made, u, v).F[0], row[0].tolist(), made.dt)
+        named = above(made, lagrangian.evaluate(made, u, v).F[0], row[0].tolist(), made.dt)
         assert bool(named.any()) == (s == error.substep)
-        u, v = reference_lagrangian.simulate(made, u, v, row[None], own, substeps=1)
+        u, v = lagrangian.simulate(made, u, v, row[None], own, substeps=1)
     assert error.particle == int(named.nonzero()[0])
     ratio = float(re.search(r"(\S+) times its running", str(error))[1])
     assert 1.0 <= ratio < 1.3

@@ -1,14 +1,14 @@
-"""Inputs of the float64 reference besides state, activation and material, against closed forms and central differences."""
+"""Inputs of the float64 oracle besides state, activation and material, against closed forms and central differences."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import torch
-from reference_scenes import DIMS, f64, full, masses, randn, rest, shaken, slopes, tiny
+from oracle_scenes import DIMS, f64, full, masses, randn, rest, shaken, slopes, tiny
 
-from softmpm import reference
 from softmpm.inputs import Inputs
+from softmpm.oracle import moving
 from softmpm.scene.scene import Pressure, Scene
 from softmpm.state import Params, State
 
@@ -47,7 +47,7 @@ def test_inputs_of_each_world_are_those_of_scenes(dim):
         strength=f64([[3.0, 9.0], [12.0, -4.0]]),
         viscosity=f64([[0.0], [0.4]]).expand(2, count),
     )
-    both = reference.simulate(scene, start, activation, params, substeps=3, inputs=inputs)
+    both = moving.simulate(scene, start, activation, params, substeps=3, inputs=inputs)
     for w in range(2):
         muscles = [
             dataclasses.replace(
@@ -67,7 +67,7 @@ def test_inputs_of_each_world_are_those_of_scenes(dim):
             walls=walls,
         )
         part = slice(w, w + 1)
-        alone = reference.simulate(
+        alone = moving.simulate(
             own,
             State(*(t[part] for t in start[:4])),
             activation[:, part],
@@ -90,8 +90,8 @@ def test_one_number_for_all_worlds(dim):
         strength=f64([muscle.strength for muscle in scene.muscles]),
     )
     activation = randn(1, 2, 2, seed=61)
-    got = reference.simulate(scene, start, activation, params, substeps=3, inputs=inputs)
-    assert_same(got, reference.simulate(scene, start, activation, params, substeps=3), 1e-13)
+    got = moving.simulate(scene, start, activation, params, substeps=3, inputs=inputs)
+    assert_same(got, moving.simulate(scene, start, activation, params, substeps=3), 1e-13)
 
 
 def test_only_the_way_of_a_direction_counts():
@@ -102,7 +102,7 @@ def test_only_the_way_of_a_direction_counts():
 
     def go(direction):
         given = Inputs(direction=direction)
-        return reference.simulate(scene, start, activation, params, substeps=2, inputs=given)
+        return moving.simulate(scene, start, activation, params, substeps=2, inputs=given)
 
     assert_same(go(3.0 * d), go(d), 1e-13)
     (slope,) = torch.autograd.grad(go(d).v[..., 0].sum(), d)
@@ -144,7 +144,7 @@ def test_gradient_of_every_input(dim):
         many = State(*(t.repeat(copies, *[1] * (t.dim() - 1)) for t in start[:4]))
         values = Inputs(**values)
         materials = Params(*(p.repeat(copies, 1) for p in params))
-        end = reference.simulate(
+        end = moving.simulate(
             scene, many, activation.repeat(1, copies, 1), materials, substeps=4, inputs=values
         )
         return sum(
@@ -172,7 +172,7 @@ def test_forces_give_their_impulse(dim):
     scene = tiny(dim)
     start, params = shaken(scene)
     mass, force = masses(scene, params)[..., None], 1e-3 * randn(2, *start.x.shape, seed=1)
-    end = reference.simulate(scene, start, None, params, substeps=7, inputs=Inputs(force=force))
+    end = moving.simulate(scene, start, None, params, substeps=7, inputs=Inputs(force=force))
     gained = (mass * (end.v - start.v)).sum(1)
     torch.testing.assert_close(gained, 7 * scene.dt * force.sum((0, 2)), rtol=1e-11, atol=1e-16)
 
@@ -183,16 +183,16 @@ def test_driven_particles_go_where_they_are_sent(dim):
     scene = tiny(dim, driven=[4, 1], gravity=(0.3, -9.8, 0.2)[:dim])
     start, params = rest(scene)
     V = randn(2, 1, 2, dim, seed=2)
-    end = reference.simulate(scene, start, None, params, substeps=5, inputs=Inputs(velocity=V))
+    end = moving.simulate(scene, start, None, params, substeps=5, inputs=Inputs(velocity=V))
     x = start.x[:, [4, 1]]
     for row in V:
         for _ in range(5):
             x = x + scene.dt * row
     assert torch.equal(end.x[:, [4, 1]], x) and torch.equal(end.v[:, [4, 1]], V[1])
-    held = reference.simulate(scene, start, None, params, substeps=10)
+    held = moving.simulate(scene, start, None, params, substeps=10)
     assert torch.equal(held.x[:, [4, 1]], start.x[:, [4, 1]]) and (held.v[:, [4, 1]] == 0).all()
     assert (held.F[:, [4, 1]] - start.F[:, [4, 1]]).abs().max() > 1e-4
-    free = reference.simulate(dataclasses.replace(scene, driven=()), start, None, params, substeps=10)
+    free = moving.simulate(dataclasses.replace(scene, driven=()), start, None, params, substeps=10)
     assert held.x[0, 0, 1] > free.x[0, 0, 1]  # a neighbour falls less
 
 
@@ -203,7 +203,7 @@ def test_a_body_that_is_driven_as_a_whole_moves_rigidly():
     start, params = rest(scene)
     V = f64([0.7, -0.2]).expand(1, 1, 12, 2)
     inputs = Inputs(velocity=V, force=f64([0.0, 1.0]))
-    end = reference.simulate(scene, start, None, params, substeps=8, inputs=inputs)
+    end = moving.simulate(scene, start, None, params, substeps=8, inputs=inputs)
     torch.testing.assert_close(end.x - start.x, 8 * scene.dt * V[0], rtol=0, atol=1e-15)
     torch.testing.assert_close(end.v, V[0])
 
@@ -222,7 +222,7 @@ def test_adjoints_of_force_and_velocity(dim):
 
     def go(which):
         inputs = Inputs(force=force, velocity=V if which is driven else None)
-        return reference.simulate(which, leaves, None, params, substeps=1, inputs=inputs)
+        return moving.simulate(which, leaves, None, params, substeps=1, inputs=inputs)
 
     end = go(scene)
     loss = sum((randn(*t.shape, seed=7 + k) * t).sum() for k, t in enumerate(end[:4]))
@@ -248,4 +248,4 @@ def test_rows_of_inputs_agree_with_the_control_steps():
         Inputs(wall_offset=torch.zeros(2, 1, 3).double()),
     ):
         with pytest.raises(ValueError, match="for 2 control steps, got"):
-            reference.simulate(scene, start, activation, params, substeps=1, inputs=given)
+            moving.simulate(scene, start, activation, params, substeps=1, inputs=given)
