@@ -11,6 +11,8 @@ from softmpm_learn import register
 
 if TYPE_CHECKING:
     from softmpm_learn.runs.run import Run
+    from softmpm_learn.settings import Settings
+    from softmpm_learn.tasks.task import Task
 
 
 def main() -> None:
@@ -20,11 +22,17 @@ def main() -> None:
     run()
 
 
-def load(folder: str | Path, device: str | None = None) -> "Run":
+def load(
+    folder: str | Path,
+    device: str | None = None,
+    *,
+    task: "Task | None" = None,
+    settings: "Settings | None" = None,
+) -> "Run":
     """Load the run of a folder at its best, see :func:`softmpm_learn.runs.loading.load`."""
     from softmpm_learn.runs.loading import load as load_run
 
-    return load_run(folder, device)
+    return load_run(folder, device, task=task, settings=settings)
 
 
 __all__ = ["load", "main", "register"]

@@ -277,7 +277,7 @@ class Run:
         if changed:
             both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
             raise SettingsError(
-                f"made with other settings: {both}; config.yaml and command line must be those of the run."
+                f"made with other settings: {both}; take those of the run, from its config.yaml or the program that began it."
             )
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])

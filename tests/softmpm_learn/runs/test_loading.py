@@ -1,5 +1,6 @@
 """A run that is loaded from its folder moves as it did, in an episode and in an environment; the blocks of docs/learning.md run."""
 
+import dataclasses
 import re
 import shutil
 from pathlib import Path
@@ -54,6 +55,25 @@ def test_a_loaded_run_is_at_its_best(finished, tmp_path):
     assert losses(run).item() == losses(result.run).item()
     first = run.settings.suited(run.task, encoded=True)
     assert first == run.settings and run.best["iteration"] == result.best_iteration
+
+
+def test_a_run_of_a_program_is_loaded_with_its_task_and_settings(finished, tmp_path):
+    """A folder without config.yaml; other settings, another task and one of the two alone are refused."""
+    out, result = finished
+    shutil.copy(out / "checkpoint.pt", tmp_path)
+    task, settings = result.run.task, result.run.settings
+    run = softmpm_learn.load(tmp_path, device="cpu", task=task, settings=settings)
+    assert losses(run).item() == losses(softmpm_learn.load(out, device="cpu")).item()
+    with pytest.raises(ValueError, match=r"must have a config.yaml, .* load\(folder, task=…, settings=…\)"):
+        softmpm_learn.load(tmp_path, device="cpu")
+    with pytest.raises(ValueError, match="both task= and settings="):
+        softmpm_learn.load(tmp_path, device="cpu", task=task)
+    slower = dataclasses.replace(settings, policy=PolicyConf(hidden=[9]))
+    with pytest.raises(ValueError, match=r"policy.hidden: \[8\] then, \[9\] now"):
+        softmpm_learn.load(tmp_path, device="cpu", task=task, settings=slower)
+    steps = dataclasses.replace(task, control_steps=task.control_steps + 1)
+    with pytest.raises(ValueError, match="task.control_steps: 4 then, 5 now"):
+        softmpm_learn.load(tmp_path, device="cpu", task=steps, settings=settings)
 
 
 def test_an_environment_has_the_trained_body(finished):
