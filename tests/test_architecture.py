@@ -18,7 +18,7 @@ LAYERS = """
     errors
     scene planning alarms kernels.structs
     checks
-    check_inputs
+    check_inputs check_nodes
     energy_density oracle.stress oracle.transfer oracle.walls
     oracle.moving oracle.step_limit kernels.physics
     oracle.contact oracle.driven oracle.overlap oracle.mirror

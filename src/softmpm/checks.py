@@ -1,4 +1,4 @@
-"""Rules of the tensors that meet a model; those of inputs are in ``check_inputs.py``.
+"""Rules of the tensors that meet a model; those of inputs are in ``check_inputs.py``, of nodes in ``check_nodes.py``.
 
 Each message names the rule, the value received and a remedy.
 """
@@ -110,42 +110,6 @@ def _total(tensor: Tensor) -> Tensor:
     if tensor.device.type != "cpu" or tensor.numel() <= ALONE:
         return tensor.sum()
     return torch.stack([part.sum() for part in tensor.reshape(-1).split(ALONE)]).sum()
-
-
-def check_shown(apart: Tensor) -> None:
-    """The four tensors of a state are what its nodes show. Reads back once: a GPU has to wait.
-
-    Args:
-        apart: Largest differences of x, v, C and F, shape (4,).
-    """
-    for name, distance in zip(State._fields, apart.tolist(), strict=False):
-        need(
-            distance == 0.0,
-            f"state.{name} was changed, but state.nodes was not, from which a call continues: they differ by {distance:g}; take "
-            "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
-        )
-
-
-def check_gradients_of_nodes(state: State) -> None:
-    """Raise ValueError if a gradient with respect to the particles of a state would be lost, since a call starts from its nodes."""
-    nodes = state.nodes
-    if nodes is None or not torch.is_grad_enabled() or nodes.u.requires_grad or nodes.v.requires_grad:
-        return
-    for name, tensor in zip("xvCF", state[:4], strict=True):
-        need(
-            not tensor.requires_grad,
-            f"state.{name} requires a gradient, but state.nodes, from which a call continues, does not; take "
-            "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
-        )
-
-
-def check_reflected(apart: Tensor) -> None:
-    """Nodes of a state are their own images in clamps and symmetries, from which they differ by this. Reads back once."""
-    need(
-        not bool(apart > 0),
-        f"state.nodes must be zero or reflected at clamps and planes of symmetry, got {float(apart):g} besides; take "
-        "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
-    )
 
 
 def check_activation(model: Sizes, activation: Tensor | None) -> None:

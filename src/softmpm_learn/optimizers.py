@@ -34,3 +34,9 @@ def make_optimizer(
     if not isinstance(made, torch.optim.Optimizer):
         raise ValueError(f"optimizer {conf.name} must be a torch.optim.Optimizer, got {type(made).__name__}.")
     return made
+
+
+def moments(optimizer: torch.optim.Optimizer, parameter: torch.nn.Parameter) -> list[torch.Tensor]:
+    """State of an optimiser that has one number for each number of a parameter, such as its moments."""
+    found = optimizer.state.get(parameter, {})
+    return [value for name, value in found.items() if isinstance(value, torch.Tensor) and name != "step"]

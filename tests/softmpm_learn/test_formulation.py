@@ -13,7 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 import softmpm
 from softmpm_learn.command import app, experiment
 from softmpm_learn.config import RunConf, conf_dir, to_run
-from softmpm_learn.runs.run import SettingsError
+from softmpm_learn.runs.identity import SettingsError
 from softmpm_learn.runs.saved import load
 from softmpm_learn.storage import checkpoint
 

@@ -23,6 +23,13 @@ MAY_CHANGE = (
 SOURCE = "source"
 """Path and digest of the robot's file. They may change, since the scene has the robot; if that is another, the file explains it."""
 
+OLDER = {"optimizer.settle": 0.0}
+"""Settings of checkpoints that do not name them, where these are not the defaults."""
+
+
+class SettingsError(ValueError):
+    """A run cannot go on with other settings than its own."""
+
 
 def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object]:
     """Settings, task and scene by name; arrays by a short digest."""
@@ -44,6 +51,27 @@ def identity_of_settings(settings: Settings) -> dict[str, object]:
         names = [n for n in values if not (group == "train" and n in MAY_CHANGE)]
         flat |= {f"{group}.{name}": values[name] for name in names}
     return flat
+
+
+def check_same(theirs: dict, ours: dict) -> None:
+    """Compare the identities of a checkpoint and of the run that would go on from it. A checkpoint older than a setting was made with
+    its default, or with what :data:`OLDER` has for it.
+
+    Raises:
+        SettingsError: Task or settings are others; names each difference.
+    """
+    theirs, ours = identity_of_settings(Settings()) | OLDER | theirs, dict(ours)
+    before, now = theirs.pop(SOURCE, None), ours.pop(SOURCE, None)
+    changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
+    if changed and before and now and before[1] != now[1]:
+        raise SettingsError(
+            f"made with another robot: the file {now[0]} has changed since; restore it, or begin a new run with it."
+        )
+    if changed:
+        both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
+        raise SettingsError(
+            f"made with other settings: {both}; take those of the run, from its config.yaml or the program that began it."
+        )
 
 
 def _described(name: str, value: object) -> Iterator[tuple[str, object]]:

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from softmpm_learn.learning.replay import ReplayError
-from softmpm_learn.runs.run import Run, SettingsError
+from softmpm_learn.runs.identity import SettingsError
+from softmpm_learn.runs.run import Run
 from softmpm_learn.storage import checkpoint, files
 
 logger = logging.getLogger("softmpm_learn")

@@ -15,7 +15,7 @@ from softmpm_learn.design import Design, declared_inputs
 from softmpm_learn.distributed import Group
 from softmpm_learn.learning.learner import Learner, make_learner
 from softmpm_learn.observe import Latent, Observer, make_observer
-from softmpm_learn.optimizers import make_optimizer
+from softmpm_learn.optimizers import make_optimizer, moments
 from softmpm_learn.policy import make_policy
 from softmpm_learn.recovery import settling
 from softmpm_learn.recovery.fallback import Fallback
@@ -23,20 +23,12 @@ from softmpm_learn.recovery.motions import Motions
 from softmpm_learn.recovery.restart import Restart
 from softmpm_learn.recovery.settling import Settling
 from softmpm_learn.runs.goals import Goals
-from softmpm_learn.runs.identity import SOURCE, identity, identity_of_settings
+from softmpm_learn.runs.identity import check_same, identity
 from softmpm_learn.seeding import seeded, stream_seed
 from softmpm_learn.settings import Settings
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
-
-
-OLDER = {"optimizer.settle": 0.0}
-"""Settings of checkpoints that do not name them, where these are not the defaults."""
-
-
-class SettingsError(ValueError):
-    """A run cannot go on with other settings than its own."""
 
 
 class Run:
@@ -259,26 +251,13 @@ class Run:
         }
 
     def load_state_dict(self, content: dict) -> None:
-        """Go on from a checkpoint of the same task and settings; one that is older than a setting was made with its default, or without
-        what :data:`OLDER` names.
+        """Go on from a checkpoint of the same task and settings.
 
         Raises:
             SettingsError: Task or settings are others; names each difference.
             ValueError, LookupError, TypeError, AttributeError, RuntimeError: It holds something else than a run.
         """
-        theirs = identity_of_settings(Settings()) | OLDER | json.loads(content["about"])
-        ours = json.loads(self.about)
-        before, now = theirs.pop(SOURCE, None), ours.pop(SOURCE, None)
-        changed = [name for name in sorted(ours.keys() | theirs.keys()) if theirs.get(name) != ours.get(name)]
-        if changed and before and now and before[1] != now[1]:
-            raise SettingsError(
-                f"made with another robot: the file {now[0]} has changed since; restore it, or begin a new run with it."
-            )
-        if changed:
-            both = "; ".join(f"{name}: {theirs.get(name)} then, {ours.get(name)} now" for name in changed)
-            raise SettingsError(
-                f"made with other settings: {both}; take those of the run, from its config.yaml or the program that began it."
-            )
+        check_same(json.loads(content["about"]), json.loads(self.about))
         self.policy.load_state_dict(content["policy"])
         self.design.load_state_dict(content["design"])
         self.optimizer.load_state_dict(content["optimizer"])
@@ -296,7 +275,7 @@ class Run:
 
     def _check_shapes(self) -> None:
         """Raise ValueError for what PyTorch does not compare when it loads: what belongs to a parameter has its shape."""
-        of = [(p.shape, moment.shape) for p in self.parameters for moment in _moments(self.optimizer, p)]
+        of = [(p.shape, moment.shape) for p in self.parameters for moment in moments(self.optimizer, p)]
         of += [(p.shape, safe.shape) for p, safe in zip(self.parameters, self.safe, strict=bool(self.safe))]
         for want, got in of:
             if want != got:
@@ -320,9 +299,3 @@ class Run:
     def about(self) -> str:
         """Identity of the run, which a resumed run must share, as JSON; its tensors are read once."""
         return json.dumps(identity(self.task, self.model, self.settings), sort_keys=True)
-
-
-def _moments(optimizer: torch.optim.Optimizer, parameter: nn.Parameter) -> list[Tensor]:
-    """State of an optimiser that has one number for each number of a parameter, such as its moments."""
-    found = optimizer.state.get(parameter, {})
-    return [value for name, value in found.items() if isinstance(value, Tensor) and name != "step"]

@@ -11,7 +11,8 @@ from softmpm_learn.command.pictures import curves
 from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.recovery.fallback import Fallback
 from softmpm_learn.recovery.settling import Settling, iterations, pace
-from softmpm_learn.runs.run import Run, SettingsError
+from softmpm_learn.runs.identity import SettingsError
+from softmpm_learn.runs.run import Run
 from softmpm_learn.storage import checkpoint
 from softmpm_learn.train import train
 from softmpm_learn.training import optimisation

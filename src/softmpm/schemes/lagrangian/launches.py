@@ -14,8 +14,8 @@ from softmpm.schemes.buffers import view
 from softmpm.schemes.lagrangian.bricks import brick_launch, lattice_struct, node_launch
 from softmpm.schemes.lagrangian.buffers import ChunkAdjoint, ChunkBuffers
 from softmpm.schemes.lagrangian.driven import drive, drive_adj
-from softmpm.schemes.lagrangian.nodal import launch_masses
 from softmpm.schemes.lagrangian.persistent import cluster_of, launch_march, launch_march_adj, segments
+from softmpm.schemes.lagrangian.projection import launch_masses
 from softmpm.schemes.launch import KernelLauncher
 
 
