@@ -33,7 +33,7 @@ def resume(run: Run, out: Path) -> dict:
         return {}
     with group.fail_together():
         seals = restore(run, content, out)
-    logger.info("Going on after iteration %d of %s.", run.iteration, out)
+    logger.info("Going on with the run in %s, of which %d iterations are done.", out, run.iteration)
     return seals
 
 

@@ -399,7 +399,7 @@ def test_the_log_follows_the_run(monkeypatch, tmp_path, finished):
     assert first.startswith("softmpm model: 2D") and "after 2 of 2 iterations" in first
     main(monkeypatch, f"resume={tmp_path}/run", "train.iterations=3")
     log = (tmp_path / "run" / "softmpm_learn.log").read_text()
-    assert log.startswith(first) and "Going on after iteration 2" in log and "after 3 of 3" in log
+    assert log.startswith(first) and "of which 2 iterations are done" in log and "after 3 of 3" in log
 
 
 def test_memory_is_for_a_whole_simulation():
