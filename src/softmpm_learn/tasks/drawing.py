@@ -1,7 +1,5 @@
 """A flat robot from masks: the pixels of each part of a picture, or the voxels of an array, become particles."""
 
-import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,8 +8,7 @@ import numpy as np
 import softmpm
 from softmpm_learn.tasks.own import Muscular, OwnConf, longer_axis, walker
 from softmpm_learn.tasks.task import Task
-
-logger = logging.getLogger("softmpm_learn")
+from softmpm_learn.tasks.thinness import warn_of_thin_limbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +39,7 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
     cut = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     height, width = whole[cut].shape
     pixel = conf.size / max(height, width)
-    thin = thinnest(whole[cut], pixel, 2 * conf.spacing)
-    if thin is not None:
-        logger.warning(
-            "A limb of %s is at most %.2g m thick, %.1f cells of %.3g m; four or more are good. Draw it thicker, or make task.size or "
-            "task.cells larger, such as task.cells=%d.",
-            *(conf.file, thin, thin / conf.spacing, conf.spacing, math.ceil(4 / thin)),
-        )
+    warn_of_thin_limbs(conf, whole[cut], pixel)
     shapes, owners = [], []
     for stiffness in sorted({part.stiffness for part in parts}):
         owner = np.full((height, width), -1)
@@ -76,30 +67,6 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
         if part.muscle and part.mask.any()
     ]
     return walker(conf, shapes, muscles)
-
-
-def thinnest(mask: np.ndarray, pixel: float, least: float) -> float | None:
-    """Largest width along the thinnest limb or neck below a least width, to an eighth of that [m]; None if there is none.
-
-    Discs of the least width fill a robot but for what is thinner and for its corners. Only what is more than one such width away from
-    the discs is a limb: corners of more than 40° are not.
-
-    Args:
-        pixel: Width of a pixel [m].
-    """
-    from scipy.ndimage import distance_transform_edt, label
-
-    parts = 1 if 8 * pixel <= least else 2 * math.ceil(4 * pixel / least)  # an even width is exact
-    fine, unit = np.pad(mask.repeat(parts, axis=0).repeat(parts, axis=1), 1), pixel / parts
-    depth = unit * np.asarray(distance_transform_edt(fine))
-    core = depth >= least / 2
-    if core.any():
-        fine &= unit * np.asarray(distance_transform_edt(~core)) > 1.5 * least
-    pieces = np.empty(fine.shape, dtype=np.int32)
-    label(fine, np.ones((3, 3)), output=pieces)
-    widest = np.zeros(pieces.max() + 1)
-    np.maximum.at(widest, pieces[fine], depth[fine])
-    return 2 * float(widest[1:].min()) if len(widest) > 1 else None
 
 
 def _fibres(mask: np.ndarray) -> tuple[float, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 import softmpm
 from softmpm_learn.tasks.own import Muscular, OwnConf, longer_axis, walker
 from softmpm_learn.tasks.task import Task
+from softmpm_learn.tasks.thinness import warn_of_thin_limbs
 
 TURNS = {
     "z": np.array([(1, 0, 0), (0, 0, 1), (0, -1, 0)]),
@@ -66,7 +67,18 @@ def mesh(conf: MeshConf) -> Task:
         shape = softmpm.mesh(surface, conf.spacing / 2, cut_cells=cut)
     except ValueError as error:
         raise ValueError(f"{conf.file}: {error}") from error
+    warn_of_thin_limbs(conf, _voxels(shape.positions, conf.spacing / 2), conf.spacing / 2)
     return walker(conf, [(shape, 1.0)], _muscles(conf, shape.positions))
+
+
+def _voxels(positions: np.ndarray, width: float) -> np.ndarray:
+    """Cells of the lattice that particles were taken from; most lie at the centres of theirs."""
+    places = positions / width
+    cells = np.rint(places - np.median(places % 1, axis=0)).astype(int)
+    cells -= cells.min(axis=0)
+    mask = np.zeros(cells.max(axis=0) + 1, dtype=bool)
+    mask[tuple(cells.T)] = True
+    return mask
 
 
 def _muscles(conf: MeshConf, rest: np.ndarray) -> list[Muscular]:

@@ -15,8 +15,8 @@ from softmpm_learn import plugins
 from softmpm_learn.command import app
 from softmpm_learn.command.experiment import finer
 from softmpm_learn.tasks import ImageConf, MeshConf, Resolution, VoxelsConf, make_task
-from softmpm_learn.tasks.drawing import thinnest
 from softmpm_learn.tasks.own import longer_axis
+from softmpm_learn.tasks.thinness import thinnest
 
 trimesh = pytest.importorskip("trimesh")
 WALKER = np.array([[3, 3, 3], [2, 1, 2], [4, 0, 4]])
@@ -166,6 +166,21 @@ def test_a_limb_thinner_than_two_cells_is_named(folder, caplog):
     for record, width, cells in zip(caplog.records, ("0.01", "0.02"), ("0.8", "1.6"), strict=True):
         assert f"at most {width} m thick, {cells} cells of" in record.getMessage()
     assert "such as task.cells=400." in caplog.records[0].getMessage()
+
+
+@pytest.mark.parametrize("surface", [False, True])
+def test_a_thin_limb_of_a_mesh_is_named(folder, caplog, surface):
+    """A body of six cells on plates of one cell, with particles at the centres of cells or of their parts inside; one of four is
+    thick enough."""
+    for thickness in (0.025, 0.1):
+        parts = [trimesh.creation.box((0.4, 0.2, 0.16))]
+        for x in (-0.1, 0.1):
+            place = trimesh.transformations.translation_matrix((x, 0.0, -0.1))
+            parts.append(trimesh.creation.box((thickness, 0.2, 0.2), place))
+        trimesh.util.concatenate(parts).export("table.stl")
+        make_task(MeshConf(file="table.stl", size=0.4, contact="surface" if surface else "nodes"))
+    (record,) = caplog.records
+    assert "table.stl is at most 0.025 m thick, 1.0 cells of 0.025 m;" in record.getMessage()
 
 
 @pytest.mark.parametrize("width", [2, 4, 8, 12])
