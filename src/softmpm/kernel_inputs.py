@@ -53,6 +53,8 @@ def derive(
 
 def expanded(model: Model, name: str, value: Tensor, horizon: Horizon) -> Tensor:
     """The input expanded to all of its axes, with the numbers of a vector side by side; a wall at rest retains its single pose."""
+    if QUANTITIES[name].axes[-1] == "dim" and value.shape[-1:] != (model.dim,):
+        value = value.expand(*value.shape[:-1], model.dim).contiguous()
     if QUANTITIES[name].axes[-1] == "dim" and value.stride(-1) != 1:
         value = value.contiguous()
     shape = model.shape_of(name, horizon.control_steps)

@@ -171,6 +171,23 @@ def test_one_number_serves_every_world_and_control_step():
         torch.testing.assert_close(a, b, rtol=1e-13, atol=0)
 
 
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+@pytest.mark.parametrize("name", ["gravity", "wall_velocity", "direction", "force", "velocity"])
+def test_one_number_serves_every_component(name, formulation):
+    """Along the axes of space a vector broadcasts too."""
+    model = build(full_scene(2), dtype=torch.float64, worlds=2, inputs=(name,), formulation=formulation)
+    shape, params, found = model.shape_of(name, 1), model.params(), []
+    activation = torch.full((1, 2, model.muscle_count), 0.3, dtype=torch.float64)
+    number = torch.tensor(0.02, dtype=torch.float64, requires_grad=True)
+    for value in (number, number.view(1), number.expand(*shape[:-1], 1), number.expand(shape).contiguous()):
+        inputs = Inputs(**{name: value})
+        end = softmpm.simulate(model, model.rest(), activation, params, substeps=2, inputs=inputs)
+        found.append([end.x.detach(), *torch.autograd.grad((end.x**2).sum() + end.v.sum(), number)])
+    for few in found[:-1]:
+        for got, want in zip(few, found[-1], strict=True):
+            torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-15)
+
+
 @pytest.mark.parametrize(
     "formulation, scheme", [("moving", "plain"), ("moving", "fast"), ("reference", "auto")]
 )
