@@ -1,5 +1,6 @@
 """to_video: a recording, or the states of a simulation, as a GIF or an MP4."""
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -19,6 +20,8 @@ from softmpm.state import State
 
 DPI = 100
 """Pixels per inch: a film is 700 pixels wide."""
+MOST_OF_A_GIF = 50
+"""Pictures per second: viewers slow down shorter ones than two hundredths of a second."""
 
 
 def to_video(
@@ -52,7 +55,7 @@ def to_video(
         world: The world of the states to show.
         colour, limits: As for :func:`softmpm.show`, with one scale for the whole film. None for ``colour`` is the activation if there
             is any, else the speed.
-        fps: Pictures per second.
+        fps: Pictures per second, at most 50 in a ``.gif``, which counts in hundredths of a second.
         rate: Simulated time per time of the film; 0.1 is slow motion.
 
     Returns:
@@ -69,6 +72,10 @@ def to_video(
     for name, value in (("fps", fps), ("rate", rate), ("period", 1.0 if period is None else period)):
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be > 0, got {value}.")
+    if path.suffix.lower() == ".gif" and fps > MOST_OF_A_GIF:
+        raise ValueError(
+            f"fps must be at most {MOST_OF_A_GIF} in a .gif, which viewers would play slowly, got {fps}; take an .mp4."
+        )
     if colour is not None and colour not in QUANTITIES:
         raise ValueError(f"colour must be one of {', '.join(QUANTITIES)}, got {colour!r}.")
     if isinstance(source, str | Path):
@@ -185,7 +192,9 @@ def _write_gif(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
         Image.fromarray(np.ascontiguousarray(picture)).quantize(256, most, dither=Image.Dither.NONE)
         for picture in pictures
     ]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0)
+    ends = [round(100 * k / fps) for k in range(len(frames) + 1)]  # a GIF counts in hundredths of a second
+    lasting = [10 * (end - begin) for begin, end in itertools.pairwise(ends)]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=lasting, loop=0)
 
 
 def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:

@@ -87,6 +87,10 @@ def test_a_film_plays_at_its_rate(model, states, tmp_path):
     assert resampled(0.1 * np.arange(10), fps=5, rate=1.0).tolist() == [0, 2, 4, 6, 8]
     film = softmpm.to_video(states, tmp_path / "a.gif", model=model, fps=5, period=0.1)
     assert len(pictures(film)) == 5
+    for fps in (15, 24, 30, 50):
+        with Image.open(softmpm.to_video(states, tmp_path / "a.gif", model=model, fps=fps)) as file:
+            lasting = [file.info["duration"] for k in range(10) if file.seek(k) is None]
+        assert sum(lasting) == pytest.approx(10_000 / fps, abs=5) and min(lasting) >= 20
 
 
 def test_the_end_of_an_episode_shows_the_last_activation(model, states, tmp_path):
@@ -148,6 +152,7 @@ def test_an_older_film_is_replaced_and_no_draft_is_left(model, states, tmp_path)
     [
         (dict(path="run.avi"), "a .gif or .mp4"),
         (dict(fps=0), "fps must be > 0"),
+        (dict(fps=60), "fps must be at most 50 in a .gif"),
         (dict(rate=-1.0), "rate must be > 0"),
         (dict(period=0.0), "period must be > 0"),
         (dict(world=1), "world must be between 0 and 0"),
