@@ -66,6 +66,12 @@ def _copy(
     for name in stored(STATIC, old.version):
         if not np.array_equal(static[name], old.static[name]):
             raise ValueError(f"{old.path} records another scene ({name} differs); record to another path.")
+    for name in ("dt", "spacing"):
+        if file.attrs[name] != getattr(old, name):
+            then, now = getattr(old, name), file.attrs[name]
+            raise ValueError(
+                f"{old.path} records another scene ({name} was {then:g} and is {now:g}); record to another path."
+            )
 
     new = tables(file)
 

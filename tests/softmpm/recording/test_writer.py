@@ -1,5 +1,6 @@
 """A recording holds what was given, survives every end of its writer, and goes on after it."""
 
+import dataclasses
 import fcntl
 import importlib.util
 import math
@@ -325,6 +326,9 @@ def test_nothing_is_overwritten_by_accident(tmp_path):
     before = path.read_bytes()
     with pytest.raises(ValueError, match="another scene .positions differs"):
         softmpm.Recorder(path, model, resume_before=1, max_particles=10)
+    slower = dataclasses.replace(model.scene, dt=model.scene.dt / 2)
+    with pytest.raises(ValueError, match=r"another scene .dt was .* and is "):
+        softmpm.Recorder(path, softmpm.build(slower, device="cpu"), resume_before=1)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
