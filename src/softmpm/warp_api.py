@@ -13,11 +13,13 @@ from typing import Any, cast
 
 import numpy as np
 import warp as wp
+from torch import Tensor
 
 from softmpm.errors import MAX_SUBSTEP
 from softmpm.inputs import groups
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
+from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
 from softmpm.schemes.inputs import Accumulators, InputsAdj
 from softmpm.schemes.lagrangian.nodal_step import NodalStep
@@ -39,7 +41,8 @@ def step(
     Args:
         state_in, state_out: From :func:`warp_state`; two different ones. With a tape both need ``requires_grad=True``,
             and neither may be written again before ``tape.backward()``.
-        solid: From :func:`warp_solid`.
+        solid: From :func:`warp_solid`. With a tape it may not be written again before ``tape.backward()`` either, on which it raises
+            RuntimeError: where an input changes from step to step, each value takes a solid of its own.
         substep: Number of this step, from 0 on, for the message of a failure.
         tape: Where the adjoint is recorded. It adds into ``.grad`` of ``state_in`` and ``solid``; ``tape.zero()`` clears.
 
@@ -64,7 +67,8 @@ def step(
         )
     _advance(model, state_in, state_out, solid, int(substep))
     if tape is not None:
-        tape.record_func(lambda: _adjoint(model, state_in, state_out, solid, substep), arrays)
+        then = None if is_capturing(model) else solid.fingerprint()
+        tape.record_func(lambda: _adjoint(model, state_in, state_out, solid, substep, then), arrays)
 
 
 @on_its_gpu
@@ -79,7 +83,11 @@ def _advance(model: Model, state_in: Any, state_out: Any, solid: WarpSolid, subs
 
 
 @on_its_gpu
-def _adjoint(model: Model, state_in: Any, state_out: Any, solid: WarpSolid, substep: int) -> None:
+def _adjoint(
+    model: Model, state_in: Any, state_out: Any, solid: WarpSolid, substep: int, then: Tensor | None
+) -> None:
+    if then is not None and not is_capturing(model):
+        solid.check_unchanged(then)
     work, wanted = solid.work, RequestedGrads(groups(model.spec))
     work.stream = stream_of(model.device)
     if isinstance(work, NodalStep):

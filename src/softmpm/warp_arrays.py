@@ -32,7 +32,8 @@ from softmpm.warp_particles import WarpState, torch_particles, warp_particles
 class WarpSolid:
     """Inputs of a step in Warp arrays, with the buffers that steps share: material, active stress, and what the scene has besides.
 
-    Arrays are written into (``wp.copy``), not replaced.
+    Arrays are written into (``wp.copy``), not replaced. The adjoint of a step reads them as they are then: between two steps on one
+    tape they keep their values, so a control signal that changes takes a further ``WarpSolid`` for each value.
     """
 
     model: Model
@@ -78,6 +79,20 @@ class WarpSolid:
         tensors = {name: wp.to_torch(array, requires_grad=False) for name, array in self.arrays().items()}
         return {name: tensor[None] if name in rows else tensor for name, tensor in tensors.items()}
 
+    def fingerprint(self) -> Tensor:
+        """A number for each array, another one if a number in it changes, shape (array,), int64."""
+        return torch.stack([_fingerprint(self.model, tensor) for tensor in self.values().values()])
+
+    def check_unchanged(self, then: Tensor) -> None:
+        """Raise RuntimeError for an array that was written since it had this fingerprint. Waits for the device."""
+        changed = (self.fingerprint() != then).tolist()
+        names = [name for name, other in zip(self.arrays(), changed, strict=True) if other]
+        if names:
+            raise RuntimeError(
+                f"{', '.join(names)} of a WarpSolid was written after a step on the tape, whose adjoint reads it; take a solid for "
+                "each value, from softmpm.warp_solid."
+            )
+
     def raise_failure(self, model: Model, state: WarpState | WarpNodal) -> None:
         """Raise :class:`softmpm.UnstableError` if a step so far failed. Waits for the device.
 
@@ -86,6 +101,14 @@ class WarpSolid:
         check_own(model, "raise_failure", solid=self, state=state)
         self.work.stream = stream_of(model.device)
         _raise_failure(model, state, self.work, self.values())
+
+
+def _fingerprint(model: Model, tensor: Tensor) -> Tensor:
+    """Sum of all numbers as integers, each times an odd number of its own."""
+    bits = tensor.reshape(-1).view(torch.int32 if tensor.element_size() == 4 else torch.int64)
+    count = bits.numel()
+    odd = model.workspace.get((_fingerprint, count), lambda: 2 * torch.arange(count, device=bits.device) + 1)
+    return (bits * odd).sum()
 
 
 def _bind(work: ParticleStep, given: Mapping[Input, wp.array]) -> None:

@@ -80,6 +80,31 @@ def test_gradients_add_up_with_other_users_of_the_arrays():
     torch.testing.assert_close(wp.to_torch(a.v.grad), 2 * once, rtol=1e-14, atol=0)
 
 
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+@pytest.mark.parametrize("name", ["active_stress", "lam", "gravity"])
+def test_a_solid_that_is_written_between_steps_is_named(formulation, name):
+    """The adjoint of the first step would read the values of the second; even those in another order are seen."""
+    model = softmpm.build(
+        busy_scene(2, per_law=4),
+        device="cpu",
+        dtype=torch.float64,
+        formulation=formulation,
+        inputs=("gravity",),
+    )
+    rows = torch.tensor([[[0.3, 0.1]], [[0.1, 0.3]]], dtype=torch.float64)
+    solids = [softmpm.warp_solid(model, None, row, requires_grad=True) for row in rows]
+    states = [softmpm.warp_state(model, requires_grad=True) for _ in range(3)]
+    tape = wp.Tape()
+    softmpm.step(model, *states[:2], solids[0], tape=tape)
+    softmpm.step(model, *states[1:], solids[1], tape=tape)
+    ones = wp.from_torch(torch.ones_like(wp.to_torch(states[2].v)), dtype=types(2, "float64").vec)
+    tape.backward(grads={states[2].v: ones})
+    array = wp.to_torch(solids[0].arrays()[name], requires_grad=False)
+    array.copy_(array.flatten().flip(0).view_as(array) if name == "active_stress" else 1.01 * array)
+    with pytest.raises(RuntimeError, match=f"^{name} of a WarpSolid was written after a step"):
+        tape.backward(grads={states[2].v: ones})
+
+
 def test_step_refuses_what_cannot_work():
     """One state twice; a tape without gradients."""
     model = softmpm.build(busy_scene(2, per_law=4), device="cpu")
