@@ -64,6 +64,7 @@ KNOWN = {
     "schemes.registry": ENTRIES,
     "autograd": {"schemes.lagrangian.nodal"},
     "kernel_inputs": {"schemes.lagrangian.driven"},
+    "quantities": {"schemes.lagrangian.nodal"},
     "warp_api": {"schemes.lagrangian.nodal_step"},
     "warp_arrays": {
         "schemes.lagrangian.nodal",

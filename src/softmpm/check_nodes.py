@@ -1,4 +1,4 @@
-"""Rules of a state with nodes that meets a model: the particles show its nodes, gradients reach them, clamps allow them.
+"""Rules of a state that meets the nodes of a model: the particles show them, gradients reach them, clamps allow them.
 
 Each message names the rule, the value received and a remedy.
 """
@@ -6,6 +6,7 @@ Each message names the rule, the value received and a remedy.
 import torch
 from torch import Tensor
 
+from softmpm.checks import Sizes
 from softmpm.state import State
 from softmpm.validate import need
 
@@ -44,3 +45,44 @@ def check_reflected(apart: Tensor) -> None:
         f"state.nodes must be zero or reflected at clamps and planes of symmetry, got {float(apart):g} besides; take "
         "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
     )
+
+
+ASTRAY = 0.5
+"""Largest distance along an axis between a particle and where its nodes show it [cells]."""
+
+
+def check_projected(model: Sizes, given: State, shown: State) -> None:
+    """The particles of a state without nodes are not inverted, and about where the nodes that were computed from them show them: these
+    have one smooth displacement, by which a particle cannot be parted from its neighbours. Reads back once.
+
+    Args:
+        shown: What the nodes show.
+    """
+    dx, det = model.scene.grid.spacing, _det(given.F)
+    way = (given.x - shown.x).abs().amax(-1) / dx
+    farthest, least = torch.stack([way.max(), det.min()]).tolist()
+    if farthest > ASTRAY:
+        world, p = _place(way, farthest)
+        raise ValueError(
+            f"in the reference formulation a state without nodes must be a smooth deformation of the rest shape, but particle {p} of "
+            f"world {world} is {farthest:.3g} cells from where the displacement of its surroundings has it, more than {ASTRAY:g}; take "
+            "positions nearer to the rest shape, or formulation='moving', whose bodies may tear."
+        )
+    collapse = model.alarms.collapse
+    if collapse is not None and not least > collapse:
+        world, p = _place(det, least)
+        raise ValueError(
+            f"det state.F must be above {collapse:g}, but that of particle {p} of world {world} is {least:.4g}; start from a "
+            "deformation gradient that is not inverted and less compressed, or set the limit with alarms=softmpm.Alarms(collapse=...)."
+        )
+
+
+def _det(F: Tensor) -> Tensor:
+    if F.shape[-1] == 2:
+        return F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
+    return (F[..., 0] * torch.linalg.cross(F[..., 1], F[..., 2], dim=-1)).sum(-1)
+
+
+def _place(values: Tensor, value: float) -> tuple[int, ...]:
+    """World and particle of a value."""
+    return tuple(torch.nonzero(values == value)[0].tolist())

@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softmpm.alarms import Alarms
 from softmpm.inputs import QUANTITIES
 from softmpm.planning.chunks import Horizon
+from softmpm.scene.scene import Scene
 from softmpm.state import Low, Nodal, Params, State, SurfaceState
 from softmpm.validate import need
 
@@ -36,6 +38,10 @@ class Sizes(Protocol):
     def spec(self) -> Any: ...
     @property
     def defaults(self) -> dict[str, Tensor]: ...
+    @property
+    def scene(self) -> Scene: ...
+    @property
+    def alarms(self) -> Alarms: ...
     @property
     def formulation(self) -> str: ...
     @property
@@ -67,6 +73,11 @@ def check_state(model: Sizes, state: State) -> None:
         return
     if not isinstance(state.low, Low):
         raise TypeError(f"state.low must be a softmpm.Low or None, got {type(state.low).__name__}.")
+    if model.dtype != torch.float32:
+        raise ValueError(
+            f"state.low must be None in {model.dtype}, which has room for these remainders in x and F; take state.to({model.dtype}), "
+            "which adds them."
+        )
     for name in ("x", "F"):
         check_tensor(model, f"state.low.{name}", getattr(state.low, name), shapes[name])
 
@@ -215,18 +226,31 @@ def check_bounds(params: NamedTuple, mass: Tensor, unit: Tensor) -> None:
 
 @torch.no_grad()
 def check_finite(state: State | None, activation: Tensor | None) -> None:
-    """All numbers that move are finite. Reads back once: a GPU has to wait."""
-    given = (
-        [] if state is None else [(f"state.{name}", getattr(state, name)) for name in ("x", "v", "C", "F")]
-    )
+    """All numbers that a call reads of a state, and the activation, are finite. Reads back once: a GPU has to wait."""
+    given = [] if state is None else list(_read(state))
     given += [] if activation is None else [("activation", activation)]
     if not given:
         return
     # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
-    totals = [_total(value) for _, value in given]
+    totals = [_total(value).double() for _, value in given]
     for (name, value), total in zip(given, torch.stack(totals).tolist(), strict=True):
         if not math.isfinite(total):
             demand(name, value, torch.isfinite(value), "finite")
+
+
+def _read(state: State) -> Iterator[tuple[str, Tensor]]:
+    """The tensors of a state that a call reads, by name: all but mean forces of the last control step."""
+    parts = {
+        "state": (state, ("x", "v", "C", "F")),
+        "state.low": (state.low, ("x", "F")),
+        "state.nodes": (state.nodes, ("u", "v", "anchor", "shift", "low")),
+        "state.surface": (state.surface, ("anchor",)),
+    }
+    for place, (part, names) in parts.items():
+        for name in names if part is not None else ():
+            value = getattr(part, name)
+            if value is not None:
+                yield f"{place}.{name}", value
 
 
 def demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:

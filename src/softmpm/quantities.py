@@ -14,6 +14,7 @@ from softmpm.energy_density import DENSITIES
 from softmpm.model import Model, check_model
 from softmpm.oracle.stress import lame
 from softmpm.rest_grid import nodes_around
+from softmpm.schemes.lagrangian.nodal import check_their_nodes
 from softmpm.state import Params, State
 from softmpm.validate import need
 
@@ -113,7 +114,7 @@ def kinetic_energy(model: Model, state: State, params: Params, *, per_body: bool
 
     Args:
         model: From :func:`softmpm.build`.
-        state: Differentiable, through ``state.nodes`` if there are any.
+        state: Differentiable, through ``state.nodes`` if there are any, which its particles then must show.
         params: Their densities weigh the particles. Differentiable.
         per_body: Whether to return that of each body.
 
@@ -121,6 +122,8 @@ def kinetic_energy(model: Model, state: State, params: Params, *, per_body: bool
         Shape (world,), or (world, body) with ``per_body``.
     """
     mass = _masses(model, state, params, "kinetic_energy")
+    if state.nodes is not None:
+        check_their_nodes(model, state)
     if state.nodes is None:
         quarter = model.scene.grid.spacing**2 / 4
         square = (state.v.double() ** 2).sum(-1) + quarter * (state.C.double() ** 2).sum((-2, -1))

@@ -174,8 +174,12 @@ class State(NamedTuple):
         return self._each(lambda part: part.clone())
 
     def to(self, *args: Any, **kwargs: Any) -> "State":
-        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``."""
-        return self._each(lambda part: part.to(*args, **kwargs))
+        """Every tensor on another device or in another precision; arguments as for ``torch.Tensor.to``. In float64 the low-order parts
+        are added to x and F, which have room for them."""
+        moved = self._each(lambda part: part.to(*args, **kwargs))
+        if moved.low is None or moved.x.dtype != torch.float64:
+            return moved
+        return moved._replace(x=moved.x + moved.low.x, F=moved.F + moved.low.F, low=None)
 
     def _each(self, change: Callable[[Any], Any]) -> "State":
         x, v, C, F = (change(tensor) for tensor in self[:4])

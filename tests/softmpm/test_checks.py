@@ -16,7 +16,7 @@ from softmpm.checks import (
     check_state,
     check_whole,
 )
-from softmpm.state import Low, Params, State
+from softmpm.state import Low, Nodal, Params, State, SurfaceState
 
 MODEL = SimpleNamespace(
     dim=2, worlds=2, particle_count=3, muscle_count=4, dtype=torch.float32, device=torch.device("cpu")
@@ -70,6 +70,13 @@ def test_low_order_parts():
             check_state(MODEL, state(low=bad))
     with pytest.raises(ValueError, match=r"state.low.F must be torch.float32"):
         check_state(MODEL, state(low=good._replace(F=good.F.double())))
+    exact = SimpleNamespace(**(vars(MODEL) | dict(dtype=torch.float64)))
+    twice = State(*(part.double() for part in state()[:4]), low=Low(*(part.double() for part in good)))
+    with pytest.raises(
+        ValueError, match=r"state.low must be None in torch.float64.*take state.to\(torch.float64\)"
+    ):
+        check_state(exact, twice)
+    check_state(exact, twice.to(torch.float64))
 
 
 def test_activation_shape():
@@ -149,6 +156,28 @@ def test_not_finite(name, bad):
         ValueError, match=re.escape(f"{name}[{index}] is {bad:g}" if index else f"{name} is {bad:g}")
     ):
         check()
+
+
+@pytest.mark.parametrize(
+    "name", ["low.x", "low.F", "nodes.u", "nodes.anchor", "nodes.shift", "surface.anchor"]
+)
+def test_other_parts_of_a_state_that_are_not_finite(name):
+    """Everything that a call reads, and no force, which it does not."""
+    d, few = torch.zeros(2, 3, 2), torch.zeros(2, 1, 3, 2)
+    start = state(
+        low=Low(d.clone(), torch.zeros(2, 3, 2, 2)),
+        nodes=Nodal(d.clone(), d.clone(), few.clone(), few + torch.nan, torch.zeros(2, 2).double()),
+        surface=SurfaceState(few.clone(), few + torch.nan),
+    )
+    check_finite(start, None)
+    part, field = name.split(".")
+    tensor = getattr(getattr(start, part), field)
+    tensor.view(-1)[-1] = torch.nan
+    index = ", ".join(str(n - 1) for n in tensor.shape)
+    with pytest.raises(
+        ValueError, match=re.escape(f"state.{name} must be finite, but state.{name}[{index}]")
+    ):
+        check_finite(start, None)
 
 
 @pytest.mark.parametrize(

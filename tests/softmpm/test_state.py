@@ -13,6 +13,18 @@ import softmpm
 TENSORS = ("x", "v", "C", "F")
 
 
+def test_float64_has_room_for_the_remainders(model, moved):
+    """``to`` adds them; a float64 model goes on where a float32 one was, with its energy to rounding."""
+    double = softmpm.build(model.scene, device="cpu", dtype=torch.float64)
+    exact, cut = moved.to(torch.float64), moved._replace(low=None).to(torch.float64)
+    assert exact.low is None and moved.low is not None and moved.to("cpu").low is not None
+    assert torch.equal(exact.x, moved.x.double() + moved.low.x.double()) and not torch.equal(exact.x, cut.x)
+    assert torch.equal(exact.F, moved.F.double() + moved.low.F.double())
+    want = softmpm.simulate(model, moved, None, model.params(), substeps=5)
+    got = softmpm.simulate(double, exact, None, double.params(), substeps=5)
+    torch.testing.assert_close(got.x, want.x.double() + want.low.x.double(), rtol=0, atol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def model():
     """Eight free particles."""
@@ -59,14 +71,15 @@ def test_low_order_parts_go_along(moved, change):
 
 
 def test_detach_clone_and_to(moved):
-    """As those of a tensor: without history, differentiable, and in another precision, the low-order parts included."""
+    """As those of a tensor: without history, differentiable, and in another precision. The low-order parts go along, in float64 in
+    x and F."""
     start = moved._replace(x=moved.x.requires_grad_())
     assert not start.detach().x.requires_grad and start.detach().x.data_ptr() == start.x.data_ptr()
     copied = start.clone()
     assert copied.x.requires_grad and copied.low is not None and moved.low is not None
     assert copied.low.F.data_ptr() != moved.low.F.data_ptr()
     leaves = _pytree.tree_leaves(moved.to(torch.float64))
-    assert all(leaf is None or leaf.dtype == torch.float64 for leaf in leaves) and len(leaves) == 8
+    assert all(leaf is None or leaf.dtype == torch.float64 for leaf in leaves) and len(leaves) == 7
     bare = moved._replace(low=None)
     assert bare.detach().low is bare.clone().low is bare.to(torch.float64).low is None
 

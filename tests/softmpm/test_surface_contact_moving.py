@@ -436,6 +436,24 @@ def test_the_depth_of_a_start_is_that_of_its_points(dtype, device):
         assert not found or decode(words.item())[1:] == (Kind.IN_WALL, int(height.argmin()))
 
 
+@pytest.mark.parametrize("scheme", ["plain", "fast"])
+def test_an_anchor_that_is_not_finite_is_refused(scheme, monkeypatch):
+    """By its place; where values cannot be read, the kernels stop at what it does. It never switches contact off."""
+    model = build(slab(), alarms=softmpm.Alarms(), scheme=scheme, worlds=2)
+    args = (None, model.params())
+    state = softmpm.simulate(model, model.rest(), *args, substeps=400)
+    pressed = int(softmpm.contact_forces(model, state).traction[1, 0, :, 1].argmax())
+    anchor = state.surface.anchor.clone()
+    anchor[1, 0, pressed] = torch.nan
+    bad = state._replace(surface=state.surface._replace(anchor=anchor))
+    with pytest.raises(ValueError, match=rf"state.surface.anchor\[1, 0, {pressed}, 0\] is nan"):
+        softmpm.simulate(model, bad, *args, substeps=1)
+    monkeypatch.setattr("softmpm.autograd.check_finite", lambda *_: None)
+    with pytest.raises(softmpm.UnstableError, match="of world 1") as caught:
+        softmpm.simulate(model, bad, *args, substeps=20)
+    assert caught.value.kind == "not_finite"
+
+
 def test_what_cannot_be_is_refused(settled):
     """Fixed-point sums, and a state of another model."""
     model, state = settled

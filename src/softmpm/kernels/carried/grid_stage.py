@@ -205,7 +205,7 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
                 add_load_adj(constants, window, outline, at_now, world, p, lane, particle, adj_load, adj)
             if node_before.shape[0] > 0:
                 add_load(window, outline, at_before, world, p, lane, load)
-                if wp.dot(J, J) > real(0.0):
+                if wp.dot(J, J) != real(0.0):
                     push(window, at_before, J, world, lane, outline.lanes, masses_before, pushed)
 
     return grid_and_loads_adj

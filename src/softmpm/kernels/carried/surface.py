@@ -228,7 +228,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         if alive:
             pushing = area * total
             if wp.static(not apart):
-                if wp.dot(total, total) > real(0.0):
+                if wp.dot(total, total) != real(0.0):  # not finite too
                     push(window, at, pushing, world, lane, outline.lanes, node, velocity)
         if lane == 0:
             impulse[world, p] = pushing
@@ -258,7 +258,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         """(K10) where ``press`` leaves it out: on the CPU, whose threads must not add to the same node."""
         world, p, lane = wp.tid()
         J = impulse[world, p]
-        if wp.dot(J, J) > real(0.0):
+        if wp.dot(J, J) != real(0.0):
             at = point_of(constants, window, outline, now, world, p, owner[world, p])
             push(window, at, J, world, lane, outline.lanes, node, velocity)
 

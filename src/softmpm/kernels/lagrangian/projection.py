@@ -199,7 +199,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         moved: wp.array2d(dtype=vec),  # x − X
         v: wp.array2d(dtype=vec),
         C: wp.array2d(dtype=mat),
-        F: wp.array2d(dtype=mat),
+        H: wp.array2d(dtype=mat),  # F − I
         # Out:
         partial_u: wp.array2d(dtype=vec),
         partial_v: wp.array2d(dtype=vec),
@@ -224,9 +224,9 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     p = inside.order[place]
                     fx = inside.fraction[place]
                     m = mass[world, place]
-                    A = (m * constants.spacing) * (F[world, p] - identity())
+                    A = (m * constants.spacing) * H[world, p]
                     b = m * moved[world, p]
-                    B = (m * constants.spacing) * (C[world, p] * F[world, p])
+                    B = (m * constants.spacing) * (C[world, p] * (H[world, p] + identity()))
                     d = m * v[world, p]
                 total_u = add(total_u, partial_u, world, brick, slot, corner, fx, A, b)
                 total_v = add(total_v, partial_v, world, brick, slot, corner, fx, B, d)
@@ -243,7 +243,7 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         moved: wp.array2d(dtype=vec),
         v: wp.array2d(dtype=vec),
         C: wp.array2d(dtype=mat),
-        F: wp.array2d(dtype=mat),
+        H: wp.array2d(dtype=mat),  # F − I
         each_u: wp.array2d(dtype=vec),  # ũ
         each_v: wp.array2d(dtype=vec),  # ṽ
         # Out:
@@ -276,11 +276,12 @@ def projection(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                     of_v = value_v(each_v, inside, world, brick, corner, fx)
                     U = gradient_u(each_u, inside, world, brick, corner, fx, constants.spacing)
                     V = gradient_v(each_v, inside, world, brick, corner, fx, constants.spacing)
+                    F = H[world, p] + identity()
                     x_here = m * of_u
                     v_here = m * of_v
-                    C_here = m * (V * wp.transpose(F[world, p]))
+                    C_here = m * (V * wp.transpose(F))
                     F_here = m * (U + wp.transpose(C[world, p]) * V)
-                    affine = wp.ddot(F[world, p] - identity(), U) + wp.ddot(C[world, p] * F[world, p], V)
+                    affine = wp.ddot(H[world, p], U) + wp.ddot(C[world, p] * F, V)
                     linear = wp.dot(moved[world, p], of_u) + wp.dot(v[world, p], of_v)
                     adj_mass[world, place] = adj_mass[world, place] + affine + linear
                     row_of_p = world * adj_x.shape[1] + p

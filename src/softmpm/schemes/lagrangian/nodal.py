@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from softmpm.check_nodes import check_gradients_of_nodes, check_reflected, check_shown
+from softmpm.check_nodes import check_gradients_of_nodes, check_projected, check_reflected, check_shown
 from softmpm.model import Model
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import of_surface_walls
@@ -37,7 +37,9 @@ def nodes_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     shift = torch.where(mean.abs() > step, step * (mean / step).round(), 0.0)
     moved = (moved - shift[:, None]).to(model.dtype)
     placed = mass.index_select(1, model.rest_grid.order)
-    found: Any = Project.apply(model, moved, state.v, state.C, state.F, placed)
+    strain = state.F - torch.eye(model.dim, dtype=model.dtype, device=model.device)
+    strain = strain if state.low is None else strain + state.low.F
+    found: Any = Project.apply(model, moved, state.v, state.C, strain, placed)
     of_nodes, u, v = found
     if model.mirror is not None:
         u, v = model.mirror.reflected(of_nodes, u, v)
@@ -49,18 +51,16 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     """Nodal state that a call starts from, with all parts: that of the state, or :func:`nodes_of` its particles if it has none.
 
     Raises:
-        ValueError: The particles do not show the nodes of the state, a gradient is asked for that of particles only, or clamps do not
-            allow the nodes; values are not checked during a capture.
+        ValueError: The particles do not show the nodes of the state, a gradient is asked for that of particles only, clamps do not
+            allow the nodes, or no nodes show anything like the particles; values are not checked during a capture.
     """
     nodes = state.nodes
     if nodes is None:
         nodes = nodes_of(model, state, mass, normals)
-    else:
-        check_gradients_of_nodes(state)
         if not is_capturing(model):
-            check_shown(apart(model, state, particles_of(model, nodes.detach())))
-            if model.mirror is not None:
-                check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
+            check_projected(model, state.detach(), particles_of(model, nodes.detach()))
+    else:
+        check_their_nodes(model, state)
     low = nodes.low
     if low is None:
         low = nodes.u.new_zeros(model.worlds, 2, *nodes.u.shape[1:])
@@ -69,6 +69,21 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     if model.spec.moving and model.mirror is None:
         nodes = _without_shift(model, nodes, normals)
     return with_reaction(model, nodes, nodes.reaction)
+
+
+def check_their_nodes(model: Model, state: State) -> None:
+    """The particles of a state show its nodes; values are not checked during a capture.
+
+    Raises:
+        ValueError: As :func:`start_of`.
+    """
+    nodes = state.nodes
+    assert nodes is not None
+    check_gradients_of_nodes(state)
+    if not is_capturing(model):
+        check_shown(apart(model, state, particles_of(model, nodes.detach())))
+        if model.mirror is not None:
+            check_reflected(model.mirror.apart(nodes.u.detach(), nodes.v.detach()))
 
 
 def _without_shift(model: Model, nodes: Nodal, normals: Tensor | None) -> Nodal:

@@ -134,11 +134,11 @@ def _show_adj(model: Model, C: Tensor, F: Tensor, *adj: Tensor) -> list[Tensor]:
 
 
 class Project(FirstOrder):
-    """Mass, displacement and velocity of the nodes (Q6), of displacement, v, C, F and mass of the particles."""
+    """Mass, displacement and velocity of the nodes (Q6), of displacement, v, C, F − I and mass of the particles."""
 
     @staticmethod
-    def forward(model, moved, v, C, F, mass):
-        return tuple(_project(model, moved, v, C, F, mass))
+    def forward(model, moved, v, C, H, mass):
+        return tuple(_project(model, moved, v, C, H, mass))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -157,11 +157,11 @@ class _ProjectAdj(FirstOrderAdjoint):
 
 
 @on_its_gpu
-def _project(model: Model, moved: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor) -> list[Tensor]:
+def _project(model: Model, moved: Tensor, v: Tensor, C: Tensor, H: Tensor, mass: Tensor) -> list[Tensor]:
     compile_first(model)
     one = _Arrays(model)
     partials, found, node_mass = one.partials(), one.nodal(), one.node_masses(mass)
-    given = one.views(mass, moved, v, C, F)
+    given = one.views(mass, moved, v, C, H)
     brick_launch(model, one.launch, one.kernels.project, model.constants, one.rest, *given, *partials)
     arguments = (one.rest, *one.views(node_mass), *partials, *one.views(*found))
     node_launch(model, one.launch, one.sums.means, *arguments)
@@ -174,7 +174,7 @@ def _project_adj(
     moved: Tensor,
     v: Tensor,
     C: Tensor,
-    F: Tensor,
+    H: Tensor,
     mass: Tensor,
     node_mass: Tensor,
     nodal_u: Tensor,
@@ -190,7 +190,7 @@ def _project_adj(
     node_launch(model, one.launch, one.sums.means_adj, *arguments)
     adj_node_mass += adj_of_nodes
     found, adj_mass = one.particles(), torch.zeros_like(mass)
-    arguments = one.views(mass, moved, v, C, F, *each, *found, adj_mass)
+    arguments = one.views(mass, moved, v, C, H, *each, *found, adj_mass)
     brick_launch(model, one.launch, one.kernels.project_adj, model.constants, one.rest, *arguments)
     kernels = masses(model.spec.dim, model.spec.dtype, model.rest_grid.bricks)
     brick_launch(model, one.launch, kernels.masses_adj, one.rest, *one.views(adj_node_mass, adj_mass))
