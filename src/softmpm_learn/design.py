@@ -2,6 +2,8 @@
 
 value = low + (high − low) · sigmoid(θ)        (D1)   θ is free, the value stays between its bounds
 
+Particles with one θ in common keep the ratios of their values where the bounds are multiples of these: a stiff part remains stiff.
+
 The variables follow from the simulator's table of quantities: a new one needs an entry in :class:`DesignConf` and nothing here.
 """
 
@@ -48,10 +50,9 @@ class Design(nn.Module):
         muscles = torch.arange(model.muscle_count, device=model.device)
         self._group = {name: particles if DESIGNABLE[name] == "particle" else muscles for name in self.start}
         for name, start in self.start.items():
-            weight = model.volume if DESIGNABLE[name] == "particle" else torch.ones_like(start)
-            first = _means(start.double(), weight.double(), self._group[name])
-            low, high = _bounds(conf, name, start, first)
-            self.free[name] = nn.Parameter(torch.logit((first - low) / (high - low)).to(model.dtype))
+            low, high = _bounds(conf, name, start.double())
+            share = _of_groups(name, (start - low) / (high - low), self._group[name])
+            self.free[name] = nn.Parameter(torch.logit(share).to(model.dtype))
             self.bounds[name] = (low.to(model.dtype), (high - low).to(model.dtype))
 
     def forward(self) -> tuple[Params, Inputs]:
@@ -62,7 +63,7 @@ class Design(nn.Module):
 
     def _value(self, name: str) -> Tensor:
         low, width = self.bounds[name]
-        return (low + width * torch.sigmoid(self.free[name]))[self._group[name]]
+        return low + width * torch.sigmoid(self.free[name])[self._group[name]]
 
     @torch.no_grad()
     def change(self) -> dict[str, Tensor]:
@@ -93,14 +94,8 @@ def _groups(per: str, count: int, regions: dict[str, np.ndarray]) -> Tensor:
     return torch.unique(group, return_inverse=True)[1]
 
 
-def _means(value: Tensor, weight: Tensor, group: Tensor) -> Tensor:
-    """Weighted mean of each group, shape (group,)."""
-    none = value.new_zeros(int(group.max()) + 1)
-    return none.index_add(0, group, value * weight) / none.index_add(0, group, weight)
-
-
-def _bounds(conf: DesignConf, name: str, start: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-    """Lowest and highest value of each group: ``{name}_range`` of the settings, or ``{name}_factor`` times its first value.
+def _bounds(conf: DesignConf, name: str, start: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest value of each particle or muscle: ``{name}_range`` of the settings, or ``{name}_factor`` times its own.
 
     Raises:
         ValueError: The scene's value is not between them.
@@ -111,12 +106,27 @@ def _bounds(conf: DesignConf, name: str, start: Tensor, first: Tensor) -> tuple[
                 f"design.{name} needs a scene whose {name} is 0 nowhere, because its bounds are multiples of it: "
                 f"set task.{name} or switch design.{name} off."
             )
-        ends = torch.stack([first * factor for factor in getattr(conf, f"{name}_factor")])
+        ends = torch.stack([start * factor for factor in getattr(conf, f"{name}_factor")])
         return ends.amin(dim=0), ends.amax(dim=0)  # a negative value changes their order
-    low, high = (torch.full_like(first, bound) for bound in getattr(conf, f"{name}_range"))
-    if not bool(((low < first) & (first < high)).all()):
+    low, high = (torch.full_like(start, bound) for bound in getattr(conf, f"{name}_range"))
+    if not bool(((low < start) & (start < high)).all()):
         raise ValueError(
             f"the scene's {name} must lie between the bounds of the design, {low.min():g} and {high.max():g}; "
-            f"it is {first.min():g} to {first.max():g}: widen design.{name}_range or switch design.{name} off."
+            f"it is {start.min():g} to {start.max():g}: widen design.{name}_range or switch design.{name} off."
         )
     return low, high
+
+
+def _of_groups(name: str, share: Tensor, group: Tensor) -> Tensor:
+    """Value of each group, which its particles have in common, shape (group,).
+
+    Raises:
+        ValueError: They do not.
+    """
+    found = share.new_zeros(int(group.max()) + 1).index_copy(0, group, share)
+    if not torch.allclose(found[group], share, rtol=1e-6, atol=0):
+        raise ValueError(
+            f"the scene's {name} must be the same all over what has one value in the design; take design.per=particle or switch "
+            f"design.{name} off."
+        )
+    return found

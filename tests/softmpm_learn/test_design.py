@@ -42,6 +42,34 @@ def test_starts_at_the_scene_with_as_many_values_as_asked(model, task, per, valu
         assert changed.tolist() == [k for k in range(32) if not 12 <= k < 16]
 
 
+@pytest.mark.parametrize("per", ["particle", "region", "uniform"])
+def test_stiff_parts_remain_stiff(make_block, task, per):
+    """Each particle starts at its own value and stays between its own bounds; those with one variable change by one factor. What has
+    bounds of its own must be the same where there is one variable."""
+    scene = make_block()
+    particles = scene.bodies[0].particles
+    halves = [
+        softmpm.Particles(particles.positions[part], 0.05**2) for part in (slice(None, 20), slice(20, None))
+    ]
+    laws = [softmpm.NeoHookean(density=1.0, young=young, poisson=0.3) for young in (20.0, 200.0)]
+    bodies = [softmpm.Body(half, law) for half, law in zip(halves, laws, strict=True)]
+    model = softmpm.build(make_block(bodies=bodies), device="cpu")
+    design, start = Design(DesignConf(per=per), model, task.regions), model.params()
+    for now, was in zip(design()[0], start, strict=True):
+        torch.testing.assert_close(now, was, rtol=1e-6, atol=0)
+    with torch.no_grad():
+        design.free["young"].fill_(50.0)
+    torch.testing.assert_close(design()[0].young, 2.0 * start.young)
+    laws[1] = softmpm.NeoHookean(density=1.0, young=20.0, poisson=0.25)
+    bodies = [softmpm.Body(half, law) for half, law in zip(halves, laws, strict=True)]
+    model = softmpm.build(make_block(bodies=bodies), device="cpu")
+    if per == "particle":
+        Design(DesignConf(per=per), model, task.regions)
+        return
+    with pytest.raises(ValueError, match="the scene's poisson must be the same .* design.per=particle"):
+        Design(DesignConf(per=per), model, task.regions)
+
+
 def test_stays_between_its_bounds(model, task):
     """However far the free variables go, the values stay in [low, high], and reach both ends."""
     conf = DesignConf(young_factor=[0.5, 3.0], poisson_range=[0.1, 0.45], density_factor=[0.9, 1.1])
