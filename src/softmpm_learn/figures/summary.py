@@ -19,9 +19,10 @@ RESTING = 0.05
 
 NOTE = (
     "Medians over the finished runs, in brackets with their bootstrap interval of 95 %; in parentheses the number of runs with an "
-    f"answer, where some have none. Passed: a walker goes forward (a loss below 0), then keeps at least {SHARE:g} of its speed and "
-    f"tilts by less than {LEVEL:g}°; what reaches for a goal stays within {1000 * NEAR:g} mm of it from 0.3 s before the end of the "
-    f"episode to 0.5 s after it, and below {RESTING:g} m/s where it should come to rest. Other objectives have no such rule."
+    "answer, where some have none. Passed: a walker goes forward (`end`, the loss of its best motion, is below 0), then keeps at "
+    f"least {SHARE:g} of its speed and tilts by less than {LEVEL:g}°; what reaches for a goal stays within {1000 * NEAR:g} mm of it "
+    f"from 0.3 s before the end of the episode to 0.5 s after it, and below {RESTING:g} m/s where it should come to rest. Other "
+    "objectives have no such rule."
 )
 DIFFERENCES = (
     "The first setting minus this one, paired by seed: the mean, of the examination the median, with its bootstrap interval of 95 %; "
@@ -39,7 +40,7 @@ def passes(row: Row) -> bool:
         return False
     if row["term"] == "reach":  # it need not come to rest where the objective does not say so
         return row["largest_miss"] <= NEAR and not row["largest_speed"] > RESTING
-    forward = row["term"] == "progress" and row["best"] < 0  # a quotient of two ways back is positive too
+    forward = row["term"] == "progress" and row["end"] < 0  # a quotient of two ways back is positive too
     return forward and row["later"] >= SHARE and row["largest_tilt"] < LEVEL
 
 

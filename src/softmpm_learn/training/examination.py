@@ -100,7 +100,7 @@ def _extremes(task: Task, long: Path) -> dict[str, float]:
     window, found = dict(begin=task.seconds - BEFORE, end=task.seconds + AFTER), {}
     for term in reversed(task.objective.terms):  # of several of a kind the first counts
         if isinstance(term, Tilt):
-            found["largest_tilt"] = term.degrees(long)
+            found["largest_tilt"] = dataclasses.replace(term, begin=0.0, end=math.inf).degrees(long)
         elif isinstance(term, Reach):
             found["largest_miss"] = dataclasses.replace(term, **window).farthest(long)
         elif isinstance(term, Still):
