@@ -141,6 +141,8 @@ def fail(jobs: Sequence[Job], failure: JobError, group: Group, failed: dict[int,
 def _tabulate(mine: Job, found: sweep.Outcome, group: Group) -> None:
     if group.first:
         sweep.record(mine.out, found)
+        if (mine.out / sweep.TABLE).exists():  # that of its seeds
+            sweep.tabulate(mine.out)
         sweep.tabulate(mine.table.parent)
 
 

@@ -88,11 +88,19 @@ def record(folder: Path, found: Outcome) -> None:
 
 
 def tabulate(sweep: Path) -> None:
-    """Write the table of all jobs of the sweep that have an outcome; of a job with several seeds, a row for each of them."""
-    folders = [path.parent for path in sweep.rglob(OUTCOME)]
-    with_seeds = {folder.parent for folder in folders if folder.name.startswith(SEED)}
-    known = [outcome(folder) for folder in folders if folder not in with_seeds]
-    rows = sorted((one for one in known if one), key=lambda one: (one.job, one.seed or 0))
+    """Write the table of all jobs of the sweep that have an outcome; of a job with several seeds, a row for each of them, unless it
+    failed before any of them did: then they have the outcomes of an earlier command, and the job's own takes their place."""
+    known = {path.parent: found for path in sweep.rglob(OUTCOME) if (found := outcome(path.parent))}
+    seeds: dict[Path, list[Path]] = {}
+    for folder in known:
+        if folder.name.startswith(SEED):
+            seeds.setdefault(folder.parent, []).append(folder)
+    hidden = set[Path]()
+    for job, its in seeds.items():
+        whole = job in known and known[job].status == "failed"
+        hidden |= set(its) if whole and all(known[one].status == "finished" for one in its) else {job}
+    shown = [one for folder, one in known.items() if folder not in hidden]
+    rows = sorted(shown, key=lambda one: (one.job, one.seed or 0))
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, [field.name for field in dataclasses.fields(Outcome)], lineterminator="\n")
     table.writeheader()

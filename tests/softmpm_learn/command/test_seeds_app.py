@@ -177,6 +177,21 @@ def test_a_seed_that_fails_is_a_row_that_says_so(main, monkeypatch, capsys):
     assert [row["status"] for row in rows(Path("all/sweep.csv"))] == ["finished"] * 3
 
 
+def test_a_job_that_fails_as_a_whole_is_a_row_among_older_seeds(main):
+    """The outcomes of its seeds are of an earlier command: they are no longer shown as finished, here or in a summary."""
+    words = ("-m", *TINY, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
+    assert main(*words)[0] == 0
+    for path in Path("sweep/0/seed_0").glob("checkpoint*.pt"):
+        path.write_bytes(b"nothing")
+    assert main(*words, "train.iterations=4")[0] == 1
+    for table in ("sweep/sweep.csv", "sweep/0/sweep.csv"):
+        first = rows(Path(table))[0]
+        assert (first["status"], first["seed"], first["loss"]) == ("failed", "", "inf") and first["error"]
+    assert [row["status"] for row in rows(Path("sweep/sweep.csv"))] == ["failed", "finished", "finished"]
+    figures.make([Path("sweep")], Path("figures"))
+    assert "2 of 2" in (Path("figures") / "summary.md").read_text()
+
+
 def test_a_sweep_has_a_row_for_each_seed(main, monkeypatch):
     """A job whose seeds have finished is skipped; one in which a seed failed is tried again, and has no objective."""
     words = ("-m", *MOVING, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
