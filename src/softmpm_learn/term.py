@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,7 +86,7 @@ class Term(Placed, ABC):
     @property
     def name(self) -> str:
         """Column of metrics.csv."""
-        return type(self).__name__.lower()
+        return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(self).__name__).lower()
 
     def window(self, path: Path) -> slice:
         """The states of the window, for the axis ``state`` of :class:`Path`.

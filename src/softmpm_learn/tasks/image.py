@@ -158,6 +158,7 @@ def _blended(label: np.ndarray, pixels: np.ndarray, known: np.ndarray) -> np.nda
 def _read(path: Path) -> tuple[np.ndarray, str]:
     """Colours on white paper, shape (row, column, 3), and the format of the file."""
     import PIL.Image
+    import PIL.ImageOps
 
     damaged = (
         ArithmeticError,
@@ -171,9 +172,12 @@ def _read(path: Path) -> tuple[np.ndarray, str]:
     )
     try:
         with PIL.Image.open(path, formats=FORMATS) as picture:
+            if picture.mode[0] in "IF":
+                raise ValueError("it has more than 8 bits for a colour; save it with 8")
             if picture.width * picture.height <= MOST_PIXELS:
-                paper = PIL.Image.new("RGBA", picture.size, "white")
-                flat = PIL.Image.alpha_composite(paper, picture.convert("RGBA")).convert("RGB")
+                upright = PIL.ImageOps.exif_transpose(picture).convert("RGBA")  # as viewers show it
+                paper = PIL.Image.new("RGBA", upright.size, "white")
+                flat = PIL.Image.alpha_composite(paper, upright).convert("RGB")
                 return np.asarray(flat), str(picture.format)
             size = f"{picture.width} x {picture.height}"
     except (*damaged, PIL.Image.DecompressionBombError) as error:

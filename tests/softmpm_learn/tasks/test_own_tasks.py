@@ -282,6 +282,21 @@ def test_voxels_are_those_of_evolution_gym(folder):
         }
 
 
+def test_a_picture_is_read_as_viewers_show_it(folder):
+    """Turned by its EXIF orientation; colours of 16 bits, which would be cut, are refused by name."""
+    with Image.open("robot.png") as picture:
+        about = picture.getexif()
+        about[0x0112] = 3  # upside down
+        picture.transpose(Image.Transpose.ROTATE_180).save("turned.png", exif=about)
+    want, got = (places(make_task(ImageConf(file=name))) for name in ("robot.png", "turned.png"))
+    np.testing.assert_allclose(got, want, atol=1e-12)
+    Image.fromarray(np.full((40, 60), 30_000, dtype=np.uint16)).save("deep.png")
+    with pytest.raises(
+        ValueError, match="deep.png cannot be read as a picture .*more than 8 bits for a colour"
+    ):
+        make_task(ImageConf(file="deep.png"))
+
+
 def test_a_mesh_stands_on_the_floor_in_3d(folder):
     """Its z axis is up unless told otherwise; slabs and boxes are muscles; its volume is that of the mesh."""
     task = make_task(MeshConf(file="robot.stl", size=0.4, slabs=4))
