@@ -20,7 +20,6 @@ from softmpm.recording.format import (
     FRAME,
     PARTS,
     PER_FRAME,
-    SCALAR,
     STATIC,
     create,
     put,
@@ -93,11 +92,10 @@ def _copy(
             when = old.read("time", [row])[1][0]
             extend("frame/index", np.array([(len(new["episode"]) - 1, when, *at.values())], FRAME))
             Content.frame(episode, when, values | parts)
-    for name, (iterations, values) in old.scalars.items():
-        kept = [(i, name.encode(), v) for i, v in zip(iterations, values, strict=True) if i < before]
-        extend("scalar", np.array(kept, SCALAR))
-        for row in kept:
-            content.scalar(*row)
+    kept = old.scalar_rows[old.scalar_rows["iteration"] < before]
+    extend("scalar", kept)
+    for row in kept.tolist():
+        content.scalar(*row)
 
 
 @contextlib.contextmanager

@@ -54,6 +54,7 @@ class Recording:
         share: Part of the model's particles that was recorded, 1 for all.
         episodes: Iterations of the recorded simulations, in the order of the run.
         scalars: Name to (iteration, value), two arrays.
+        scalar_rows: Iteration, name and value of each in the order in which they were recorded.
 
     Raises:
         FileNotFoundError, OSError: There is no such file, or it is damaged.
@@ -145,7 +146,8 @@ class Recording:
         for name in index.dtype.names or ():
             self._frame[name] = index[name]
         check_frames(self.path, self._frame, self._tables)
-        self.scalars = self._by_name(complete(self._tables["scalar"][()]))
+        self.scalar_rows = complete(self._tables["scalar"][()])
+        self.scalars = self._by_name(self.scalar_rows)
 
     def _dataset(self, name: str, dtype: np.dtype) -> h5py.Dataset:
         return plain_dataset(self.path, self._file, name, dtype)
