@@ -37,14 +37,17 @@ def readable(path: Path) -> "str | Unmarked":
     new = bytearray(head)
     new[_FLAGS], new[_END] = 0, struct.pack("<Q", size)  # the writer may have added more than it noted
     new[_CHECKSUM] = _checksum(bytes(new[:44]))
-    return Unmarked(path, bytes(new))
+    return Unmarked(path, bytes(new), size)
 
 
 class Unmarked(io.RawIOBase):
-    """A file whose first bytes are replaced, for h5py's driver of Python files."""
+    """A file whose first bytes are replaced, for h5py's driver of Python files.
 
-    def __init__(self, path: Path, head: bytes):
-        self._file, self._head = open(path, "rb", buffering=0), head  # noqa: SIM115
+    Its size remains that which the superblock was given: while a writer reserves disk space the file is longer for a moment.
+    """
+
+    def __init__(self, path: Path, head: bytes, size: int):
+        self._file, self._head, self._size = open(path, "rb", buffering=0), head, size  # noqa: SIM115
 
     def readable(self) -> bool:
         return True
@@ -53,6 +56,8 @@ class Unmarked(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            return self._file.seek(self._size + offset)
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import forked
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from helpers import busy_scene
 
 import softmpm
 from softmpm.recording import file as recording_file
+from softmpm.recording.superblock import readable
 from softmpm.recording.writer import strain
 
 COUNT, NODES = 400, (16, 16)
@@ -222,6 +224,19 @@ def reading(path: Path, times: int) -> None:
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+
+
+def test_a_file_may_become_shorter_while_it_is_opened(tmp_path):
+    """By the disk space that a writer had reserved when the reader looked at its size."""
+    model, path = small_model(), tmp_path / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        record(recorder, model, 0)
+        size = path.stat().st_size
+        os.truncate(path, size + 2**20)
+        presented = readable(path)
+        os.truncate(path, size)
+        with h5py.File(presented, "r") as file:
+            assert len(file["frame/index"]) == 4
 
 
 def test_a_writer_waits_for_readers_that_open_the_file(tmp_path):
