@@ -213,6 +213,8 @@ class Worlds:
     def _reward(self, before: State, activation: Tensor, moving: np.ndarray, failed: np.ndarray) -> Tensor:
         """Reward of the step that has just been made, which also adds to the loss."""
         mask, after, steps, found = self._mask(moving), self.shown, self.steps - moving, []
+        if failed.any():
+            after = select(self._mask(failed), at_rest(after), after)
         for costs in (self._costs, self._losses):
             cost = costs.cost(before, after, activation, steps, self.goal)
             if failed.any():
@@ -228,6 +230,11 @@ class Worlds:
     def detach(self) -> None:
         """Cut the gradient: later steps do not differentiate through earlier ones."""
         self.state = self.state.detach()
+
+
+def at_rest(state: State) -> State:
+    """The state without its velocities."""
+    return state._replace(v=torch.zeros_like(state.v), C=torch.zeros_like(state.C))
 
 
 def centroids(task: Task, model: Model) -> Observer:

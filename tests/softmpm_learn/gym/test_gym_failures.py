@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from softmpm_learn.gym import EnvConf, SoftRobotEnv, make_vec
-from softmpm_learn.objective import Effort, Low, Objective, Progress
+from softmpm_learn.objective import Effort, Low, Objective, Progress, Still
 
 FAILING = dict(seconds=0.1, device="cpu", strength=1e5, safety=1.0)
 """An arm whose muscles are too strong for its time step as soon as they pull."""
@@ -62,6 +62,21 @@ def test_a_failed_world_is_charged_until_the_horizon(task, make_block):
     want = moved - (costs[1] + (steps - 1) * costs[2]) / (steps + 1) - 1e-2 / steps
     assert total == pytest.approx(want, rel=1e-6)
     assert info["loss"] == pytest.approx(costs[0] / (steps + 1) - want, rel=1e-6)
+
+
+@pytest.mark.parametrize("reward", ["dense", "objective"])
+def test_a_failed_world_has_no_speed(task, make_block, reward):
+    """The velocity with which it fails is charged in no step, neither in the one that fails nor in those that are left."""
+    muscles = [dataclasses.replace(muscle, strength=290.0) for muscle in task.scene.muscles]
+    still = Objective(Still(particles=np.arange(16)))
+    fast = dataclasses.replace(task, scene=make_block(muscles=muscles), objective=still)
+    env = SoftRobotEnv(fast, EnvConf(device="cpu", reward=reward))
+    env.reset(seed=0)
+    env.step(np.full(2, 0.1))
+    before = env.worlds.loss.clone()
+    _, charged, terminated, _, info = env.step(np.full(2, 1.0))
+    assert terminated and before > 0 and env.worlds.shown.v[0, :16].mean(dim=0).norm() > 0.1
+    assert charged == 0.0 and info["loss"] == before
 
 
 def test_a_failed_world_has_no_gradient():
