@@ -20,19 +20,19 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
 
-from softmpm_learn.term import Path, Term
+from softmpm_learn.term import Path, Sum, Term
 
 
 @dataclass(frozen=True, kw_only=True)
 class Progress(Term):
     """Go far: minus the distance [m] that the mean position travels along an axis within the window."""
 
-    adds_up: ClassVar[Literal["states", "steps", "way"]] = "way"
+    adds_up: ClassVar[Sum | None] = "way"
     axis: int = 0
     particles: np.ndarray | None = None
     """Indices of the particles that count, None for all."""
@@ -64,6 +64,7 @@ class Progress(Term):
 class Reach(Term):
     """Bring a part to a place and hold it there: mean squared distance [m²] of its mean position from the place."""
 
+    adds_up: ClassVar[Sum | None] = "states"
     particles: np.ndarray
     """Indices of the particles that should get there."""
     target: np.ndarray
@@ -96,6 +97,7 @@ class Reach(Term):
 class Still(Term):
     """Come to rest: mean squared speed [m²/s²] of the mean of some particles."""
 
+    adds_up: ClassVar[Sum | None] = "states"
     particles: np.ndarray
     """Indices of the particles."""
 
@@ -117,7 +119,7 @@ class Still(Term):
 class Effort(Term):
     """Mean squared activation [-] (Spielberg et al. 2021 use weights of about 1e-6)."""
 
-    adds_up: ClassVar[Literal["states", "steps", "way"]] = "steps"
+    adds_up: ClassVar[Sum | None] = "steps"
 
     def value(self, path: Path) -> Tensor:
         """Squared activation [-], mean over the control steps of the window and the muscles, shape (world,)."""
@@ -128,6 +130,7 @@ class Effort(Term):
 class Low(Term):
     """Do not fall: mean of max(0, lowest − height)² [m²], of the particles' mean height."""
 
+    adds_up: ClassVar[Sum | None] = "states"
     lowest: float
     """Height that costs nothing [m]."""
     up: int = 1
@@ -143,6 +146,7 @@ class Low(Term):
 class Tilt(Term):
     """Keep level: mean squared change of the slope from the hind part of the robot to its front part since rest [-]."""
 
+    adds_up: ClassVar[Sum | None] = "states"
     front: np.ndarray
     back: np.ndarray
     """Indices of the particles of either part."""
@@ -182,6 +186,7 @@ class Stretch(Term):
     It sees a crack that opens, which :func:`softmpm.von_mises_strain` of the particles on its sides hardly does.
     """
 
+    adds_up: ClassVar[Sum | None] = "states"
     pairs: np.ndarray
     """Indices of the particles of each pair, shape (pair, 2), such as :func:`softmpm.neighbour_pairs`."""
     rest: np.ndarray

@@ -6,13 +6,16 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from softmpm import State
+
+Sum = Literal["states", "steps", "way"]
+"""Sum that a term's value is, see :attr:`Term.adds_up`."""
 
 
 class Path:
@@ -66,14 +69,25 @@ class Placed:
 class Term(Placed, ABC):
     """A term of an objective: its weight times its value. Smaller is better."""
 
-    adds_up: ClassVar[Literal["states", "steps", "way"]] = "states"
-    """The value is a mean over the states or the control steps of the window, or a sum over the control steps that lie in it. Where
-    rewards are given step by step, a constraint counts state by state."""
+    adds_up: ClassVar[Sum | None] = None
+    """Shares of a control step in the value, by which environments give rewards (docs/gym.md): "states" if the value is a mean over
+    the states of the window, each seen alone, "steps" if over its control steps, "way" if a sum over the control steps that lie in it.
+    None, for all other values, costs more: a step has the change of the value of the episode so far. A class with a ``value`` of its
+    own does not inherit it."""
     weight: float = 1.0
     begin: float = 0.0
     """The window begins here [s]; the state of that time counts."""
     end: float = math.inf
     """The window ends here [s]; the state of that time counts."""
+
+    def __init_subclass__(cls, **settings: Any):
+        super().__init_subclass__(**settings)
+        if "value" in vars(cls) and "adds_up" not in vars(cls):
+            cls.adds_up = None
+        if cls.adds_up not in (None, *get_args(Sum)):
+            raise ValueError(
+                f"adds_up of {cls.__name__} must be one of {', '.join(get_args(Sum))} or None, got {cls.adds_up!r}."
+            )
 
     @abstractmethod
     def value(self, path: Path) -> Tensor:
@@ -94,7 +108,9 @@ class Term(Placed, ABC):
         Raises:
             ValueError: There is none.
         """
-        near = 1e-6 * path.times[-1]
+        near = (
+            1e-3 * path.times[:2][-1]
+        )  # of a control step, so that the windows of a whole episode and of its first part agree
         inside = [k for k, time in enumerate(path.times) if self.begin - near <= time <= self.end + near]
         if not inside:
             raise ValueError(

@@ -169,6 +169,35 @@ def test_a_term_of_a_user(path):
     torch.testing.assert_close(got, 2.0 * path.x[3:].var(dim=2).sum(dim=-1).mean(dim=0))
 
 
+def test_a_value_of_ones_own_declares_how_it_adds_up():
+    """A term that declares nothing does not add up, even if the term that it is made from does; a wrong word is refused."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Nearest(Reach):
+        def value(self, path: Path) -> Tensor:
+            return self._away(path).norm(dim=-1).amin(dim=0)
+
+    @dataclass(frozen=True, kw_only=True)
+    class Named(Reach):
+        """A reach by another name."""
+
+    assert Nearest.adds_up is None and AtMost.adds_up is None and Named.adds_up == Reach.adds_up == "states"
+    with pytest.raises(
+        ValueError, match="adds_up of Wrong must be one of states, steps, way or None, got 'state'"
+    ):
+
+        class Wrong(Term):
+            adds_up = "state"
+
+
+def test_the_window_of_a_part_of_an_episode_is_that_of_the_whole(path):
+    """Where a window begins at a rounded time too."""
+    part = Path(path.times[:2], path.states[:2], path.activation[:1])
+    for begin, want in ((0.5, 1), (0.5000004, 1), (0.5002, 1), (0.4, 1), (0.0, 0)):
+        late = Effort(begin=begin)
+        assert late.window(path).start == late.window(part).start == want
+
+
 def test_a_window_without_states_is_refused(path):
     """The message has the window and the end of the episode."""
     with pytest.raises(ValueError, match="window from 2.5 to inf s without a state; the episode ends at 2 s"):

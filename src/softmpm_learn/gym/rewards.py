@@ -2,6 +2,9 @@
 
 dense       windows of time are left out: distances count, and places are compared, from the first step to the last
 objective   as the learner counts it: the sum over an episode is minus the loss, but for what the first state adds
+
+Terms that add up (:attr:`softmpm_learn.term.Term.adds_up`) are evaluated on a single step. The others are evaluated on the motion so
+far, of which there is none without a step or a state in the window: a step adds the change of their value.
 """
 
 import dataclasses
@@ -13,6 +16,7 @@ import torch
 from torch import Tensor
 
 from softmpm import State
+from softmpm_learn.gym.motions import Step
 from softmpm_learn.tasks import Task
 from softmpm_learn.term import Path, Term
 
@@ -20,21 +24,32 @@ REWARDS = ("dense", "objective")
 
 
 class Costs:
-    """Contribution of a control step to the loss of an episode."""
+    """Costs of the running episode of each world.
 
-    def __init__(self, task: Task, dense: bool):
-        self.task, self.count, self.period = task, task.control_steps, task.control_period
-        self._terms = [self._shared(term, dense) for term in task.objective.terms]
+    Args:
+        task: Whose objective counts.
+        reward: One of :data:`REWARDS`.
+        like: Gives the shape, (world, muscle), the device and the precision.
 
-    def _shared(self, term: Term, dense: bool) -> tuple[Term, float, np.ndarray]:
+    Attributes:
+        wholes: Terms that do not add up, each with the number of states with which its window begins to count.
+        total: Sum of the costs so far, with that of the initial state, shape (world,), detached.
+    """
+
+    def __init__(self, task: Task, reward: str, like: Tensor):
+        self.horizon, self.period = task.control_steps, task.control_period
+        terms = task.objective.terms
+        if reward == "dense":
+            terms = tuple(dataclasses.replace(term, begin=0.0, end=math.inf) for term in terms)
+        path: Any = Path([k * self.period for k in range(self.horizon + 1)], [], torch.empty(0))
+        self._terms = [self._shared(term, path) for term in terms if term.adds_up]
+        self.wholes = [(term, term.window(path).start + 1) for term in terms if not term.adds_up]
+        self.total = self._added = self._whole = like.new_zeros(like.shape[0])
+
+    def _shared(self, term: Term, path: Path) -> tuple[Term, float, np.ndarray]:
         """The term on the state after a step or on the way there, the share of the first state, and that of each step."""
-        if dense:
-            term = dataclasses.replace(term, begin=0.0, end=math.inf)
-        path: Any = Path([k * self.period for k in range(self.count + 1)], [], torch.empty(0))
-        states, share = (
-            term.window(path),
-            np.zeros(self.count + 1),
-        )  # the last one for :meth:`cost` after the end
+        states = term.window(path)
+        share = np.zeros(self.horizon)
         if term.adds_up == "way":
             share[states.start : states.stop - 1] = 1.0
             return dataclasses.replace(term, begin=0.0, end=math.inf), 0.0, share
@@ -46,25 +61,47 @@ class Costs:
         share[max(states.start - 1, 0) : states.stop - 1] = 1.0 / (states.stop - states.start)
         return alone, (1.0 / (states.stop - states.start) if states.start == 0 else 0.0), share
 
-    def first(self, state: State, activation: Tensor, goal: Tensor | None) -> Tensor:
-        """Contribution of the initial state, shape (world,); ``activation`` gives the shape (world, muscle)."""
-        path = Path([0.0, self.period], [state, state], torch.zeros_like(activation)[None], goal)
-        return self._sum(activation, [(term, first) for term, first, _ in self._terms], path)
-
-    def cost(
-        self, before: State, after: State, activation: Tensor, steps: np.ndarray, goal: Tensor | None
-    ) -> Tensor:
-        """Contribution of a control step, shape (world,).
+    def begin(self, worlds: Tensor, state: State, activation: Tensor, goal: Tensor | None) -> None:
+        """Begin new episodes.
 
         Args:
-            activation: Activation during the step [-], shape (world, muscle).
-            steps: Number of the step in the episode of each world, shape (world,).
+            worlds: Which worlds, shape (world,).
+            state: Initial state of every world.
+            activation: Gives the shape (world, muscle).
+            goal: Goal of each world [m], shape (world, dim), or None.
         """
-        path, at = (
-            Path([0.0, self.period], [before, after], activation[None], goal),
-            np.minimum(steps, self.count),
-        )
-        return self._sum(activation, [(term, share[at]) for term, _, share in self._terms], path)
+        path = Path([0.0, self.period], [state, state], torch.zeros_like(activation)[None], goal)
+        first = self._sum(activation, [(term, first) for term, first, _ in self._terms], path)
+        self._added, self.total = (torch.where(worlds, first, one) for one in (self._added, self.total))
+
+    def add(self, step: Step, motions: list[tuple[Tensor, Path]]) -> Tensor:
+        """Cost of a control step, shape (world,), 0 of worlds that do not take part. Differentiable.
+
+        Args:
+            motions: With this step, of :meth:`softmpm_learn.gym.motions.Motions.add`; only :attr:`wholes` need them.
+        """
+        before, device = step.count - step.moving, step.activation.device
+        cost = self._cost(step, before)
+        if step.failed.any():
+            cost = cost + torch.where(torch.as_tensor(step.failed, device=device), self._standing(step), 0.0)
+        cost = torch.where(torch.as_tensor(step.moving, device=device), cost, 0.0)
+        going = torch.as_tensor(before > 0, device=device)
+        earlier = torch.where(going, self._whole, 0.0) if before.any() else torch.zeros_like(self._whole)
+        self._added, self._whole = self._added + cost.detach(), self._value(motions)
+        self.total = self._added + self._whole.detach()
+        return cost + (self._whole - earlier)
+
+    def _cost(self, step: Step, before: np.ndarray) -> Tensor:
+        """Contribution of the terms that add up, shape (world,)."""
+        path = Path([0.0, self.period], [step.before, step.after], step.activation[None], step.goal)
+        return self._sum(step.activation, [(term, share[before]) for term, _, share in self._terms], path)
+
+    def _standing(self, step: Step) -> Tensor:
+        """Their contribution after the step if a world stands still until the horizon, shape (world,)."""
+        nothing = torch.zeros_like(step.activation)
+        path = Path([0.0, self.period], [step.after, step.after], nothing[None], step.goal)
+        left = [(term, np.array([share[k:].sum() for k in step.count])) for term, _, share in self._terms]
+        return self._sum(step.activation, left, path)
 
     def _sum(self, like: Tensor, shares: list[tuple[Term, Any]], path: Path) -> Tensor:
         total = like.new_zeros(like.shape[0])
@@ -74,11 +111,15 @@ class Costs:
                 total = total + factor * term.value(path)
         return total
 
-    def standing(self, state: State, activation: Tensor, steps: np.ndarray, goal: Tensor | None) -> Tensor:
-        """Contribution of the steps from ``steps`` on if a world stands still until the horizon, shape (world,)."""
-        nothing = torch.zeros_like(activation)
-        path = Path([0.0, self.period], [state, state], nothing[None], goal)
-        left = [
-            (term, np.array([share[k : self.count].sum() for k in steps])) for term, _, share in self._terms
-        ]
-        return self._sum(activation, left, path)
+    def _value(self, motions: list[tuple[Tensor, Path]]) -> Tensor:
+        """Value of the terms that do not add up, of the motions so far, shape (world,)."""
+        total = torch.zeros_like(self._added)
+        for worlds, path in motions:
+            for term, states in self.wholes:
+                if len(path.states) >= states:
+                    total = total.index_add(0, worlds, (term.weight * term.value(path)).to(total.dtype))
+        return total
+
+    def detach(self) -> None:
+        """Cut the gradient."""
+        self._whole = self._whole.detach()

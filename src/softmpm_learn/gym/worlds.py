@@ -15,6 +15,7 @@ from torch import Tensor
 
 import softmpm
 from softmpm import Failures, Inputs, Model, Params, State, UnstableError
+from softmpm_learn.gym.motions import Motions, Step
 from softmpm_learn.gym.rewards import REWARDS, Costs
 from softmpm_learn.observe import Centroids, Observer
 from softmpm_learn.setting_checks import lengths
@@ -79,8 +80,6 @@ class Worlds:
     Attributes:
         model: Model of all worlds.
         size: Numbers in an observation.
-        loss: Loss of the episode so far, as the learner defines it, shape (world,), detached; of a complete episode it is the ``loss``
-            of a gradient-based run.
     """
 
     def __init__(self, task: Task, count: int, conf: EnvConf):
@@ -100,7 +99,6 @@ class Worlds:
         self.params = Params(*(value.detach().to(place) for value in params))
         self.inputs = Inputs(**{k: v.detach().to(place) for k, v in inputs.items() if v is not None})
         self.observer = (conf.observer or centroids)(task, self.model)
-        self._costs, self._losses = Costs(task, conf.reward == "dense"), Costs(task, dense=False)
         self._spread = self._tensor(self._checked_spread())
         self._centre = self._tensor([] if task.goal is None else task.goal)
         self.goal = self._centre.expand(count, -1).clone() if len(self._spread) else None
@@ -110,7 +108,8 @@ class Worlds:
         self.steps = np.zeros(count, dtype=int)
         self.activation = self._tensor(np.zeros((count, self.model.muscle_count)))
         self._fresh = np.ones(count, dtype=bool)
-        self.loss = self._losses.first(self.origin, self.activation, self.goal)
+        self._costs = {reward: Costs(task, reward, self.activation) for reward in ("objective", conf.reward)}
+        self._motions = Motions(task) if self._costs["objective"].wholes else None
 
     def _checked_spread(self) -> list[float]:
         spread = list(self.conf.goal_spread)
@@ -146,7 +145,16 @@ class Worlds:
         self.steps = np.where(worlds, 0, self.steps)
         self._fresh = self._fresh | worlds
         self.activation = select(mask, torch.zeros_like(self.activation), self.activation)
-        self.loss = torch.where(mask, self._losses.first(self.origin, self.activation, self.goal), self.loss)
+        for costs in self._costs.values():
+            costs.begin(mask, self.origin, self.activation, self.goal)
+        if self._motions:
+            self._motions.trim(self.steps)
+
+    @property
+    def loss(self) -> Tensor:
+        """Loss of the episode so far, as the learner defines it, shape (world,), detached; of a complete episode it is the ``loss`` of
+        a gradient-based run."""
+        return self._costs["objective"].total
 
     def observe(self) -> Tensor:
         """Features and, if it is drawn at random, the goal in [-1, 1] along each axis of its box; shape (world, size)."""
@@ -172,7 +180,7 @@ class Worlds:
 
         Args:
             activation: Activation [-], shape (world, muscle). Differentiable.
-            moving: Worlds that take part, shape (world,); the others stay as they are, with a reward of 0.
+            moving: Worlds that take part, shape (world,); the others have just begun and stay as they are, with a reward of 0.
         """
         moving = np.ones(self.count, dtype=bool) if moving is None else moving
         before = self.shown
@@ -212,17 +220,13 @@ class Worlds:
 
     def _reward(self, before: State, activation: Tensor, moving: np.ndarray, failed: np.ndarray) -> Tensor:
         """Reward of the step that has just been made, which also adds to the loss."""
-        mask, after, steps, found = self._mask(moving), self.shown, self.steps - moving, []
+        after = self.shown
         if failed.any():
             after = select(self._mask(failed), at_rest(after), after)
-        for costs in (self._costs, self._losses):
-            cost = costs.cost(before, after, activation, steps, self.goal)
-            if failed.any():
-                still = costs.standing(after, activation, self.steps, self.goal)
-                cost = cost + torch.where(self._mask(failed), still, 0.0)
-            found.append(torch.where(mask, cost, 0.0))
-        self.loss = self.loss + found[1].detach()
-        return -found[0]
+        step = Step(before, after, activation, self.goal, self.steps, moving, failed)
+        motions = self._motions.add(step) if self._motions else []
+        cost = {reward: costs.add(step, motions) for reward, costs in self._costs.items()}
+        return -cost[self.conf.reward]
 
     def _mask(self, worlds: np.ndarray) -> Tensor:
         return torch.as_tensor(worlds, device=self.model.device)
@@ -230,6 +234,10 @@ class Worlds:
     def detach(self) -> None:
         """Cut the gradient: later steps do not differentiate through earlier ones."""
         self.state = self.state.detach()
+        for costs in self._costs.values():
+            costs.detach()
+        if self._motions:
+            self._motions.detach()
 
 
 def at_rest(state: State) -> State:
