@@ -1,7 +1,7 @@
 """Episodes of a task in the worlds of one model, each with a clock of its own: reset, step, observation and reward.
 
 The reward of a control step is minus what it adds to the loss (rewards.py). A world that fails ends its episode and is charged as if it
-stood still in its last state until the horizon, so that failing is not rewarded.
+stood still in its last posture until the horizon, without velocity and activation: a bad posture is paid for, later effort is not.
 """
 
 import math
