@@ -110,7 +110,7 @@ class Term(Placed, ABC):
         """
         near = (
             1e-3 * path.times[:2][-1]
-        )  # of a control step, so that the windows of a whole episode and of its first part agree
+        )  # of a control step: the first part of an episode has the windows of all of it
         inside = [k for k, time in enumerate(path.times) if self.begin - near <= time <= self.end + near]
         if not inside:
             raise ValueError(
