@@ -7,7 +7,8 @@ import numpy as np
 from softmpm.scene.scene import Scene
 
 REACH = 1.25
-"""Neighbours are nearer than this many spacings of their body: the axis neighbours of a lattice, not the diagonal ones."""
+"""Neighbours are nearer than this many spacings of their body: the axis neighbours of a lattice, not the diagonal ones. The spacing is
+the typical distance of particles, or the width of the volume of one where that is larger: a thin body has its rows closer together."""
 ROOM = 1.35
 """They may at least stretch by this factor before they are too far apart: pairs that are nearly so at rest are no neighbours."""
 
@@ -22,7 +23,8 @@ def rest_neighbours(scene: Scene, longest: float) -> np.ndarray:
     """
     parts, first = [], 0
     for body in scene.bodies:
-        found = _within(body.particles.positions, longest / ROOM)
+        width = float(np.median(body.particles.volume)) ** (1 / body.particles.positions.shape[1])
+        found = _within(body.particles.positions, width, longest / ROOM)
         parts.append(np.where(found < 0, -1, found + first))
         first += len(body.particles)
     return np.concatenate(parts).astype(np.int32)
@@ -39,7 +41,7 @@ def neighbour_pairs(scene: Scene) -> np.ndarray:
     return np.stack([one, found[one, place]], axis=1)
 
 
-def _within(positions: np.ndarray, longest: float) -> np.ndarray:
+def _within(positions: np.ndarray, width: float, longest: float) -> np.ndarray:
     from scipy.spatial import KDTree
 
     count, dim = positions.shape
@@ -48,7 +50,7 @@ def _within(positions: np.ndarray, longest: float) -> np.ndarray:
     nearest = min(2 * dim, count - 1)
     found = KDTree(positions).query(positions, k=nearest + 1, workers=-1)
     distance, index = (np.asarray(part)[:, 1:] for part in found)  # without the particle itself
-    spacing = np.median(distance[:, 0])
+    spacing = max(np.median(distance[:, 0]), width)
     own = np.arange(count)[:, None]
     near = (distance <= REACH * spacing) & (distance <= longest)
     mutual = (index[index] == own[..., None]).any(-1)  # else only this particle lists the pair

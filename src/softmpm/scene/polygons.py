@@ -75,7 +75,9 @@ def _pieces(polygons: Sequence[np.ndarray], extent: float) -> tuple[np.ndarray, 
         length = np.linalg.norm(along)
         across = np.array([-along[1], along[0]]) / length
         low, high = (start - a) @ across, (end - a) @ across  # heights of all edges above this one
-        crossing = (low > 0) != (high > 0)
+        crossing = ((low > 0) != (high > 0)) & (
+            np.maximum(abs(low), abs(high)) > SNAP * extent
+        )  # not along this one
         share = low[crossing] / (low[crossing] - high[crossing])
         met = start[crossing] + share[:, None] * (end - start)[crossing]
         touching = start[np.abs(low) <= SNAP * extent]

@@ -51,6 +51,17 @@ def test_unions_of_squares(parts, parts_left, exact):
     assert len(boundary) == parts_left and area(boundary) == pytest.approx(exact, rel=1e-12)
 
 
+@pytest.mark.parametrize("angle", np.linspace(0.1, 6.0, 20))
+def test_collinear_sides_in_any_direction(angle):
+    """A frame of four bars and a T, whose sides lie on each other up to rounding."""
+    R = np.array([(math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))])
+    bars = [SQUARE * (3, 1), SQUARE * (3, 1) + (0, 2), SQUARE * (1, 3), SQUARE * (1, 3) + (2, 0)]
+    letter = [SQUARE * (3, 1) + (0, 2), SQUARE * (1, 3) + (1, 0)]
+    for parts, exact, left in ((bars, 8.0, 2), (letter, 5.0, 1)):
+        boundary = union_boundary([part @ R.T + 0.3 for part in parts])
+        assert len(boundary) == left and area(boundary) == pytest.approx(exact, rel=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_the_area_of_a_union_is_that_of_its_points(seed):
     """Of random polygons that cross each other and themselves: against the share of a million points."""
