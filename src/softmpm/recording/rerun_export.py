@@ -53,6 +53,10 @@ def to_rerun(
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}.")
     rrd = Path(recording).with_suffix(".rrd") if rrd is None else Path(rrd)
+    if rrd.resolve() == Path(recording).resolve():
+        raise ValueError(
+            f"the Rerun file would replace the recording {recording}; give it another name with rrd=."
+        )
     draft = rrd.with_name(f"{rrd.name}.new")
     stream = rr.RecordingStream("softmpm")
     try:

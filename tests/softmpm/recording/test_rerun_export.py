@@ -208,3 +208,14 @@ def test_forces_are_drawn(tmp_path, dim):
         if "SeriesLines:names" in (batch := one.to_record_batch()).schema.names
     ]
     assert names == [[f"wall {k} {axis}" for k in (0, 1) for axis in "xyz"[:dim]]]
+
+
+@pytest.mark.parametrize("name", ["run.h5", "run.rrd"])
+def test_a_recording_is_not_replaced(tmp_path, name):
+    """By its own Rerun file, whatever it is called."""
+    path = make(tmp_path / name)
+    before = path.read_bytes()
+    for rrd in (path, None) if name == "run.rrd" else (path,):
+        with pytest.raises(ValueError, match="would replace the recording"):
+            softmpm.to_rerun(path, rrd)
+    assert path.read_bytes() == before
