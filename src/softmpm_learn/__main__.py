@@ -13,7 +13,7 @@ def main() -> None:
     asked = bool({"--help", "-h"} & set(words))
     signals = Signals()
     signals.install()  # before the imports that take seconds
-    if asked and not files:
+    if asked and not files and not plugins.has_packages():
         print(help_text())
         return
 

@@ -3,6 +3,7 @@
 Only what the command line names is imported, and entry points of the group ``softmpm_learn``; never what a run's folder names.
 """
 
+import hashlib
 import importlib.util
 import sys
 import traceback
@@ -36,7 +37,7 @@ def load(path: str | Path) -> ModuleType | None:
         return None
     if not path.is_file():
         raise ValueError(f"there is no file {path}.")
-    name = f"softmpm_learn_file_{path.stem}"
+    name = f"softmpm_learn_file_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -53,6 +54,11 @@ def load(path: str | Path) -> ModuleType | None:
         _loading.pop()
     loaded.append(path)
     return module
+
+
+def has_packages() -> bool:
+    """True if installed packages have entry points."""
+    return bool(entry_points(group=GROUP))
 
 
 def load_packages() -> None:

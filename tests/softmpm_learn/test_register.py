@@ -171,6 +171,7 @@ def test_an_entry_point_is_imported_once(folder, monkeypatch):
     monkeypatch.setattr(plugins, "_packages", set())
     points = [EntryPoint("parts", "parts", "softmpm_learn")]
     monkeypatch.setattr(plugins, "entry_points", lambda group: points if group == "softmpm_learn" else [])
+    assert plugins.has_packages()
     plugins.load_packages()
     plugins.load_packages()
     assert POLICIES.added == ["spring"]
@@ -179,6 +180,16 @@ def test_an_entry_point_is_imported_once(folder, monkeypatch):
         ValueError, match="entry point none = 'module_that_is_not_there' .* cannot be imported"
     ):
         plugins.load_packages()
+
+
+def test_files_of_one_name_do_not_replace_each_other(folder):
+    """Those of other folders are other files: what the second registers is taken."""
+    for place in ("a", "b"):
+        (folder / place).mkdir()
+        (folder / place / "parts.py").write_text(PARTS)
+    plugins.load(folder / "a" / "parts.py")
+    with pytest.raises(ValueError, match="b/parts.py, line .* is registered already, by"):
+        plugins.load(folder / "b" / "parts.py")
 
 
 def test_a_taken_name_is_refused():

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import gymnasium
 
+from softmpm_learn import plugins
 from softmpm_learn.gym.env import SoftRobotEnv
 from softmpm_learn.gym.vector import SoftRobotVectorEnv
 from softmpm_learn.gym.worlds import EnvConf
@@ -19,7 +20,8 @@ def identifier(name: str) -> str:
 
 
 def register() -> None:
-    """Register every task."""
+    """Register every task, those of installed packages among them."""
+    plugins.load_packages()
     for name in TASKS:
         if identifier(name) not in gymnasium.registry:
             gymnasium.register(

@@ -33,6 +33,7 @@ def load(folder: Path) -> RunConf:
     Raises:
         ValueError: There is none, or it is not one; names the file.
     """
+    plugins.load_packages()
     files.check_folder(folder)
     path = folder / NAME
     if not path.exists():
@@ -46,7 +47,10 @@ def load(folder: Path) -> RunConf:
         if isinstance(saved, DictConfig):
             _need_files(saved, folder)
         if name not in TASKS:
-            raise ValueError(f"it names the task {name!r}; known are {', '.join(TASKS)}.")
+            known = ", ".join(TASKS)
+            raise ValueError(
+                f"it names the task {name!r}; known are {known}. One of a package needs the package."
+            )
         task: Any = TASKS[str(name)].kind
         return to_run(DictConfig(OmegaConf.merge(OmegaConf.structured(RunConf(task=task())), saved)))
     except MissingFileError:
