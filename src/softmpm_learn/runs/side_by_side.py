@@ -16,12 +16,15 @@ from torch.nn import functional
 
 from softmpm import Inputs, Model, Params, State
 from softmpm_learn.design import Design
-from softmpm_learn.observe import Observer
+from softmpm_learn.observe import Latent, Observer
+from softmpm_learn.runs.likeness import alike
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.stacking import Stacked
 
 ROUNDING = {torch.float32: 1e-5, torch.float64: 1e-12}
 """Largest difference of two equal observations, relative to the largest value: a GPU adds up the particles at a node in any order."""
+DENT = 0.1
+"""Largest share of the way to a corner by which the robots of a :func:`probe` are displaced: no particle turns inside out."""
 
 
 class Kinds:
@@ -62,7 +65,7 @@ class Kinds:
 
 
 class Observers(Observer):
-    """Observers of all runs. What equal observers see before they encode it is the same, up to rounding, and computed once.
+    """Observers of all runs. What observers that are alike see before they encode it is the same, up to rounding, and computed once.
 
     Attributes:
         size: Number of features of the observer that has most of them; those of a run come first.
@@ -228,23 +231,44 @@ class _Encoder(nn.Module):
 
 
 def probe(model: Model) -> State:
-    """A state in which robots of different worlds move differently."""
-    state = model.rest()
-    wave = torch.linspace(0.0, 9.0, state.v.numel(), dtype=state.v.dtype, device=state.v.device).sin()
-    return state._replace(v=wave.view_as(state.v))
+    """A smooth state in which robots are displaced, deformed and moving, in each world differently. A robot stays in its box at rest:
+    its points X move towards the lowest corner of the box, by a share of the way of up to :data:`DENT`.
+    """
+    rest = model.rest()
+    place = {"dtype": model.dtype, "device": model.device}
+    away = rest.x - model.positions.amin(dim=0)
+    wave = torch.arange(1.0, model.dim + 1, **place) / away.max()  # [1/m]
+    phase = away @ wave + torch.arange(model.worlds, **place)[:, None]
+    share = 1 - DENT * (1 + phase.sin()) / 2
+    slope = -DENT / 2 * phase.cos()[..., None] * wave  # of the share, along each axis
+    phases = phase[..., None] + torch.arange(model.dim, **place)
+    return rest._replace(
+        x=rest.x + (share - 1)[..., None] * away,
+        v=phases.sin(),
+        C=phases.cos()[..., None] * wave,
+        F=share[..., None, None] * rest.F + away[..., None] * slope[..., None, :],
+    )
 
 
 @torch.no_grad()
 def _known(eyes: list[Observer], seen: list[Tensor], observer: Observer, model: Model, state: State) -> int:
-    """Number of the observer that sees the same; a new one is added, with what it saw."""
+    """Number of the observer that is alike in its first step and sees the same; a new one is added, with what it saw."""
     found = observer.observe(model, state)
-    for n, other in enumerate(seen):
+    for n, (eye, other) in enumerate(zip(eyes, seen, strict=True)):
         near = ROUNDING[other.dtype] * other.abs().max()
-        if other.shape == found.shape and bool((found - other).abs().max() <= near):
+        same = other.shape == found.shape and bool((found - other).abs().max() <= near)
+        if same and alike(_first_step(eye), _first_step(observer)):
             return n
     eyes.append(observer)
     seen.append(found)
     return len(eyes) - 1
+
+
+def _first_step(observer: Observer) -> tuple[type, dict[str, Any]]:
+    """Class and attributes of an observer, of a learned one without those of its second step."""
+    second = {"encoder", "size", "trained"} if isinstance(observer, Latent) else set()
+    parts = vars(observer) | observer._modules
+    return type(observer), {name: parts[name] for name in parts if name not in {"_modules", *second}}
 
 
 def _example(runs: Sequence[Run], members: Sequence[int], share: int) -> tuple:

@@ -21,10 +21,11 @@ from softmpm import rollout
 from softmpm_learn import register
 from softmpm_learn.command.seeds import split
 from softmpm_learn.episode import run_episode
-from softmpm_learn.observe import VelocityImage
+from softmpm_learn.observe import Observer, VelocityImage
 from softmpm_learn.runs.loops import ClosedLoop
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
+from softmpm_learn.runs.side_by_side import probe
 from softmpm_learn.settings import Settings, TrainConf
 from softmpm_learn.storage import checkpoint
 from softmpm_learn.train import Plan, Result, train, train_side_by_side
@@ -516,6 +517,67 @@ def test_policies_that_cannot_be_batched_are_evaluated_in_turn(task, conf, tmp_p
     alone(task, conf, tmp_path / "alone")
     for k in range(SEEDS):
         assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
+
+
+class Posture(Observer):
+    """Random projections of displacements forward and up: numbers that are no buffers. The probe shows nothing of them."""
+
+    size = 3
+
+    def __init__(self, model: softmpm.Model, scale: float):
+        super().__init__()
+        self.rest, self.scale, self.seen = model.positions, scale, SEEN
+        self.directions = torch.randn(model.positions.numel(), self.size, dtype=model.dtype)
+
+    def observe(self, model, state):
+        self.seen.append(1)
+        return (state.x - self.rest).clamp(min=0.0).flatten(1) @ self.directions / self.scale
+
+    def encode(self, observation):
+        return observation
+
+
+SEEN: list[int] = []
+
+
+def test_observers_that_differ_where_the_probe_does_not_look(task, conf, tmp_path, monkeypatch):
+    """An option and what is drawn from the seed: each run is what it is alone. What is equal in both is computed once."""
+    monkeypatch.setattr(register.OBSERVERS, "_entries", dict(register.OBSERVERS._all()))
+    register.observer("posture")(lambda conf, model, task, *, scale=0.1: Posture(model, scale))
+    conf = changed(conf, observer=dict(name="posture"), train=dict(seeds=1, iterations=3))
+    options = dict(observer=dict(name="posture", options=dict(scale=0.3)))
+    changes = (dict(), options, dict(train=dict(seed=5)), dict(policy=dict(hidden=[4])))
+    plans = [Plan(settings=changed(conf, **one), out=tmp_path / str(k)) for k, one in enumerate(changes)]
+    model = built(task, conf, len(plans))
+    runs = Runs([Run(task, model, plan.settings, plan.out, runs=len(plans)) for plan in plans])
+    SEEN.clear()
+    runs.observer.observe(model, model.rest())
+    assert len(SEEN) == 3
+    train_side_by_side(task, model, plans)
+    for k, plan in enumerate(plans):
+        train(task, built(task, conf), plan.settings, tmp_path / "alone" / str(k))
+        assert_same(plan.out, tmp_path / "alone" / str(k))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_probe_is_a_motion_of_every_part_in_its_box(task, dtype):
+    """All four tensors differ from world to world; F is the gradient of the places, C that of the velocity."""
+    worlds = 3
+    model = softmpm.build(task.scene, device="cpu", dtype=getattr(torch, dtype), worlds=worlds)
+    state, rest = probe(model), model.rest()
+    low, high = rest.x.amin(dim=(0, 1)), rest.x.amax(dim=(0, 1))
+    assert bool(((state.x >= low) & (state.x <= high)).all())
+    assert bool((torch.linalg.det(state.F) > 0.5).all())
+    for part, still in zip(state[:4], rest[:4], strict=True):
+        moved = (part - still).flatten(1)
+        assert bool((moved.abs().amax(dim=1) > 1e-3).all()) and torch.pdist(moved).min() > 1e-3
+    x, y = task.scene.bodies[0].particles.positions.T
+    for axis, (near, far) in enumerate(((x == x[8], x == x[16]), (y == y[1], y == y[3]))):
+        step = rest.x[0, far, axis].mean() - rest.x[0, near, axis].mean()
+        for value, slope in ((state.x, state.F), (state.v, state.C)):
+            got = (value[:, far] - value[:, near]) / step
+            middle = (slope[:, far] + slope[:, near])[..., axis] / 2
+            assert (got - middle).abs().max() < 0.1 * middle.abs().max()
 
 
 # Settings
