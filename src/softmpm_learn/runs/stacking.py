@@ -11,18 +11,22 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from softmpm_learn.runs.likeness import alike
+
 logger = logging.getLogger("softmpm_learn")
 
 TOLERANCE = {torch.float32: 1e-2, torch.float64: 1e-8}
 """Largest difference, relative to the largest value, of a batched evaluation from one module after another: rounding. Convolutions in
 float32 have ten bits on a GPU (TF32)."""
+DIFFER = "Modules %s differ in more than their weights: evaluated one after another."
 
 
 class Stacked:
-    """Modules evaluated at once, or one after another where PyTorch cannot batch them (:func:`torch.vmap`).
+    """Modules evaluated at once; or one after another where they differ in more than the values of their parameters and buffers, or
+    where PyTorch cannot batch them (:func:`torch.vmap`).
 
     Args:
-        modules: Of one structure.
+        modules: Of one kind.
         dims: For each input, 0 if it has the leading axis of the modules, None if all of them get the same.
         probe: Inputs, of which the first has the leading axis, for a comparison of both ways.
 
@@ -34,7 +38,10 @@ class Stacked:
         self.modules, self.dims = list(modules), dims
         self._rows: list[dict[str, Tensor]] = []
         self._stacks: dict[str, Tensor] = {}
-        self.batched = self._stack() and self._agrees(probe)
+        self.batched = self._are_alike()
+        if self.batched:
+            self._stack()
+            self.batched = self._agrees(probe)
 
     def __call__(self, *inputs: Tensor | None) -> Tensor:
         """Output of each module, along a leading axis."""
@@ -65,19 +72,22 @@ class Stacked:
                     place.copy_(tensor.detach())
                     tensor.data = place
 
+    def _are_alike(self) -> bool:
+        first, *others = self.modules
+        if all(alike(first, other, weights=False) for other in others):
+            return True
+        logger.info(DIFFER, type(first).__name__)
+        return False
+
     @torch.no_grad()
-    def _stack(self) -> bool:
-        """False where the modules differ in more than the values of their weights and buffers."""
-        rows = [dict(module.named_parameters()) | dict(module.named_buffers()) for module in self.modules]
-        first = {name: (tensor.shape, tensor.dtype) for name, tensor in rows[0].items()}
-        if any({name: (t.shape, t.dtype) for name, t in row.items()} != first for row in rows):
-            return False
-        for name, tensor in rows[0].items():
-            stack = torch.stack([row[name].detach() for row in rows])
+    def _stack(self) -> None:
+        self._rows = [
+            dict(module.named_parameters()) | dict(module.named_buffers()) for module in self.modules
+        ]
+        for name, tensor in self._rows[0].items():
+            stack = torch.stack([row[name].detach() for row in self._rows])
             self._stacks[name] = stack.requires_grad_(tensor.requires_grad)
-        self._rows = rows
         self._bind()
-        return True
 
     def _bind(self) -> None:
         for k, row in enumerate(self._rows):
@@ -86,14 +96,14 @@ class Stacked:
 
     @torch.no_grad()
     def _agrees(self, probe: tuple) -> bool:
-        """True if both ways give the same; a module may refuse the transform, or have values that are neither weight nor buffer."""
+        """True if both ways give the same; a module may refuse the transform, or read numbers that are not its own."""
         want = self._in_turn(*probe)
         kind = type(self.modules[0]).__name__
         try:
             away = (self._at_once(*probe) - want).abs().max()
             if bool(away <= TOLERANCE.get(want.dtype, 1e-2) * want.abs().max()):
                 return True
-            logger.info("Modules %s differ in more than their weights: evaluated one after another.", kind)
+            logger.info(DIFFER, kind)
         except Exception as error:  # whatever a user's module cannot do under vmap
             logger.info("Modules %s are evaluated one after another, not batched: %s", kind, error)
         return False

@@ -217,6 +217,24 @@ def test_what_equal_observers_see_is_computed_once_though_it_is_rounded(task, co
     assert len(seen) == 1
 
 
+OWN = [
+    *(dict(observer=dict(name=name)) for name, entry in register.OBSERVERS.items() if entry.is_own),
+    *(dict(policy=dict(name=name)) for name, entry in register.POLICIES.items() if entry.is_own),
+    *(dict(policy=dict(name="mlp", clock=False)), dict(learning=dict(target_network=False))),
+]
+"""Every observer and every policy of the package."""
+
+
+@pytest.mark.parametrize("change", OWN, ids=str)
+def test_what_the_package_has_is_evaluated_at_once(task, conf, tmp_path, change):
+    """Seeds of each observer see once and are batched with their policies, goals drawn at random included."""
+    conf = changed(conf, train=dict(seeds=SEEDS, goal_spread=[0.2, 0.1]), **change)
+    model = built(task, conf, SEEDS)
+    runs = Runs([Run(task, model, one, tmp_path / str(k), runs=SEEDS) for k, one in enumerate(split(conf))])
+    assert len(runs.observer._eyes) == 1
+    assert [(len(stack.modules), stack.batched) for stack in runs.stacks] == [(SEEDS, True), (SEEDS, True)]
+
+
 # Failures
 
 
@@ -504,7 +522,18 @@ class Tuned(Stubborn):
         return torch.tanh(self.factor * self.layer(z))
 
 
-@pytest.mark.parametrize("kind", [Stubborn, Tuned])
+class Delayed(Stubborn):
+    """One with a number of its own that does not matter late in an episode."""
+
+    def __init__(self, size: int, muscles: int):
+        super().__init__(size, muscles)
+        self.begin = 0.05 * torch.rand(()).item()
+
+    def forward(self, z, time, goal=None):
+        return torch.tanh(self.layer(z)) * ((time - self.begin) / 0.02).clamp(0.0, 1.0)[..., None]
+
+
+@pytest.mark.parametrize("kind", [Stubborn, Tuned, Delayed])
 def test_policies_that_cannot_be_batched_are_evaluated_in_turn(task, conf, tmp_path, monkeypatch, kind):
     """With the same values."""
     monkeypatch.setattr(register.POLICIES, "_entries", dict(register.POLICIES._all()))

@@ -97,3 +97,26 @@ def test_modules_of_other_shapes_are_evaluated_in_turn():
     torch.testing.assert_close(stack(z), in_turn(modules, (0,), (z,)))
     gradients = torch.autograd.grad(stack(z).sum(), stack.weights)
     assert [len(part) for part in stack.split(gradients)] == [4, 4]
+
+
+class Later(nn.Module):
+    """A number that is no weight matters after a second."""
+
+    def __init__(self, begin: float):
+        super().__init__()
+        self.begin, self.layer = begin, nn.Linear(3, 2)
+
+    def forward(self, z, time):
+        return self.layer(z) * (time - self.begin).clamp(min=1.0)
+
+
+@pytest.mark.parametrize("begin", [(0.5, 0.7), (0.5, 0.5)])
+def test_modules_that_differ_where_the_probe_does_not_look(caplog, begin):
+    """They are evaluated in turn, and the log says so; alike in all but their weights they are batched."""
+    modules, z = [Later(one) for one in begin], torch.randn(2, 5, 3)
+    with caplog.at_level("INFO", logger="softmpm_learn"):
+        stack = Stacked(modules, (0, None), (z, torch.tensor(0.1)))
+    assert stack.batched == (begin[0] == begin[1])
+    assert ("Modules Later differ in more than their weights" in caplog.text) != stack.batched
+    late = (z, torch.tensor(9.0))
+    torch.testing.assert_close(stack(*late), in_turn(modules, stack.dims, late))
