@@ -490,12 +490,13 @@ def test_a_gradient_that_is_not_finite_is_tried_again_from_halfway_back(
     real, calls = torch.autograd.grad, itertools.count()
 
     def spoilt(*args, **kwargs):
-        factor = value if next(calls) == 2 else 1.0  # an attempt has two: of the simulation, of the policy
+        # The check of the policy has three, an attempt two: of the simulation, of the policy.
+        factor = value if next(calls) == 5 else 1.0
         return [gradient * factor for gradient in real(*args, **kwargs)]
 
     monkeypatch.setattr(torch.autograd, "grad", spoilt)
     second = train.train(task, model, conf, tmp_path / "two").run
-    assert next(calls) == 6
+    assert next(calls) == 9
     for now, want in zip(second.safe, halfway, strict=True):
         torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
     assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"]

@@ -13,6 +13,7 @@ import softmpm
 from softmpm import Model
 from softmpm_learn.design import Design, declared_inputs
 from softmpm_learn.distributed import Group
+from softmpm_learn.episode import times_of
 from softmpm_learn.learning.learner import Learner, make_learner
 from softmpm_learn.observe import Latent, Observer, make_observer
 from softmpm_learn.optimizers import make_optimizer, moments
@@ -24,6 +25,7 @@ from softmpm_learn.recovery.restart import Restart
 from softmpm_learn.recovery.settling import Settling
 from softmpm_learn.runs.goals import Goals
 from softmpm_learn.runs.identity import check_same, identity
+from softmpm_learn.runs.policy_check import check_policy
 from softmpm_learn.seeding import seeded, stream_seed
 from softmpm_learn.settings import Settings
 
@@ -95,7 +97,10 @@ class Run:
         policy = make_policy(
             conf, self.observer.size, self.model.muscle_count, self.task.seconds, seed, self.goals.box
         )
-        return policy.to(self.model.device, self.model.dtype)
+        policy = policy.to(self.model.device, self.model.dtype)
+        times, worlds = times_of(self.task, self.model), len(self.worlds)
+        check_policy(conf.name, policy, self.observer.size, times, worlds, self.goals.middle())
+        return policy
 
     def _make_design(self) -> Design:
         return Design(self.settings.design, self.model, self.task.regions)
