@@ -45,11 +45,63 @@ def closed_surface(source: Any) -> tuple[np.ndarray, np.ndarray]:
             f"the mesh is not closed: {(joined != 2).sum()} of its {len(joined)} edges do not join two faces; "
             "try merge_vertices(), then trimesh.repair.fill_holes, or close it where it was drawn."
         )
-    need(
-        bool(source.is_winding_consistent) and source.volume != 0,
-        "the mesh's faces do not all turn the same way, so it has no inside: try trimesh.repair.fix_normals.",
+    turned = (
+        "the mesh's faces do not all turn the same way, so it has no inside: try trimesh.repair.fix_normals."
     )
-    return vertices, faces if source.volume > 0 else faces[:, ::-1]  # all faces may turn inwards
+    need(bool(source.is_winding_consistent), turned)
+    part = _parts(faces)
+    volume = _volumes(vertices, faces, part)
+    if volume.sum() < 0.0:  # all faces may turn inwards
+        faces, volume = faces[:, ::-1], -volume
+    _refuse_inverted_parts(vertices, faces, part, volume)
+    need(volume.sum() != 0.0, turned)
+    return vertices, faces
+
+
+def _refuse_inverted_parts(
+    vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, volume: np.ndarray
+) -> None:
+    """Refuse parts of negative volume, except cavities, which have material all around them."""
+    if not (volume < 0.0).any():
+        return
+    negative, size = np.flatnonzero(volume < 0.0), float(np.ptp(vertices, axis=0).max())
+    outlines = [triangle_outline(split_triangles(vertices[faces[part == k]], size / 32)) for k in negative]
+    beside = np.concatenate([outline.points - 1e-5 * size * outline.normals for outline in outlines])
+    start = np.cumsum([0] + [len(outline.points) for outline in outlines[:-1]])
+    enclosed = winding_inside(
+        vertices, faces[volume[part] >= 0.0], beside
+    )  # by the others, not flush with them
+    material = winding_inside(vertices, faces, beside)  # nowhere for what lies in a cavity
+    cavity = np.logical_and.reduceat(enclosed, start) & np.logical_or.reduceat(material, start)
+    inverted = int((~cavity).sum())
+    need(
+        inverted == 0,
+        f"{inverted} of the mesh's {len(volume)} parts {'is' if inverted == 1 else 'are'} turned inside out against the rest, and "
+        "no cavity within it: try trimesh.repair.fix_normals(mesh, multibody=True), which turns every part outwards and fills "
+        "cavities, or join the parts again with part.invert() for those that are wrong.",
+    )
+
+
+def _parts(faces: np.ndarray) -> np.ndarray:
+    """Number of the part of each face, from 0; faces of a part are connected by edges, each of which joins two."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    order = np.lexsort(edges.T)  # the two faces of an edge become neighbours
+    one, other = (order // 3).reshape(-1, 2).T
+    links = coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(len(faces), len(faces)))
+    return connected_components(links, directed=False)[1]
+
+
+def _volumes(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Volume of each part, negative if it is turned inside out; 0 for a sheet without thickness, whatever its rounding."""
+    corner = vertices[faces]
+    middle = np.stack([np.bincount(part, x) for x in corner.mean(axis=1).T], axis=1)
+    a, b, c = np.moveaxis(corner - (middle / np.bincount(part)[:, None])[part][:, None], 1, 0)
+    volume = np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c)) / 6)
+    area = np.bincount(part, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    return np.where(np.abs(volume) > 1e-9 * area**1.5, volume, 0.0)
 
 
 def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

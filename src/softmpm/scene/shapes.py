@@ -202,6 +202,8 @@ def mesh(
 ) -> Particles:
     """Fill a closed triangle mesh with particles; needs trimesh (``pip install softmpm[mesh]``).
 
+    Parts of a mesh may overlap. A part whose faces turn inwards is a cavity and lies within the others.
+
     Args:
         source: Path of a mesh file, or a ``trimesh.Trimesh``, in metres. A file in millimetres wants
             ``trimesh.load_mesh(path).apply_scale(1e-3)``.

@@ -124,6 +124,58 @@ def test_inside_out_and_overlap():
     assert mesh(both, 0.25).volume.sum() == pytest.approx(1.5, rel=1e-12)
 
 
+def cube(side, x=0.0, inverted=False):
+    solid = trimesh.creation.box(extents=(side, side, side)).apply_translation((x, 0, 0))
+    if inverted:
+        solid.invert()
+    return solid
+
+
+@pytest.mark.parametrize(
+    "parts, said",
+    [
+        ([(1, 0), (0.4, 1.5, True)], "1 of the mesh's 2 parts is"),  # apart
+        ([(1, 0), (0.8, 0.7, True)], "1 of the mesh's 2 parts is"),  # it would carve a notch
+        ([(1, 0), (0.4, 0.3, True)], "1 of the mesh's 2 parts is"),  # flush with the other
+        ([(1, 0), (1, 1.5, True)], "1 of the mesh's 2 parts is"),  # together without volume
+        ([(2, 0), (1, 0, True), (0.5, 0, True)], "1 of the mesh's 3 parts is"),  # the core of a cavity
+        ([(2, 0), (1, 2, True), (1, -2, True), (1, 0, True)], "2 of the mesh's 4 parts are"),
+        ([(2, 0, True), (1, 3)], "1 of the mesh's 2 parts is"),  # the larger one
+    ],
+)
+def test_parts_turned_inside_out(parts, said):
+    """A part that is inverted and no cavity is refused, not left out; turned as the message says, all parts are filled."""
+    joined = trimesh.util.concatenate([cube(*part) for part in parts])
+    with pytest.raises(ValueError, match=rf"^{said} turned inside out .*multibody=True.*part\.invert\(\)"):
+        mesh(joined, 0.1)
+    upright = mesh(trimesh.util.concatenate([cube(*part[:2]) for part in parts]), 0.1)
+    trimesh.repair.fix_normals(joined, multibody=True)
+    np.testing.assert_array_equal(mesh(joined, 0.1).positions, upright.positions)
+
+
+@pytest.mark.parametrize("far", [0.0, 100.0])
+@pytest.mark.parametrize(
+    "parts, volume",
+    [
+        ([(2, 0), (1, 0, True)], 7),
+        ([(2, 0, True), (1, 0)], 7),  # all turned the other way
+        ([(2, 0), (1, 0, True), (0.6, 0)], 7 + 0.6**3),  # a core in the cavity
+        ([(2, 0), (1, 0, True), (0.8, 0), (0.4, 0, True)], 7 + 0.8**3 - 0.4**3),
+        ([(2, 0), (1, 0, True), (1, 1.3), (1, 2.3)], 7 + 1.8),  # others overlap and touch
+        ([(2, 0), (0.4, 0.5, True), (0.4, -0.5, True)], 8 - 2 * 0.4**3),
+        (
+            [(1, 0), (1, 0.5), (0.4, 0.6, True)],
+            1.5 - 0.4 * 0.4 * 0.4 + 0.4 * 0.4 * 0.1,
+        ),  # where one part ends
+    ],
+)
+def test_cavities(parts, volume, far):
+    """A part turned inwards with material all around it is a cavity, within a cavity there may be a part, and so on."""
+    joined = trimesh.util.concatenate([cube(*part) for part in parts])
+    joined.apply_translation((far, 0, 0))
+    assert mesh(joined, 0.05).volume.sum() == pytest.approx(volume, rel=2e-3)
+
+
 def test_parts_within_a_part():
     """Small boxes that hide the way out along x, y and z from a point leave it inside: no ray is asked."""
     parts = [trimesh.creation.box(extents=(4, 4, 4))]
