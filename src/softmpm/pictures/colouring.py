@@ -1,5 +1,6 @@
 """Colours of particles: the quantity that they show, its scale, and its colour map. NumPy only."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,7 +24,7 @@ CATEGORIES = np.array(
     ],
     float,
 )
-"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart, and darker ones."""
+"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart, and darker ones; :func:`categories` has more."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,34 @@ class Colouring:
         """Colours of values, shape (particle, 3), 0 to 255; what is not finite is passive."""
         known = np.isfinite(values)
         if self.names:
-            colours = self.ramp[np.where(known, values, 0).astype(int) % len(self.ramp)]
+            colours = self.ramp[np.where(known, values, 0).astype(int)]
         else:
             low, high = self.limits
             at = np.clip((np.where(known, values, low) - low) / (high - low), 0.0, 1.0) * (len(self.ramp) - 1)
             stops = np.arange(len(self.ramp))
             colours = np.stack([np.interp(at, stops, channel) for channel in self.ramp.T], -1)
         return np.where(known[:, None], colours, PASSIVE)
+
+
+def categories(count: int) -> np.ndarray:
+    """Different colours, shape (count, 3), 0 to 255: the fixed ones, then the farthest from all before, paper and grey."""
+    taken = CATEGORIES[:count]
+    if count <= len(CATEGORIES):
+        return taken
+    levels = np.linspace(0.0, 255.0, max(9, math.ceil((8 * count) ** (1 / 3))))
+    every = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
+    apart = np.full(len(every), np.inf)
+    for colour in (np.full(3, 255.0), PASSIVE, *taken):
+        apart = np.minimum(apart, _difference(every, colour))
+    while len(taken) < count:
+        taken = np.vstack([taken, every[apart.argmax()]])
+        apart = np.minimum(apart, _difference(every, taken[-1]))
+    return taken
+
+
+def _difference(colours: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """Square of a distance, shape (colour,): of red, green and blue, of which the eye tells green apart best."""
+    return (colours - colour) ** 2 @ np.array((2.0, 4.0, 3.0))
 
 
 def values_of(colour: str, place: Surroundings, instant: Instant) -> np.ndarray:
@@ -82,7 +104,7 @@ def coloured(
     """Colours of values that are shown together; None for ``colour`` is an array of the user's own."""
     if colour in ("muscle", "body"):
         count = len(place.muscle) if colour == "muscle" else int(place.body.max()) + 1
-        return Colouring("", CATEGORIES, names=tuple(f"{colour} {k}" for k in range(count)))
+        return Colouring("", categories(count), names=tuple(f"{colour} {k}" for k in range(count)))
     if limits is not None and not (np.isfinite(limits).all() and limits[0] < limits[1]):
         raise ValueError(f"limits must be two numbers in ascending order, got {limits}.")
     if colour == "activation":

@@ -27,6 +27,10 @@ LABELS = (1.55, 0.45)
 COLOUR_BAR = 0.35
 """Further room across for a colour bar with numbers of six digits and a label [inch]; without it the layout cuts off the label of the y
 axis."""
+NAMES = 0.65
+"""Room across for the names of the colours within that for labels [inch]; a figure with wider ones is wider."""
+TYPE = (8, 6)
+"""Size of the names of colours [point], of up to two columns and of more."""
 
 
 def show(
@@ -161,11 +165,9 @@ def panels_of(
         corners = (low, high) if place.dim == 2 else Camera(low, high, place.up).frame(low, high)
         width, height = corners[1] - corners[0]
         rows, columns = _grid(count, float(height / width))
-        figure = Picture(
-            figsize=_size(float(rows * height), float(columns * width), rows, columns, not colouring.names),
-            layout="constrained",
-            facecolor="white",
-        )
+        size = _size(float(rows * height), float(columns * width), rows, columns, not colouring.names)
+        room = size[1]
+        figure = Picture(figsize=size, layout="constrained", facecolor="white")
         axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
         for spare in axes[count:]:
             spare.set_axis_off()
@@ -175,10 +177,13 @@ def panels_of(
         if len(axes) != count:
             raise ValueError(f"axes must be one for each world, {count}, got {len(axes)}.")
         figure = axes[0].get_figure()
+        size, room = None, axes[-1].get_window_extent().height / figure.dpi
     panels = [Panel(one, place, low, high, traction) for one in axes]
     for one in axes if place.dim == 2 and count > 1 else ():
         one.label_outer()
-    _key(figure, list(axes), colouring)
+    key = _key(figure, list(axes), colouring, room)
+    if size is not None and key is not None:
+        _widen(figure, key, size[0] - NAMES)
     return figure, panels
 
 
@@ -195,25 +200,35 @@ def _size(height: float, width: float, rows: int, columns: int, bar: bool) -> tu
     return max(scale * width + across, NARROWEST), max(scale * height, LOWEST) + above
 
 
-def _key(figure: Any, axes: list[Any], colouring: Colouring) -> None:
-    """The colour bar, or the names of the categories."""
+def _widen(figure: Any, key: Any, width: float) -> None:
+    """Place the names of the colours beside the panels, which have this width [inch]; the figure becomes as wide as both."""
+    across = 1.05 * key.get_window_extent().width / figure.dpi + 0.15  # letters vary with the resolution
+    figure.set_figwidth(width + across)
+    key.set_in_layout(False)  # the layout of panels of a fixed aspect would not settle
+    figure.get_layout_engine().set(rect=(0.0, 0.0, width / (width + across), 1.0))
+    key.set_bbox_to_anchor((width / (width + across), 0.5), transform=figure.transFigure)
+
+
+def _key(figure: Any, axes: list[Any], colouring: Colouring, room: float) -> Any:
+    """The colour bar, or the names of the categories in columns of this height [inch], which are returned."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
     from matplotlib.patches import Patch
 
     if colouring.names:
-        names = colouring.names[: len(colouring.ramp)]
         patches = [
             Patch(facecolor=colour / 255, label=name)
-            for colour, name in zip(colouring.ramp, names, strict=False)
+            for colour, name in zip(colouring.ramp, colouring.names, strict=True)
         ]
-        axes[-1].legend(
-            handles=patches, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8
-        )
-        return
+        rows = [max(1, int((72 * room / points - 1.0) / 1.6)) for points in TYPE]  # with the space between
+        columns = [math.ceil(len(patches) / most) for most in rows]
+        small = columns[0] > 2
+        look: dict = dict(frameon=False, fontsize=TYPE[small], ncols=columns[small], columnspacing=1.0)
+        return axes[-1].legend(handles=patches, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
     ramp = LinearSegmentedColormap.from_list(colouring.label or "values", colouring.ramp / 255)
     bar = figure.colorbar(
         ScalarMappable(Normalize(*colouring.limits), ramp), ax=axes, shrink=0.85, pad=0.02, aspect=25
     )
     bar.set_label(colouring.label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
+    return None

@@ -19,7 +19,7 @@ from softmpm.recording.reader import Recording
 from softmpm.state import State
 
 DPI = 100
-"""Pixels per inch: a film is 700 pixels wide."""
+"""Pixels per inch: a film is 700 pixels wide, and wider with names of colours."""
 MOST_OF_A_GIF = 50
 """Pictures per second: viewers slow down shorter ones than two hundredths of a second."""
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import softmpm
-from softmpm.pictures.colouring import CATEGORIES
+from softmpm.pictures.colouring import CATEGORIES, PASSIVE, categories
 from softmpm.recording import style
 
 RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
@@ -146,6 +146,39 @@ def test_own_values_have_a_labelled_scale(model):
     figure = softmpm.show(model, model.rest(), colour=values, world=1, label="mass [kg]")
     (bar,) = (axes for axes in figure.axes if axes.get_ylabel() == "mass [kg]")
     assert bar.get_ylim() == pytest.approx((1.0, 1.5))
+
+
+@pytest.mark.parametrize("count, height", [(12, 0.6), (14, 0.3), (14, 0.05), (30, 0.3), (70, 0.3)])
+def test_each_of_many_muscles_has_a_colour_and_a_name(count, height):
+    """Also more than the fixed colours: each is in the picture, the names are all there, and nothing touches an edge."""
+    block = softmpm.box((0.1, FLOOR), (0.9, FLOOR + height), 1 / 240)
+    strip = np.floor((block.positions[:, 0] - 0.1) / 0.8 * count)
+    muscles = [
+        softmpm.Muscle(particles=np.flatnonzero(strip == k), direction=(0.0, 1.0), strength=1.0)
+        for k in range(count)
+    ]
+    figure = softmpm.show(scene_of(bodies=[softmpm.Body(block, RUBBER)], walls=[], muscles=muscles))
+    image = pixels(figure)
+    middles = [np.median(where(image, colour, 1)[1]) for colour in categories(count)]
+    assert np.all(np.diff(middles) > 0)
+    key = figure.axes[-1].get_legend()
+    assert [text.get_text() for text in key.get_texts()] == [f"muscle {k}" for k in range(count)]
+    box, whole = key.get_window_extent(), figure.bbox
+    assert whole.x0 < box.x0 and box.x1 < whole.x1 and whole.y0 < box.y0 and box.y1 < whole.y1
+    png = io.BytesIO()
+    figure.savefig(png, dpi=100)
+    every = np.asarray(Image.open(png).convert("L"))
+    for edge in (every[0], every[-1], every[:, 0], every[:, -1]):
+        assert edge.min() > 250
+
+
+@pytest.mark.parametrize("count, least", [(12, 30), (24, 30), (60, 30), (500, 10)])
+def test_categories_can_be_told_apart(count, least):
+    """From each other, from white and from the grey of no muscle, in at least one of red, green and blue."""
+    colours = np.vstack([categories(count), np.full(3, 255.0), PASSIVE])
+    apart = np.abs(colours[:, None] - colours[None]).max(-1) + 255.0 * np.eye(count + 2)
+    assert apart.min() >= least
+    np.testing.assert_array_equal(categories(count)[:12], CATEGORIES)
 
 
 def test_tractions_are_green_arrows(model):
