@@ -2,6 +2,7 @@
 
 import io
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -77,7 +78,7 @@ def show(
         raise TypeError(f"show needs a model or a scene, got {type(model).__name__}.")
     scene = model if isinstance(model, Scene) else model.scene
     place = of_scene(scene)
-    worlds = (world,) if isinstance(world, int) else tuple(world)
+    worlds = _whole(world)
     instants = _instants(model, state, activation, worlds)
     if colour is None:
         at_work = "activation" if activation is not None else "speed"
@@ -97,6 +98,14 @@ def show(
     if axes is None:
         figure.draw_without_rendering()  # the ticks decide the layout, which decides the ticks: once is not enough
     return figure
+
+
+def _whole(world: Any) -> tuple[int, ...]:
+    """Worlds as integers, of whatever whole numbers."""
+    try:
+        return tuple(operator.index(k) for k in (world if np.ndim(world) else (world,)))
+    except TypeError as error:
+        raise TypeError(f"world must be a whole number, or several of these, got {world!r}.") from error
 
 
 def _instants(

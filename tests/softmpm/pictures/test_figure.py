@@ -181,6 +181,15 @@ def test_categories_can_be_told_apart(count, least):
     np.testing.assert_array_equal(categories(count)[:12], CATEGORIES)
 
 
+@pytest.mark.parametrize("world", [np.int64(1), torch.tensor(1), np.array(1), np.array([1]), [np.int64(1)]])
+def test_a_world_is_any_whole_number(model, world):
+    """Of NumPy and PyTorch too; a fraction is refused."""
+    image = pixels(softmpm.show(model, model.rest(), world=world))
+    np.testing.assert_array_equal(image, pixels(softmpm.show(model, model.rest(), world=1)))
+    with pytest.raises(TypeError, match="whole number"):
+        softmpm.show(model, model.rest(), world=1.5)  # pyright: ignore[reportArgumentType]
+
+
 def test_tractions_are_green_arrows(model):
     """A force on one surface point draws an arrow there, upward; without forces there is no green."""
     state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1)
