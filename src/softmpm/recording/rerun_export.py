@@ -92,9 +92,10 @@ def _log_static(stream, source: Recording, show: Show) -> None:
     for name in ("activation", "strain"):
         stream.log(f"scene/robot/{name}", points.from_fields(radii=radii), static=True)
     _log_walls(stream, source)
-    muscles = [f"muscle {k}" for k in range(len(source.static["muscle"]))]
-    if muscles:
-        stream.log("activation", rr.SeriesLines(names=muscles), static=True)
+    fibres = _fibres(source)
+    if len(fibres):
+        names = [f"{'muscle' if has else 'pressure'} {k}" for k, has in enumerate(fibres)]
+        stream.log("activation", rr.SeriesLines(names=names), static=True)
     if show.has["force"]:
         names = [f"wall {k} {axis}" for k in source.static["surface_wall"] for axis in "xyz"[: source.dim]]
         stream.log("force", rr.SeriesLines(names=names), static=True)
@@ -103,6 +104,20 @@ def _log_static(stream, source: Recording, show: Show) -> None:
         if source.dim == 2:
             look["draw_order"] = 40.0  # before the particles, which have 30
         stream.log("scene/traction", _arrows(source).from_fields(**look), static=True)
+
+
+def _fibres(source: Recording) -> np.ndarray:
+    """Whether each actuator has fibres, as muscles do, shape (muscle,); the direction of a pressure is recorded as zero."""
+    return (source.static["muscle_direction"] != 0).any(axis=1)
+
+
+def _legend(source: Recording) -> str:
+    """What red and blue are."""
+    fibres = _fibres(source)
+    muscles, pressures = "muscles: red pulls, blue pushes", "pressures: red expands, blue contracts"
+    if fibres.all():
+        return muscles
+    return f"{muscles}; {pressures}" if fibres.any() else pressures
 
 
 def _log_walls(stream, source: Recording) -> None:
@@ -255,7 +270,7 @@ def _blueprint(source: Recording, show: Show):
     import rerun.blueprint as rrb
 
     robot, walls = "/scene/robot", "/scene/walls/**"
-    main = _space(source, show, "muscles: red pulls, blue pushes", [f"{robot}/activation", walls])
+    main = _space(source, show, _legend(source), [f"{robot}/activation", walls])
     rest = [_space(source, show, f"strain, 0 to {show.strain:.2g}", [f"{robot}/strain", walls])]
     if show.has["field"]:
         name = f"grid velocity, up to {show.speed:.2g} m/s"

@@ -9,7 +9,7 @@ from surface_scenes import block, forces_of, made, record_forces
 
 import softmpm
 from softmpm.__main__ import main
-from softmpm.recording import style
+from softmpm.recording import rerun_export, style
 
 chunk = pytest.importorskip("rerun.chunk")
 
@@ -118,6 +118,44 @@ def test_fields_walls_latent_and_curves(tmp_path):
     captions = column(rrd, "/caption", "TextDocument:text").tolist()
     assert ["Iteration 0" in captions[0], "Iteration 10" in captions[1]] == [True, True]
     assert "odd/name: ü: 10" in captions[1] and "note: x" in captions[1]
+
+
+@pytest.mark.parametrize(
+    "kinds, names, title",
+    [
+        ("m", ["muscle 0"], "muscles: red pulls, blue pushes"),
+        ("p", ["pressure 0"], "pressures: red expands, blue contracts"),
+        (
+            "mp",
+            ["muscle 0", "pressure 1"],
+            "muscles: red pulls, blue pushes; pressures: red expands, blue contracts",
+        ),
+    ],
+)
+def test_pressures_are_no_muscles(tmp_path, monkeypatch, kinds, names, title):
+    """A pressure is named as one, and its positive activation expands."""
+    titles, space = [], rerun_export._space
+    monkeypatch.setattr(rerun_export, "_space", lambda *given: titles.append(given[2]) or space(*given))
+    body = softmpm.Body(
+        softmpm.box((0.3, 0.3), (0.6, 0.6), spacing=0.1), softmpm.NeoHookean(density=1.0, young=1.0)
+    )
+    actuators = [
+        softmpm.Muscle(particles=[k], direction=(0.0, -1.0), strength=1.0)
+        if kind == "m"
+        else softmpm.Pressure(particles=[k], strength=1.0)
+        for k, kind in enumerate(kinds)
+    ]
+    grid = softmpm.Grid(shape=(9, 9), spacing=0.125)
+    model = softmpm.build(softmpm.Scene(grid=grid, bodies=[body], muscles=actuators, dt=1e-3), device="cpu")
+    with softmpm.Recorder(tmp_path / "run.h5", model) as recorder:
+        recorder.episode(0).frame(0.0, model.rest(), torch.ones(len(kinds)))
+    rrd = softmpm.to_rerun(tmp_path / "run.h5")
+    found = [
+        flat(batch.column("SeriesLines:names")).tolist()
+        for one in chunk.RrdReader(rrd).stream().filter(content="/activation")
+        if "SeriesLines:names" in (batch := one.to_record_batch()).schema.names
+    ]
+    assert found == [names] and titles[0] == title
 
 
 def test_less_can_be_shown(tmp_path):
