@@ -107,12 +107,12 @@ def _log_static(stream, source: Recording, show: Show) -> None:
 
 
 def _fibres(source: Recording) -> np.ndarray:
-    """Whether each actuator has fibres, as muscles do, shape (muscle,); the direction of a pressure is recorded as zero."""
+    """True for each actuator with fibres, as muscles have, shape (muscle,); the direction of a pressure is recorded as zero."""
     return (source.static["muscle_direction"] != 0).any(axis=1)
 
 
 def _legend(source: Recording) -> str:
-    """What red and blue are."""
+    """Meaning of red and blue."""
     fibres = _fibres(source)
     muscles, pressures = "muscles: red pulls, blue pushes", "pressures: red expands, blue contracts"
     if fibres.all():
