@@ -18,9 +18,9 @@ LAYERS = """
     errors
     scene planning alarms kernels.structs
     checks
-    check_inputs check_nodes
+    check_inputs
     energy_density oracle.stress oracle.transfer oracle.walls
-    oracle.moving oracle.step_limit kernels.physics
+    oracle.moving oracle.step_limit kernels.physics check_nodes
     oracle.contact oracle.driven oracle.overlap oracle.mirror
     stability kernels.convert oracle.lagrangian oracle.moving_contact
     kernels.material kernels.rasterize kernels.plain kernels.fast kernels.lagrangian

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from softmpm.checks import Sizes
+from softmpm.oracle.stress import det
 from softmpm.state import State
 from softmpm.validate import need
 
@@ -58,9 +59,9 @@ def check_projected(model: Sizes, given: State, shown: State) -> None:
     Args:
         shown: What the nodes show.
     """
-    dx, det = model.scene.grid.spacing, _det(given.F)
+    dx, volume = model.scene.grid.spacing, det(given.F)
     way = (given.x - shown.x).abs().amax(-1) / dx
-    farthest, least = torch.stack([way.max(), det.min()]).tolist()
+    farthest, least = torch.stack([way.max(), volume.min()]).tolist()
     if farthest > ASTRAY:
         world, p = _place(way, farthest)
         raise ValueError(
@@ -70,17 +71,11 @@ def check_projected(model: Sizes, given: State, shown: State) -> None:
         )
     collapse = model.alarms.collapse
     if collapse is not None and not least > collapse:
-        world, p = _place(det, least)
+        world, p = _place(volume, least)
         raise ValueError(
             f"det state.F must be above {collapse:g}, but that of particle {p} of world {world} is {least:.4g}; start from a "
             "deformation gradient that is not inverted and less compressed, or set the limit with alarms=softmpm.Alarms(collapse=...)."
         )
-
-
-def _det(F: Tensor) -> Tensor:
-    if F.shape[-1] == 2:
-        return F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
-    return (F[..., 0] * torch.linalg.cross(F[..., 1], F[..., 2], dim=-1)).sum(-1)
 
 
 def _place(values: Tensor, value: float) -> tuple[int, ...]:

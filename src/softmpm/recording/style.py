@@ -25,7 +25,7 @@ def pack(rgb: np.ndarray) -> np.ndarray:
 
 
 def activation_colours(static: dict[str, np.ndarray], activation: np.ndarray) -> np.ndarray:
-    """Red where muscles pull, blue where they push, the body's grey at rest.
+    """Red where the activation is positive, as of muscles that pull, blue where it is negative, the body's grey at rest.
 
     Args:
         static: Of a recording.

@@ -68,9 +68,8 @@ def _refuse_inverted_parts(
     outlines = [triangle_outline(split_triangles(vertices[faces[part == k]], size / 32)) for k in negative]
     beside = np.concatenate([outline.points - 1e-5 * size * outline.normals for outline in outlines])
     start = np.cumsum([0] + [len(outline.points) for outline in outlines[:-1]])
-    enclosed = winding_inside(
-        vertices, faces[volume[part] >= 0.0], beside
-    )  # by the others, not flush with them
+    others = faces[volume[part] >= 0.0]
+    enclosed = winding_inside(vertices, others, beside)  # and not flush with them
     material = winding_inside(vertices, faces, beside)  # nowhere for what lies in a cavity
     cavity = np.logical_and.reduceat(enclosed, start) & np.logical_or.reduceat(material, start)
     inverted = int((~cavity).sum())

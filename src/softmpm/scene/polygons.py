@@ -75,9 +75,8 @@ def _pieces(polygons: Sequence[np.ndarray], extent: float) -> tuple[np.ndarray, 
         length = np.linalg.norm(along)
         across = np.array([-along[1], along[0]]) / length
         low, high = (start - a) @ across, (end - a) @ across  # heights of all edges above this one
-        crossing = ((low > 0) != (high > 0)) & (
-            np.maximum(abs(low), abs(high)) > SNAP * extent
-        )  # not along this one
+        apart = np.maximum(np.abs(low), np.abs(high)) > SNAP * extent  # the others lie along this one
+        crossing = apart & ((low > 0) != (high > 0))
         share = low[crossing] / (low[crossing] - high[crossing])
         met = start[crossing] + share[:, None] * (end - start)[crossing]
         touching = start[np.abs(low) <= SNAP * extent]

@@ -22,9 +22,7 @@ def alike(one: Any, other: Any, *, weights: bool = True) -> bool:
     """
     try:
         return _alike(one, other, weights)
-    except (
-        Exception
-    ):  # a class that cannot be compared or pickled; RecursionError of an object that refers to itself
+    except Exception:  # what cannot be compared or pickled, or refers to itself
         return False
 
 
