@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from bench.problems import contact, exact, statics, waves
 
 RESULTS = Path(__file__).parents[1] / "bench" / "results"
@@ -58,6 +59,15 @@ def test_a_disc_rests_as_hertz_says():
 def test_a_block_rests_on_the_floor():
     """Without a gap: within half a hundredth of a cell."""
     assert abs(contact.gap(2, 2)["error %"]) <= 0.5
+
+
+def test_a_soft_block_rests_on_a_slope(monkeypatch):
+    """With its corners on nodes, where it rolled a metre down when the outline did not load the nodes as the particles do."""
+    monkeypatch.syspath_prepend(RESULTS.parent)
+    from bench import slope
+
+    found = slope.slope(6, (0.0, 0.0), "reference", torch.device("cpu"))
+    assert found["1.5 s, mm"] < 25.0
 
 
 def test_the_exact_answers():

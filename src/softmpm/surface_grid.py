@@ -1,7 +1,8 @@
 """Interpolation at the surface points of bodies in the reference formulation, found once when a model is built.
 
-Weights of nodes that hold next to no mass are dropped, and the others corrected by an affine function of the distance, so that affine
-fields stay exact: such a node would move far at the touch of a wall. Derivation: docs/math/contact.md.
+The weights divide a pressure among the nodes as the stress of the particles behind it is divided. Those of nodes that hold next to no
+mass are dropped, since such a node would move far at the touch of a wall, and the others corrected by an affine function of the
+distance, so that affine fields stay exact. Derivation: docs/math/contact.md.
 """
 
 import itertools
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.rest_grid import RestGrid, flat, stencils
+from softmpm.rest_grid import RestGrid, bases, flat, stencils
 from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.state import State
 from softmpm.surface_points import SurfacePoints
@@ -38,8 +39,11 @@ class SurfaceGrid(SurfacePoints):
         super().__init__(scene, device)
         grid, dim = scene.grid, scene.grid.dim
         points, areas, density = (one.cpu().numpy() for one in (self.points, self.areas, self.density))
+        outlines = [body.particles.outline for body in scene.bodies if body.particles.outline is not None]
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
-        base, f, weights = stencils(points / grid.spacing, offsets)
+        base, f = bases(points / grid.spacing)
+        arms = offsets - f[:, None]
+        weights = face_weights(arms, np.concatenate([outline.normals for outline in outlines]))
         at = flat(base[:, None] + offsets, grid.shape)
         index = rest.index.cpu().numpy()
         sorting = np.argsort(index)
@@ -51,7 +55,7 @@ class SurfaceGrid(SurfacePoints):
             share *= body.material.density * np.asarray(body.particles.volume)[:, None]
             np.add.at(mass, np.searchsorted(index, flat(near[:, None] + offsets, grid.shape)), share)
         held = (index[numbers] == at) & (mass[numbers] > LEAST * density[:, None] * grid.spacing**dim)
-        weights = consistent(np.where(held, weights, 0.0), offsets - f[:, None])
+        weights = consistent(np.where(held, weights, 0.0), arms)
         main = np.take_along_axis(numbers, np.abs(weights).argmax(axis=1)[:, None], axis=1)
         numbers = sorting[
             np.where(weights != 0.0, numbers, main)
@@ -93,6 +97,22 @@ class SurfaceGrid(SurfacePoints):
             near = u.index_select(1, self.stencil.reshape(-1)).reshape(len(u), *self.stencil.shape, -1)
         x = self.points.to(u.dtype) + (self.weights.to(u.dtype)[..., None] * near).sum(2)
         return x if shift is None else (x + shift[:, None]).to(u.dtype)
+
+
+def face_weights(arms: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Shares of the nodes in a pressure on a face, (K11), shape (point, node). They sum to one and are exact for affine fields.
+
+    Args:
+        arms: Distance of each node from the point in cells, shape (point, node, dim).
+        normals: Unit normals of the face, shape (point, dim).
+    """
+    d = np.abs(arms)
+    t = np.maximum(1.5 - d, 0.0)
+    along = np.where(d < 0.5, 0.75 - d**2, t**2 / 2)
+    across = np.where(d < 0.5, 13 / 16 - 1.5 * d**2 + d**4, t**3 - t**4 / 2)
+    axes = np.eye(arms.shape[-1], dtype=bool)
+    shares = np.stack([np.where(axis, across, along).prod(axis=-1) for axis in axes], axis=-1)
+    return np.einsum("pna,pa->pn", shares, normals**2)
 
 
 def consistent(weights: np.ndarray, arms: np.ndarray) -> np.ndarray:

@@ -93,6 +93,36 @@ def test_corrected_weights_are_exact_for_affine_fields(dim):
     assert np.allclose(consistent(np.array([[0.25, 0.5, 0.0]]), arms), [[0.0, 1.0, 0.0]])
 
 
+@pytest.mark.parametrize("place", [0.0, 0.3, 0.5])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_pressure_is_divided_as_the_stress_behind_it(dim, place, monkeypatch):
+    """(K11): forces on all nodes from a pressure on the outline are those from the same pressure in the particles of a box, Σ V g."""
+    monkeypatch.setattr("softmpm.surface_grid.LEAST", 0.0)
+    h, fine = 0.1, 10 if dim == 2 else 6
+    low = np.full(dim, (3 + place) * h)
+    box = softmpm.box(low, low + 3 * h, spacing=h / fine)
+    body = softmpm.Body(box, softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3))
+    wall = softmpm.Wall(normal=(0.0,) * (dim - 1) + (1.0,), offset=low[0])
+    made = softmpm.Scene(
+        grid=softmpm.Grid(shape=(10,) * dim, spacing=h), bodies=[body], walls=[wall], dt=1e-5
+    )
+    model = build(made)
+    assert isinstance(model.surface, SurfaceGrid) and box.outline is not None
+    nodes = model.rest_grid.nodes.double().numpy() * h
+    arms = (nodes[:, None] - box.positions) / h
+    splines = np.where(
+        np.abs(arms) < 0.5, 0.75 - arms**2, 0.5 * np.maximum(1.5 - np.abs(arms), 0.0) ** 2
+    ).prod(-1)
+    inner = np.einsum("p,np,npa->na", box.volume, 4 / h * splines, arms)
+    loads = (
+        model.surface.weights.numpy()[..., None] * (box.outline.areas[:, None] * box.outline.normals)[:, None]
+    )
+    outer = np.zeros_like(inner)
+    np.add.at(outer, model.surface.stencil.numpy(), loads)
+    np.testing.assert_allclose(outer, inner, rtol=0, atol=0.01 * h ** (dim - 1))
+    assert np.abs(inner).max() > 0.4 * h ** (dim - 1)
+
+
 def test_calls_in_turn_are_one_call(device):
     """The anchors travel with the state."""
     model = build(block(2), device=device, dtype=torch.float64)
