@@ -49,13 +49,16 @@ def kernel(options: Mapping[str, Any] | None = None, **settings) -> Callable[[Ca
     """Decorator of a kernel without a generated adjoint, in a module of its own.
 
     Kernels with the same code and options are one kernel. Warp compares the numbers of their closures in single precision, or as 32-bit
-    integers.
+    integers. It computes a hash of the code for each number of threads in a block, the first one for that in the options, which is
+    1 where there is no GPU, as on a CPU in any case.
 
     Args:
         options: Compile options, as in ``wp.set_module_options``.
         settings: Further arguments of ``wp.kernel``.
     """
-    return wp.kernel(module="unique", module_options=dict(options or {}), enable_backward=False, **settings)
+    threads = {} if wp.is_cuda_available() else {"block_dim": 1}
+    options = {**threads, **(options or {})}
+    return wp.kernel(module="unique", module_options=options, enable_backward=False, **settings)
 
 
 def kernel_in_order(records: int) -> Callable[[Callable], wp.Kernel]:
