@@ -9,7 +9,7 @@ No process waits for one that has failed: what may fail in one of them stands in
 
 import importlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
@@ -106,6 +106,13 @@ class Group:
         if self.size > 1:
             dist.broadcast_object_list(values, src=source)
         return values[0]
+
+    def collect(self, values: Sequence[T]) -> list[T]:
+        """The values of all processes, in the order of the processes, in every process: plain values, their number may differ."""
+        parts = [list(values)] * self.size
+        if self.size > 1:
+            dist.all_gather_object(parts, list(values))
+        return [value for part in parts for value in part]
 
     def once(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
         """Do ``work`` in the first process, while the others wait; gives its result there and None elsewhere.

@@ -257,7 +257,8 @@ def test_alone_nothing_is_communicated():
     group, tensor = Group(), torch.ones(2)
     assert group.split(5) == range(5) and group.any(True) and not group.any(False)
     assert group.average([tensor])[0] is tensor and group.gather(tensor, dim=0) is tensor
-    assert group.broadcast("text") == "text" and group.once(max, 2, 3) == 3
+    assert group.broadcast("text") == "text" and group.collect(["text"]) == ["text"]
+    assert group.once(max, 2, 3) == 3
     with pytest.raises(KeyError) as caught, group.fail_together():
         raise KeyError
     assert not isinstance(caught.value, OtherProcessError) and not torch.distributed.is_initialized()

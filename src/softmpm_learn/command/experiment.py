@@ -8,6 +8,7 @@ import shutil
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -82,6 +83,9 @@ def run_side_by_side(
         members, task = [member for share in shares for member in share], make_task(conf.task)
         model = make_model(task, conf, group, None if alone else len(members))
     logger.info("%s", model.describe(task.substeps))
+    if not alone and group.size > 1:
+        own = ", ".join(map(str, sorted({one.train.seed for one, _ in members})))
+        logger.info("Progress is reported of the seeds of the first process: %s.", own)
     with contextlib.ExitStack() as open_loggers, contextlib.ExitStack() as held:
         loggers = [open_loggers.enter_context(Loggers(one.train.log, place)) for one, place in members]
         progress = held.enter_context(ProgressBar(conf.train.iterations)) if group.first else None
@@ -130,11 +134,12 @@ def run_side_by_side(
                     own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
     rest = iter(results)
     found = [[next(rest) for _ in share] for share in shares]
+    ends = [group.collect([Ending.of(result) for result in own]) for own in found] if not alone else []
     if group.first:
-        last = [
-            farewell(own[0], task, place) if alone else farewell_of_seeds(own, place)
-            for own, (_, place) in zip(found, jobs, strict=True)
-        ]
+        if alone:
+            last = [farewell(results[0], task, out)]
+        else:
+            last = [farewell_of_seeds(own, place) for own, (_, place) in zip(ends, jobs, strict=True)]
         for text in (account(seconds, time.perf_counter() - began), *last):
             logger.info("%s", text)
         signals.advice = f"The run had ended; everything is in {out if len(jobs) == 1 else out.parent}."
@@ -215,19 +220,39 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     return "\n".join(lines)
 
 
-def farewell_of_seeds(results: Sequence[Result], out: Path) -> str:
-    """Summary of several seeds; its last line is what to do next."""
-    losses = [result.best_loss for result in results if math.isfinite(result.best_loss) and not result.error]
+@dataclass(frozen=True)
+class Ending:
+    """End of the run of a seed, which its process passes to the others."""
+
+    seed: int
+    best_loss: float
+    evaluated: bool
+    """True if ``best_loss`` is that of an evaluation."""
+    failed: bool
+    finished: bool
+
+    @classmethod
+    def of(cls, result: Result) -> "Ending":
+        run = result.run
+        return cls(
+            run.settings.train.seed, result.best_loss, run.evaluated, bool(result.error), result.finished
+        )
+
+
+def farewell_of_seeds(ends: Sequence[Ending], out: Path) -> str:
+    """Summary of the seeds of all processes; its last line is what to do next."""
+    ends = sorted(ends, key=lambda one: one.seed)
+    losses = [one.best_loss for one in ends if math.isfinite(one.best_loss) and not one.failed]
     lines, place = [], _relative(out)
     if losses:
-        middle, ends = statistics.median(losses), f"{min(losses):.5g} to {max(losses):.5g}"
-        what = "evaluations" if results[0].run.evaluated else "losses"
-        lines.append(f"Best {what} of {len(losses)} seeds: median {middle:.5g}, from {ends}.")
-    failed = [str(result.run.settings.train.seed) for result in results if result.error]
+        middle, span = statistics.median(losses), f"{min(losses):.5g} to {max(losses):.5g}"
+        what = "evaluations" if ends[0].evaluated else "losses"
+        lines.append(f"Best {what} of {len(losses)} seeds: median {middle:.5g}, from {span}.")
+    failed = [str(one.seed) for one in ends if one.failed]
     if failed:
         lines.append(f"Failed: seed {', '.join(failed)}.")
     lines.append(f"Each seed has a folder in {place}, and a row in {place}/{sweep.TABLE}.")
-    if failed or not all(result.finished for result in results):
+    if failed or not all(one.finished for one in ends):
         lines.append(f"To go on: {plugins.command()} resume={place}")
     return "\n".join(lines)
 

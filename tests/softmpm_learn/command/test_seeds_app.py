@@ -246,9 +246,13 @@ def torchrun(*words: str, cwd: Path) -> subprocess.CompletedProcess:
 
 
 def test_processes_share_the_seeds(main, tmp_path):
-    """Each has its own, without an exchange of gradients: three seeds in two processes are those of one."""
+    """Each has its own, without an exchange of gradients: three seeds in two processes are those of one. The last lines are of all."""
     done = torchrun(*PLAIN, "train.seeds=3", "hydra.run.dir=two", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    best = [float(row["loss"]) for row in rows(Path("two/sweep.csv"))]
+    middle, ends = statistics.median(best), f"{min(best):.5g} to {max(best):.5g}"
+    assert f"Best evaluations of 3 seeds: median {middle:.5g}, from {ends}." in done.stdout
+    assert "of the seeds of the first process: 0, 2." in done.stdout
     assert main(*PLAIN, "train.seeds=3", "hydra.run.dir=one")[0] == 0
     assert [row["seed"] for row in rows(Path("two/sweep.csv"))] == ["0", "1", "2"]
     for k in range(3):
