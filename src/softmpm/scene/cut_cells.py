@@ -23,12 +23,33 @@ def sample_points(middles: np.ndarray, spacing: float) -> np.ndarray:
     return middles[:, None] + np.stack(np.meshgrid(*[along] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
 
 
-def share_inside(distance: np.ndarray, width: float) -> np.ndarray:
+def share_inside(distance: np.ndarray, width: float, thickness: np.ndarray | float = np.inf) -> np.ndarray:
     """Share of a small cube of this width that lies inside, from the signed distance of its middle, negative inside [m].
 
-    Exact for planes along its sides; for others the error is odd in the distance and averages out.
+    Exact for planes along its sides, and for sheets between two of them; for others the error is odd in the distance and averages
+    out.
+
+    Args:
+        distance: Of the nearest point of the surface [m].
+        width: Of the cube [m].
+        thickness: From that point on to the surface opposite [m]: a sheet thinner than the cube fills a part of it.
     """
-    return np.clip(0.5 - distance / width, 0.0, 1.0)
+    return np.clip(0.5 - distance / width, 0.0, 1.0) - np.clip(0.5 - (distance + thickness) / width, 0.0, 1.0)
+
+
+def inward(
+    points: np.ndarray, nearest: np.ndarray, normal: np.ndarray, distance: np.ndarray, shift: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays into a shape from the nearest points of its surface: starts, shifted inwards [m], and unit vectors, shapes (point, dim).
+
+    Args:
+        normal: Unit inward normals there, for points no farther than the shift, shape (point, dim).
+        distance: Signed distance of the points, negative inside [m].
+    """
+    size = np.abs(distance)[:, None]
+    away = (nearest - points) * np.where(distance > 0.0, 1.0, -1.0)[:, None]
+    direction = np.where(size > shift, away / np.maximum(size, shift), normal)
+    return nearest + shift * direction, direction
 
 
 def inner_parts(middles: np.ndarray, weights: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import warp as wp
 
 from softmpm.kernels.compile import launch
 from softmpm.scene.boundary import split_triangles, triangle_outline
-from softmpm.scene.cut_cells import share_inside
+from softmpm.scene.cut_cells import inward, share_inside
 from softmpm.scene.outline import Outline
 from softmpm.validate import need
 
@@ -111,14 +111,22 @@ def winding_inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
 def mesh_coverage(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, width: float) -> np.ndarray:
     """Share of a small cube of this width around each point (point, 3) that lies inside."""
     inside, nearest, face = _nearest(vertices, faces, points)
-    distance = np.linalg.norm(points - nearest, axis=1)
-    share = share_inside(np.where(inside, -distance, distance), width)
-    close = np.flatnonzero(inside & (share < 1.0))
+    distance = np.linalg.norm(points - nearest, axis=1) * np.where(inside, -1.0, 1.0)
+    share = share_inside(distance, width)
+    close = np.flatnonzero((share > 0.0) & (np.abs(distance) < width / 2))
     corner = vertices[faces[face[close]]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    beyond = nearest[close] + 0.05 * width * normal
-    share[close[winding_inside(vertices, faces, beyond)]] = 1.0  # that face lies within another part
+    beyond = 0.05 * width  # of a surface, where the outside must be; else that face lies within another part
+    shift = 0.01 * width
+    start, direction = inward(points[close], nearest[close], -normal, distance[close], shift)
+    thickness = shift + _ray_length(vertices, faces, start, direction, width)
+    thin = np.flatnonzero(np.isfinite(thickness))
+    opposite = nearest[close[thin]] + (thickness[thin] + beyond)[:, None] * direction[thin]
+    thickness[thin[winding_inside(vertices, faces, opposite)]] = np.inf
+    share[close] = share_inside(distance[close], width, thickness)
+    covered = inside[close] & winding_inside(vertices, faces, nearest[close] + beyond * normal)
+    share[close[covered]] = 1.0
     return share
 
 
@@ -152,19 +160,52 @@ def _nearest(
     vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inside test of points (point, 3), the nearest point of the surface, and its face."""
-    low = vertices.min(axis=0)
-    unit = float(np.ptp(vertices, axis=0).max())  # the query is in float32: keep its numbers near one
-    surface = wp.Mesh(
-        wp.array((vertices - low) / unit, dtype=wp.vec3, device="cpu"),
-        wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu"),
-        support_winding_number=True,
-    )
+    surface, low, unit = _surface(vertices, faces)
     queries = wp.array((points - low) / unit, dtype=wp.vec3, device="cpu")
     inside = wp.zeros(len(points), dtype=wp.int32, device="cpu")
     nearest = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
     face = wp.zeros(len(points), dtype=wp.int32, device="cpu")
     launch(_query, len(points), [surface.id, queries, inside, nearest, face], wp.get_device("cpu"))
     return inside.numpy().astype(bool), low + unit * nearest.numpy().astype(np.float64), face.numpy()
+
+
+def _ray_length(
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, directions: np.ndarray, most: float
+) -> np.ndarray:
+    """Distance of each point from the surface along a unit vector (point, 3) [m], shape (point,); inf above ``most``."""
+    surface, low, unit = _surface(vertices, faces)
+    starts = wp.array((points - low) / unit, dtype=wp.vec3, device="cpu")
+    along = wp.array(directions, dtype=wp.vec3, device="cpu")
+    length = wp.full(len(points), np.inf, dtype=wp.float32, device="cpu")
+    launch(_cast, len(points), [surface.id, starts, along, most / unit, length], wp.get_device("cpu"))
+    return unit * length.numpy().astype(np.float64)
+
+
+def _surface(vertices: np.ndarray, faces: np.ndarray) -> tuple[wp.Mesh, np.ndarray, float]:
+    """The mesh shifted and scaled to span one, as queries are in float32; the shift and the unit [m]."""
+    low, unit = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    surface = wp.Mesh(
+        wp.array((vertices - low) / unit, dtype=wp.vec3, device="cpu"),
+        wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu"),
+        support_winding_number=True,
+    )
+    return surface, low, unit
+
+
+@wp.kernel
+def _cast(
+    # In:
+    surface: wp.uint64,
+    points: wp.array(dtype=wp.vec3),  # pyright: ignore
+    directions: wp.array(dtype=wp.vec3),  # pyright: ignore
+    most: float,
+    # Out:
+    length: wp.array(dtype=wp.float32),  # pyright: ignore
+):
+    i = wp.tid()
+    query = wp.mesh_query_ray(surface, points[i], directions[i], most)
+    if query.result:  # pyright: ignore
+        length[i] = query.t  # pyright: ignore
 
 
 @wp.kernel

@@ -4,7 +4,7 @@ An edge is divided where others meet it; a piece is part of the boundary if one 
 not. So polygons may overlap, share sides, cross themselves and turn either way.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -54,13 +54,39 @@ def union_boundary(polygons: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 def boundary_distance(points: np.ndarray, boundary: Sequence[np.ndarray]) -> np.ndarray:
     """Distance of each point from closed polygons [m], shape (point,)."""
-    square = np.full(len(points), np.inf)
+    return np.linalg.norm(points - nearest_on(points, boundary)[0], axis=1)
+
+
+def nearest_on(points: np.ndarray, boundary: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest point of closed polygons to each point [m], and the unit normal to the left of its edge, shapes (point, 2)."""
+    square, nearest, left = np.full(len(points), np.inf), np.empty_like(points), np.empty_like(points)
+    for a, along in _edges(boundary):
+        share = np.clip((points - a) @ along / (along @ along), 0.0, 1.0)
+        place = a + share[:, None] * along
+        found = np.square(points - place).sum(axis=1)
+        closer = found < square
+        square[closer], nearest[closer] = found[closer], place[closer]
+        left[closer] = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    return nearest, left
+
+
+def ray_length(points: np.ndarray, directions: np.ndarray, boundary: Sequence[np.ndarray]) -> np.ndarray:
+    """Distance of each point from closed polygons along a unit vector (point, 2) [m], shape (point,); inf where there is nothing."""
+    length = np.full(len(points), np.inf)
+    for a, along in _edges(boundary):
+        across = directions[:, 0] * along[1] - directions[:, 1] * along[0]
+        away, slope = a - points, np.where(across == 0.0, np.inf, across)  # a parallel edge is not met
+        ahead = (away[:, 0] * along[1] - away[:, 1] * along[0]) / slope
+        share = (away[:, 0] * directions[:, 1] - away[:, 1] * directions[:, 0]) / slope
+        met = (across != 0.0) & (ahead > 0.0) & (share >= 0.0) & (share <= 1.0)
+        length = np.where(met, np.minimum(length, ahead), length)
+    return length
+
+
+def _edges(boundary: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Start and vector of each edge of closed polygons."""
     for polygon in boundary:
-        for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-            along = b - a
-            share = np.clip((points - a) @ along / (along @ along), 0.0, 1.0)
-            square = np.minimum(square, np.square(points - a - share[:, None] * along).sum(axis=1))
-    return np.sqrt(square)
+        yield from zip(polygon, np.roll(polygon, -1, axis=0) - polygon, strict=True)
 
 
 def _pieces(polygons: Sequence[np.ndarray], extent: float) -> tuple[np.ndarray, np.ndarray]:

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softmpm.scene.boundary import ball_outline, box_outline, polygon_outline
-from softmpm.scene.cut_cells import SAMPLES, inner_parts, merge_slivers, sample_points, share_inside
+from softmpm.scene.cut_cells import SAMPLES, inner_parts, inward, merge_slivers, sample_points, share_inside
 from softmpm.scene.image import Inside, coverage, mask_contours, silhouette
 from softmpm.scene.mesh import closed_surface, mesh_coverage, mesh_outline, near_surface, winding_inside
-from softmpm.scene.polygons import boundary_distance, inside_any, union_boundary
+from softmpm.scene.polygons import boundary_distance, inside_any, nearest_on, ray_length, union_boundary
 from softmpm.scene.scene import Particles
 from softmpm.validate import need
 
@@ -84,6 +84,9 @@ def _cut_ball(radii: np.ndarray, middles: np.ndarray, spacing: float) -> tuple[n
     distance = (level - 1.0) * level / np.linalg.norm(samples / radii, axis=2)  # to first order
     weights = share_inside(distance, spacing / SAMPLES)
     share[cut], centroid[cut] = inner_parts(middles[cut], weights, spacing)
+    if radii.min() < spacing:  # both sides cross the same samples, which know the nearer one only
+        whole = math.prod(radii) * (math.pi if len(radii) == 2 else 4 / 3 * math.pi) / spacing ** len(radii)
+        share[cut] *= (whole - share[~cut].sum()) / share[cut].sum()
     return share, centroid
 
 
@@ -130,8 +133,10 @@ def _cut_polygons(
     cut = boundary_distance(middles, boundary) < spacing * math.sqrt(0.5)
     samples = sample_points(middles[cut], spacing)
     flat = samples.reshape(-1, 2)
-    distance = boundary_distance(flat, boundary) * np.where(inside_any(flat, drawn), -1.0, 1.0)
-    weights = share_inside(distance, spacing / SAMPLES).reshape(len(samples), -1)
+    place, normal = nearest_on(flat, boundary)
+    distance = np.linalg.norm(flat - place, axis=1) * np.where(inside_any(flat, drawn), -1.0, 1.0)
+    thickness = ray_length(*inward(flat, place, normal, distance, 1e-6 * spacing), boundary)
+    weights = share_inside(distance, spacing / SAMPLES, thickness).reshape(len(samples), -1)
     share[cut], centroid[cut] = inner_parts(middles[cut], weights, spacing)
     return share, centroid
 
