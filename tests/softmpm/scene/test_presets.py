@@ -237,7 +237,7 @@ def test_the_page_has_the_step_limits():
             K, mass = 2 * mu + dim * lam, m.density * 5e-3**2
             by_hand = (math.sqrt((2 * m.viscosity) ** 2 + K * mass) - 2 * m.viscosity) / K
             assert softmpm.stable_dt(box_scene(m, dim)) == pytest.approx(by_hand, rel=1e-6)
-            assert float(cell) == pytest.approx(1e6 * by_hand, rel=5.1e-3)
+            assert float(cell) == float(f"{1e6 * by_hand:.3g}"), name
 
 
 def test_the_code_of_the_page_runs():
