@@ -104,26 +104,27 @@ def build(
     else:
         check_moving(scene, surface, place, deterministic)
         scheme, reason = choose_scheme(scene, dtype, int(worlds), scheme, surface and bool(deterministic))
-    return Model(
-        scene,
-        place,
-        dtype,
-        scheme,
-        reason,
-        SCHEMES[scheme].footprint,
-        relevant(alarms, formulation, surface),
-        formulation=formulation,
-        formulation_reason=why,
-        surface=surface,
-        contact_width=float(contact_width),
-        given=given,
-        deterministic=bool(deterministic),
-        fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme),
-        worlds=int(worlds),
-        memory_budget=_whole_bytes(memory_budget),
-        calls=int(calls),
-        threads=None if threads is None else int(threads),
-    )
+    with torch.inference_mode(False):  # else the model could not take part in a gradient later
+        return Model(
+            scene,
+            place,
+            dtype,
+            scheme,
+            reason,
+            SCHEMES[scheme].footprint,
+            relevant(alarms, formulation, surface),
+            formulation=formulation,
+            formulation_reason=why,
+            surface=surface,
+            contact_width=float(contact_width),
+            given=given,
+            deterministic=bool(deterministic),
+            fixed_point=bool(deterministic) and in_fixed_point(place, dtype, scheme),
+            worlds=int(worlds),
+            memory_budget=_whole_bytes(memory_budget),
+            calls=int(calls),
+            threads=None if threads is None else int(threads),
+        )
 
 
 def _check_settings(dtype: torch.dtype, scheme: str, deterministic: bool, contact_width: float) -> None:

@@ -271,6 +271,24 @@ def test_it_works_in_inference_mode(scheme):
     assert torch.equal(*found)
 
 
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+def test_a_model_built_in_inference_mode_has_gradients(formulation):
+    """Outside of it, the same as of a model that was built there."""
+    scene = busy_scene(2, per_law=4)
+    with torch.inference_mode():
+        inner = softmpm.build(scene, device="cpu", formulation=formulation)
+        softmpm.simulate(inner, inner.rest(), None, inner.params(), substeps=2)
+        softmpm.rasterize(inner, inner.rest())
+    found = []
+    for model in (inner, softmpm.build(scene, device="cpu", formulation=formulation)):
+        start = model.rest()
+        start.v.requires_grad_()
+        end = softmpm.simulate(model, start, None, model.params(), substeps=2)
+        loss = dot(cotangent(end), end) + softmpm.rasterize(model, end).velocity.square().sum()
+        found += torch.autograd.grad(loss, start.v)
+    assert torch.equal(*found)
+
+
 @pytest.mark.parametrize(
     "number, cause",
     [(torch.nan, "look at the loss"), (torch.inf, "look at the loss"), (3e38, "scale the loss")],
