@@ -1,6 +1,8 @@
 """Clamps and planes of symmetry: every value and gradient against the float64 oracle, and what they promise."""
 
+import ast
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -260,6 +262,29 @@ def test_clamps_that_cannot_be_are_refused(wall, said):
     settings = dict(normal=(1.0, 0.0), offset=0.2, contact="clamp")
     with pytest.raises(ValueError, match=said):
         make()
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("away", [0.4, -0.4])
+def test_a_face_off_the_plane_is_refused(side, away):
+    """Before or behind the plane by less than half a spacing; moved as the message says, or without an outline, the body is taken."""
+    made, shape = corner(2), softmpm.box((0.2, 0.33), (0.45, 0.53), spacing=0.05)
+    plane = 0.2 if side > 0 else 0.45
+    wall = softmpm.Wall(normal=(side, 0.0), offset=side * plane, contact="clamp")
+
+    def make(particles: softmpm.Particles):
+        body = softmpm.Body(particles, made.bodies[0].material)
+        return build(dataclasses.replace(made, bodies=[body], walls=[wall], muscles=[]))
+
+    off = shape.moved((side * away * 0.05, 0.0))
+    where = "in front of" if away > 0 else "behind"
+    with pytest.raises(
+        ValueError, match=rf"begins 0\.02 m {where} the plane .* 0\.4 particle spacings"
+    ) as refused:
+        make(off)
+    (shift,) = re.findall(r"moved\((.*)\)\.$", str(refused.value))
+    make(off.moved(ast.literal_eval(shift)))
+    make(softmpm.Particles(off.positions, off.volume))
 
 
 @pytest.mark.parametrize("kind", ["clamp", "symmetry"])
