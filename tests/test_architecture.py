@@ -75,7 +75,7 @@ KNOWN = {
 }
 """Modules of schemes that others import."""
 OUTSIDE = {
-    "rerun": {"recording.rerun_export"},
+    "rerun": {"recording.rerun_export", "recording.rerun_blueprint"},
     "h5py": {f"recording.{name}" for name in ("format", "format_checks", "reader", "file", "writer")},
     "hydra": set(),
     "matplotlib": {"pictures.figure", "pictures.film", "pictures.panel"},

@@ -1,4 +1,4 @@
-"""to_rerun: a recording as a Rerun file, for ``rerun run.rrd``. No other module imports rerun.
+"""to_rerun: a recording as a Rerun file, for ``rerun run.rrd``. Its views are those of :mod:`softmpm.recording.rerun_blueprint`.
 
 Three time lines: ``time`` plays the recorded simulations one after the other at the speed of the simulation;
 ``frame`` counts their frames; ``iteration`` is that of the run. A number of an iteration between two recorded
@@ -14,6 +14,7 @@ import numpy as np
 
 from softmpm.recording import style
 from softmpm.recording.reader import Recording
+from softmpm.recording.rerun_blueprint import blueprint, curve, fibres_of
 from softmpm.recording.selection import Show, Simulation, plan
 
 _BLOCK_BYTES = 2**26  # of positions converted at a time
@@ -63,7 +64,7 @@ def to_rerun(
         with Recording(recording) as source, warnings.catch_warnings():
             warnings.simplefilter("error", RerunWarning)  # rerun would warn and leave data out
             show = plan(source, every, max_particles)
-            stream.save(draft, default_blueprint=_blueprint(source, show))
+            stream.save(draft, default_blueprint=blueprint(source, show))
             _log_all(stream, source, show)
         stream.flush()
         stream.disconnect()
@@ -92,7 +93,7 @@ def _log_static(stream, source: Recording, show: Show) -> None:
     for name in ("activation", "strain"):
         stream.log(f"scene/robot/{name}", points.from_fields(radii=radii), static=True)
     _log_walls(stream, source)
-    fibres = _fibres(source)
+    fibres = fibres_of(source)
     if len(fibres):
         names = [f"{'muscle' if has else 'pressure'} {k}" for k, has in enumerate(fibres)]
         stream.log("activation", rr.SeriesLines(names=names), static=True)
@@ -104,20 +105,6 @@ def _log_static(stream, source: Recording, show: Show) -> None:
         if source.dim == 2:
             look["draw_order"] = 40.0  # before the particles, which have 30
         stream.log("scene/traction", _arrows(source).from_fields(**look), static=True)
-
-
-def _fibres(source: Recording) -> np.ndarray:
-    """True for each actuator with fibres, as muscles have, shape (muscle,); the direction of a pressure is recorded as zero."""
-    return (source.static["muscle_direction"] != 0).any(axis=1)
-
-
-def _legend(source: Recording) -> str:
-    """Meaning of red and blue."""
-    fibres = _fibres(source)
-    muscles, pressures = "muscles: red pulls, blue pushes", "pressures: red expands, blue contracts"
-    if fibres.all():
-        return muscles
-    return f"{muscles}; {pressures}" if fibres.any() else pressures
 
 
 def _log_walls(stream, source: Recording) -> None:
@@ -256,69 +243,4 @@ def _log_scalars(stream, source: Recording, show: Show) -> None:
             rr.TimeColumn("iteration", sequence=iterations),
             rr.TimeColumn("time", duration=np.interp(iterations, known, time)),
         ]
-        _send_series(stream, _curve(name), times, values[:, None])
-
-
-def _curve(name: str) -> str:
-    """Entity of a scalar, whatever characters its name has."""
-    import rerun as rr
-
-    return rr.new_entity_path(["scalars", name])
-
-
-def _blueprint(source: Recording, show: Show):
-    import rerun.blueprint as rrb
-
-    robot, walls = "/scene/robot", "/scene/walls/**"
-    main = _space(source, show, _legend(source), [f"{robot}/activation", walls])
-    rest = [_space(source, show, f"strain, 0 to {show.strain:.2g}", [f"{robot}/strain", walls])]
-    if show.has["field"]:
-        name = f"grid velocity, up to {show.speed:.2g} m/s"
-        rest.append(_space(source, show, name, ["/scene/grid/velocity", walls]))
-    if show.has["traction"]:
-        name = f"traction of the walls, up to {show.traction:.2g} Pa"
-        rest.append(_space(source, show, name, [f"{robot}/activation", "/scene/traction", walls]))
-    side: list = [rrb.TextDocumentView(origin="/caption", name="now playing")]
-    quiet = rrb.PlotLegend(visible=False)
-    curves = [
-        rrb.TimeSeriesView(origin=_curve(name), name=name, plot_legend=quiet) for name in source.scalars
-    ]
-    if curves:
-        side.append(rrb.Tabs(*curves, active_tab=0))
-    for name in ("activation", "latent", "force"):
-        if show.has[name]:
-            title = "force of the walls [N]" if name == "force" else name
-            side.append(rrb.TimeSeriesView(origin=f"/{name}", name=title, plot_legend=quiet))
-    left = rrb.Vertical(main, rrb.Horizontal(*rest), row_shares=[3, 2])
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            left, rrb.Vertical(*side, row_shares=[2] + [3] * (len(side) - 1)), column_shares=[5, 2]
-        ),
-        rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all"),
-        collapse_panels=True,
-    )
-
-
-def _space(source: Recording, show: Show, name: str, contents: list[str]):
-    """A view of the scene that stands upright and shows the robot's whole way."""
-    import rerun.blueprint as rrb
-
-    white = rrb.Background(color=[252, 252, 252])
-    if source.dim == 2:
-        bounds = rrb.VisualBounds2D(
-            x_range=[show.low[0], show.high[0]], y_range=[-show.high[1], -show.low[1]]
-        )
-        return rrb.Spatial2DView(
-            origin="/", contents=contents, name=name, visual_bounds=bounds, background=white
-        )
-    gravity = source.static["gravity"].astype(float)
-    up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 1.0, 0.0])
-    position, target = style.eye(show.low, show.high, up)
-    return rrb.Spatial3DView(
-        origin="/",
-        contents=contents,
-        name=name,
-        background=white,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=up),
-    )
+        _send_series(stream, curve(name), times, values[:, None])

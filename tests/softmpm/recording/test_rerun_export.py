@@ -9,7 +9,7 @@ from surface_scenes import block, forces_of, made, record_forces
 
 import softmpm
 from softmpm.__main__ import main
-from softmpm.recording import rerun_export, style
+from softmpm.recording import rerun_blueprint, style
 
 chunk = pytest.importorskip("rerun.chunk")
 
@@ -134,8 +134,8 @@ def test_fields_walls_latent_and_curves(tmp_path):
 )
 def test_pressures_are_no_muscles(tmp_path, monkeypatch, kinds, names, title):
     """A pressure is named as one, and its positive activation expands."""
-    titles, space = [], rerun_export._space
-    monkeypatch.setattr(rerun_export, "_space", lambda *given: titles.append(given[2]) or space(*given))
+    titles, space = [], rerun_blueprint._space
+    monkeypatch.setattr(rerun_blueprint, "_space", lambda *given: titles.append(given[2]) or space(*given))
     body = softmpm.Body(
         softmpm.box((0.3, 0.3), (0.6, 0.6), spacing=0.1), softmpm.NeoHookean(density=1.0, young=1.0)
     )
