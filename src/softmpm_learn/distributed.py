@@ -27,6 +27,11 @@ def in_full(error: BaseException | None) -> str:
     return " ".join([str(error), *getattr(error, "__notes__", ())])
 
 
+def is_lost(error: BaseException) -> bool:
+    """True for the error of gloo where a process that others wait for has ended: by an error of its own, or killed."""
+    return isinstance(error, RuntimeError) and "gloo/transport" in str(error)
+
+
 class OtherProcessError(RuntimeError):
     """Raised where nothing failed, because something did in another process; the message is the one given there."""
 

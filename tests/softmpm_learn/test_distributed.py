@@ -238,6 +238,36 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
     assert last["end"] == pytest.approx(end["end"], rel=SAME) and math.isfinite(end["end"])
 
 
+ODD = """
+import torch
+from softmpm_learn import register
+
+class Odd(torch.nn.Linear):
+    calls = 0
+
+    def forward(self, z, time, goal=None):
+        self.calls += 1
+        if self.calls > 40 and torch.distributed.get_rank() == 1:
+            raise ValueError("spikes of my own")
+        return torch.tanh(super().forward(z))
+
+@register.policy("odd")
+def odd(conf, space):
+    return Odd(space.features, space.muscles)
+"""
+
+
+def test_the_error_of_a_process_is_not_buried(tmp_path):
+    """Where one fails alone, its own sentence is shown, and its traceback is kept; the other names no library and leaves none."""
+    (tmp_path / "odd.py").write_text(ODD)
+    words = ("odd.py", "policy=odd", *ARM, "train.iterations=30", "train.pictures=false", "hydra.run.dir=out")
+    done = torchrun("-m", "softmpm_learn", *words, "observer=centroids", "device=cpu", cwd=tmp_path)
+    assert done.returncode != 0 and "softmpm_learn: spikes of my own." in done.stderr
+    assert "gloo" not in done.stderr
+    assert "spikes" in (tmp_path / "out" / "error.1.txt").read_text()
+    assert not (tmp_path / "out" / "error.txt").exists()
+
+
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="native threads are listed by Linux only")
 def test_no_thread_of_the_group_outlives_it(both):
     """A native thread that runs while the interpreter is torn down may end the process with SIGABRT, now and then."""

@@ -18,7 +18,7 @@ from softmpm_learn.command.experiment import run_experiment, run_side_by_side
 from softmpm_learn.command.sentences import EXPECTED, end, give_up, sentence
 from softmpm_learn.command.stop import Signals
 from softmpm_learn.config import RunConf
-from softmpm_learn.distributed import Group, OtherProcessError
+from softmpm_learn.distributed import Group, OtherProcessError, is_lost
 from softmpm_learn.runs.runs import shared
 from softmpm_learn.storage import files, sweep
 from softmpm_learn.storage.checkpoint import LockedError
@@ -162,9 +162,9 @@ def experiments(jobs: Sequence[tuple[RunConf, Path]], group: Group, signals: Sig
 
 
 def _left(error: Exception, out: Path, group: Group) -> str:
-    """Leave the traceback in the folder of the run, unless that is another's; gives a note on where it is, if people need it."""
+    """Leave the traceback in the folder of the run, unless that or the error is another's; gives a note on its place for people."""
     place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
-    if isinstance(error, LockedError):
+    if isinstance(error, LockedError) or is_lost(error):
         return ""
     try:
         files.replace(place, "".join(traceback.format_exception(error)).encode())

@@ -16,7 +16,7 @@ from omegaconf.errors import (
 
 from softmpm_learn import plugins
 from softmpm_learn.config import unknown_key
-from softmpm_learn.distributed import in_full
+from softmpm_learn.distributed import in_full, is_lost
 from softmpm_learn.tasks.image import unknown_colour
 
 EXPECTED = (
@@ -64,6 +64,8 @@ def sentence(error: BaseException) -> str:
             else f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
         )
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
+    if is_lost(error):
+        return "another process of this run has ended; its own message says why, or torchrun reports the signal that killed it."
     text = in_full(error).strip() or "no details"
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror

@@ -299,6 +299,8 @@ def test_a_fault_of_the_program_is_called_so():
     assert sentence(KeyError("x")) == "KeyError: 'x' (a fault of the program)."
     assert sentence(RuntimeError("first\n  second")) == "first second."
     assert sentence(RuntimeError()) == "no details."
+    broken = "[gloo/transport/tcp/pair.cc:553] Connection closed by peer [127.0.0.1]:48860."
+    assert sentence(RuntimeError(broken)).startswith("another process of this run has ended; its own message")
     noted = RuntimeError("No memory.")
     noted.add_note("Buy some")
     assert sentence(noted) == "No memory. Buy some."
