@@ -36,6 +36,35 @@ def test_the_loop_gives_the_gradient_of_all_parameters(task, name):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())
 
 
+class Noisy(Centroids):
+    """Centroids as a sensor with noise measures them."""
+
+    def observe(self, model, state):
+        return super().observe(model, state) * (1.0 + 0.1 * torch.randn(len(state.x), 1, 1))
+
+
+def test_noise_of_an_observer_leaves_the_gradient_right(task):
+    """Observations are made once: the policy's gradient takes the features that it was given, and the states' the same noise."""
+    task = viscous(task)
+    model = softmpm.build(task.scene, device="cpu")
+    observer = Noisy(model, list(task.regions.values()), task.body_length)
+    policy = make_policy(PolicyConf(name="mlp"), observer.size, 2, 0.1, seed=0)
+    design, weights = Design(DesignConf(strength=True), model, task.regions), list(policy.parameters())
+    free, params, inputs = list(design.parameters()), *design()
+    loop, losses = ClosedLoop(task, model, observer, policy, design, weights, free), []
+    with torch.random.fork_rng([]):
+        for seed in (1, 2):
+            torch.manual_seed(seed)
+            episode, got = loop(None)
+            torch.manual_seed(seed)
+            loss = run_episode(task, model, observer, policy, params, inputs=inputs).loss.mean()
+            want = torch.autograd.grad(loss, [*weights, *free], retain_graph=True)
+            for a, b in zip(got, want, strict=True):
+                torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())
+            losses.append(episode.loss.item())
+    assert losses[0] != losses[1]
+
+
 @pytest.mark.parametrize("dtype, deterministic", [("float32", False), ("float64", False), ("float64", True)])
 def test_sums_in_order_are_not_captured(task, dtype, deterministic):
     """They wait for the device, which a CUDA graph cannot; every other loop goes through the graph."""
