@@ -19,7 +19,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn.__main__ import help_text
-from softmpm_learn.command import app, experiment
+from softmpm_learn.command import app, experiment, farewell
 from softmpm_learn.command.sentences import sentence
 from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
@@ -546,7 +546,7 @@ def test_without_rerun_the_recording_can_be_converted_later(monkeypatch, tmp_pat
 
     monkeypatch.setattr(softmpm, "to_rerun", missing)
     monkeypatch.chdir(tmp_path)
-    said = experiment.convert(tmp_path / "out")
+    said = farewell.convert(tmp_path / "out")
     assert said.startswith(f"python -m softmpm {Path('out') / 'run.h5'} && rerun {Path('out') / 'run.rrd'}")
 
 

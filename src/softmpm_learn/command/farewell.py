@@ -1,0 +1,114 @@
+"""Last lines of a run: what came out of it, where it is, and what to do next."""
+
+import math
+import os
+import shutil
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import softmpm
+from softmpm_learn import plugins
+from softmpm_learn.command.pictures import last_episode
+from softmpm_learn.storage import sweep
+from softmpm_learn.tasks import Task
+from softmpm_learn.train import Result
+
+
+def farewell(result: Result, task: Task, out: Path) -> str:
+    """Summary of the result; its last line is the command to view the recording or to resume the run."""
+    lines = []
+    if math.isfinite(result.best_loss):
+        what = "evaluation" if result.run.evaluated else "loss"
+        lines.append(
+            f"Best {what} {result.best_loss:.5g}, in iteration {result.best_iteration}{_outcome(task, out)}."
+        )
+    if count := result.run.fallback.count:
+        lines.append(f"It failed or fell far below its best and went back to it: {_times(count)}.")
+    if count := result.run.restart.count:
+        lines.append(f"It got nowhere and began anew: {_times(count)}.")
+    if result.examination:
+        lines.append(f"Examined: {_examined(result.examination)}.")
+    shown = _relative(out)
+    if not result.finished:
+        lines.append(f"Stopped after {result.run.iteration} iterations.")
+    if (out / "run.h5").exists():
+        lines.append(f"Everything is in {shown}. To look at the recording: {convert(out)}")
+    else:
+        lines.append(f"Everything is in {shown}; train.record_every=0, so nothing was recorded.")
+    if not result.finished:
+        lines.append(f"To go on: {plugins.command()} resume={shown}")
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """End of the run of a seed, which its process passes to the others."""
+
+    seed: int
+    best_loss: float
+    evaluated: bool
+    """True if ``best_loss`` is that of an evaluation."""
+    failed: bool
+    finished: bool
+
+    @classmethod
+    def of(cls, result: Result) -> "Ending":
+        run = result.run
+        return cls(
+            run.settings.train.seed, result.best_loss, run.evaluated, bool(result.error), result.finished
+        )
+
+
+def farewell_of_seeds(ends: Sequence[Ending], out: Path) -> str:
+    """Summary of the seeds of all processes; its last line is what to do next."""
+    ends = sorted(ends, key=lambda one: one.seed)
+    losses = [one.best_loss for one in ends if math.isfinite(one.best_loss) and not one.failed]
+    lines, place = [], _relative(out)
+    if losses:
+        middle, span = statistics.median(losses), f"{min(losses):.5g} to {max(losses):.5g}"
+        what = "evaluations" if ends[0].evaluated else "losses"
+        lines.append(f"Best {what} of {len(losses)} seeds: median {middle:.5g}, from {span}.")
+    failed = [str(one.seed) for one in ends if one.failed]
+    if failed:
+        lines.append(f"Failed: seed {', '.join(failed)}.")
+    lines.append(f"Each seed has a folder in {place}, and a row in {place}/{sweep.TABLE}.")
+    if failed or not all(one.finished for one in ends):
+        lines.append(f"To go on: {plugins.command()} resume={place}")
+    return "\n".join(lines)
+
+
+def _examined(examination: dict[str, float]) -> str:
+    """Findings at the end of a run; see examination.py."""
+    answers = {name: "none" if math.isnan(value) else f"{value:.3g}" for name, value in examination.items()}
+    return ", ".join(f"{name} {answer}" for name, answer in answers.items())
+
+
+def _outcome(task: Task, out: Path) -> str:
+    """Achievement of the robot in the last recorded simulation, in words."""
+    episode = last_episode(out / "run.h5")
+    if episode is None:
+        return ""
+    words = task.objective.outcome(episode[1]["x"], task.body_length)
+    return f"; {words}" if words else ""
+
+
+def convert(out: Path) -> str:
+    """Turn run.h5 into run.rrd; gives the command that opens the recording, or that converts it elsewhere."""
+    recording, picture = out / "run.h5", out / "run.rrd"
+    try:
+        softmpm.to_rerun(recording, picture)
+    except ImportError:
+        return f"python -m softmpm {_relative(recording)} && rerun {_relative(picture)} (with rerun-sdk)"
+    return f"rerun {_relative(picture)}" if shutil.which("rerun") else f"python -m rerun {_relative(picture)}"
+
+
+def _relative(path: Path) -> str:
+    """As short as it can be typed from here."""
+    here = os.path.relpath(path)
+    return str(path) if here.startswith("..") else here
+
+
+def _times(count: int) -> str:
+    return f"{count} time{'s' if count > 1 else ''}"
