@@ -175,6 +175,29 @@ def test_a_block_sticks():
     assert abs(incline(-0.5, "surface")[1]) < 1e-6
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+def test_a_smooth_wall_leaves_the_gradient_along_it(formulation, dim):
+    """Nothing acts along a wall without friction: the derivative of the mean velocity along it with respect to that of the start is 1,
+    also where no point has moved yet."""
+    shape = softmpm.box((0.4,) * dim, (0.6,) * dim, spacing=0.05)
+    made = softmpm.Scene(
+        grid=softmpm.Grid(shape=(11,) * dim, spacing=0.1),
+        bodies=[softmpm.Body(shape, softmpm.NeoHookean(density=1.3, young=100.0))],
+        walls=[softmpm.Wall(normal=(0.0, 1.0, 0.0)[:dim], offset=0.4)],
+        dt=1e-3,
+    )
+    model = softmpm.build(made, "cpu", torch.float64, formulation=formulation, contact="surface")
+    start, along = model.rest(), torch.zeros(dim, dtype=torch.float64, requires_grad=True)
+    down = torch.tensor([0.0, -0.2, 0.0][:dim], dtype=torch.float64)
+    start = start._replace(v=start.v + down + along)
+    end = softmpm.simulate(model, start, None, model.params(), substeps=2)
+    assert softmpm.contact_forces(model, end).total[0, 0, 1] > 0
+    softmpm.mean_velocity(model, end, model.params())[0, 0].backward()
+    assert along.grad is not None
+    assert along.grad[0].item() == pytest.approx(1.0, abs=1e-12)
+
+
 def at_the_edge(made: softmpm.Scene) -> softmpm.Scene:
     """The scene with the block in a corner of the grid, where its particles have all their nodes and its outline has not."""
     shape = softmpm.box((0.03, 0.03), (0.23, 0.23), spacing=0.05)

@@ -144,7 +144,7 @@ def surface_contact(dim: int, dtype: str) -> SimpleNamespace:
                 adj.friction = P * along
                 adj_P += friction * along
                 adj_e = (-c * friction * P / size) * (adj_T - along * way)
-            else:
+            elif friction > real(0.0):  # a smooth wall holds no point
                 adj_x = vec()
                 adj_v = vec()
                 adj.anchor = adj_next
