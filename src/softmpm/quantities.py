@@ -96,8 +96,11 @@ def von_mises_strain(state: State) -> Tensor:
     derivative where E' = 0, which does not exist, is taken as zero.
     """
     E = _green_strain(state)
-    trace = E.diagonal(dim1=-2, dim2=-1).sum(-1)
-    square = 2 / 3 * ((E**2).sum((-2, -1)) - trace**2 / 3)
+    normal = E.diagonal(dim1=-2, dim2=-1)
+    shear = E - torch.diag_embed(normal)
+    normal = torch.nn.functional.pad(normal, (0, 3 - E.shape[-1]))
+    apart = normal - normal.roll(1, -1)  # E:E minus the square of the trace would cancel
+    square = 2 / 3 * ((shear**2).sum((-2, -1)) + (apart**2).sum(-1) / 3)
     positive = square > 0
     return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0).to(state.F.dtype)
 

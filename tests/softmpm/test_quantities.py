@@ -187,9 +187,21 @@ def test_strains():
     eps = 1e-6  # uniaxial, incompressible, in 3D
     thin = torch.diag(torch.tensor([1 + eps, 1 - eps / 2, 1 - eps / 2], dtype=torch.float64))[None, None]
     assert softmpm.von_mises_strain(State(thin, thin, thin, thin)).item() == pytest.approx(eps, rel=1e-5)
-    rest = torch.eye(3, dtype=torch.float64)[None, None].requires_grad_()
-    softmpm.von_mises_strain(State(rest, rest, rest, rest)).sum().backward()
-    assert (rest.grad == 0).all()
+    for size in (1.0, 1.2, 0.7):
+        swollen = (size * torch.eye(3, dtype=torch.float64))[None, None].requires_grad_()
+        softmpm.von_mises_strain(State(swollen, swollen, swollen, swollen)).sum().backward()
+        assert (swollen.grad == 0).all()
+
+
+def test_a_small_distortion_of_a_large_change_of_volume():
+    """Cubes that swell by 1.2, along one axis by 1.2 + δ: 2/3 (1.2 δ + δ²/2), and its derivative, to the rounding of 1.2 + δ."""
+    for delta in (1e-4, 1e-8, 1e-10):
+        F = torch.tensor([1.2, 1.2, 1.2 + delta], dtype=torch.float64).diag()[None, None].requires_grad_()
+        found = softmpm.von_mises_strain(State(F, F, F, F))
+        found.sum().backward()
+        assert F.grad is not None
+        assert found.item() == pytest.approx(2 / 3 * (1.2 * delta + delta**2 / 2), rel=1e-15 / delta)
+        assert F.grad[0, 0, 2, 2].item() == pytest.approx(2 / 3 * (1.2 + delta), rel=1e-12)
 
 
 def test_small_motions_in_single_precision():
