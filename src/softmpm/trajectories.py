@@ -9,14 +9,16 @@ from torch import Tensor
 
 from softmpm.alarms import Failures
 from softmpm.autograd import simulate
-from softmpm.check_inputs import check_inputs, steps_of
+from softmpm.batches import refuse_batches
+from softmpm.check_inputs import check_inputs, check_inputs_bounds, steps_of
 from softmpm.check_inputs import control_steps as steps_of_call
-from softmpm.checks import check_activation, check_horizon, check_state, check_whole
+from softmpm.checks import check_activation, check_finite, check_horizon, check_state, check_whole
 from softmpm.errors import UnstableError
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.kernel_inputs import expanded, velocity_to
 from softmpm.model import Model, check_model
 from softmpm.planning.chunks import Horizon
+from softmpm.schemes.capture import is_capturing
 from softmpm.state import Params, State
 from softmpm.validate import need
 
@@ -77,6 +79,10 @@ def trajectory(
         f"every must divide the number of control steps, got every={every} and {steps} control steps; leave out the last "
         f"{steps % every} or take another number.",
     )
+    refuse_batches((*start.differentiable(), activation, *given.values()))
+    if not is_capturing(model):  # before the first frame, by the rows of the whole trajectory
+        check_finite(start, activation)
+        check_inputs_bounds(given)
     given = _with_velocity(model, start, given, horizon)
     if activation is None and all(steps_of(name, value) is None for name, value in given.items()):
         activation = model.positions.new_zeros(steps, model.worlds, model.muscle_count)

@@ -174,6 +174,20 @@ def test_what_does_not_fit_is_refused():
         softmpm.trajectory(model.scene, start, activation, params, substeps=1)
 
 
+@pytest.mark.parametrize("name", ["activation", "force", "position"])
+def test_a_number_that_is_not_finite_is_refused_at_once(name):
+    """By its name and its row in the whole trajectory, before the first frame."""
+    model = build(full_scene(2), inputs=("force",))
+    leaves = {key: leaf.detach() for key, leaf in leaves_of(model, ("force", "position")).items()}
+    leaves[name][4].view(-1)[1] = torch.nan
+    start, activation, params, inputs = arguments(leaves)
+    frames = []
+    place = rf"{name}\[4, 0, {'1' if name == 'activation' else '0, 1'}\] is nan"
+    with pytest.raises(ValueError, match=place):
+        softmpm.trajectory(model, start, activation, params, substeps=1, inputs=inputs, observe=frames.append)
+    assert not frames
+
+
 def test_in_a_graph(device):
     """Captured with its gradient and its energies, replayed on new values: as without a graph."""
     model = build(busy_scene(2), device=device, worlds=2, deterministic=True)
