@@ -183,16 +183,20 @@ def check_horizon(steps: int, substeps: int) -> Horizon:
 
 def check_params(model: Sizes, params: NamedTuple) -> None:
     """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
-    want = (model.worlds, model.particle_count)
     for name, value in fields("params", params, Params._fields):
         check_tensor(model, f"params.{name}", value)
-        shape = tuple(value.shape)
-        fits = all(n in (1, full) for n, full in zip(reversed(shape), reversed(want), strict=False))
-        if not fits or len(shape) > 2:
-            raise ValueError(
-                f"params.{name} must broadcast to (world, particle) = {want}, got shape {shape}; "
-                "one value for each world needs shape (world, 1)."
-            )
+        check_broadcasts(f"params.{name}", value, "particle", (model.worlds, model.particle_count))
+
+
+def check_broadcasts(name: str, value: Tensor, axis: str, want: tuple[int, int]) -> None:
+    """Shape that broadcasts to (world, ``axis``), which is ``want``."""
+    shape, each = tuple(value.shape), 1 if axis == "particle" else want[1]
+    fits = all(n in (1, full) for n, full in zip(reversed(shape), reversed(want), strict=False))
+    if not fits or len(shape) > 2:
+        raise ValueError(
+            f"{name} must broadcast to (world, {axis}) = {want}, got shape {shape}; one value for each world needs shape "
+            f"(world, {each})."
+        )
 
 
 def check_whole(name: str, value: Any) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from softmpm.checks import check_params, check_state, check_tensor
+from softmpm.checks import check_broadcasts, check_params, check_state, check_tensor
 from softmpm.energy_density import DENSITIES
 from softmpm.model import Model, check_model
 from softmpm.oracle.stress import lame
@@ -51,6 +51,7 @@ def body_mean(model: Model, field: Tensor, weight: Tensor | None = None) -> Tens
     )
     weight = model.volume if weight is None else weight
     check_tensor(model, "weight", weight)
+    check_broadcasts("weight", weight, "particle", lead)
     return _mean(model, field.double(), weight.double().expand(lead), per_body=True)
 
 
@@ -186,6 +187,7 @@ def gravitational_energy(
         height = sum(g * x[..., axis] for axis, g in enumerate(model.scene.gravity or ()))
     else:
         check_tensor(model, "gravity", gravity)
+        check_broadcasts("gravity", gravity, "dim", (model.worlds, model.dim))
         height = (gravity.double().expand(model.worlds, model.dim)[:, None] * x).sum(-1)
     return _total(model, -mass * height, per_body)
 

@@ -288,5 +288,13 @@ def test_what_is_no_state_is_refused():
         softmpm.momentum(model, rest, params._replace(density=params.density[:3]))
     with pytest.raises(ValueError, match=r"field must have shape \(world, particle, ...\)"):
         softmpm.body_mean(model, rest.x[0])
+    with pytest.raises(
+        ValueError, match=r"weight must broadcast to \(world, particle\) = .*, got shape \(3,\)"
+    ):
+        softmpm.body_mean(model, rest.x, torch.ones(3))
+    with pytest.raises(
+        ValueError, match=r"gravity must broadcast to \(world, dim\) = \(1, 2\), got shape \(3,\)"
+    ):
+        softmpm.gravitational_energy(model, rest, params, torch.ones(3))
     with pytest.raises(TypeError, match=r"state must be a softmpm\.State"):
         softmpm.green_strain(rest.F)
