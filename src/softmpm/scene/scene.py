@@ -89,7 +89,7 @@ class Particles:
 
     def moved(self, by: Sequence[float]) -> "Particles":
         """The same shape, with its outline, displaced by a vector [m]."""
-        shift, outline = np.asarray(by, dtype=np.float64), self.outline
+        shift, outline = array("by", by).astype(np.float64), self.outline
         need(
             shift.shape == self.positions.shape[1:],
             f"a shape moves by {self.positions.shape[1]} numbers, one per axis, got {by}.",

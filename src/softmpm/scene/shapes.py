@@ -19,7 +19,7 @@ from softmpm.scene.image import Inside, coverage, mask_contours, silhouette
 from softmpm.scene.mesh import closed_surface, mesh_coverage, mesh_outline, near_surface, winding_inside
 from softmpm.scene.polygons import boundary_distance, inside_any, nearest_on, ray_length, union_boundary
 from softmpm.scene.scene import Particles
-from softmpm.validate import need
+from softmpm.validate import array, need
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -58,7 +58,7 @@ def ball(
     spacing², with particles of different volumes.
     """
     middle, spacing = _point("center", center), _spacing(spacing)
-    radii = np.asarray(radius, dtype=np.float64)
+    radii = array("radius", radius).astype(np.float64)
     need(
         radii.shape in ((), middle.shape) and bool(np.isfinite(radii).all() and (radii > 0).all()),
         f"radius must be one number > 0 m, or {len(middle)} of them, one per axis, got {radius}.",
@@ -103,7 +103,8 @@ def polygons(
         spacing: Distance of neighbouring particles [m].
         cut_cells: Take every cell that the union crosses, with the volume and the centroid of the part inside.
     """
-    spacing, drawn = _spacing(spacing), [np.asarray(part, dtype=np.float64) for part in parts]
+    spacing = _spacing(spacing)
+    drawn = [array(f"polygon {k}", part).astype(np.float64) for k, part in enumerate(parts)]
     need(len(drawn) > 0, "polygons needs at least one polygon.")
     for k, part in enumerate(drawn):
         need(
@@ -243,7 +244,7 @@ def _cut_mesh(
 
 
 def _point(name: str, value: Sequence[float]) -> np.ndarray:
-    point = np.asarray(value, dtype=np.float64)
+    point = array(name, value).astype(np.float64)
     need(
         point.shape in ((2,), (3,)) and bool(np.isfinite(point).all()),
         f"{name} must be 2 or 3 finite numbers [m], got {value}.",

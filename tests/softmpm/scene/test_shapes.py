@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softmpm.scene import shapes
-from softmpm.scene.shapes import ball, box
+from softmpm.scene.shapes import ball, box, polygons
 
 
 @pytest.mark.parametrize("lower, upper", [((0.3, 0.1), (0.5, 0.3)), ((0.0, 0.0, -1.0), (0.33, 0.1, 0.27))])
@@ -89,6 +89,22 @@ def test_refuses(make, message):
 def test_sizes_beyond_integers(make):
     """1e31 cells along an axis overflowed, and the box was called too thin."""
     with pytest.raises(ValueError, match="the shape spans 1e.31 lattice cells along an axis, at most 2e.08"):
+        make()
+
+
+@pytest.mark.parametrize(
+    "make, name",
+    [
+        (lambda: ball((0.0, 0.0), "1", 0.1), "radius"),
+        (lambda: ball((0.0, 0.0), True, 0.1), "radius"),
+        (lambda: box(("0", "0"), (1.0, 1.0), 0.1), "lower"),
+        (lambda: polygons([[("0", "0"), ("1", "0"), ("0", "1")]], 0.1), "polygon 0"),
+        (lambda: box((0.0, 0.0), (1.0, 1.0), 0.1).moved((True, False)), "by"),
+    ],
+)
+def test_texts_and_truths_are_no_numbers(make, name):
+    """NumPy would read "1" and True as 1.0."""
+    with pytest.raises(TypeError, match=f"{name} must be real numbers"):
         make()
 
 
