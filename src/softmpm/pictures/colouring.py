@@ -103,8 +103,9 @@ def coloured(
 ) -> Colouring:
     """Colours of values that are shown together; None for ``colour`` is an array of the user's own."""
     if colour in ("muscle", "body"):
-        count = len(place.muscle) if colour == "muscle" else int(place.body.max()) + 1
-        return Colouring("", categories(count), names=tuple(f"{colour} {k}" for k in range(count)))
+        bodies = (f"body {k}" for k in range(int(place.body.max()) + 1))
+        names = place.actuators if colour == "muscle" else tuple(bodies)
+        return Colouring("", categories(len(names)), names=names)
     if limits is not None and not (np.isfinite(limits).all() and limits[0] < limits[1]):
         raise ValueError(f"limits must be two numbers in ascending order, got {limits}.")
     if colour == "activation":

@@ -27,6 +27,8 @@ class Surroundings:
     """Index of each particle's body, shape (particle,)."""
     muscle: np.ndarray
     """Membership of each actuator, shape (muscle, particle), boolean."""
+    fibre: np.ndarray
+    """Fibre direction of each actuator at rest [-], shape (muscle, dim); zero of one without fibres, such as a pressure."""
     driven: np.ndarray
     """Driven particles, shape (particle,), boolean; a recording does not contain them."""
     normals: np.ndarray
@@ -45,6 +47,11 @@ class Surroundings:
     @property
     def dim(self) -> int:
         return self.rest.shape[1]
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the actuators, with their numbers."""
+        return tuple(f"{'muscle' if fibre.any() else 'pressure'} {k}" for k, fibre in enumerate(self.fibre))
 
     @property
     def up(self) -> np.ndarray:
@@ -97,6 +104,9 @@ def of_scene(scene: Scene) -> Surroundings:
         radii=style.radii(np.concatenate([part.volume for part in parts]), 1.0, dim),
         body=np.repeat(np.arange(len(parts)), count),
         muscle=muscle,
+        fibre=np.array([getattr(one, "direction", (0.0,) * dim) for one in scene.muscles], float).reshape(
+            -1, dim
+        ),
         driven=driven,
         normals=np.array([wall.normal for wall in scene.walls]).reshape(-1, dim),
         offsets=np.array([wall.offset for wall in scene.walls], float),
@@ -115,6 +125,7 @@ def of_recording(recording: Recording) -> Surroundings:
         radii=style.radii(static["volume"].astype(float), recording.share, dim),
         body=static["body"],
         muscle=static["muscle"].astype(bool),
+        fibre=static["muscle_direction"].astype(float),
         driven=np.zeros(recording.particle_count, bool),
         normals=static["wall_normal"].astype(float),
         offsets=static["wall_offset"].astype(float),

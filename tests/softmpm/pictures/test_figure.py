@@ -12,6 +12,7 @@ from PIL import Image
 
 import softmpm
 from softmpm.pictures.colouring import CATEGORIES, PASSIVE, categories
+from softmpm.pictures.surroundings import of_recording
 from softmpm.recording import style
 
 RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
@@ -170,6 +171,22 @@ def test_each_of_many_muscles_has_a_colour_and_a_name(count, height):
     every = np.asarray(Image.open(png).convert("L"))
     for edge in (every[0], every[-1], every[:, 0], every[:, -1]):
         assert edge.min() > 250
+
+
+def test_a_pressure_is_called_one(tmp_path):
+    """As in describe() and in Rerun, with its number among all actuators; of a recording too."""
+    actuators = [
+        softmpm.Muscle(particles=range(20), direction=(0.0, 1.0), strength=1.0),
+        softmpm.Pressure(particles=range(20, 40), strength=1.0),
+    ]
+    scene = scene_of(muscles=actuators)
+    key = softmpm.show(scene).axes[-1].get_legend()
+    assert [text.get_text() for text in key.get_texts()] == ["muscle 0", "pressure 1"]
+    model = softmpm.build(scene, device="cpu")
+    with softmpm.Recorder(tmp_path / "run.h5", model) as recorder, recorder.episode(iteration=0) as episode:
+        episode.frame(0.0, model.rest())
+    with softmpm.Recording(tmp_path / "run.h5") as recording:
+        assert of_recording(recording).actuators == ("muscle 0", "pressure 1")
 
 
 @pytest.mark.parametrize("count, least", [(12, 30), (24, 30), (60, 30), (500, 10)])
