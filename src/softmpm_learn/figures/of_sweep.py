@@ -114,7 +114,10 @@ def curves_figure(
             axes.legend(frameon=False, fontsize=7)
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    figure.supxlabel("iteration", fontsize=10)
+    if len(panels) == 1:  # the layout sets the label of a figure into a legend outside of its axes
+        grid[0].set_xlabel("iteration", fontsize=10)
+    else:
+        figure.supxlabel("iteration", fontsize=10)
     figure.supylabel(f"{quantity}, median and quartiles over seeds", fontsize=10)
     if len(panels) == 1:
         figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=min(9, 800 / widest))

@@ -183,6 +183,16 @@ def test_curves_are_medians_at_each_iteration(tmp_path, drawn):
     assert (failed["status"], failed["final"], failed["error"]) == ("failed", "", "it broke")
 
 
+def test_the_legend_leaves_the_name_of_the_axis_free(swept, tmp_path, drawn):
+    """Below the curves there are both, one below the other."""
+    program.make([swept], tmp_path)
+    figure = drawn[0]
+    figure.draw_without_rendering()
+    label, renderer = figure.axes[0].xaxis.label, figure._get_renderer()
+    assert label.get_text() == "iteration"
+    assert label.get_window_extent(renderer).y0 > figure.legends[0].get_window_extent(renderer).y1
+
+
 def test_every_seed_is_a_point(swept, tmp_path, drawn):
     """In a panel for each quantity that has numbers, with a label that has the unit."""
     program.make([swept], tmp_path)
