@@ -50,6 +50,7 @@ class Run:
         fallback: Decides when the run goes back to its best.
         restart: Decides when it begins anew.
         settling: Decides whether it settles.
+        saturated: The log has been told that the activations are at their bounds; no part of a checkpoint.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Run:
         self.optimizer = make_optimizer(settings.optimizer, *rates)
         self._first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.safe: list[Tensor] = []
+        self.saturated = False
 
     def model_of(self, task: "Task", worlds: int) -> Model:
         """Model of another task, or with other worlds, built as the task says; for simulations without a gradient."""

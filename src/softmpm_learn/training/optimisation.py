@@ -17,6 +17,9 @@ from softmpm_learn.training.evaluation import Evaluation, due, evaluate, evaluat
 from softmpm_learn.training.run_logger import RunLogger, recorded
 from softmpm_learn.training.timing import clock
 
+SATURATED = 0.98
+"""Root mean square of the activations from which on they are at their bounds: the gradient through tanh is a twenty-fifth there."""
+
 logger = logging.getLogger("softmpm_learn")
 
 
@@ -71,6 +74,8 @@ def optimise(
             failed = {0: error}
         if not failed:
             found = {k: row | {"retries": retries[k]} for k, row in rows.items() if isinstance(row, dict)}
+            for k, row in found.items():
+                warn_of_saturation(runs.all[k], row["activation"])
             with clock(seconds, "evaluate"):
                 update(runs, found)
             return found, episode.observations
@@ -81,6 +86,20 @@ def optimise(
             go_back(runs, k, error, retries.get(k, 0))
             retries[k] += 1
     return {}, None
+
+
+def warn_of_saturation(run: Run, activation: float) -> None:
+    """Log a warning, once, if the activations of an episode are at their bounds, by their root mean square."""
+    if activation < SATURATED or run.saturated:
+        return
+    run.saturated = True
+    logger.warning(
+        "Iteration %d: the activations are at their bounds (root mean square %.3f), where the policy has hardly any gradient and stays "
+        "as it is. If the loss falls no further, begin again with a lower optimizer.policy_rate, which is %g here.",
+        run.iteration,
+        activation,
+        run.settings.optimizer.policy_rate,
+    )
 
 
 def save_before(runs: Runs, loggers: Sequence[RunLogger], streams: dict[int, Tensor]) -> None:
