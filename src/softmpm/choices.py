@@ -22,7 +22,7 @@ def choose_formulation(scene: Scene, scheme: str, wanted: str) -> tuple[str, str
     if wanted not in ("auto", "moving", "reference"):
         raise ValueError(f"formulation must be 'auto', 'moving' or 'reference', got {wanted!r}.")
     if wanted != "auto":
-        return wanted, "as asked for"
+        return wanted, f"formulation={wanted!r}" + (", the default" if wanted == "moving" else "")
     if scene.body_contact:
         return "moving", "the scene does not state body_contact=False"
     try:

@@ -312,7 +312,8 @@ def test_auto_takes_the_reference_formulation_where_it_serves():
         assert model.formulation == formulation and why in model.formulation_reason
         assert f"{formulation} formulation: {model.formulation_reason}" in model.describe(substeps=10)
     model = softmpm.build(full_scene(2, **alone), device="cpu")
-    assert model.formulation == "moving" and "moving formulation: as asked for" in model.describe(substeps=10)
+    assert model.formulation == "moving"  # the default, which nobody asked for
+    assert "moving formulation: formulation='moving', the default\n" in model.describe(substeps=10)
     with pytest.raises(TypeError, match="body_contact must be True or False, got 'no'"):
         full_scene(2, body_contact="no")
 
