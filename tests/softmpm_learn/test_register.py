@@ -12,6 +12,7 @@ import forked
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from PIL import Image, ImageDraw
 
 import softmpm
 from softmpm_learn import plugins, register
@@ -25,7 +26,7 @@ from softmpm_learn.tasks import TaskConf, make_task
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "robots.md").read_text()
-HOPPER, PARTS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+JUMPER, HOPPER, PARTS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 (END,) = (dedent(text) for text in re.findall(r"^    if __name__.*?(?=^\S)", PAGE, re.DOTALL | re.MULTILINE))
 TINY = [
     *("experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
@@ -65,6 +66,23 @@ def refusal(done) -> str:
     said = done.stderr.strip().splitlines()
     assert len(said) == 1 and said[0].startswith("softmpm_learn: "), done.stderr
     return said[0]
+
+
+def test_a_robot_of_a_picture_takes_another_objective(folder):
+    """The jumper of the page trains: its height is a column of metrics.csv, and nothing of a walk is left."""
+    (folder / "jumper.py").write_text(JUMPER)
+    pen = ImageDraw.Draw(drawing := Image.new("RGB", (60, 40), "white"))
+    pen.rectangle((0, 0, 59, 19), fill="#808080")
+    for left, colour in ((5, "#ff0000"), (40, "#0000ff")):
+        pen.rectangle((left, 20, left + 14, 39), fill=colour)
+    drawing.save(folder / "robot.png")
+    words = ("jumper.py", "task=jumper", "task.file=robot.png", *TINY, "task.at=0.02", "hydra.run.dir=run")
+    done = run(folder, *words)
+    assert done.returncode == 0, done.stderr
+    with open(folder / "run" / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 and {"jump", "effort", "stretch"} < set(rows[0]) and "progress" not in rows[0]
+    assert -0.01 < float(rows[0]["jump"]) < 0.01
 
 
 def test_a_task_of_a_stranger_trains_and_goes_on(folder):
