@@ -355,6 +355,24 @@ def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
     assert list(drawn)[-1] == "strength of the muscles" and drawn["strength of the muscles"][0].shape == (32,)
 
 
+def test_a_design_of_stiff_parts_is_drawn_over_that_of_the_scene(task, make_block, settings, tmp_path):
+    """Else the picture has the two moduli of the parts, ten to one, and a change of some percent cannot be seen."""
+    scene = make_block()
+    (body,) = scene.bodies
+    stiff = dataclasses.replace(body.material, young=10 * body.material.young)
+    halves = [
+        softmpm.Body(softmpm.Particles(part, 0.05**2), material)
+        for part, material in zip(np.split(body.particles.positions, 2), (body.material, stiff), strict=True)
+    ]
+    scene = dataclasses.replace(scene, bodies=halves, dt=1e-3)
+    conf = copy_of(settings, observer=dict(name="centroids"))
+    model = softmpm.build(scene, device="cpu")
+    drawn = design(Run(dataclasses.replace(task, scene=scene), model, conf, tmp_path))
+    values, unit = drawn["Young's modulus, over that of the scene"]
+    assert unit == "" and values == pytest.approx(np.ones(32), rel=1e-5)
+    assert drawn["density"][1] == "kg/m³" and drawn["density"][0] == pytest.approx(np.ones(32), rel=1e-5)
+
+
 @pytest.mark.parametrize("observer", ["latent", "centroids", "kmeans"])
 @pytest.mark.parametrize("alone", ["policy", "design"])
 def test_it_gets_better(task, model, settings, tmp_path, observer, alone):

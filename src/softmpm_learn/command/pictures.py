@@ -106,17 +106,24 @@ def decoded(run: Run) -> np.ndarray:
 
 @torch.no_grad()
 def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
-    """Material of the best robot and the inputs that were designed: value on each particle and unit."""
+    """Material of the best robot and the inputs that were designed: value on each particle and unit; of a material that differs between
+    parts of the scene the quotient with that of the scene."""
     now = run.policy_snapshot()
     if run.best["iteration"] >= 0:
         run.load_policy(run.best)
     params, inputs = run.design()
     run.load_policy(now)
     found = params._asdict() | {name: value for name, value in inputs._asdict().items() if value is not None}
-    shown = {}
+    first, shown = run.model.params()._asdict(), {}
     for name, value in found.items():
         title, unit = DESIGN.get(name, (name, ""))
-        shown[title] = (_on_particles(run.model, name, value.cpu().numpy()), unit)
+        values = _on_particles(run.model, name, value.cpu().numpy())
+        if (
+            name in first and first[name].ne(first[name].flatten()[0]).any()
+        ):  # stiff parts would hide what was designed
+            title, unit = f"{title}, over that of the scene", ""
+            values = values / first[name].cpu().numpy().reshape(-1)
+        shown[title] = (values, unit)
     return shown
 
 
