@@ -3,6 +3,7 @@ import dataclasses
 import gc
 import itertools
 import json
+import math
 import os
 import shutil
 import signal
@@ -468,6 +469,17 @@ def test_a_run_without_a_retry_left_goes_back_to_its_best(
     )
     now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
     assert now == pytest.approx(before * conf.optimizer.fallback_rate)
+
+
+@pytest.mark.parametrize("above, want", [(math.inf, ("1", "0")), (-100.0, ("0", "1"))])
+def test_what_follows_failed_steps_is_counted(task, model, settings, tmp_path, monkeypatch, above, want):
+    """A run without a retry left that goes back to its best, or begins anew, does so in the row of that iteration."""
+    optimizer = dict(retries=1, restart_above=above)
+    conf = copy_of(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=3))
+    monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8, 9}))
+    train.train(task, model, conf, tmp_path)
+    found = [(row["fallbacks"], row["restarts"]) for row in rows(tmp_path)]
+    assert found == [("0", "0"), want, ("0", "0")]
 
 
 @pytest.mark.parametrize("at, iteration", [({0}, 0), (set(range(13, 99)), 2)])

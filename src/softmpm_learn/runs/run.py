@@ -216,6 +216,11 @@ class Run:
         return "beginning anew with other first weights"
 
     @property
+    def returns(self) -> dict[str, int]:
+        """Times that it fell back to its best and began anew so far, by the columns of metrics.csv."""
+        return {"fallbacks": self.fallback.count, "restarts": self.restart.count}
+
+    @property
     def evaluated(self) -> bool:
         """True if evaluations choose the best, and not the loss of the episodes."""
         return self.goals.box is not None or (self.settings.train.endurance or 1) > 1

@@ -62,6 +62,7 @@ def optimise(
     """
     streams = {k: runs.all[k].goals.stream.get_state() for k in runs.active}
     goals, retries = runs.goals(runs.active), dict.fromkeys(runs.active, 0)
+    returns = {k: runs.all[k].returns for k in runs.active}
     while runs.active:
         runs.move(runs.active)
         try:
@@ -78,6 +79,8 @@ def optimise(
                 warn_of_saturation(runs.all[k], row["activation"])
             with clock(seconds, "evaluate"):
                 update(runs, found)
+            for k, row in found.items():  # after failed attempts or after the step
+                row |= {name: count - returns[k][name] for name, count in runs.all[k].returns.items()}
             return found, episode.observations
         ends = any(k not in runs.active for k in failed)
         with clock(seconds, "save"), runs.group.fail_together():
@@ -157,21 +160,22 @@ def update(runs: Runs, rows: dict[int, dict[str, float]]) -> None:
     begin = [k for k in rows if runs.all[k].begins_to_settle()]
     evaluate_best(runs, [k for k in begin if runs.all[k].evaluated])
     for k, row in rows.items():
-        row |= step(runs.all[k], row["loss"], values[k], k in begin) | {"best": runs.all[k].best["loss"]}
+        step(runs.all[k], row["loss"], values[k], k in begin)
+        row["best"] = runs.all[k].best["loss"]
 
 
-def step(run: Run, loss: float, value: float, begins: bool = False) -> dict[str, int]:
-    """Take the step along the gradient, go back to the best, or begin anew; how often it fell back and began anew, 0 or 1.
+def step(run: Run, loss: float, value: float, begins: bool = False) -> None:
+    """Take the step along the gradient, go back to the best, or begin anew.
 
     Args:
         loss: That of the episode.
         value: By which the best is chosen; nan where it is not known.
         begins: The run begins to settle.
     """
-    conf, restarts, low = run.settings.optimizer, run.restart.count, ""
+    conf, low = run.settings.optimizer, ""
     is_far = run.fallback.is_due(value, run.best["loss"], conf, run.settles)
     if settle(run, begins):
-        return {"fallbacks": 0, "restarts": 0}
+        return
     if not run.settles and run.restart.is_due(loss, conf):
         low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
     elif is_far:
@@ -182,8 +186,6 @@ def step(run: Run, loss: float, value: float, begins: bool = False) -> dict[str,
         logger.warning("Iteration %d: %s.", run.iteration, low)
     else:
         run.step()
-    anew = run.restart.count - restarts
-    return {"fallbacks": int(bool(low)) - anew, "restarts": anew}
 
 
 def settle(run: Run, begins: bool) -> bool:
