@@ -207,7 +207,8 @@ class ClosedLoop:
         loss = (
             episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()
         )  # a run's parameters see its own worlds
-        adj = torch.autograd.grad(loss, [*activations, *self.free])
+        # An objective that ends before the episode does not see the last activations:
+        adj = torch.autograd.grad(loss, [*activations, *self.free], materialize_grads=True)
         adj_activations, adj_free = adj[: len(activations)], adj[len(activations) :]
         gradients = (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
         return episode.detach(), gradients, frames

@@ -10,6 +10,7 @@ from learners import viscous
 import softmpm
 from softmpm_learn.design import Design
 from softmpm_learn.episode import Frame, run_episode
+from softmpm_learn.objective import Objective, Progress
 from softmpm_learn.observe import Centroids
 from softmpm_learn.policy import make_policy
 from softmpm_learn.runs.loops import ClosedLoop
@@ -34,6 +35,21 @@ def test_the_loop_gives_the_gradient_of_all_parameters(task, name):
     want = torch.autograd.grad(loss, [*policy.parameters(), *free])
     for a, b in zip(got, want, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6 * b.abs().max().item())
+
+
+def test_an_objective_may_end_before_the_episode(task):
+    """The gradient is that of an episode without the control steps after its end, which do not count."""
+    model = softmpm.build(task.scene, device="cpu")
+    observer = Centroids(model, list(task.regions.values()), task.body_length)
+    policy = make_policy(PolicyConf(name="linear"), observer.size, 2, 0.1, seed=0)
+    design = Design(DesignConf(), model, task.regions)
+    weights, free, found = list(policy.parameters()), list(design.parameters()), []
+    for steps, end in ((3, math.inf), (6, 3 * task.control_period)):
+        ends = dataclasses.replace(task, control_steps=steps, objective=Objective(Progress(end=end)))
+        found.append(ClosedLoop(ends, model, observer, policy, design, weights, free)(None)[1])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-5, atol=1e-6 * a.abs().max().item())
+        assert a.abs().max() > 0
 
 
 class Noisy(Centroids):
