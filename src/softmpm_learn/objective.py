@@ -18,7 +18,6 @@ class Spread(Term):
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -51,9 +50,6 @@ class Progress(Term):
     def rate(self, path: Path) -> float:
         """Minus the mean speed [m/s]."""
         return -self.speed(path).mean().item()
-
-    def worst(self, verdicts: Sequence[float]) -> float:
-        return -super().worst([-one for one in verdicts])
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         moved = float((x[-1] - x[0])[:, self.axis].mean())

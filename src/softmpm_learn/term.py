@@ -133,10 +133,6 @@ class Term(Placed, ABC):
         """Quotient of another :meth:`rate` and that of the episode, 1 if they agree."""
         return other / own if own else math.nan
 
-    def worst(self, verdicts: Sequence[float]) -> float:
-        """The worst of several; nan if one is."""
-        return math.nan if any(math.isnan(one) for one in verdicts) else max(verdicts)
-
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         """Outcome in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
         return ""

@@ -79,17 +79,19 @@ def _answers(
         return dict.fromkeys(NAMES, math.nan)
     term, T, (long,) = task.objective.terms[0], task.seconds, motions["long"]
 
-    def against(path: Path | None, like: Term = term) -> float:
-        return math.nan if path is None else term.verdict(term.rate(own), like.rate(path))
+    def against(paths: list[Path | None], like: Term = term) -> float:
+        """Verdict on the worst, nan if one is not known."""
+        rates = [math.nan if path is None else like.rate(path) for path in paths]
+        return math.nan if any(map(math.isnan, rates)) else term.verdict(term.rate(own), max(rates))
 
     found = dict.fromkeys(NAMES, math.nan)
     if long is not None:
         late, then = (dataclasses.replace(term, begin=a, end=b) for a, b in ((T / 2, T), (T, LONGER * T)))
         found["later"] = term.verdict(late.rate(own), then.rate(long))
     for name in ("kicked", "friction"):
-        found[name] = term.worst([against(path) for path in motions[name]])
+        found[name] = against(motions[name])
     if finer is not None:
-        found["finer"] = against(motions["finer"][0], finer.objective.terms[0])
+        found["finer"] = against(motions["finer"], finer.objective.terms[0])
     if long is not None:
         found |= _extremes(task, long)
     return found

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from softmpm_learn.episode import run_episode
 from softmpm_learn.objective import Objective, Progress, Reach, Still, Tilt
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
+from softmpm_learn.term import Path, Term
 from softmpm_learn.train import train
 from softmpm_learn.training import examination
 from softmpm_learn.training.examination import examine, motion, rubbed
@@ -58,6 +60,26 @@ def test_answers_are_those_of_simulations_by_hand(run, task):
         and math.isnan(found["finer"])
         and math.isnan(found["largest_tilt"])
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap(Term):
+    """Mean distance of the robot from a place ahead, above or below zero [m]."""
+
+    place: float
+
+    def value(self, path: Path):
+        return self.place - path.x[-1, ..., 0].mean(dim=-1)
+
+
+@pytest.mark.parametrize("place", [0.0, 1.0])
+def test_the_worse_of_two_has_the_larger_value(run, task, place):
+    """Whatever the sign of the values: behind the place and beyond it, the robot that comes less far is the worse."""
+    run.task = dataclasses.replace(task, objective=Objective(Gap(place=place)))
+    own, *kicked = (positions(run, task, kick)[0][-1].item() for kick in (0.0, 0.1, -0.1))
+    assert max(kicked) - min(kicked) > 1e-4
+    want = (place - min(kicked)) / (place - own)
+    assert examine(Runs([run]))[0]["kicked"] == pytest.approx(want, rel=1e-5)
 
 
 def test_the_finer_grid_replays_the_activations(run, task, make_block):
