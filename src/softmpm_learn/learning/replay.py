@@ -23,8 +23,9 @@ from torch import Tensor
 from softmpm_learn.storage import files
 
 SPLITS = ("training", "validation")
-MANY = 512
-"""Number of evenly chosen pictures that suffices for validation and for means."""
+MANY = 509
+"""Number of evenly chosen pictures that suffices for validation and for means. A prime: at a whole distance, such as 4, they would
+show a gait of 16 pictures in four of its phases only."""
 HELD_OUT = 2
 """Place in a cycle of the iteration held out. The one before the next cycle is for training: with a learning phase at the end of each
 cycle the autoencoder learns from the newest motion, and validation is two iterations old."""
@@ -153,7 +154,8 @@ class Replay:
     def some(self, split: str) -> Tensor:
         """At most :data:`MANY` evenly chosen pictures of a split, oldest first, shape (picture, dim, *nodes)."""
         places = self.places(split)
-        chosen = places[:: max(1, -(-len(places) // MANY))]
+        count = min(len(places), MANY)
+        chosen = places[torch.arange(count) * len(places) // max(1, count)]
         return self.pictures.index_select(0, chosen.to(self.device))
 
     def draw(self, generator: torch.Generator, count: int, split: str = "training") -> Tensor:

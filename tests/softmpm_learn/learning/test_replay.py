@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from softmpm_learn.learning.replay import Replay, ReplayError, split_of
+from softmpm_learn.learning.replay import MANY, Replay, ReplayError, split_of
 from softmpm_learn.settings import LearningConf
 
 SHAPE = (3, 2, 5, 4)
@@ -136,13 +136,25 @@ def test_pictures_are_those_of_the_newest_simulations(tmp_path):
 
 
 def test_some_pictures_are_evenly_chosen(tmp_path):
-    """At most 512, at equal distances, from the first on."""
+    """At most 509, at distances that differ by one picture at most, from the first on."""
     replay = Replay(tmp_path, (300, 1, 1), simulations=5)
     for number in (0, 4, 5):
-        replay.add(number, 1000.0 * number + torch.arange(300.0).view(300, 1, 1))
-    everything = replay.pictures[replay.places("training")]
-    assert torch.equal(replay.some("training"), everything[::2]) and len(everything) == 900
+        replay.add(number, 300.0 * (0, 4, 5).index(number) + torch.arange(300.0).view(300, 1, 1))
+    some = replay.some("training").flatten()
+    assert len(some) == MANY == 509 and some[0] == 0
+    assert set(some.diff().tolist()) == {1.0, 2.0} and some[-1] >= 898
     assert len(replay.some("validation")) == 0
+
+
+def test_some_pictures_show_all_phases_of_a_gait(tmp_path):
+    """As often as all pictures do: of a walker with 20 simulations for training, of 80 pictures each, and a gait of 16 pictures."""
+    replay = Replay(tmp_path, (80, 1, 1), simulations=50)
+    phase = torch.arange(80.0) % 16
+    for number in range(50):
+        replay.add(number, phase.view(80, 1, 1))
+    assert len(replay.places("training")) == 1600
+    _, counts = replay.some("training").unique(return_counts=True)
+    assert len(counts) == 16 and counts.min() >= 0.9 * MANY / 16
 
 
 def test_comes_back_from_disk_exactly(tmp_path):
