@@ -170,7 +170,8 @@ class LearningConf:
     validation: float = 0.2
     """Share of the iterations that are held out for validation, at most a quarter; their neighbours are used for neither."""
     replay: bool = True
-    """Refinement 2: learn from many past simulations; False learns from those since the last learning phase."""
+    """Refinement 2: learn from many past simulations; False learns from those since the last learning phase. Of fewer iterations than a
+    cycle of the split, of 1/``validation``, none may be for training, and such a phase is left out."""
     simulations: int = 50
     """Most simulations in the replay buffer; the oldest go first. Of many worlds it takes a share of this in each iteration."""
     megabytes: float = 256.0
