@@ -67,10 +67,12 @@ class Design(nn.Module):
 
     @torch.no_grad()
     def change(self) -> dict[str, Tensor]:
-        """Mean over the particles or muscles of |now / start − 1| [-], shape (), of each material parameter and of each variable."""
+        """Mean over the particles or muscles of |now / start − 1| [-], shape (), of each material parameter and of each variable; those
+        that start at 0 do not count, and where all do it is nan."""
         change = {name: (self._value(name) / start - 1).abs() for name, start in self.start.items()}
+        change = {name: c.where(self.start[name] != 0, torch.nan) for name, c in change.items()}
         none = self._params.young.new_zeros(())
-        return dict.fromkeys(Params._fields, none) | {name: c.mean() for name, c in change.items()}
+        return dict.fromkeys(Params._fields, none) | {name: c.nanmean() for name, c in change.items()}
 
 
 def _scene_values(model: Model, name: str) -> Tensor:

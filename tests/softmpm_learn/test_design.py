@@ -1,3 +1,6 @@
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -83,6 +86,19 @@ def test_stays_between_its_bounds(model, task):
             torch.testing.assert_close(value, torch.full_like(getattr(start, name), bounds[name][end]))
     change = design.change()
     assert change["young"] == pytest.approx(2.0) and change["density"] == pytest.approx(0.1, rel=1e-5)
+
+
+def test_a_poisson_ratio_that_starts_at_zero(make_block, task):
+    """It has no relative change: that of the others is reported, and nan where there is none."""
+    body, other = make_block().bodies[0], np.array([[0.35, 0.45], [0.4, 0.45]])
+    soft = dataclasses.replace(body, material=dataclasses.replace(body.material, poisson=0.0))
+    rest = dataclasses.replace(body, particles=softmpm.Particles(other, 0.05**2))
+    for bodies, want in (([soft], math.nan), ([soft, rest], 2 / 3)):
+        model = softmpm.build(make_block(bodies=bodies), device="cpu")
+        design = Design(DesignConf(poisson_range=[-0.2, 0.4]), model, {})
+        with torch.no_grad():
+            design.free["poisson"].fill_(0.0)  # in the middle of the bounds: 0.1
+        assert design.change()["poisson"].item() == pytest.approx(want, nan_ok=True)
 
 
 def test_switched_off_parts_are_the_scene(model, task):
