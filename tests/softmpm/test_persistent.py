@@ -22,7 +22,7 @@ def test_the_same_as_single_launches(kind, device, monkeypatch):
     bits, or its stages race. On a CPU they are those of single launches; on a GPU the forms agree to rounding, also that whose threads
     may have several bricks, nodes and points."""
     made, found, remainders = block(2), [], []
-    body = softmpm.Body(softmpm.box((0.3, 0.3), (0.5, 0.5), spacing=0.05), made.bodies[0].material)
+    body = softmpm.Body(softmpm.box((0.325, 0.325), (0.525, 0.525), spacing=0.05), made.bodies[0].material)
     on_cpu = torch.device(device).type == "cpu"
     for form in ("launches", "kernel", "kernel", *([] if on_cpu else ["loops"])):
         scene = block(2, bodies=[body], **(UNDAMPED if kind == "undamped" else {}))
