@@ -51,7 +51,7 @@ class Surroundings:
     @property
     def actuators(self) -> tuple[str, ...]:
         """Names of the actuators, with their numbers."""
-        return tuple(f"{'muscle' if fibre.any() else 'pressure'} {k}" for k, fibre in enumerate(self.fibre))
+        return style.actuator_names(self.fibre)
 
     @property
     def up(self) -> np.ndarray:
@@ -94,6 +94,7 @@ def of_scene(scene: Scene) -> Surroundings:
     parts = [body.particles for body in scene.bodies]
     count = [len(part) for part in parts]
     dim, every = scene.grid.dim, sum(count)
+    fibre = np.array([getattr(one, "direction", (0.0,) * dim) for one in scene.muscles], float)
     muscle = np.zeros((len(scene.muscles), every), bool)
     for row, actuator in zip(muscle, scene.muscles, strict=True):
         row[actuator.particles] = True
@@ -104,9 +105,7 @@ def of_scene(scene: Scene) -> Surroundings:
         radii=style.radii(np.concatenate([part.volume for part in parts]), 1.0, dim),
         body=np.repeat(np.arange(len(parts)), count),
         muscle=muscle,
-        fibre=np.array([getattr(one, "direction", (0.0,) * dim) for one in scene.muscles], float).reshape(
-            -1, dim
-        ),
+        fibre=fibre.reshape(-1, dim),
         driven=driven,
         normals=np.array([wall.normal for wall in scene.walls]).reshape(-1, dim),
         offsets=np.array([wall.offset for wall in scene.walls], float),

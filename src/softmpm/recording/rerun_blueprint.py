@@ -68,16 +68,11 @@ def _space(source: Recording, show: Show, name: str, contents: list[str]):
 
 def legend(source: Recording) -> str:
     """Meaning of red and blue."""
-    fibres = fibres_of(source)
+    fibres = source.static["muscle_direction"].any(axis=1)  # zero for a pressure
     muscles, pressures = "muscles: red pulls, blue pushes", "pressures: red expands, blue contracts"
     if fibres.all():
         return muscles
     return f"{muscles}; {pressures}" if fibres.any() else pressures
-
-
-def fibres_of(source: Recording) -> np.ndarray:
-    """True for each actuator with fibres, as muscles have, shape (muscle,); the direction of a pressure is recorded as zero."""
-    return (source.static["muscle_direction"] != 0).any(axis=1)
 
 
 def curve(name: str) -> str:

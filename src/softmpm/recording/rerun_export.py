@@ -14,7 +14,7 @@ import numpy as np
 
 from softmpm.recording import style
 from softmpm.recording.reader import Recording
-from softmpm.recording.rerun_blueprint import blueprint, curve, fibres_of
+from softmpm.recording.rerun_blueprint import blueprint, curve
 from softmpm.recording.selection import Show, Simulation, plan
 
 _BLOCK_BYTES = 2**26  # of positions converted at a time
@@ -93,9 +93,8 @@ def _log_static(stream, source: Recording, show: Show) -> None:
     for name in ("activation", "strain"):
         stream.log(f"scene/robot/{name}", points.from_fields(radii=radii), static=True)
     _log_walls(stream, source)
-    fibres = fibres_of(source)
-    if len(fibres):
-        names = [f"{'muscle' if has else 'pressure'} {k}" for k, has in enumerate(fibres)]
+    names = style.actuator_names(source.static["muscle_direction"])
+    if names:
         stream.log("activation", rr.SeriesLines(names=names), static=True)
     if show.has["force"]:
         names = [f"wall {k} {axis}" for k in source.static["surface_wall"] for axis in "xyz"[: source.dim]]
