@@ -101,10 +101,8 @@ def _check_faces(scene: Scene, mirror: Mirror) -> None:
     """Raise ValueError for a body that reaches the plane although its outline does not begin there."""
     plane, axis = 0.5 * mirror.twice * scene.grid.spacing, mirror.axis
     for b, body in enumerate(scene.bodies):
-        outline, spacing = (
-            body.particles.outline,
-            float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim),
-        )
+        outline = body.particles.outline
+        spacing = float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim)
         nearest = (mirror.side * (body.particles.positions[:, axis] - plane)).min()
         if outline is None or nearest >= spacing:
             continue

@@ -1,4 +1,4 @@
-"""Last lines of a run: what came out of it, where it is, and what to do next."""
+"""Last lines of the log of a run: its outcome, its folder, and the command that shows or continues it."""
 
 import math
 import os

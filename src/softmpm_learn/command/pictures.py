@@ -118,9 +118,7 @@ def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
     for name, value in found.items():
         title, unit = DESIGN.get(name, (name, ""))
         values = _on_particles(run.model, name, value.cpu().numpy())
-        if (
-            name in first and first[name].ne(first[name].flatten()[0]).any()
-        ):  # stiff parts would hide what was designed
+        if name in first and len(first[name].unique()) > 1:  # stiff parts would hide what was designed
             title, unit = f"{title}, over that of the scene", ""
             values = values / first[name].cpu().numpy().reshape(-1)
         shown[title] = (values, unit)
