@@ -2,10 +2,11 @@
 
 A call is divided into chunks. The backward pass of a chunk needs all of its intermediate states and the mass and momentum of the
 nodes. With N substeps, chunks of L, S bytes of a state inside, G of the nodes and B of a state between chunks, U bytes
-that are derived from a state inside, and A bytes of other buffers of each chunk:
+that are derived from a state inside, A bytes of other buffers of each chunk, and E of a state that one chunk passes on to the next
+beside those that it stores:
 
-    store all: all intermediate states of all chunks, N (S + G) and S + A for each chunk; no substep is recomputed, but U is derived
-               for one chunk at a time, L U for each shape that chunks have
+    store all: all intermediate states of all chunks, N (S + G), S + A for each chunk and E between two of them; no substep is
+               recomputed, but U is derived for one chunk at a time, L U for each shape that chunks have
     schedule:  one chunk at a time is recomputed, L (S + U + G) + S + A for each shape; of the ⌈N/L⌉ states between
                chunks, s are stored, s B, and the others are recomputed with as few chunks as possible (checkpointing.py)
 
@@ -96,6 +97,8 @@ class Sizes(NamedTuple):
     """Part of a state inside a chunk that is not stored: the backward pass of the chunk computes it from the rest [B]."""
     apart: int = 0
     """Other buffers of each chunk that stores its states [B]."""
+    passed_on: int = 0
+    """State that each chunk of a call that stores its states passes on to the next one, if that is not among these states [B]."""
 
 
 def default_budget(device: torch.device, sizes: Sizes) -> int:
@@ -111,13 +114,13 @@ def default_budget(device: torch.device, sizes: Sizes) -> int:
     return max(min(sizes.calls, most) * one, one + (sizes.calls - 1) * sizes.start)
 
 
-def sizes_of(model, *, inside: int, nodes: int, between: int, derived: int = 0, apart: int = 0) -> Sizes:
+def sizes_of(model, *, inside: int, nodes: int, between: int) -> Sizes:
     """Sizes of a scheme whose states take these numbers of bytes; the rest does not depend on the scheme."""
     particles = model.worlds * model.particle_count
     start = state_bytes(particles, model.dim, model.dtype.itemsize)
     price = 1 if model.device.type == "cpu" else price_of_chunk(particles)
     longest = longest_chunk(particles)
-    return Sizes(inside, nodes, between, start, longest, price, model.calls, derived, apart)
+    return Sizes(inside, nodes, between, start, longest, price, model.calls)
 
 
 class Plan(NamedTuple):
@@ -150,6 +153,7 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     """
     chunks = horizon.chunks(sizes.longest)
     everything = horizon.total * (sizes.inside + sizes.nodes) + len(chunks) * (sizes.inside + sizes.apart)
+    everything += max(len(chunks) - 1, 0) * sizes.passed_on
     derived = sizes.derived * sum(n for n, _ in {chunk.shape for chunk in chunks})
     others = sizes.calls - 1
     if sizes.calls * everything + derived + others * sizes.start <= budget or horizon.total == 0:

@@ -3,12 +3,15 @@
 import threading
 import weakref
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.capture import is_capturing, keep_alive, once_in_capture
+
+T = TypeVar("T")
 
 
 class CachedGraph(NamedTuple):
@@ -46,7 +49,7 @@ class GraphCache(ABC):
         self.model = model
         # By whether they store their intermediate states, then by shape, the most recent last:
         self._free: dict[bool, dict[tuple, _FreeList]] = {False: {}, True: {}}
-        self._shared_adjoints: dict[RequestedGrads, Any] = {}
+        self._shared: dict[Any, Any] = {}
         # The backward pass of this thread's calls may run in other threads.
         self.lock = threading.RLock()
 
@@ -96,23 +99,27 @@ class GraphCache(ABC):
     def adjoint(self, cached: CachedGraph, wanted: RequestedGrads) -> Any:
         """The adjoint of a graph for the requested gradients, built on first use."""
         graph, adjoints = cached
-        shared, known = self._shared(graph, wanted), adjoints.get(wanted)
+        shared = self.shared(wanted, lambda: self.new_shared(graph, wanted))
+        known = adjoints.get(wanted)
         if known is None or known[0] is not shared:
             if is_capturing(self.model):
                 keep_alive(known)  # no graph may be destroyed now
             known = adjoints[wanted] = shared, self.new_adjoint(graph, shared)
         return known[1]
 
-    def _shared(self, graph: Any, wanted: RequestedGrads) -> Any:
-        """Buffers that all backward passes share. A capture takes those of the cache, since its replays may run beside other calls."""
+    def shared(self, key: Any, make: Callable[[], T]) -> T:
+        """Buffers that chunks use in turn, made on first use.
 
-        def take() -> Any:
-            return self._shared_adjoints.pop(wanted, None) or self.new_shared(graph, wanted)
+        A capture takes those of the cache, since its replays may run beside other calls.
+        """
+
+        def take() -> T:
+            return self._shared.pop(key, None) or make()
 
         if is_capturing(self.model):
-            return once_in_capture((self, wanted), take)
-        shared = self._shared_adjoints[wanted] = take()
-        return shared
+            return once_in_capture((self, key), take)
+        found = self._shared[key] = take()
+        return found
 
 
 class Lease:

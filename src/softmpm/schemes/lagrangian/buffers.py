@@ -19,8 +19,7 @@ from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
 from softmpm.schemes.lagrangian.footprint import stored_nodes
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
-from softmpm.schemes.lagrangian.overlap import OverlapCheck
-from softmpm.schemes.lagrangian.surface import SurfaceContact, SurfaceContactAdj
+from softmpm.schemes.lagrangian.surface import SurfaceBuffersAdj, SurfaceContact, SurfaceContactAdj
 from softmpm.schemes.sorted_inputs import SortedInputs, add_unsorted, unsort
 from softmpm.state import Nodal
 
@@ -45,7 +44,6 @@ class ChunkBuffers:
         inputs: Inputs, those of particles in the order of their places.
         contact: Contact of surface points, or None.
         reflection: Clamps and planes of symmetry, or None.
-        overlap: Check for bodies that pass through each other, or None.
     """
 
     def __init__(self, model: Model, chunk: Chunk, keep: bool):
@@ -79,7 +77,6 @@ class ChunkBuffers:
         self.struct = self.struct_on(self.u)
         if model.mirror is not None:
             self.reflection = Reflection(model, self.mass)
-        self.overlap = None if model.overlap is None else OverlapCheck(model)
 
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
@@ -100,10 +97,9 @@ class ChunkBuffers:
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        states = sum(
-            one.nbytes for one in (self.u, self.v, self.low, self.w, self.mass, self.anchor, self.partial)
-        )
-        return states + (0 if self.overlap is None else self.overlap.bytes)
+        nodes, points = (self.u, self.v, self.low, self.w, self.mass, self.partial), (self.anchor, self.force)
+        contact = 0 if self.contact is None else self.contact.bytes
+        return sum(one.nbytes for one in (*nodes, *points, self.order)) + self.inputs.bytes + contact
 
     def index(self, s: int) -> int:
         """Number of the state before substep ``s``."""
@@ -112,6 +108,11 @@ class ChunkBuffers:
     def index_u(self, s: int) -> int:
         """Number of the displacements before substep ``s``."""
         return s if self._keeps_u else s % 2
+
+    @property
+    def last_u(self) -> wp.array:
+        """Displacements after the last substep."""
+        return self.u_arrays[self.index_u(self.chunk.length)]
 
     def load(
         self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Tensor | None
@@ -154,6 +155,8 @@ class SharedAdjoint:
         mass: Adjoint of the masses of the nodes.
         partials: Sums of the bricks for the adjoints of displacements and velocities.
         low: What rounding has kept from the displacements of a chunk that are recomputed.
+        contact: Buffers of contact of surface points, or None.
+        reflected: Two nodal velocities of clamps and planes of symmetry, or none.
     """
 
     def __init__(self, buffers: ChunkBuffers, wanted: RequestedGrads):
@@ -171,6 +174,9 @@ class SharedAdjoint:
         self.u_array, self.v_array = view(self.u, vec), view(self.v, vec)
         self.mass_array = view(self.mass, buffers.types.real)
         self.partial_arrays = [view(one, vec) for one in self.partials]
+        self.contact = None if buffers.contact is None else SurfaceBuffersAdj(buffers.contact)
+        reflection = buffers.reflection
+        self.reflected = [] if reflection is None else [reflection.vectors(), reflection.vectors()]
         self._displacements = self.u.new_empty(0)
         self.low = self.u.new_empty(0 if stores_u(self.model.spec) else self.u.shape)
         self._accumulators: dict[int, Accumulators] = {}
@@ -219,10 +225,11 @@ class ChunkAdjoint:
             self.at, self.u_arrays = forward.struct_on(self.u), views(self.u, forward.types.vec)
         self.contact = self.reflection = None
         if forward.reflection is not None:
-            given = forward.words_array, shared.mass_array
+            given = forward.words_array, shared.mass_array, *shared.reflected
             self.reflection = ReflectionAdj(forward.reflection, forward.contact, *given)
         if forward.contact is not None:
-            self.contact = SurfaceContactAdj(forward.contact, shared.wanted)
+            assert shared.contact is not None
+            self.contact = SurfaceContactAdj(forward.contact, shared.contact, shared.wanted)
         self.struct = self._struct()
 
     def _struct(self) -> Any:
@@ -233,8 +240,8 @@ class ChunkAdjoint:
         struct.partial_u, struct.partial_v = shared.partial_arrays
         for name in ("u", "v", "f", "anchor", "force"):
             setattr(struct, name, view(getattr(shared, name), t.vec))
-        if self.contact is not None:
-            self.contact.add_to(struct)
+        if shared.contact is not None:
+            shared.contact.add_to(struct)
         return struct
 
     def load(self, start: Nodal, adj_end: Nodal) -> None:
@@ -247,10 +254,10 @@ class ChunkAdjoint:
                 self.shared.low.copy_(start.low.detach()[:, 0])
         self.found.clear()
         self.forward.words.fill_(NEVER)
-        clear(self.shared.mass)
-        if self.contact is not None:
-            self.contact.clear()
         shared = self.shared
+        clear(shared.mass)
+        if shared.contact is not None:
+            shared.contact.clear()
         for own, given in zip(shared.state, adj_end[:4], strict=True):
             own.copy_(given)
 

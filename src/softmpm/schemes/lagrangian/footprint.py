@@ -29,21 +29,41 @@ class LagrangianFootprint:
         return model.rest_grid.count
 
     def sizes(self, model) -> Sizes:
-        field, anchors = _field_bytes(model), _anchor_bytes(model)
-        w = model.worlds * stored_nodes(model) * model.dim * model.dtype.itemsize
-        held = math.prod(model.reaction_shape) * model.dtype.itemsize
+        real, field, anchors = model.dtype.itemsize, _field_bytes(model), _anchor_bytes(model)
+        w = model.worlds * stored_nodes(model) * model.dim * real
         u = field if stores_u(model.spec) else 0
-        inside, between = field + u + w + anchors, 4 * field + 2 * anchors + held
-        apart = 2 * (field - u) + 2 * field + _sum_bytes(model)  # two displacements that take turns; low
-        return sizes_of(model, inside=inside, nodes=0, between=between, derived=field - u, apart=apart)
+        inside, between = field + u + w + anchors, 4 * field + 2 * anchors + _reaction_bytes(model)
+        shown = 2 * real * model.worlds * model.particle_count * (model.dim + model.dim**2)
+        sizes = sizes_of(model, inside=inside, nodes=0, between=between)
+        apart = 2 * (field - u) + _chunk_bytes(model)  # two displacements that take turns
+        return sizes._replace(start=shown + between, derived=field - u, apart=apart, passed_on=between)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
-        real, nodal = model.dtype.itemsize, 3 * _field_bytes(model) + _anchor_bytes(model)
-        sums = _sum_bytes(model)
-        forward = 2 * nodal + 2 * _field_bytes(model) + sums + input_bytes(model, 1) + overlap_bytes(model)
-        kept = 0 if not chosen.keep_all else model.worlds * model.rest_grid.count * real
-        low = 0 if stores_u(model.spec) else _field_bytes(model)
-        return Buffers(forward, kept, 2 * nodal + low + 2 * sums)
+        field, anchors, sums, contact = (
+            part(model) for part in (_field_bytes, _anchor_bytes, _sum_bytes, _contact_bytes)
+        )
+        chunks, overlap = horizon.chunks(chosen.longest), overlap_bytes(model)
+        # One runs, one is launched ahead, and one of another shape may be cached.
+        at_once = min(len(chunks), 2 + (len({chunk.shape for chunk in chunks}) > 1))
+        graphs = at_once * (4 * field + 2 * anchors + _chunk_bytes(model))
+        low = 0 if stores_u(model.spec) else field
+        reflected = 0 if model.mirror is None else 2 * field
+        passed = 2 * (3 * field + anchors)  # adjoints of two states
+        backward = passed + low + 2 * sums + 2 * contact + reflected
+        return Buffers(graphs + overlap, overlap + (0 if chosen.keep_all else graphs), backward)
+
+
+def _chunk_bytes(model) -> int:
+    """Bytes of the buffers of a chunk besides its states: low, masses, sums, inputs and their order, forces, contact."""
+    order = 4 * model.worlds * model.particle_count
+    nodes = 2 * _field_bytes(model) + _field_bytes(model) // model.dim + _sum_bytes(model)
+    points = _anchor_bytes(model) + _contact_bytes(model)
+    return nodes + input_bytes(model, 1) + order + points
+
+
+def _reaction_bytes(model) -> int:
+    """Bytes of the mean forces of clamps and planes of symmetry."""
+    return math.prod(model.reaction_shape) * model.dtype.itemsize
 
 
 def _field_bytes(model) -> int:
@@ -54,6 +74,14 @@ def _field_bytes(model) -> int:
 def _sum_bytes(model) -> int:
     """Bytes of the sums of the bricks."""
     return model.worlds * model.rest_grid.window.numel() * model.dim * model.dtype.itemsize
+
+
+def _contact_bytes(model) -> int:
+    """Bytes of the velocities without contact, and of the impulse and the mobility of each surface point."""
+    if model.surface is None:
+        return 0
+    points = model.worlds * model.anchor_shape[2] * (model.dim + 1) * model.dtype.itemsize
+    return _field_bytes(model) + points
 
 
 def _anchor_bytes(model) -> int:

@@ -40,15 +40,13 @@ def launch_chunk(buffers: ChunkBuffers, launch: KernelLauncher) -> None:
 def _check_end(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Check the state after the last substep ``s``, of which no forces are computed."""
     model, inputs = buffers.model, buffers.inputs.particle_struct(s, s)
-    u, words = buffers.u_arrays[buffers.index_u(s + 1)], buffers.words_array
+    u, words = buffers.last_u, buffers.words_array
     limited = s > 0  # else the next substep is checked
     kernel, arguments = cells(model.spec, model.rest_grid.bricks).check_state, (s, limited, True, u, words)
     brick_launch(model, launch, kernel, model.constants, inputs, buffers.rest, *arguments)
     if buffers.contact is not None:
         shift = buffers.shift_arrays[buffers.index(s + 1)]
         buffers.contact.check_end(launch, buffers.inputs.grid_struct(s), s, shift, u, words)
-    if buffers.overlap is not None:
-        buffers.overlap.check(launch, s, u, words)
 
 
 def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:

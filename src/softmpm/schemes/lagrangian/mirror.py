@@ -78,6 +78,7 @@ class ReflectionAdj:
         contact: Surface contact of the chunk, or None.
         words: Status words, all of them of worlds that run.
         adj_mass: Adjoint of the masses of the nodes, added into.
+        free, scratch: Buffers of nodal velocities.
 
     Attributes:
         reaction: Adjoint of the mean forces.
@@ -89,11 +90,13 @@ class ReflectionAdj:
         contact: SurfaceContact | None,
         words: wp.array,
         adj_mass: wp.array,
+        free: wp.array,
+        scratch: wp.array,
     ):
         self.forward, self.contact = forward, contact
         self._words, self._adj_mass = words, adj_mass
         self._kernels = mirror_adj(forward.model.spec)
-        self._free, self._scratch = forward.vectors(), forward.vectors()
+        self._free, self._scratch = free, scratch
         self.reaction = torch.empty_like(forward.reaction)
         self._reaction = view(self.reaction, types(forward.model.spec.dim, forward.model.spec.dtype).vec)
 

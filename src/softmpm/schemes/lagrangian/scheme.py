@@ -15,6 +15,7 @@ from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
+from softmpm.schemes.capture import is_capturing, keep_alive
 from softmpm.schemes.device import stream_of
 from softmpm.schemes.graph_cache import GraphCache, Lease
 from softmpm.schemes.inputs import InputsAdj, ReusedParticleStruct, Values, elapsed, grid_struct, stiffest
@@ -24,6 +25,7 @@ from softmpm.schemes.lagrangian.footprint import LagrangianFootprint
 from softmpm.schemes.lagrangian.frame import shift_of
 from softmpm.schemes.lagrangian.launches import launch_chunk, launch_chunk_adj
 from softmpm.schemes.lagrangian.nodal import nodes_of, particles_of, with_reaction
+from softmpm.schemes.lagrangian.overlap import OverlapCheck
 from softmpm.schemes.lagrangian.surface import check_start
 from softmpm.schemes.launch import LaunchReplay, launcher
 from softmpm.state import Nodal, State
@@ -35,6 +37,7 @@ class ChunkGraph:
     def __init__(self, model: Model, chunk: Chunk, keep: bool):
         self.buffers = ChunkBuffers(model, chunk, keep)
         self._replay = LaunchReplay(model)
+        self._check: tuple[OverlapCheck, LaunchReplay] | None = None
 
     def load(
         self, stream: wp.Stream | None, chunk: Chunk, start: Nodal, values: Values, frozen: Tensor | None
@@ -47,6 +50,16 @@ class ChunkGraph:
     def run(self, stream: wp.Stream | None) -> None:
         """Launch all substeps on what the buffers hold."""
         self._replay.run(stream, lambda launch: launch_chunk(self.buffers, launch))
+
+    def check(self, stream: wp.Stream | None, overlap: OverlapCheck) -> None:
+        """Look for bodies that pass through each other in the final state."""
+        model, known = self.buffers.model, self._check
+        if known is None or known[0] is not overlap:
+            if is_capturing(model):
+                keep_alive(known)  # no graph may be destroyed now
+            known = self._check = overlap, LaunchReplay(model)
+        u, last = self.buffers.last_u, self.buffers.chunk.length - 1
+        known[1].run(stream, lambda launch: overlap.check(launch, last, u, self.buffers.words_array))
 
     def end(self) -> Nodal:
         """Copy of the final state."""
@@ -79,6 +92,13 @@ class ChunkGraphAdj:
 
 class LagrangianGraphs(GraphCache):
     """Chunk graphs of one model."""
+
+    @property
+    def overlap(self) -> OverlapCheck | None:
+        """Check for bodies that pass through each other, or None."""
+        if self.model.overlap is None:
+            return None
+        return self.shared(OverlapCheck, lambda: OverlapCheck(self.model))
 
     def new_graph(self, chunk: Chunk, keep: bool) -> ChunkGraph:
         return ChunkGraph(self.model, chunk, keep)
@@ -115,6 +135,8 @@ class LagrangianRun:
         graph, stream = self._lease.cached.graph, stream_of(pool.model.device)
         graph.load(stream, chunk, start, values, frozen)
         graph.run(stream)
+        if (overlap := pool.overlap) is not None:
+            graph.check(stream, overlap)
         self.end, self.words = graph.end(), graph.buffers.words
 
     def release(self) -> None:

@@ -1,5 +1,6 @@
 """Contact of surface points in a chunk of the reference formulation: its buffers and launches."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -76,6 +77,12 @@ class SurfaceContact:
             view(one, types(model.spec.dim, model.spec.dtype).real) for one in (D, self.rate)
         )
 
+    @property
+    def bytes(self) -> int:
+        """Bytes of the buffers."""
+        numbers = self.model.dim * math.prod(self.nodes) + (self.model.dim + 1) * math.prod(self.points)
+        return numbers * self.model.dtype.itemsize
+
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
 
@@ -120,24 +127,35 @@ def check_start(
     launch(surface(model.spec).check_depth, points, *arguments, part=POINT_PART)
 
 
-class SurfaceContactAdj:
-    """Adjoint of :class:`SurfaceContact`."""
+class SurfaceBuffersAdj:
+    """Buffers of the adjoint of contact, which all chunks share.
 
-    def __init__(self, forward: SurfaceContact, wanted: RequestedGrads):
-        self.forward, self._kernels = forward, surface_adj(forward.model.spec, wanted)
+    Attributes:
+        scratch: Nodal velocities that nobody reads.
+    """
+
+    def __init__(self, forward: SurfaceContact):
         self._shared = forward.vectors(forward.nodes)
-        self._scratch = forward.vectors(forward.nodes) if forward.model.driven_grid else self._shared
+        self.scratch = forward.vectors(forward.nodes) if forward.model.driven_grid else self._shared
         self._x, self._free = forward.vectors(forward.points), forward.vectors(forward.points)
         self._D = forward.tensor(*forward.points)
+        self._D_array = view(self._D, types(forward.model.spec.dim, forward.model.spec.dtype).real)
 
     def add_to(self, bar: Any) -> None:
         """Set the fields of contact in the struct of the adjoints, except for those of the state."""
-        bar.shared, bar.x, bar.free = self._shared, self._x, self._free
-        bar.D = view(self._D, types(self.forward.model.spec.dim, self.forward.model.spec.dtype).real)
+        bar.shared, bar.x, bar.free, bar.D = self._shared, self._x, self._free, self._D_array
 
     def clear(self) -> None:
         """Set all sums to zero."""
         clear(self._D)
+
+
+class SurfaceContactAdj:
+    """Adjoint of :class:`SurfaceContact`."""
+
+    def __init__(self, forward: SurfaceContact, buffers: SurfaceBuffersAdj, wanted: RequestedGrads):
+        self.forward, self.buffers = forward, buffers
+        self._kernels = surface_adj(forward.model.spec, wanted)
 
     def advance(
         self,
@@ -156,7 +174,7 @@ class SurfaceContactAdj:
         constants, out = one.model.constants, (at, bar, adj_inputs, s)
         dim, part = one.in_portions(one.nodes), NODE_PART // PORTION
         launch(self._kernels.settle_adj, dim, constants, inputs, rest, *out, part=part)
-        drive(one.model, launch, inputs, at.words, u, self._scratch, one.free)
+        drive(one.model, launch, inputs, at.words, u, self.buffers.scratch, one.free)
         arguments = (constants, inputs, one.struct, *out, one.chunk.anew(s))
         dim = one.in_portions(one.points)
         launch(self._kernels.press_adj, dim, *arguments, part=POINT_PART // PORTION)

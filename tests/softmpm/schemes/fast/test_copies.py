@@ -251,11 +251,11 @@ def test_a_capture_takes_the_buffers_that_backward_passes_share(made, monkeypatc
 
     want, pool = gradient(), fast_scheme.Fast.of(model)._pool
     assert pool is not None
-    (before,) = pool._shared_adjoints.values()
+    (before,) = pool._shared.values()
     with monkeypatch.context() as patch, capture.collected_resources() as resources:
         pretend_capture(patch)
         assert torch.equal(gradient(), want) and torch.equal(gradient(), want)
-    assert any(one is before for one in resources.made.values()) and not pool._shared_adjoints
+    assert any(one is before for one in resources.made.values()) and not pool._shared
     assert torch.equal(gradient(), want)
-    (after,) = pool._shared_adjoints.values()
+    (after,) = pool._shared.values()
     assert after is not before
