@@ -7,6 +7,7 @@ log.
 No process waits for one that has failed: what may fail in one of them stands in :meth:`Group.fail_together`.
 """
 
+import datetime
 import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +21,9 @@ from torch import Tensor
 
 P = ParamSpec("P")
 T = TypeVar("T")
+LONGEST = datetime.timedelta(days=365)
+"""Longest time that a process waits for another: as long as any run. PyTorch's half an hour is less than what a process with more seeds
+than another may take longer. A process that has ended is noticed at once, by its connections."""
 
 
 def in_full(error: BaseException | None) -> str:
@@ -171,7 +175,7 @@ def joined() -> Iterator[Group]:
     # and its threads would then last until the interpreter is torn down, where a thread that needs Python ends the process.
     importlib.import_module("torch.distributed.nn")
     gpus = torch.cuda.is_available() and dist.is_nccl_available()
-    dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo")
+    dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo", timeout=LONGEST)
     try:
         yield Group(
             rank=dist.get_rank(),

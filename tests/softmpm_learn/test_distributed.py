@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import datetime
 import importlib.util
 import itertools
 import json
@@ -302,6 +303,20 @@ def test_without_torchrun_there_is_no_process_group(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "1")
     with distributed.joined() as group:
         assert group == Group() and not torch.distributed.is_initialized()
+
+
+def test_a_process_waits_as_long_as_another_runs(monkeypatch):
+    """Processes with other numbers of seeds end hours apart, and none gives up waiting for the others."""
+    begun, group = {}, torch.distributed
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    monkeypatch.setattr(group, "init_process_group", lambda name, **settings: begun.update(settings))
+    monkeypatch.setattr(group, "destroy_process_group", lambda: None)
+    monkeypatch.setattr(group, "get_rank", lambda: 0)
+    monkeypatch.setattr(group, "get_world_size", lambda: 2)
+    with distributed.joined():
+        assert begun["timeout"] >= datetime.timedelta(days=30)
 
 
 def test_worlds_are_split_evenly():
