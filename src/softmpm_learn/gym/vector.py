@@ -1,6 +1,7 @@
 """Many robots as one gymnasium environment: the worlds of one model, advanced by one launch."""
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,8 @@ class SoftRobotVectorEnv(VectorEnv):
     def _seed(self, seed: int | Sequence[int | None] | None, mask: np.ndarray) -> None:
         """New generators for the worlds of the mask that have a seed, and for all if there are none yet."""
         count = self.num_envs
-        seeds = [seed + k for k in range(count)] if isinstance(seed, int) else list(seed or [None] * count)
+        seeds: Any = [None] * count if seed is None else seed
+        seeds = [seeds + k for k in range(count)] if isinstance(seeds, Integral) else list(seeds)
         if len(seeds) != count:
             raise ValueError(f"seed must be one number or {count}, got {len(seeds)}.")
         if not self._generators:

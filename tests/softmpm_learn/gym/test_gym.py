@@ -151,6 +151,13 @@ def test_seeds_decide_kicks_and_goals():
     assert not make("arm", **SHORT).reset(seed=1)[0].any()  # at rest without a kick
 
 
+@pytest.mark.parametrize(("seed", "problem"), [(np.int64(0), "python integer"), ([], "one number or 2")])
+def test_what_is_no_seed_is_refused(seed, problem):
+    """A number that a single environment refuses, or an empty list, does not count as no seed."""
+    with pytest.raises((gymnasium.error.Error, ValueError), match=problem):
+        make_vec("arm", 2, **SHORT).reset(seed=seed)
+
+
 def total_return(env, rows: torch.Tensor) -> torch.Tensor:
     """Weighted sum of all observations and rewards of an episode from the beginning."""
     env.reset(seed=0)
