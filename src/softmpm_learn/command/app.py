@@ -110,8 +110,7 @@ def job(
         conf = _configured(config, out, group)
         (results,) = experiments([(conf, out)], group, signals)
         if conf.train.seeds > 1:
-            words = [text for text in hydra_config.overrides.task if not text.startswith("resume=")]
-            about = {"job": 0, "settings": " ".join(words), "folder": str(out)}
+            about = seeds.job_of(conf, out, hydra_config.overrides.task)
             found = seeds.record(conf, out, results, group, about)
             if found and found.status == "failed":
                 end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")

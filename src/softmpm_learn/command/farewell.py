@@ -73,8 +73,10 @@ def farewell_of_seeds(ends: Sequence[Ending], out: Path) -> str:
     failed = [str(one.seed) for one in ends if one.failed]
     if failed:
         lines.append(f"Failed: seed {', '.join(failed)}.")
-    lines.append(f"Each seed has a folder in {place}, and a row in {place}/{sweep.TABLE}.")
-    if failed or not all(one.finished for one in ends):
+    stopped = any(not (one.finished or one.failed) for one in ends)
+    has = "; those that have ended have" if stopped else ", and"
+    lines.append(f"Each seed has a folder in {place}{has} a row in {place}/{sweep.TABLE}.")
+    if failed or stopped:
         lines.append(f"To go on: {plugins.command()} resume={place}")
     return "\n".join(lines)
 

@@ -162,6 +162,34 @@ def test_they_go_on_with_resume(main):
         assert losses(Path(f"all/seed_{k}")) == pytest.approx(losses(Path(f"whole/seed_{k}")), rel=1e-9)
 
 
+def test_a_job_that_is_resumed_keeps_its_number_and_settings(main):
+    """In the rows of its seeds, with what was changed; the same command of its sweep has them in its table."""
+    words = ("-m", *PLAIN, "train.seeds=2", "train.iterations=1,2", "hydra.sweep.dir=sweep")
+    assert main(*words)[0] == 0
+    before = rows(Path("sweep/sweep.csv"))
+    assert main("resume=sweep/1", "train.iterations=3")[0] == 0
+    assert main(*words)[0] == 0
+    after = rows(Path("sweep/sweep.csv"))
+    assert [(row["job"], row["seed"]) for row in after] == [(row["job"], row["seed"]) for row in before]
+    for one, other in zip(before, after, strict=True):
+        assert other["settings"] == one["settings"].replace("iterations=2", "iterations=3")
+
+
+def test_a_run_that_is_resumed_before_a_seed_ended_has_its_task(main, monkeypatch, caplog):
+    """Its rows name it. The line on the table says that only seeds that have ended have a row."""
+    real = experiment.train_side_by_side
+    with monkeypatch.context() as patch, caplog.at_level("INFO", logger="softmpm_learn"):
+        patch.setattr(
+            experiment, "train_side_by_side", lambda *a, **k: real(*a, **k | {"stop": lambda: True})
+        )
+        assert main(*PLAIN, "train.seeds=2", "hydra.run.dir=all")[0] == 0
+    assert "a folder in all; those that have ended have a row in all/sweep.csv." in caplog.text
+    assert main("resume=all")[0] == 0
+    assert [row["settings"] for row in rows(Path("all/sweep.csv"))] == [
+        f"task=arm train.seed={k}" for k in range(2)
+    ]
+
+
 def test_a_seed_that_fails_is_a_row_that_says_so(main, monkeypatch, capsys):
     """The exit code tells it, the others finish; the same folder tries it again."""
     with monkeypatch.context() as patch:
