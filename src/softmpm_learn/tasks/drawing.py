@@ -40,7 +40,7 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
     height, width = whole[cut].shape
     pixel = conf.size / max(height, width)
     warn_of_thin_limbs(conf, whole[cut], pixel)
-    shapes, owners = [], []
+    shapes, owners, taken = [], [], set[tuple[float, ...]]()
     for stiffness in sorted({part.stiffness for part in parts}):
         owner = np.full((height, width), -1)
         for k, part in enumerate(parts):
@@ -55,6 +55,7 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
             spacing=conf.spacing / 2,
             cut_cells=conf.on_surface or conf.formulation == "reference",
         )
+        shape = _without(shape, taken)
         near = np.asarray(distance_transform_edt(owner < 0, return_distances=False, return_indices=True))
         x, y = np.floor(shape.positions / pixel).astype(int).T
         column, row = np.clip(x, 0, width - 1), np.clip(height - 1 - y, 0, height - 1)
@@ -67,6 +68,15 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
         if part.muscle and part.mask.any()
     ]
     return walker(conf, shapes, muscles)
+
+
+def _without(shape: softmpm.Particles, taken: set[tuple[float, ...]]) -> softmpm.Particles:
+    """The shape without particles at places that are taken: a lattice cell of which two bodies have half each is one particle, of the
+    first. Its own places are taken from then on."""
+    places = [tuple(place) for place in shape.positions.tolist()]
+    free = [place not in taken for place in places]
+    taken.update(places)
+    return softmpm.Particles(shape.positions[free], np.asarray(shape.volume)[free], shape.outline)
 
 
 def _fibres(mask: np.ndarray) -> tuple[float, ...]:

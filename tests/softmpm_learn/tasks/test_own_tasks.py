@@ -154,6 +154,17 @@ def test_a_picture_is_a_robot(folder):
     assert lowest == pytest.approx(task.scene.walls[0].offset, abs=1e-9)
 
 
+def test_a_cell_that_two_bodies_share_by_halves_is_one_particle(folder):
+    """Stiff voxels of 10.5 particles across fill the lattice as soft ones do, where nodes meet the floor and cells are not cut."""
+    np.save("robot.npy", np.array([[1, 2, 1, 2], [3, 1, 2, 4]]))
+    stiff, soft = (
+        make_task(VoxelsConf(file="robot.npy", size=0.2625, contact="nodes", stiffness=stiffness))
+        for stiffness in (10.0, 1.0)
+    )
+    found = [sorted(places(task).round(9).tolist()) for task in (stiff, soft)]
+    assert len(stiff.scene.bodies) == 2 and found[0] == found[1]
+
+
 def test_a_limb_thinner_than_two_cells_is_named(folder, caplog):
     """Legs of 30 mm on cells of 12.5 mm are not; others are, with their width and the cells of which it has four."""
     for conf in (ImageConf(file="robot.png", size=0.2), VoxelsConf(file="robot.npy")):
