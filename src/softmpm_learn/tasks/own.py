@@ -111,7 +111,7 @@ def walker(
             )
     place: tuple[float, ...] = (START, height)
     if rest.shape[1] == 3:
-        grid, walls, place = _widened(grid, walls, place, float(np.ptp(rest[:, 2])) + conf.spacing)
+        grid, walls, place = _widened(grid, walls, place, rest[:, 2])
     material = neo_hookean(conf)
     bodies = [
         softmpm.Body(shape.moved(place), dataclasses.replace(material, young=factor * material.young))
@@ -171,13 +171,17 @@ def _check_size(conf: OwnConf, rest: np.ndarray, grid: softmpm.Grid, height: flo
 
 
 def _widened(
-    grid: softmpm.Grid, walls: Sequence[softmpm.Wall], place: tuple[float, ...], width: float
+    grid: softmpm.Grid, walls: Sequence[softmpm.Wall], place: tuple[float, ...], across: np.ndarray
 ) -> tuple[softmpm.Grid, list[softmpm.Wall], tuple[float, ...]]:
-    """The track in 3D, with a wall on either side: its grid, its walls, and the place of the lower corner of a robot so wide."""
-    margin = 4 * grid.spacing
+    """The track in 3D, with a wall on either side: its grid, its walls, and the place of the lower corner of a robot.
+
+    The robot, with its particles at these places along z [m], stands in the middle, on a plane of nodes: a grid that is not symmetric
+    about it would turn it to one side.
+    """
+    margin, width = 4 * grid.spacing, float(np.ptp(across)) + grid.spacing
     side = math.ceil((width / 2 + SIDES + margin) / grid.spacing) * grid.spacing  # from the middle
     wide = softmpm.Grid(shape=(*grid.shape, round(2 * side / grid.spacing) + 1), spacing=grid.spacing)
     found = [dataclasses.replace(wall, normal=(*wall.normal, 0.0)) for wall in walls]
     found.append(softmpm.Wall(normal=(0.0, 0.0, 1.0), offset=margin))
     found.append(softmpm.Wall(normal=(0.0, 0.0, -1.0), offset=margin - 2 * side))
-    return wide, found, (*place, side - width / 2)
+    return wide, found, (*place, side - float(across.min() + across.max()) / 2)

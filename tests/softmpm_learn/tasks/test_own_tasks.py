@@ -154,6 +154,17 @@ def test_a_picture_is_a_robot(folder):
     assert lowest == pytest.approx(task.scene.walls[0].offset, abs=1e-9)
 
 
+@pytest.mark.parametrize("contact", ["surface", "nodes"])
+def test_a_mesh_walks_in_the_middle_of_its_track(folder, contact):
+    """Walls, grid and particles are symmetric about one plane of nodes, so nothing turns a symmetric robot to one side."""
+    scene = make_task(MeshConf(file="robot.stl", cells=50, contact=contact)).scene
+    middle, across = (scene.grid.shape[2] - 1) / 2, scene.bodies[0].particles.positions[:, 2]
+    assert middle == round(middle)
+    left, right = (wall.offset / scene.grid.spacing for wall in scene.walls[2:])
+    assert left - right == pytest.approx(2 * middle)
+    np.testing.assert_allclose(np.sort(across), np.sort(2 * middle * scene.grid.spacing - across), atol=1e-6)
+
+
 def test_a_cell_that_two_bodies_share_by_halves_is_one_particle(folder):
     """Stiff voxels of 10.5 particles across fill the lattice as soft ones do, where nodes meet the floor and cells are not cut."""
     np.save("robot.npy", np.array([[1, 2, 1, 2], [3, 1, 2, 4]]))
