@@ -17,6 +17,9 @@ TURNS = {
     "y": np.eye(3, dtype=int),
 }
 """Rotations that bring an axis of the file up, to y, and leave x forward."""
+SLACK = 1e-4
+"""A particle within this share of the bounding box of a face of a muscle lies on it, whatever its rounding: that of float32 in a file
+and of centroids of cut cells is below 1e-6."""
 
 
 @dataclass(kw_only=True)
@@ -88,8 +91,12 @@ def _muscles(conf: MeshConf, rest: np.ndarray) -> list[Muscular]:
     slabs = {f"slab{k}": [edges[k], 0.0, 0.0, edges[k + 1], math.inf, math.inf] for k in range(conf.slabs)}
     found, free = [], np.ones(len(rest), dtype=bool)
     for name, box in (conf.boxes or slabs).items():
-        upper = np.where(np.array(box[3:]) >= 1.0, math.inf, box[3:])  # the far face belongs to the last
-        chosen = np.flatnonzero(free & (share >= box[:3]).all(axis=1) & (share < upper).all(axis=1))
+        lower, upper = (
+            np.array(box[:3]) - SLACK,
+            np.array(box[3:]) - SLACK,
+        )  # an upper face belongs to the next
+        upper[np.array(box[3:]) >= 1.0] = math.inf  # but the far one to the last
+        chosen = np.flatnonzero(free & (share >= lower).all(axis=1) & (share < upper).all(axis=1))
         free[chosen] = False
         direction = longer_axis(rest[chosen]) if conf.boxes and len(chosen) else (1.0, 0.0, 0.0)
         found.append(Muscular(name, chosen, direction))

@@ -155,6 +155,16 @@ def test_a_picture_is_a_robot(folder):
 
 
 @pytest.mark.parametrize("contact", ["surface", "nodes"])
+def test_a_column_on_the_edge_of_two_slabs_belongs_to_one(folder, contact):
+    """Every other one of eleven lies on an edge of the five slabs: as a whole it belongs to the one further along the axis."""
+    trimesh.creation.box((0.275, 0.12, 0.12)).export("robot.stl")
+    task = make_task(MeshConf(file="robot.stl", size=0.275, cells=20, slabs=5, contact=contact))
+    column = (places(task)[:, 0] / 0.025).astype(int)
+    slabs = [sorted(set(column[task.regions[f"slab{k}"]].tolist())) for k in range(5)]
+    assert slabs == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9, 10]]
+
+
+@pytest.mark.parametrize("contact", ["surface", "nodes"])
 def test_a_mesh_walks_in_the_middle_of_its_track(folder, contact):
     """Walls, grid and particles are symmetric about one plane of nodes, so nothing turns a symmetric robot to one side."""
     scene = make_task(MeshConf(file="robot.stl", cells=50, contact=contact)).scene
