@@ -132,7 +132,7 @@ def walker(
         ],
         rest=rest,
         regions=regions,
-        torso=np.flatnonzero(rest[:, 1] >= np.median(rest[:, 1])),
+        torso=np.flatnonzero(rest[:, 1] > np.median(rest[:, 1]) - 1e-3 * conf.spacing),  # whole rows
     )
     digest = hashlib.sha256(Path(conf.file).read_bytes()).hexdigest()
     return dataclasses.replace(task, source=Source(conf.file, digest))

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from softmpm_learn import plugins
 from softmpm_learn.command import app
 from softmpm_learn.command.experiment import finer
+from softmpm_learn.objective import Tilt
 from softmpm_learn.tasks import ImageConf, MeshConf, Resolution, VoxelsConf, make_task
 from softmpm_learn.tasks.own import longer_axis
 from softmpm_learn.tasks.thinness import thinnest
@@ -162,6 +163,15 @@ def test_a_column_on_the_edge_of_two_slabs_belongs_to_one(folder, contact):
     column = (places(task)[:, 0] / 0.025).astype(int)
     slabs = [sorted(set(column[task.regions[f"slab{k}"]].tolist())) for k in range(5)]
     assert slabs == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9, 10]]
+
+
+def test_the_torso_of_a_mesh_has_whole_rows(folder):
+    """Of five rows the third has the median height, up to rounding: all of it belongs to the upper half of the robot."""
+    trimesh.creation.box((0.3, 0.12, 0.12)).export("robot.stl")
+    task = make_task(MeshConf(file="robot.stl", cells=20, slabs=3))
+    (tilt,) = (term for term in task.objective.terms if isinstance(term, Tilt))
+    rows = (places(task)[tilt.front, 1] / 0.025).astype(int)
+    assert set(np.bincount(rows)[2:]) == {3 * 5} and not (rows < 2).any()
 
 
 @pytest.mark.parametrize("contact", ["surface", "nodes"])
