@@ -26,7 +26,7 @@ from softmpm_learn.tasks import TaskConf, make_task
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "robots.md").read_text()
-JUMPER, HOPPER, PARTS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+LOOK, JUMPER, HOPPER, PARTS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 (END,) = (dedent(text) for text in re.findall(r"^    if __name__.*?(?=^\S)", PAGE, re.DOTALL | re.MULTILINE))
 TINY = [
     *("experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
@@ -68,14 +68,28 @@ def refusal(done) -> str:
     return said[0]
 
 
-def test_a_robot_of_a_picture_takes_another_objective(folder):
-    """The jumper of the page trains: its height is a column of metrics.csv, and nothing of a walk is left."""
-    (folder / "jumper.py").write_text(JUMPER)
+def draw(path):
+    """A robot with two legs, which are its muscles."""
     pen = ImageDraw.Draw(drawing := Image.new("RGB", (60, 40), "white"))
     pen.rectangle((0, 0, 59, 19), fill="#808080")
     for left, colour in ((5, "#ff0000"), (40, "#0000ff")):
         pen.rectangle((left, 20, left + 14, 39), fill=colour)
-    drawing.save(folder / "robot.png")
+    drawing.save(path)
+
+
+def test_a_robot_of_a_picture_is_shown(tmp_path, monkeypatch):
+    """By the lines of the page, in a folder with the picture."""
+    monkeypatch.chdir(tmp_path)
+    draw(tmp_path / "robot.png")
+    exec(LOOK, {})
+    with Image.open(tmp_path / "scene.png") as picture:
+        assert picture.width > 300
+
+
+def test_a_robot_of_a_picture_takes_another_objective(folder):
+    """The jumper of the page trains: its height is a column of metrics.csv, and nothing of a walk is left."""
+    (folder / "jumper.py").write_text(JUMPER)
+    draw(folder / "robot.png")
     words = ("jumper.py", "task=jumper", "task.file=robot.png", *TINY, "task.at=0.02", "hydra.run.dir=run")
     done = run(folder, *words)
     assert done.returncode == 0, done.stderr

@@ -35,6 +35,11 @@ class Camera:
         scale = self._distance / np.maximum(depth, 0.05 * self._distance)
         return np.stack([across * scale, above * scale], -1), scale
 
+    def nearer(self, points: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        """Points (…, 3), moved towards the camera by a distance (…, 1) [m]."""
+        way = self.position - points
+        return points + distance * way / np.linalg.norm(way, axis=-1, keepdims=True)
+
     def shading(self, place: Surroundings, positions: np.ndarray) -> np.ndarray:
         """Brightness of each particle (particle,): Lambert's law, with the normal from the centre of its neighbours to it."""
         outward = positions - positions[place.neighbours].mean(1)

@@ -39,6 +39,8 @@ class Colouring:
     """Ends of the scale."""
     names: tuple[str, ...] = ()
     """Of categories; their values are 0, 1, ..."""
+    with_fibres: bool = False
+    """True for a quantity of muscles, with which their fibres are drawn."""
 
     def rgb(self, values: np.ndarray) -> np.ndarray:
         """Colours of values, shape (particle, 3), 0 to 255; what is not finite is passive."""
@@ -102,14 +104,15 @@ def coloured(
     limits: tuple[float, float] | None,
 ) -> Colouring:
     """Colours of values that are shown together; None for ``colour`` is an array of the user's own."""
+    with_fibres = colour in ("muscle", "activation") and bool(place.fibre.any())
     if colour in ("muscle", "body"):
         bodies = (f"body {k}" for k in range(int(place.body.max()) + 1))
         names = place.actuators if colour == "muscle" else tuple(bodies)
-        return Colouring("", categories(len(names)), names=names)
+        return Colouring("", categories(len(names)), names=names, with_fibres=with_fibres)
     if limits is not None and not (np.isfinite(limits).all() and limits[0] < limits[1]):
         raise ValueError(f"limits must be two numbers in ascending order, got {limits}.")
     if colour == "activation":
-        return Colouring(LABELS[colour], ACTIVATION, limits or (-1.0, 1.0))
+        return Colouring(LABELS[colour], ACTIVATION, limits or (-1.0, 1.0), with_fibres=with_fibres)
     ramp = {"speed": SPEED, "strain": style.STRAIN, None: VALUES}[colour]
     return Colouring(LABELS.get(colour or "", label), ramp, limits or _span(values, colour is None))
 

@@ -32,6 +32,8 @@ NAMES = 0.65
 """Room across for the names of the colours within that for labels [inch]; a figure with wider ones is wider."""
 TYPE = (8, 6)
 """Size of the names of colours [point], of up to two columns and of more."""
+STROKE = "strokes: fibres"
+"""Words beside the colours where fibres are drawn."""
 
 
 def show(
@@ -53,7 +55,8 @@ def show(
         softmpm.show(model, state, colour="strain").savefig("strain.png")
         softmpm.show(model, state, world=range(4))  # four worlds side by side
 
-    The figure shows itself in a notebook. Walls are drawn as the scene describes them. Driven particles have dark edges.
+    The figure shows itself in a notebook. Walls are drawn as the scene describes them. Driven particles have dark edges. Over
+    the colours "muscle" and "activation" strokes show the fibres of muscles, which deform with the body; in 3D those at the surface.
 
     Args:
         model: What ``state`` belongs to; a scene is drawn at rest.
@@ -187,7 +190,7 @@ def panels_of(
             raise ValueError(f"axes must be one for each world, {count}, got {len(axes)}.")
         figure = axes[0].get_figure()
         size, room = None, axes[-1].get_window_extent().height / figure.dpi
-    panels = [Panel(one, place, low, high, traction) for one in axes]
+    panels = [Panel(one, place, low, high, traction, colouring.with_fibres) for one in axes]
     for one in axes if place.dim == 2 and count > 1 else ():
         one.label_outer()
     key = _key(figure, list(axes), colouring, room)
@@ -229,15 +232,19 @@ def _key(figure: Any, axes: list[Any], colouring: Colouring, room: float) -> Any
             Patch(facecolor=colour / 255, label=name)
             for colour, name in zip(colouring.ramp, colouring.names, strict=True)
         ]
-        rows = [max(1, int((72 * room / points - 1.0) / 1.6)) for points in TYPE]  # with the space between
+        title = STROKE if colouring.with_fibres else None
+        rows = [
+            max(1, int((72 * room / points - 1.0) / 1.6) - bool(title)) for points in TYPE
+        ]  # with the space between
         columns = [math.ceil(len(patches) / most) for most in rows]
         small = columns[0] > 2
         look: dict = dict(frameon=False, fontsize=TYPE[small], ncols=columns[small], columnspacing=1.0)
+        look |= dict(title=title, title_fontsize=TYPE[small], alignment="left")
         return axes[-1].legend(handles=patches, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
     ramp = LinearSegmentedColormap.from_list(colouring.label or "values", colouring.ramp / 255)
     bar = figure.colorbar(
         ScalarMappable(Normalize(*colouring.limits), ramp), ax=axes, shrink=0.85, pad=0.02, aspect=25
     )
-    bar.set_label(colouring.label, fontsize=9)
+    bar.set_label(colouring.label + f"; {STROKE}" * colouring.with_fibres, fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return None

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from softmpm.pictures.camera import Camera, round_length, tiles
+from softmpm.pictures.fibres import STROKES, Fibres, stroke_colours
 from softmpm.pictures.instant import Instant
 from softmpm.pictures.surroundings import Surroundings
 from softmpm.recording import style
@@ -23,10 +24,21 @@ class Panel:
         place: Everything that does not move.
         low, high: Box to frame [m], shape (dim,).
         traction: Traction of the longest arrow [Pa]; 0 for no arrows.
+        with_fibres: Draw the fibres of the muscles.
     """
 
-    def __init__(self, axes: Any, place: Surroundings, low: np.ndarray, high: np.ndarray, traction: float):
+    def __init__(
+        self,
+        axes: Any,
+        place: Surroundings,
+        low: np.ndarray,
+        high: np.ndarray,
+        traction: float,
+        with_fibres: bool = False,
+    ):
         self._axes, self._place, self._traction = axes, place, traction
+        gap = max(place.spacing, float((high - low).max()) / STROKES)
+        self._fibres = Fibres(place, gap) if with_fibres else None
         self._moving: list[Any] = []
         self._camera = Camera(low, high, place.up) if place.dim == 3 else None
         corners = (low, high) if self._camera is None else self._camera.frame(low, high)
@@ -51,19 +63,37 @@ class Panel:
         for artist in self._moving:
             artist.remove()
         self._moving = []
-        finite = np.isfinite(instant.positions).all(-1)
-        x, radii, rgb = instant.positions[finite], self._place.radii[finite], rgb[finite] / 255
-        edge = self._place.driven[finite]
+        x, radii, edge = instant.positions, self._place.radii, self._place.driven
         if self._camera is not None:
-            shade = self._camera.shading(self._place, instant.positions)[finite]
+            rgb = rgb * self._camera.shading(self._place, x)[:, None]
+        if self._fibres is not None:
+            x, radii, rgb, edge = self._with_strokes(self._fibres, x, radii, rgb, edge)
+        finite = np.isfinite(x).all(-1)
+        x, radii, rgb, edge = x[finite], radii[finite], rgb[finite] / 255, edge[finite]
+        if self._camera is not None:
             x, scale = self._camera.project(x)
             order = np.argsort(scale)  # from back to front
-            x, radii, rgb, edge = x[order], (radii * scale)[order], (rgb * shade[:, None])[order], edge[order]
+            x, radii, rgb, edge = x[order], (radii * scale)[order], rgb[order], edge[order]
         self._dots(x, radii, rgb, edge, zorder=2)
         if instant.places is not None:
             self._draw_points(instant.places, instant.traction)
         if title:
             self._axes.set_title(title, fontsize=9, loc="left")
+
+    def _with_strokes(
+        self, strokes: Fibres, x: np.ndarray, radii: np.ndarray, rgb: np.ndarray, edge: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Particles, and after them the dots of the fibres' strokes: positions, radii, colours and dark edges."""
+        dots = strokes.dots(x)
+        if self._camera is not None:  # in front of the particles that they belong to
+            dots = self._camera.nearer(dots, 1.5 * radii[strokes.particle, None, None])
+        over = np.repeat(stroke_colours(rgb[strokes.particle]), dots.shape[1], axis=0)
+        return (
+            np.concatenate([x, dots.reshape(-1, self._place.dim)]),
+            np.concatenate([radii, np.full(len(over), strokes.radius)]),
+            np.concatenate([rgb, over]),
+            np.concatenate([edge, np.zeros(len(over), bool)]),
+        )
 
     def _dots(self, x: np.ndarray, radii: np.ndarray, rgb: np.ndarray, edge: np.ndarray, zorder: int) -> None:
         from matplotlib.collections import EllipseCollection

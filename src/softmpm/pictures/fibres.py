@@ -1,0 +1,79 @@
+"""Strokes along the fibres of muscles, which deform with the particles around them. NumPy only."""
+
+import numpy as np
+
+from softmpm.pictures.surroundings import Surroundings
+
+STROKES = 24
+"""Number of strokes that follow each other along the longest side of a picture."""
+LENGTH, RADIUS = 0.7, 0.035
+"""Length at rest and half the width of a stroke, in distances between two."""
+DARK, LIGHT = np.array((44, 44, 52), float), np.array((250, 250, 250), float)
+"""Colours of strokes, on light and on dark particles."""
+OUTSIDE = 0.6
+"""Distance between a particle and the mean of its neighbours from which on it is at the surface, in its radii; at a plane it is 1.2."""
+
+
+class Fibres:
+    """Strokes along the fibres of all muscles of a picture: rows of dots, which a picture sorts by depth as it does particles.
+
+    Args:
+        gap: Distance between two strokes [m].
+
+    Attributes:
+        particle: Particle in the middle of each stroke, shape (stroke,).
+    """
+
+    def __init__(self, place: Surroundings, gap: float):
+        self._place = place
+        seen = _outside(place) if place.dim == 3 else np.ones(len(place.rest), bool)
+        chosen = [
+            _spread(place.rest, np.flatnonzero(members & (seen if (members & seen).any() else members)), gap)
+            for members in place.muscle
+        ]
+        chosen = [part if fibre.any() else part[:0] for part, fibre in zip(chosen, place.fibre, strict=True)]
+        self.particle = np.concatenate([*chosen, np.empty(0)]).astype(np.int64)
+        along = np.repeat(place.fibre, [len(part) for part in chosen], axis=0)
+        self._along = LENGTH * gap * along / np.linalg.norm(along, axis=-1, keepdims=True)
+        self.radius = RADIUS * gap
+        count = 2 * int(np.ceil(LENGTH / (2 * RADIUS))) + 1  # dots overlap by a half
+        self._shares = np.linspace(-0.5, 0.5, count)
+
+    def dots(self, positions: np.ndarray) -> np.ndarray:
+        """Dots of each stroke [m], shape (stroke, dot, dim), not finite where particles around are not."""
+        along = (self._gradient(positions) @ self._along[..., None])[..., 0]
+        return positions[self.particle][:, None] + self._shares[:, None] * along[:, None]
+
+    def _gradient(self, positions: np.ndarray) -> np.ndarray:
+        """Deformation gradient around each stroke: least squares over neighbours, and none along axes in which they have no extent."""
+        near = self._place.neighbours[self.particle]
+        rest, now = (x[near] - x[self.particle][:, None] for x in (self._place.rest, positions))
+        inverse = np.linalg.pinv(np.swapaxes(rest, 1, 2) @ rest, rcond=1e-6, hermitian=True)
+        flat = np.eye(self._place.dim) - np.swapaxes(rest, 1, 2) @ rest @ inverse
+        return np.swapaxes(now, 1, 2) @ rest @ inverse + flat
+
+
+def stroke_colours(rgb: np.ndarray) -> np.ndarray:
+    """Colour of a stroke on each of these colours, shape (stroke, 3), 0 to 255: the one that can be told from it."""
+    return np.where((rgb @ (0.3, 0.59, 0.11) > 110.0)[:, None], DARK, LIGHT)
+
+
+def _outside(place: Surroundings) -> np.ndarray:
+    """Particles at the surface of their body, shape (particle,), boolean."""
+    inward = place.rest[place.neighbours].mean(1) - place.rest
+    return np.linalg.norm(inward, axis=-1) > OUTSIDE * place.radii
+
+
+def _spread(rest: np.ndarray, members: np.ndarray, gap: float) -> np.ndarray:
+    """Particles among these, at least one, that are about this far apart: near the middles of cubes, those of full ones first."""
+    x = rest[members]
+    _, cube, count = np.unique(
+        np.floor((x - x.mean(0)) / gap + 0.5), axis=0, return_inverse=True, return_counts=True
+    )
+    cube, found = cube.ravel(), []
+    for k in np.argsort(-count, kind="stable"):
+        inside = np.flatnonzero(cube == k)
+        middle = inside[np.linalg.norm(x[inside] - x[inside].mean(0), axis=-1).argmin()]
+        if all(np.linalg.norm(x[found] - x[middle], axis=-1) > LENGTH * gap):
+            found.append(middle)
+    return members[found]

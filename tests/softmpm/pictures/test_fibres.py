@@ -1,0 +1,120 @@
+"""Strokes along the fibres of muscles: their direction is measured in pixels."""
+
+import dataclasses
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import find_objects, label
+
+import softmpm
+from softmpm.pictures.colouring import CATEGORIES
+from softmpm.pictures.fibres import DARK, LIGHT, Fibres, stroke_colours
+from softmpm.pictures.surroundings import of_scene
+
+RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
+DIRECTION = {2: (math.cos(math.radians(30)), math.sin(math.radians(30))), 3: (0.0, 1.0, 0.0)}
+
+
+def scene_of(dim: int, *, pressure: bool = False) -> softmpm.Scene:
+    """A block whose left half is a muscle; in 2D with fibres 30 degrees from the x axis, in 3D with upright ones."""
+    block = softmpm.box((0.3,) * dim, (0.7,) * dim, 1 / 30 if dim == 2 else 1 / 20)
+    half = np.flatnonzero(block.positions[:, 0] < 0.5)
+    actuator = (
+        softmpm.Pressure(particles=half, strength=1.0)
+        if pressure
+        else softmpm.Muscle(particles=half, direction=DIRECTION[dim], strength=1.0)
+    )
+    return softmpm.Scene(
+        grid=softmpm.Grid(shape=(21,) * dim, spacing=1 / 20),
+        bodies=[softmpm.Body(block, RUBBER)],
+        muscles=[actuator],
+        gravity=tuple(-9.8 * np.eye(dim)[1]),
+        dt=2e-4,
+    )
+
+
+def angles(figure, colour: np.ndarray) -> list[float]:
+    """Angle of each stroke of this colour with the x axis [degrees], in [0, 180)."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=150)
+    image = np.asarray(Image.open(png).convert("RGB")).astype(int)
+    number, _ = label((np.abs(image - colour).max(-1) <= 3), np.ones((3, 3)))
+    found = []
+    for k, part in enumerate(find_objects(number), 1):
+        row, column = (number[part] == k).nonzero()
+        if 15 < len(row) < 500:
+            points = np.stack([column - column.mean(), row.mean() - row], -1)
+            _, sizes, axes = np.linalg.svd(points, full_matrices=False)
+            if sizes[0] > 4 * sizes[1]:
+                found.append(math.degrees(math.atan2(*axes[0, ::-1])) % 180)
+    return found
+
+
+@pytest.fixture(scope="module")
+def model() -> softmpm.Model:
+    return softmpm.build(scene_of(2), device="cpu")
+
+
+@pytest.mark.parametrize("turn", [0.0, 40.0])
+def test_strokes_turn_with_the_muscle(model, turn):
+    """Strokes lie along the fibre of the scene, turned as the body is: dark on the grey of a muscle at rest."""
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    state = model.rest()
+    state.x[0] = (state.x[0] - 0.5) @ torch.tensor([[c, s], [-s, c]]) + 0.5
+    found = angles(softmpm.show(model, state, activation=torch.zeros(1)), DARK)
+    assert len(found) > 20
+    np.testing.assert_allclose(found, 30.0 + turn, atol=4.0)
+
+
+def test_strokes_stretch_with_the_muscle(model):
+    """Along the fibre by a half, across to none: the rows of dots have the deformation of the particles around them."""
+    place = of_scene(model.scene)
+    fibres, rest = Fibres(place, 0.05), place.rest
+    along = np.array(DIRECTION[2])
+    stretched = rest + 0.5 * np.outer(rest @ along, along)
+    rows, longer = (dots[:, -1] - dots[:, 0] for dots in (fibres.dots(rest), fibres.dots(stretched)))
+    np.testing.assert_allclose(rows, np.tile(0.7 * 0.05 * along, (len(rows), 1)), atol=1e-9)
+    np.testing.assert_allclose(longer, 1.5 * rows, atol=1e-9)
+    stretched[fibres.particle[0]] = np.nan
+    assert np.isfinite(fibres.dots(stretched)).any() and not np.isfinite(fibres.dots(stretched)[0]).any()
+
+
+def test_a_row_of_particles_has_strokes_across_it():
+    """Where neighbours lie on one line, they tell nothing of the fibre across, which stays as at rest."""
+    scene = scene_of(2)
+    line = np.stack([np.linspace(0.3, 0.6, 12), np.full(12, 0.5)], -1)
+    body = softmpm.Body(softmpm.Particles(positions=line, volume=np.full(12, 1e-3)), RUBBER)
+    muscle = softmpm.Muscle(particles=range(12), direction=(0.0, 1.0), strength=1.0)
+    place = of_scene(dataclasses.replace(scene, bodies=[body], muscles=[muscle]))
+    dots = Fibres(place, 0.05).dots(line + 0.1)
+    np.testing.assert_allclose(dots[:, -1] - dots[:, 0], np.tile((0.0, 0.035), (len(dots), 1)), atol=1e-9)
+
+
+def test_strokes_are_told_from_dark_colours():
+    """Of the colours of muscles, blue has light strokes; a scene shows them before anything is built, and names them."""
+    figure = softmpm.show(scene_of(2))
+    found = angles(figure, LIGHT)
+    assert len(found) > 20
+    np.testing.assert_allclose(found, 30.0, atol=4.0)
+    assert figure.axes[-1].get_legend().get_title().get_text() == "strokes: fibres"
+    np.testing.assert_array_equal(stroke_colours(CATEGORIES[:2]), [LIGHT, DARK])
+
+
+def test_strokes_of_a_solid_are_at_its_surface():
+    """Upright fibres are seen from the front."""
+    found = angles(softmpm.show(scene_of(3)), LIGHT)
+    assert len(found) > 5
+    np.testing.assert_allclose(np.median(found), 90.0, atol=6.0)
+
+
+@pytest.mark.parametrize("change", [dict(colour="speed"), dict(colour="body"), dict(pressure=True)])
+def test_other_pictures_have_no_strokes(change):
+    """Neither other colours than those of muscles, nor a pressure, which has no fibres."""
+    figure = softmpm.show(scene_of(2, pressure="pressure" in change), colour=change.get("colour"))
+    assert not angles(figure, LIGHT) and not angles(figure, DARK)
+    legend = figure.axes[-1].get_legend()
+    assert legend is None or not legend.get_title().get_text()
