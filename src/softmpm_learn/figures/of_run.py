@@ -23,7 +23,8 @@ SIGNED = "RdBu"
 def loss_figure(
     path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, lowest: str = "loss"
 ) -> None:
-    """Draw curves over the iterations, one panel each; ``lowest`` names one that also shows its lowest value so far.
+    """Draw curves over the iterations, one panel each; ``lowest`` names one that also shows its lowest value so far. A few values that
+    would flatten the others are marked at the edge, and the farthest stands above it.
 
     Args:
         curves: For each name the iterations and the values; values that are not finite leave gaps.
@@ -45,7 +46,9 @@ def loss_figure(
         if name == lowest:
             axes.legend(frameon=False)
         axes.set_title(name, fontsize=9, loc="left")
-        axes.set_yscale(canvas.scale(value))
+        scale = canvas.scale(value)
+        axes.set_yscale(scale)
+        canvas.limit(axes, canvas.limits(value, scale), [(iteration, value, "#1f5fa8")])
         axes.spines[["top", "right"]].set_visible(False)
         axes.margins(x=0.01)
         if place == len(names) - 1:

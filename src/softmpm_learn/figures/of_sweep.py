@@ -86,7 +86,8 @@ def curves_figure(
 
     Args:
         runs: Rows of runs.csv.
-        groups: Rows of jobs.csv for each setting; runs that failed are counted in the legend and not drawn.
+        groups: Rows of jobs.csv for each setting; runs that failed are counted in the legend and not drawn. Values outside of an axis
+            that they would flatten are marked at its edge.
         settings: Columns of jobs.csv in which runs differ.
     """
     first = next(iter(groups.values()))[0]
@@ -102,11 +103,19 @@ def curves_figure(
     columns = 2 if widest <= 42 else 1
     figure, grid = _curve_axes(len(panels), -(-len(groups) // columns))
     scale = canvas.scale([value for line in series.values() for value in line.values()])
+    quartiles = {
+        (title, name): _quartiles(members, series)
+        for title, lines in panels.items()
+        for name, members in lines.items()
+    }
+    ends = canvas.limits(np.concatenate([table.ravel() for _, table in quartiles.values()]), scale)
     for axes, (title, lines) in zip(grid, panels.items(), strict=False):
         for name, members in lines.items():
-            _curve(axes, members, series, styles[name], _count(name, members))
+            _curve(axes, *quartiles[title, name], styles[name], _count(name, members))
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_yscale(scale)
+        of_panel = [(*quartiles[title, name], styles[name][0]) for name in lines]
+        canvas.limit(axes, ends, [(x, y, colour) for x, table, colour in of_panel for y in table])
         axes.spines[["top", "right"]].set_visible(False)
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.margins(x=0.01)
@@ -149,17 +158,23 @@ def _curve_axes(panels: int, rows: int) -> tuple[Any, np.ndarray]:
     return figure, figure.subplots(high, 2, squeeze=False, sharex=True, sharey=True).ravel()
 
 
-def _curve(axes, members: Sequence[Row], series: Mapping[int, dict[int, float]], style, text: str) -> None:
-    """The curve of one setting, from the values of each run by iteration."""
+def _quartiles(
+    members: Sequence[Row], series: Mapping[int, dict[int, float]]
+) -> tuple[list[int], np.ndarray]:
+    """Iterations of the runs of one setting, and quartiles and median over them, shape (3, iteration)."""
     finished = [int(row["run"]) for row in members if row["status"] == "finished"]
     lines = [series.get(number, {}) for number in finished]
     iterations = sorted({k for line in lines for k in line})
     table = np.array([[line.get(k, math.nan) for k in iterations] for line in lines])
-    low, middle, high = np.nanquantile(table, [0.25, 0.5, 0.75], axis=0) if table.size else ([], [], [])
-    (colour, dashes), marker = style, "o" if len(iterations) < 3 else None
+    return iterations, np.nanquantile(table, [0.25, 0.5, 0.75], axis=0) if table.size else np.empty((3, 0))
+
+
+def _curve(axes, iterations: Sequence[int], quartiles: np.ndarray, style, text: str) -> None:
+    """The curve of one setting; of a single run there is no band."""
+    (low, middle, high), (colour, dashes) = quartiles, style
+    marker = "o" if len(iterations) < 3 else None
     axes.plot(iterations, middle, dashes, color=colour, marker=marker, linewidth=2, label=text)
-    if len(lines) > 1:
-        axes.fill_between(iterations, low, high, color=colour, alpha=0.18, linewidth=0)
+    axes.fill_between(iterations, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
 def _count(name: str, members: Sequence[Row]) -> str:

@@ -125,6 +125,49 @@ def test_losses_over_decades_are_drawn_as_logarithms(tmp_path):
     ] == [*("log", "linear", "linear", "linear", "linear")]
 
 
+FALL = -1.0 + np.exp(-np.arange(100) / 4.0)
+
+
+@pytest.mark.parametrize(
+    "values, scale, expected",
+    [
+        (FALL, "linear", None),
+        (1e3 * FALL, "linear", None),
+        ([1.0] * 99 + [5.0], "linear", None),
+        (np.append(np.linspace(0.0, 1.0, 101), np.nan), "linear", None),
+        (np.append(np.linspace(0.0, 1.0, 101), 5e4), "linear", (-0.05, 1.05)),
+        (np.append(np.linspace(0.0, 1.0, 101), -5e4), "linear", (-0.05, 1.05)),
+        (10.0 ** np.append(np.linspace(0.0, 1.0, 101), 50.0), "log", (10.0**-0.05, 10.0**1.05)),
+        ([], "linear", None),
+    ],
+)
+def test_an_axis_leaves_out_what_would_flatten_it(values, scale, expected):
+    """And not the fall at the beginning of a run. Where it does, the others have all of it."""
+    found = canvas.limits(values, scale)
+    if expected is None:
+        assert found is None
+    else:
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_values_outside_of_an_axis_are_marked(tmp_path, monkeypatch):
+    """A triangle at each place, and the farthest value above the axes; without such values there is neither."""
+    drawn, save = [], canvas.save
+    monkeypatch.setattr(
+        canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi)
+    )
+    spikes = FALL + np.where(np.isin(np.arange(100), (40, 70)), 5e4, 0.0)
+    spikes[80] = -700.0
+    loss_figure(tmp_path / "loss.png", {"loss": (range(100), spikes), "evaluation": (range(100), FALL)})
+    loss, other = drawn[0].axes
+    marks = {
+        line.get_marker(): list(line.get_xdata()) for line in loss.lines if line.get_marker() in ("^", "v")
+    }
+    assert marks == {"^": [40, 70], "v": [80]}
+    assert loss.get_title(loc="right") == "▲ up to 5e+04  ▼ down to -700" and loss.get_ylim()[1] < 0.1
+    assert other.get_title(loc="right") == "" and not any(line.get_marker() == "^" for line in other.lines)
+
+
 def test_robot_figure_shows_activation_and_design(tmp_path, scene):
     """A muscle that pulls is red, one that pushes is blue, a row is added for each frame and one for the design."""
     rest = scene.bodies[0].particles.positions

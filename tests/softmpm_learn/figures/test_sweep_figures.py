@@ -100,6 +100,19 @@ def test_a_row_for_each_run_and_iteration(swept, tmp_path):
     assert {row["term"] for row in jobs} == {"progress"} and jobs[0]["kicked"] == ""
 
 
+def test_a_spike_does_not_flatten_the_curves(swept, tmp_path, drawn):
+    """Of two seeds of one setting, at one iteration: the axis has the other values, and marks the place and the value in its colour."""
+    for job in range(6):
+        losses = np.linspace(0.0, -1.0, 100)
+        losses[60] += 5e4 * (job < 2)
+        metrics(swept / str(job), losses)
+    program.make([swept], tmp_path)
+    axes = drawn[0].axes[0]
+    assert axes.get_ylim() == pytest.approx((-1.0, 0.0), abs=0.2)
+    marks = [(*line.get_xdata(), line.get_color()) for line in axes.lines if line.get_marker() == "^"]
+    assert set(marks) == {(60, COLOURS[0])} and axes.get_title(loc="right") == "▲ up to 5e+04"
+
+
 def test_settings_are_compared_seed_by_seed(swept, tmp_path):
     """Mean differences by hand; the interval of three pairs lies between the extremes."""
     program.make([swept], tmp_path)
