@@ -81,5 +81,10 @@ def _crossings(outline: np.ndarray, side: np.ndarray) -> np.ndarray:
 
 def round_length(extent: float) -> float:
     """The largest of 1, 2, 5 · 10ⁿ that is at most a fifth of an extent."""
-    unit = 10.0 ** np.floor(np.log10(extent / 5))
-    return float(unit * max(step for step in (1, 2, 5) if step * unit <= extent / 5 * (1 + 1e-9)))
+    return round_below(extent / 5)
+
+
+def round_below(most: float) -> float:
+    """The largest of 1, 2, 5 · 10ⁿ that is at most this."""
+    unit = 10.0 ** np.floor(np.log10(most))
+    return float(unit * max(step for step in (1, 2, 5) if step * unit <= most * (1 + 1e-9)))

@@ -55,8 +55,9 @@ def show(
         softmpm.show(model, state, colour="strain").savefig("strain.png")
         softmpm.show(model, state, world=range(4))  # four worlds side by side
 
-    The figure shows itself in a notebook. Walls are drawn as the scene describes them. Driven particles have dark edges. Over
-    the colours "muscle" and "activation" strokes show the fibres of muscles, which deform with the body; in 3D those at the surface.
+    The figure shows itself in a notebook. Walls are drawn as the scene describes them; an arrow above the figure is the scale of their
+    tractions. Driven particles have dark edges. Over the colours "muscle" and "activation" strokes show the fibres of muscles, which
+    deform with the body; in 3D those at the surface.
 
     Args:
         model: What ``state`` belongs to; a scene is drawn at rest.
@@ -191,6 +192,8 @@ def panels_of(
         figure = axes[0].get_figure()
         size, room = None, axes[-1].get_window_extent().height / figure.dpi
     panels = [Panel(one, place, low, high, traction, colouring.with_fibres) for one in axes]
+    if traction > 0.0:
+        panels[0].draw_scale("traction" if count == 1 else "")  # beside the name of a world
     for one in axes if place.dim == 2 and count > 1 else ():
         one.label_outer()
     key = _key(figure, list(axes), colouring, room)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from softmpm.pictures.camera import Camera, round_length, tiles
+from softmpm.pictures.camera import Camera, round_below, round_length, tiles
 from softmpm.pictures.fibres import STROKES, Fibres, stroke_colours
 from softmpm.pictures.instant import Instant
 from softmpm.pictures.surroundings import Surroundings
@@ -14,6 +14,8 @@ POINT = (44, 44, 52)
 """Colour of surface points and of the edges of driven particles."""
 POINT_RADIUS = 0.07
 """Of a surface point [cells]."""
+RAISED = 8.0
+"""Height of the reference arrow above a panel [point]."""
 
 
 class Panel:
@@ -128,12 +130,31 @@ class Panel:
         ):  # from outside to the surface, and behind the particles, which would be hidden
             feet, tips, zorder = self._camera.project(feet - arrows)[0], self._camera.project(feet)[0], 1.5
         if len(feet):
-            look: dict = dict(angles="xy", scale_units="xy", scale=1.0, units="xy", zorder=zorder)
-            colour = tuple(np.array(style.TRACTION) / 255)
-            width = 0.2 * self._place.spacing
-            self._moving.append(
-                self._axes.quiver(*feet.T, *(tips - feet).T, color=[colour], width=width, **look)
-            )
+            self._moving.append(self._arrows(feet, tips - feet, zorder=zorder))
+
+    def draw_scale(self, name: str) -> None:
+        """Draw an arrow for a round traction above the upper right corner, with this name and its value."""
+        from matplotlib.transforms import ScaledTranslation
+
+        traction = round_below(self._traction)
+        length = style.LONGEST * self._place.spacing * traction / self._traction
+        foot = np.array([[self._axes.get_xlim()[1] - length, self._axes.get_ylim()[1]]])
+        raised = ScaledTranslation(0.0, RAISED / 72, self._axes.figure.dpi_scale_trans)
+        self._arrows(foot, np.array([[length, 0.0]]), transform=self._axes.transData + raised, clip_on=False)
+        self._axes.annotate(
+            f"{name} {_pascal(traction)}".strip(),
+            foot[0],
+            (-4.0, RAISED),
+            textcoords="offset points",
+            fontsize=8,
+            ha="right",
+            va="center",
+            annotation_clip=False,
+        )
+
+    def _arrows(self, feet: np.ndarray, vectors: np.ndarray, **look) -> Any:
+        look |= dict(angles="xy", scale_units="xy", scale=1.0, units="xy", width=0.2 * self._place.spacing)
+        return self._axes.quiver(*feet.T, *vectors.T, color=[tuple(np.array(style.TRACTION) / 255)], **look)
 
     def _draw_walls(self, low: np.ndarray, high: np.ndarray) -> None:
         place = self._place
@@ -216,3 +237,9 @@ class Panel:
                 name, away, fontsize=8, color="0.25", ha="center", va="center", annotation_clip=False
             )
         self._axes.set_xlabel(f"arrows and tiles: {length:g} m", fontsize=8, loc="left")
+
+
+def _pascal(stress: float) -> str:
+    """A stress with its unit, of the prefixes the one with which the figure is at least 1."""
+    size, unit = next((one for one in ((1e6, "MPa"), (1e3, "kPa")) if stress >= one[0]), (1.0, "Pa"))
+    return f"{stress / size:g} {unit}"

@@ -15,6 +15,7 @@ WALL = {
 }
 MOST_ARROWS = 3000
 LEAST_ARROW = 0.01  # of the longest
+LONGEST = 3.0  # length of the longest arrow [cells]
 TRACTION = (20, 110, 50)
 
 
@@ -140,9 +141,9 @@ def traction_arrows(
 
 
 def _drawn(vectors: np.ndarray, spacing: float) -> np.ndarray:
-    """Arrows of three cells for vectors of length one and more."""
+    """Arrows of the greatest length for vectors of length one and more."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors * (3 * spacing / np.maximum(length, 1))
+    return vectors * (LONGEST * spacing / np.maximum(length, 1))
 
 
 def frame_box(low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from PIL import Image
 
 import softmpm
 from softmpm.pictures.colouring import CATEGORIES, PASSIVE, categories
+from softmpm.pictures.panel import _pascal
 from softmpm.pictures.surroundings import of_recording
 from softmpm.recording import style
 
@@ -57,6 +58,11 @@ def pixels(figure: Figure, dpi: int = 100) -> np.ndarray:
 def where(image: np.ndarray, colour: np.ndarray, within: int = 6) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels of a colour."""
     return (np.abs(image - np.asarray(colour, dtype=int)).max(-1) <= within).nonzero()
+
+
+def upper_edge(figure: Figure, image: np.ndarray) -> int:
+    """Row of pixels below which the first panel is."""
+    return round((1.0 - figure.axes[0].get_position().y1) * len(image))
 
 
 def test_bodies_and_walls_are_where_they_are_in_metres():
@@ -218,8 +224,32 @@ def test_tractions_are_green_arrows(model):
     force = torch.zeros_like(state.surface.force)
     force[0, 0, point] = torch.tensor([0.0, 5.0])
     pushed = state._replace(surface=state.surface._replace(force=force))
-    rows, columns = where(pixels(softmpm.show(model, pushed)), style.TRACTION)
+    image = pixels(figure := softmpm.show(model, pushed))
+    rows, columns = where(image[upper_edge(figure, image) :], style.TRACTION)
     assert len(rows) > 30 and np.ptp(rows) > 2 * np.ptp(columns)
+
+
+@pytest.mark.parametrize("worlds, words", [(0, "traction 200 Pa"), ((0, 1), "200 Pa")])
+def test_an_arrow_is_the_scale_of_the_tractions(model, worlds, words):
+    """In pixels, the reference arrow and that of the one traction, which is not round, are as long as their values say."""
+    state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1)
+    point = int(model.surface.shown(state)[0][:, 0].argmin())
+    force = torch.zeros_like(state.surface.force)
+    force[0, 0, point, 1] = 320.0 * model.surface.areas[point]
+    pushed = state._replace(surface=state.surface._replace(force=force))
+    figure = softmpm.show(model, pushed, world=worlds)
+    assert [text.get_text() for axes in figure.axes for text in axes.texts] == [words]
+    image = pixels(figure, dpi=300)
+    top = upper_edge(figure, image)
+    length = np.ptp(where(image[:top], style.TRACTION)[1])
+    assert length / np.ptp(where(image[top:], style.TRACTION)[0]) == pytest.approx(200 / 320, rel=0.05)
+    assert not any(axes.texts for axes in softmpm.show(model, state).axes)
+
+
+@pytest.mark.parametrize("stress, text", [(0.5, "0.5 Pa"), (999.0, "999 Pa"), (2e3, "2 kPa"), (5e6, "5 MPa")])
+def test_a_stress_has_a_prefix(stress, text):
+    """From a thousand on."""
+    assert _pascal(stress) == text
 
 
 def test_driven_particles_have_dark_edges():
