@@ -13,7 +13,8 @@ def contact_forces(model: Model, state: State) -> ContactForces:
     """Forces of the separating walls on the surface points in the control step that ended in ``state``.
 
     The mean over a control step of T seconds is the sum of its impulses over T, so T times the total force is the momentum that the
-    walls transferred. For the mean over a whole call, give the call one control step.
+    walls transferred. For the mean over a whole call, give the call one control step. Other walls have no row: that of the wall k of
+    the scene is ``model.surface.walls.index(k)``.
 
     Args:
         model: From :func:`softmpm.build`, with contact at surface points (docs/formulations.md).
@@ -59,7 +60,8 @@ def clamp_forces(model: Model, state: State) -> Tensor:
         state: Result of :func:`softmpm.simulate`. Differentiable, through ``state.nodes``.
 
     Returns:
-        Forces [N], in 2D N per metre of depth, shape (world, wall, dim), of the walls of these kinds in the order of the scene.
+        Forces [N], in 2D N per metre of depth, shape (world, wall, dim), of the walls of these kinds alone, in the order of the scene:
+        row k is that of ``scene.walls[model.mirror.walls[k]]``.
 
     Raises:
         TypeError: ``model`` or ``state`` are of another type.

@@ -16,13 +16,14 @@ class MirrorGrid:
     """Groups of nodes that are images of each other, or held.
 
     Attributes:
+        walls: Number of each clamp and plane of symmetry in ``scene.walls``, for the axis ``wall`` of :func:`softmpm.clamp_forces`.
         count: Number of groups.
         group: Group of each node, -1 for none, shape (node,), int64.
         members: Nodes of each group, filled up with the number of nodes, shape (group, most), int32.
         present: True for nodes with mass, shape (node,).
         first: First node with mass of each node's group, or the node itself, shape (node,), int64.
         signs: Motion of each node along each axis over that of its group: 1 or -1, and 0 where it is held, shape (node, dim), float64.
-        shares: Share of each clamp and plane of symmetry, in the order of the scene, in the force on each group along each axis (B3),
+        shares: Share of each of these walls in the force on each group along each axis (B3),
             shape (wall, group, dim), float64.
     """
 
@@ -30,6 +31,7 @@ class MirrorGrid:
         image = 2 * rest.nodes.cpu().numpy().astype(np.int64)  # in half cells
         signs = np.ones(image.shape)
         mirrors = mirrors_of(scene)
+        self.walls = tuple(one.wall for one in mirrors)
         for one in mirrors:
             behind = one.side * (image[:, one.axis] - one.twice) < 0
             image[behind, one.axis] = 2 * one.twice - image[behind, one.axis]

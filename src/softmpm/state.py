@@ -245,7 +245,9 @@ class GridField(NamedTuple):
 class ContactForces(NamedTuple):
     """Forces of the separating walls on the bodies, mean values over the last control step. Differentiable.
 
-    The axis ``wall`` counts the walls of the kind ``separate`` in the order of the scene. In 2D a force is per metre of depth.
+    The axis ``wall`` counts the walls of the kind ``separate`` alone, in the order of the scene: row k is that of
+    ``scene.walls[model.surface.walls[k]]``. Clamps and planes of symmetry are in :func:`softmpm.clamp_forces`. In 2D a force is per
+    metre of depth.
     """
 
     total: Tensor

@@ -19,7 +19,8 @@ class SurfacePoints:
         stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
         density: Density of the material of each point [kg/m³], shape (point,), float64.
         waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
-        normals: Unit normals of the separating walls, shape (wall, dim), float64.
+        walls: Number of each separating wall in ``scene.walls``, for the axis ``wall`` of :func:`softmpm.contact_forces`.
+        normals: Unit normals of these walls, shape (wall, dim), float64.
     """
 
     def __init__(self, scene: Scene, device: torch.device):
@@ -27,7 +28,8 @@ class SurfacePoints:
         counts = [len(outline) for outline in outlines]
         density = np.repeat([body.material.density for body in scene.bodies], counts)
         modulus = np.repeat([longitudinal_modulus(body.material) for body in scene.bodies], counts)
-        normals = [wall.normal for wall in scene.walls if wall.contact == "separate"]
+        self.walls = tuple(k for k, wall in enumerate(scene.walls) if wall.contact == "separate")
+        normals = [scene.walls[k].normal for k in self.walls]
         self.device, self.count = device, sum(counts)
         self.points = self._tensor(np.concatenate([outline.points for outline in outlines]))
         self.areas = self._tensor(np.concatenate([outline.areas for outline in outlines]))

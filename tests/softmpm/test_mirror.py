@@ -173,6 +173,26 @@ def test_forces_of_clamps_are_the_change_of_momentum(contact, device):
     assert not floor or (touched != 0).all()
 
 
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+def test_rows_of_forces_lead_to_walls_of_the_scene(formulation):
+    """Contact forces and clamp forces count walls of their kinds alone; the model has the number of each in the scene."""
+    clamp, floor = corner(2).walls[:2]
+    slip = softmpm.Wall(normal=(-1.0, 0.0), offset=-0.7, contact="slip")
+    ceiling = softmpm.Wall(normal=(0.0, -1.0), offset=-0.8)
+    walls = [slip, clamp, floor, ceiling] if formulation == "reference" else [slip, floor, ceiling]
+    model = softmpm.build(
+        corner(2, walls=walls, muscles=[]), device="cpu", formulation=formulation, contact="surface"
+    )
+    state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=40)
+    assert model.surface is not None
+    total, numbers = softmpm.contact_forces(model, state).total, model.surface.walls
+    assert [walls[k] for k in numbers] == [floor, ceiling] and total.shape == (1, 2, 2)
+    assert total[0, numbers.index(walls.index(floor)), 1] > 0 and not total[0, 1].any()
+    if formulation == "reference":
+        assert model.mirror is not None and model.mirror.walls == (1,)
+        assert softmpm.clamp_forces(model, state).shape == (1, 1, 2)
+
+
 def test_a_step_on_warp_arrays_has_the_forces_of_simulate(device):
     """Forces and their gradient with respect to the state, to the bit."""
     model = build(corner(2), device=device, dtype=torch.float64)
