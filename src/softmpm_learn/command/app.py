@@ -5,6 +5,7 @@ import dataclasses
 import logging
 import math
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -58,6 +59,7 @@ def main(signals: Signals | None = None, own: Sequence[str] = ()) -> None:
                 signals.quiet = True
                 logging.disable(logging.WARNING)  # the first process says it
             _load(own)
+            sys.argv[1:] = map(with_infinity, sys.argv[1:])
             check_flags(sys.argv[1:])
             check_words(sys.argv[1:])
             register(group.broadcast(time.time()))
@@ -218,6 +220,11 @@ def check_words(words: Sequence[str]) -> None:
             raise ValueError(
                 f"a run is resumed with its own settings; only {', '.join(CHANGEABLE)} may change, not {key}."
             )
+
+
+def with_infinity(word: str) -> str:
+    """A word of the command line whose values may be infinity as YAML writes it, ``.inf``, as Hydra reads it: ``inf``."""
+    return re.sub(r"(?<=[=,])([+-]?)\.inf(?=,|$)", r"\1inf", word, flags=re.IGNORECASE)
 
 
 def _key(text: str) -> str:

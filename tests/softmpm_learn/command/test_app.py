@@ -55,6 +55,25 @@ def composed(*overrides):
         return compose("config", list(overrides))
 
 
+@pytest.mark.parametrize(
+    "word, read",
+    [
+        *(
+            ("optimizer.fade=.inf", "optimizer.fade=inf"),
+            ("optimizer.fade=0.1,.inf", "optimizer.fade=0.1,inf"),
+        ),
+        *(
+            ("optimizer.restart_above=-.Inf", "optimizer.restart_above=-inf"),
+            ("task.file=a.inf", "task.file=a.inf"),
+        ),
+        *(("resume=./x.inf", "resume=./x.inf"), ("-m", "-m")),
+    ],
+)
+def test_infinity_may_be_written_as_in_yaml(word, read):
+    """As a file of settings has it, so that what config.yaml says can be given on the command line."""
+    assert app.with_infinity(word) == read
+
+
 def commands_of(page: Path) -> list[list[str]]:
     """Settings of each command of a page, of a list of values the first; without the commands for files of one's own."""
     text = page.read_text().replace("\\\n", " ")
@@ -92,6 +111,14 @@ def main(monkeypatch, *overrides) -> None:
     quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
     monkeypatch.setattr(sys, "argv", ["softmpm_learn", *overrides, *quiet])
     app.main()
+
+
+def test_gradients_need_not_fade(monkeypatch, capsys):
+    """``optimizer.fade=.inf`` is a setting of the command line, and is printed as it was written."""
+    monkeypatch.setattr(sys, "argv", ["softmpm_learn", "optimizer.fade=.inf", "--cfg", "job"])
+    app.main()
+    assert "fade: .inf" in capsys.readouterr().out
+    assert to_run(composed("optimizer.fade=inf")).optimizer.fade == float("inf")
 
 
 def environment() -> dict[str, str]:
