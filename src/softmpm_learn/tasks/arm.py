@@ -12,7 +12,7 @@ import numpy as np
 from softmpm import Body, Grid, Muscle, Scene, Wall, neighbour_pairs
 from softmpm_learn.objective import Effort, Objective, Reach, Still, Stretch
 from softmpm_learn.tasks.outline import Limb
-from softmpm_learn.tasks.task import LASTING, STRETCH, Task, TaskConf, clock, filled, neo_hookean
+from softmpm_learn.tasks.task import LASTING, STRETCH, Task, TaskConf, clock, filled, material
 
 BASE = (0.45, 0.0625)  # where the arm leaves the clamp [m]
 LENGTH = 0.36  # clamp to tip [m]
@@ -84,7 +84,7 @@ def arm(conf: ArmConf) -> Task:
     nodes = conf.cells
     scene = Scene(
         grid=Grid(shape=(round(0.9 * nodes), round(0.7 * nodes)), spacing=conf.spacing),
-        bodies=[Body(shape, neo_hookean(conf))],
+        bodies=[Body(shape, material(conf))],
         muscles=muscles,
         walls=[Wall(normal=(0.0, 1.0), offset=BASE[1], contact="stick")],
         gravity=(0.0, -conf.gravity),

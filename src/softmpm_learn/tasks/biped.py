@@ -6,7 +6,7 @@ import numpy as np
 
 from softmpm import Body, Muscle
 from softmpm_learn.tasks.outline import Limb, foot, smooth
-from softmpm_learn.tasks.task import Task, filled, neo_hookean
+from softmpm_learn.tasks.task import Task, filled, material
 from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
 TORSO = (
@@ -48,5 +48,5 @@ def biped(conf: BipedConf) -> Task:
     ]
     regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
     grid, walls, height = track(conf)
-    body = Body(shape.moved((0.2, height)), neo_hookean(conf))
+    body = Body(shape.moved((0.2, height)), material(conf))
     return walker_task(conf, grid, walls, [body], muscles, rest=rest, regions=regions, torso=regions["body"])

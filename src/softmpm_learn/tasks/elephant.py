@@ -10,7 +10,7 @@ import numpy as np
 
 from softmpm import Body, Muscle
 from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
-from softmpm_learn.tasks.task import Task, filled, neo_hookean
+from softmpm_learn.tasks.task import Task, filled, material
 from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
@@ -76,7 +76,7 @@ def elephant(conf: ElephantConf) -> Task:
     rest = shape.positions
     regions, muscles = actuate(rest, limbs, conf.strength)
     grid, walls, height = track(conf)
-    body = Body(shape.moved((0.22, height)), neo_hookean(conf))
+    body = Body(shape.moved((0.22, height)), material(conf))
     return walker_task(conf, grid, walls, [body], muscles, rest=rest, regions=regions, torso=regions["body"])
 
 

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 import softmpm
-from softmpm_learn.tasks.task import Source, Task, neo_hookean
+from softmpm_learn.tasks.task import Source, Task, material
 from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 START = 0.2
@@ -112,9 +112,9 @@ def walker(
     place: tuple[float, ...] = (START, height)
     if rest.shape[1] == 3:
         grid, walls, place = _widened(grid, walls, place, rest[:, 2])
-    material = neo_hookean(conf)
+    solid = material(conf)
     bodies = [
-        softmpm.Body(shape.moved(place), dataclasses.replace(material, young=factor * material.young))
+        softmpm.Body(shape.moved(place), dataclasses.replace(solid, young=factor * solid.young))
         for shape, factor in shapes
     ]
     regions = {muscle.name: muscle.particles for muscle in muscles}

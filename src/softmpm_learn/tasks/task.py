@@ -15,6 +15,13 @@ from softmpm_learn.objective import Objective
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
+Solid = softmpm.NeoHookean | softmpm.StableNeoHookean | softmpm.FixedCorotated | softmpm.BarrierCorotated
+LAWS: dict[str, type[Solid]] = {
+    "neo_hookean": softmpm.NeoHookean,
+    "stable_neo_hookean": softmpm.StableNeoHookean,
+    "fixed_corotated": softmpm.FixedCorotated,
+    "barrier_corotated": softmpm.BarrierCorotated,
+}
 WIDTH = 0.01
 """Distance over which surface contact sets in while a robot learns [cells]."""
 LASTING = 3
@@ -52,6 +59,9 @@ class TaskConf:
     """Length of an episode [s]."""
     control_period: float = 0.0125
     """Time between two decisions of the policy [s]."""
+    law: str = "neo_hookean"
+    """Elastic law of the material: neo_hookean, stable_neo_hookean, fixed_corotated or barrier_corotated; all results in docs/ are of
+    the first."""
     young: float = 5e4
     """Young's modulus E [Pa]; where co-design starts."""
     poisson: float = 0.3
@@ -86,7 +96,7 @@ class TaskConf:
     gradients were usable (docs/gait.md)."""
 
     def __post_init__(self):
-        for name, known in (("formulation", FORMULATIONS), ("contact", CONTACTS)):
+        for name, known in (("formulation", FORMULATIONS), ("contact", CONTACTS), ("law", tuple(LAWS))):
             if getattr(self, name) not in known:
                 raise ValueError(
                     f"task.{name} must be one of {', '.join(known)}; got {getattr(self, name)!r}."
@@ -215,13 +225,12 @@ def clock(conf: TaskConf, scene: softmpm.Scene) -> tuple[softmpm.Scene, int, int
     return scene, max(1, round(conf.seconds / conf.control_period)), substeps
 
 
-def neo_hookean(conf: TaskConf) -> softmpm.NeoHookean:
+def material(conf: TaskConf) -> Solid:
     """The material that the settings describe."""
     shear = conf.young / (2 * (1 + conf.poisson))
     viscosity = conf.viscosity or conf.retardation * shear
-    return softmpm.NeoHookean(
-        density=conf.density, young=conf.young, poisson=conf.poisson, viscosity=viscosity
-    )
+    law = LAWS[conf.law]
+    return law(density=conf.density, young=conf.young, poisson=conf.poisson, viscosity=viscosity)
 
 
 def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:

@@ -121,6 +121,21 @@ def test_gradients_need_not_fade(monkeypatch, capsys):
     assert to_run(composed("optimizer.fade=inf")).optimizer.fade == float("inf")
 
 
+def test_a_robot_of_another_law_learns(monkeypatch, tmp_path):
+    """One iteration through the barrier law leaves a finite loss and a row."""
+    words = (
+        "task.law=barrier_corotated",
+        "train.iterations=1",
+        "train.pictures=false",
+        "train.record_every=0",
+    )
+    main(monkeypatch, *TINY, *words, f"hydra.run.dir={tmp_path}")
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert 0.0 < float(row["loss"]) < float("inf")
+    assert "law: barrier_corotated" in (tmp_path / "config.yaml").read_text()
+
+
 def environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
 

@@ -10,7 +10,7 @@ import torch
 import softmpm
 from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
 from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
-from softmpm_learn.tasks.task import Resolution, Task, TaskConf
+from softmpm_learn.tasks.task import LAWS, Resolution, Task, TaskConf
 from softmpm_learn.tasks.walker import EDGE
 
 ROBOTS = ("elephant", "arm", "biped")
@@ -129,6 +129,16 @@ def test_retardation_is_viscosity_over_shear_modulus():
     scene = biped(BipedConf(retardation=1e-3, young=5e4, poisson=0.25)).scene
     assert scene.bodies[0].material.viscosity == pytest.approx(20.0)
     assert scene.dt < biped(BipedConf(retardation=0.0, young=5e4, poisson=0.25)).scene.dt
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_is_that_of_the_material(law):
+    """Of every task, with the numbers of the settings; an unknown one is refused by a list."""
+    for kind in (ArmConf, BipedConf):
+        material = make_task(kind(law=law, young=2e4)).scene.bodies[0].material
+        assert type(material) is LAWS[law] and material.young == 2e4
+    with pytest.raises(ValueError, match="task.law must be one of neo_hookean, stable_neo_hookean"):
+        ArmConf(law="rubber")
 
 
 def test_walkers_learn_with_contact_that_converges():
