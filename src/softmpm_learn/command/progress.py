@@ -1,6 +1,7 @@
 """Progress report of a run: a bar with loss and remaining time on a terminal, a few log lines elsewhere."""
 
 import logging
+import math
 import statistics
 import sys
 import time
@@ -21,28 +22,31 @@ class ProgressBar:
         self.total, self.every = total, max(1, round(total / lines))
         self.lowest = float("inf")
         self._first: int | None = None
-        self._began = time.monotonic()
+        self._began = math.nan
         self._bar = tqdm(total=total, dynamic_ncols=True, smoothing=0.1) if sys.stderr.isatty() else None
 
     def __call__(self, iteration: int, *losses: float) -> None:
         """Iteration number ``iteration``, counted from 0, has ended with these losses, one for each run side by side."""
         if self._first is None:
-            self._first = iteration
+            self._first, self._began = iteration, time.monotonic()  # the first one also compiles
             if self._bar is not None:
-                self._bar.initial = self._bar.n = self._bar.last_print_n = iteration
+                self._bar.initial = self._bar.n = self._bar.last_print_n = iteration + 1
+                self._bar.unpause()
         self.lowest = min(self.lowest, *losses)
         done, loss = iteration + 1, statistics.median(losses)
         all_of = f" ({min(losses):.5g} to {max(losses):.5g})" if len(losses) > 1 else ""
         text = f"loss {loss:.5g}{all_of}, lowest {self.lowest:.5g}"
         if self._bar is not None:
             self._bar.set_postfix_str(text, refresh=False)
-            self._bar.update(1)
+            self._bar.update(done - self._bar.n)
+            self._bar.refresh()
         elif done % self.every == 0 or done == self.total or iteration == self._first:
-            left = self._left(done - self._first, self.total - done)
-            logger.info("after %d of %d iterations: %s, %s left", done, self.total, text, left)
+            left = self._left(iteration - self._first, self.total - done)
+            logger.info("after %d of %d iterations: %s%s", done, self.total, text, left)
 
-    def _left(self, done: int, missing: int) -> str:
-        return duration((time.monotonic() - self._began) / done * missing)
+    def _left(self, timed: int, missing: int) -> str:
+        """Words for the time that missing iterations take, from those that were timed: all but the first, which compiles."""
+        return f", {duration((time.monotonic() - self._began) / timed * missing)} left" if timed else ""
 
     def __enter__(self) -> "ProgressBar":
         return self

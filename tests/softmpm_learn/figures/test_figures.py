@@ -9,9 +9,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import softmpm
+from softmpm_learn.command import progress as progress_module
 from softmpm_learn.command.pictures import curves
 from softmpm_learn.command.progress import ProgressBar
 from softmpm_learn.figures import VALUES, canvas, latent_figure, loss_figure, robot_figure
+from softmpm_learn.training.timing import duration
 
 
 @pytest.fixture(scope="module")
@@ -209,8 +211,19 @@ def test_progress_without_a_terminal_writes_a_few_lines(caplog):
             progress(k, float((k - 30) ** 2))
     lines = [record.getMessage() for record in caplog.records]
     assert len(lines) == 5
-    assert lines[0].startswith("after 1 of 40 iterations: loss 900") and " left" in lines[0]
+    assert lines[0] == "after 1 of 40 iterations: loss 900, lowest 900" and " left" in lines[1]
     assert lines[-1].startswith("after 40 of 40 iterations: loss 81, lowest 0")
+
+
+def test_the_time_left_leaves_out_the_first_iteration(caplog, monkeypatch):
+    """Which compiles kernels for 90 s here, while the others take 1 s each: after the second, 18 s are left of 20 iterations."""
+    clock = iter((90.0, 91.0))
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
+    with caplog.at_level("INFO", logger="softmpm_learn"), ProgressBar(20) as progress:
+        progress(0, 1.0)
+        progress(1, 1.0)
+    first, second = (record.getMessage() for record in caplog.records)
+    assert "left" not in first and second.endswith(f", {duration(18.0)} left")
 
 
 def test_progress_of_runs_side_by_side_is_their_median_and_range(caplog):
