@@ -52,13 +52,16 @@ def test_a_gradient_takes_the_memory_that_is_stated(what, budget, device):
     body = softmpm.Body(shape, softmpm.NeoHookean(density=1.0, young=100.0, poisson=0.3))
     grid = softmpm.Grid(shape=(10, 10, 10), spacing=0.1)
     scene = softmpm.Scene(grid=grid, bodies=[body], gravity=(0.0, -0.1, 0.0), dt=1e-3, **SCENES[what])
-    model = softmpm.build(scene, device=device, formulation="reference", worlds=WORLDS, memory_budget=budget)
-    start = model.rest()._replace(nodes=None)
-    start.v.requires_grad_()
+    settings = dict(device=device, formulation="reference", worlds=WORLDS, memory_budget=budget)
+    model, other = softmpm.build(scene, **settings), softmpm.build(scene, **settings)
+    start = softmpm.simulate(other, other.rest(), None, other.params(), substeps=1)  # with nodes
+    assert start.nodes is not None
+    velocity = start.nodes.v.requires_grad_()
 
     def work():
         end = softmpm.simulate(model, start, None, model.params(), substeps=SUBSTEPS)
-        torch.autograd.grad(end.x.sum(), start.v)
+        torch.autograd.grad(end.x.sum(), velocity)
 
     stated = memory(model, Horizon(1, SUBSTEPS)).backward
-    assert peak_bytes(work, device) == pytest.approx(stated, rel=0.05)
+    # The initial state, which is counted, exists before.
+    assert 0.9 * stated < peak_bytes(work, device) < 1.05 * stated
