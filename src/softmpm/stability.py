@@ -17,14 +17,16 @@ shrinks with stretch; half of that at rest leaves room for a stretch of 1.7 (fix
 
 import math
 import warnings
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.oracle.moving import actuator_tangent, lame, tangent, viscous_tangent
+from softmpm.oracle.stress import actuator_tangent, lame, law_of, tangent, viscous_tangent
 from softmpm.scene.check_scene import check_scene
+from softmpm.scene.materials import Material
 from softmpm.scene.scene import Scene
 from softmpm.state import Params
 from softmpm.validate import need
@@ -214,8 +216,8 @@ def _limit(
     scene: Scene, group: _Group, given: Params | None, F: Tensor, activation: float
 ) -> tuple[float, float, int]:
     """Stable step [s] of a group of particles, the stiffness [Pa] that sets it, and the particle."""
-    material, one = scene.bodies[group.body].material, torch.ones(F.shape[:-2], dtype=torch.float64)
-    A_mu, A_lam = tangent(material, F, one, 0 * one), tangent(material, F, 0 * one, one)
+    material = scene.bodies[group.body].material
+    A_mu, A_lam = _unit_tangents(material, F)
     A_active = torch.zeros_like(A_mu)
     for m in group.muscles:
         A_unit = actuator_tangent(scene.muscles[m], F)
@@ -241,6 +243,23 @@ def _limit(
     world, particle = divmod(int(squared.argmin()), squared.shape[1])
     dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
     return dt, K[world, particle].item(), int(group.particles[particle])
+
+
+def _unit_tangents(material: Material, F: Tensor) -> tuple[Tensor, Tensor]:
+    """Stiffness of the law with μ = 1 Pa, λ = 0 and with μ = 0, λ = 1 Pa; that at rest is computed once for each law."""
+    law, dim = law_of(material), F.shape[-1]
+    at_rest = F.ndim == 2 and torch.equal(F, torch.eye(dim, dtype=torch.float64))
+    if at_rest and (law, dim) in _at_rest:
+        return _at_rest[law, dim]
+    one = torch.ones(F.shape[:-2], dtype=torch.float64)
+    found = tangent(material, F, one, 0 * one), tangent(material, F, 0 * one, one)
+    if at_rest:
+        _at_rest[law, dim] = found
+    return found
+
+
+_at_rest: dict[tuple[Callable, int], tuple[Tensor, Tensor]] = {}
+"""Results of :func:`_unit_tangents` at rest: a scene has a group of particles for each muscle, and a program builds many models."""
 
 
 def _stiffening_sign(A_unit: Tensor) -> Tensor:
