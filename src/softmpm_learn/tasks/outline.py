@@ -115,6 +115,7 @@ class Limb:
 
     def part(self, points: np.ndarray, start: float, end: float, side: int = 0) -> np.ndarray:
         """Indices of the points of a piece of the limb; ``side`` 1 keeps its left half, -1 its right."""
-        along, left = self.locate(points)
-        chosen = inside(points, self.outline()) & (along >= start) & (along < end)
-        return np.flatnonzero(chosen if side == 0 else chosen & (np.sign(left) == side))
+        of_limb = np.flatnonzero(inside(points, self.outline()))
+        along, left = self.locate(points[of_limb])
+        chosen = (along >= start) & (along < end)
+        return of_limb[chosen if side == 0 else chosen & (np.sign(left) == side)]
