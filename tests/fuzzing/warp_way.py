@@ -13,7 +13,7 @@ from fuzzing.scenes import SPECIALS, Plan, scene_of, scenes
 from fuzzing.verdict import Verdict
 
 _FIELDS = ("base", "fx", "v", "C", "H")
-_ARRAYS = ("mass", "mu", "lam", "pull")
+_ARRAYS = ("mass", "mu", "lam", "active_stress")
 _TENSORS = ("x", "v", "C", "F", "young", "poisson", "density", "activation")
 _faulty = st.one_of(
     st.tuples(
@@ -178,7 +178,7 @@ def _compared(plan: Plan, call: Call, given: Stepping) -> Verdict:
     tape.backward(grads={a: wp.from_torch(t.contiguous(), dtype=a.dtype) for a, t in seeds.items()})
     got = [wp.to_torch(a.grad) for a in states[0].differentiable()]
     got[0] = got[0] / model.scene.grid.spacing
-    for name, one, other in zip("xvCF", got, want, strict=True):
+    for name, one, other in zip("xvCF", got[:4], want, strict=True):
         if not bool(torch.isfinite(one).all()):
             return Verdict("not finite", f"gradient of {name}")
         digits = 1e-9 if model.dtype == torch.float64 else 1e-3
