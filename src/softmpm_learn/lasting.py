@@ -54,5 +54,5 @@ class Lasting:
     def __call__(self, path: Path) -> Tensor:
         """True where a motion lasts, shape (world,)."""
         before, after = self._before.speed(path), self._after.speed(path)
-        level = self._level.slope(path).abs().amax(dim=0) < math.tan(math.radians(LEVEL))
+        level = self._level.angle(path).amax(dim=0) < math.radians(LEVEL)
         return (before > 0) & (after >= SHARE * before) & level

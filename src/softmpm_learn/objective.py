@@ -140,7 +140,10 @@ class Low(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class Tilt(Term):
-    """Keep level: mean squared change of the slope from the hind part of the robot to its front part since rest [-]."""
+    """Keep level: mean squared change of the slope from the hind part of the robot to its front part since rest [-].
+
+    In 3D the squared slope from side to side is added.
+    """
 
     adds_up: ClassVar[Sum | None] = "states"
     front: np.ndarray
@@ -161,16 +164,54 @@ class Tilt(Term):
         share[self.back] -= 1 / len(self.back)
         return share / (share @ self.rest[:, self.along])
 
+    @functools.cached_property
+    def parts(self) -> np.ndarray:
+        """Indices of the particles of both parts."""
+        return np.union1d(self.front, self.back)
+
+    @functools.cached_property
+    def level(self) -> np.ndarray:
+        """Weights [1/m] by which the places of both parts give the vectors that were unit vectors along the horizontal axes at rest,
+        by least squares, shape (particle of the parts, axis): from back to front, and in 3D from side to side.
+        """
+        rest = self.rest[self.parts]
+        weights = np.linalg.pinv(rest - rest.mean(axis=0), rcond=1e-9).T
+        axes = [self.along, *sorted({0, 1, 2}.difference((self.along, self.up)))][: rest.shape[1] - 1]
+        if not (np.abs(weights[:, axes]).max(axis=0) > 0).all():
+            raise ValueError(
+                "Tilt needs parts that have an extent along each horizontal axis: give it more particles."
+            )
+        return weights[:, axes]
+
     def value(self, path: Path) -> Tensor:
         """Squared change of the slope [-], mean over the states of the window, shape (world,)."""
-        return self.slope(path).square().mean(dim=0)
+        squared = self.slope(path).square()
+        if self.rest.shape[1] == 3:
+            squared = squared + self.turned(path)[1][..., self.up].square()
+        return squared.mean(dim=0)
 
     def degrees(self, path: Path) -> float:
         """The largest tilt of any world in the window."""
-        return math.degrees(math.atan(self.slope(path).abs().max().item()))
+        return math.degrees(self.angle(path).max().item())
+
+    def angle(self, path: Path) -> Tensor:
+        """Inclination of the plane of the parts, in 2D of the line, that was horizontal at rest [rad], shape (state, world)."""
+        first, *second = self.turned(path)
+        if second:
+            normal = first.cross(second[0], dim=-1)
+            rises = normal[..., self.up] * (1.0 if (self.up - self.along) % 3 == 2 else -1.0)
+            runs = (normal.square().sum(dim=-1) - rises.square()).clamp(min=0.0).sqrt()
+            return runs.atan2(rises)
+        return first[..., self.up].abs().atan2(first[..., self.along])
+
+    def turned(self, path: Path) -> list[Tensor]:
+        """Vectors that were unit vectors along the horizontal axes at rest [-], shape (state, world, dim) each."""
+        x = path.x[self.window(path)]
+        vectors = x[..., self.on("parts", x), :].transpose(-1, -2) @ self.on("level", x)
+        return list(vectors.unbind(dim=-1))
 
     def slope(self, path: Path) -> Tensor:
-        """Change of the slope since rest [-], shape (state, world)."""
+        """Change of the slope from back to front since rest, relative to their distance at rest [-], shape (state, world)."""
         x = path.x[self.window(path)]
         return x[..., self.up] @ self.on("lever", x) - float(self.lever @ self.rest[:, self.up])
 

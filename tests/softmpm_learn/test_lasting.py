@@ -22,11 +22,11 @@ from softmpm_learn.training.evaluation import evaluate
 
 T, PERIOD = 2.0, 0.25
 """Length of an episode and time between two states [s]."""
-REST = np.array([(0.0, 0.0), (0.0, 0.3), (2.0, 0.1), (2.0, 0.6)])
-"""The hind and the front part of a robot that is not level at rest; the first of each is a sole [m]."""
+REST = np.array([(0.0, 0.0), (2.0, 0.1), (0.0, 0.2), (0.0, 0.5), (2.0, 0.3), (2.0, 0.8)])
+"""Two soles, the hind and the front part of a robot that is not level at rest [m]."""
 LASTING = Lasting(
-    progress=Progress(particles=np.array([0, 2]), begin=5.0),
-    tilt=Tilt(front=np.array([2, 3]), back=np.array([0, 1]), rest=REST),
+    progress=Progress(particles=np.array([0, 1]), begin=5.0),
+    tilt=Tilt(front=np.array([4, 5]), back=np.array([2, 3]), rest=REST),
     seconds=T,
 )
 LASTS = {
@@ -48,9 +48,9 @@ def path_of(speeds, tilts=0.0) -> Path:
     parts = np.repeat(np.array(speeds).T, [4, 4, 8, 8], axis=0)
     way = PERIOD * np.concatenate([0 * parts[:1], parts]).cumsum(axis=0)
     rise = 2.0 * np.tan(np.radians(np.broadcast_to(tilts, way.shape)))
-    moved = np.stack([way[..., None] * [1, -1, 1, -1], rise[..., None] * [0, 0, 1, 1]], axis=-1)
+    moved = np.stack([way[..., None] * [1, 1, -1, -1, -1, -1], rise[..., None] * [0, 1, 0, 0, 1, 1]], axis=-1)
     x = torch.from_numpy(REST + moved).float()
-    other = torch.zeros(x.shape[1], 4, 2, 2)
+    other = torch.zeros(x.shape[1], len(REST), 2, 2)
     states = [softmpm.State(one, torch.zeros_like(one), other, other) for one in x]
     return Path(PERIOD * np.arange(len(x)), states, torch.zeros(len(parts), len(speeds), 1))
 

@@ -138,6 +138,36 @@ def test_low_and_tilt(path):
     torch.testing.assert_close(at_rest.value(path)[0], torch.tensor(0.0))
 
 
+def test_a_robot_tilts_by_the_angle_that_it_has_turned_by():
+    """In 2D by a pitch, upside down too, in 3D by a pitch or a roll, whichever axis is up; turning about the vertical is no tilt."""
+    sides = np.linspace(3.0, 4.0, 6), np.linspace(1.0, 1.2, 3), np.linspace(2.0, 2.4, 4)
+    rest = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
+
+    def seen(rest, turn, **axes):
+        x = torch.from_numpy(rest @ turn.T).float()[None, None]
+        parts = dict(front=np.flatnonzero(rest[:, 0] > 3.7), back=np.flatnonzero(rest[:, 0] < 3.3))
+        tilt = Tilt(**parts, rest=rest, **axes)
+        nothing = torch.zeros(0, 1, 1)
+        path = Path(np.zeros(1), [softmpm.State(x[0], x[0], x[0], x[0])], nothing)
+        return tilt.degrees(path), float(tilt.value(path))
+
+    def about(axis, angle):
+        turned, (i, j) = np.eye(3), [k for k in range(3) if k != axis]
+        turned[[i, j], [i, j]], turned[i, j] = math.cos(angle), -math.sin(angle)
+        turned[j, i] = math.sin(angle)
+        return turned
+
+    for angle in (-3.0, -0.6, 0.2, 2.5):
+        want = pytest.approx(abs(math.degrees(angle)), abs=1e-3)
+        assert seen(rest[:, :2], about(2, angle)[:2, :2])[0] == want
+        assert seen(rest, about(2, angle))[0] == want and seen(rest, about(0, angle))[0] == want
+        assert seen(rest, about(1, angle)) == pytest.approx((0.0, 0.0), abs=1e-3)
+        assert seen(rest, about(0, angle))[1] == pytest.approx(math.sin(angle) ** 2, rel=1e-3)
+        assert seen(rest[:, [0, 2, 1]], about(1, angle), up=2)[0] == want
+    with pytest.raises(ValueError, match="extent along each horizontal axis"):
+        seen(rest * [1.0, 1.0, 0.0], np.eye(3))
+
+
 def test_a_constraint_costs_what_is_beyond_it(path):
     """The square of the excess; nothing, and no gradient, within the limit."""
     effort = Effort(weight=7.0).value(path)

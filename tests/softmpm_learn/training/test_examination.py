@@ -127,8 +127,10 @@ def test_the_tilt_is_the_largest_until_the_end(run, task):
             run.design()[0],
             on_frame=lambda f: states.append(f.state),
         )
-    slopes = [(state.x[0, :, 1].double().numpy() - rest[:, 1]) @ tilt.lever for state in states]
-    want = math.degrees(math.atan(max(map(abs, slopes))))
+    parts = np.concatenate([task.regions["right"], task.regions["left"]])
+    first = np.column_stack([rest[parts], np.ones(len(parts))])
+    lines = [np.linalg.lstsq(first, state.x[0, parts].double().numpy())[0][0] for state in states]
+    want = max(math.degrees(math.atan2(abs(rise), run)) for run, rise in lines)
     early = dataclasses.replace(tilt, end=task.control_period)
     for one in (tilt, early):  # whatever the window of the term
         run.task = dataclasses.replace(task, objective=Objective(Progress(), one))
