@@ -156,6 +156,12 @@ class Tilt(Term):
     up: int = 1
     """Vertical axis."""
 
+    def __post_init__(self):
+        if self.rest.shape[1] == 3 and not np.allclose(self.vectors, np.eye(3)[self.horizontal], atol=1e-6):
+            raise ValueError(
+                "Tilt needs parts that have an extent along each horizontal axis: give it more particles."
+            )
+
     @functools.cached_property
     def lever(self) -> np.ndarray:
         """Weight of each particle's height in the slope [1/m], shape (particle,)."""
@@ -175,13 +181,17 @@ class Tilt(Term):
         by least squares, shape (particle of the parts, axis): from back to front, and in 3D from side to side.
         """
         rest = self.rest[self.parts]
-        weights = np.linalg.pinv(rest - rest.mean(axis=0), rcond=1e-9).T
-        axes = [self.along, *sorted({0, 1, 2}.difference((self.along, self.up)))][: rest.shape[1] - 1]
-        if not (np.abs(weights[:, axes]).max(axis=0) > 0).all():
-            raise ValueError(
-                "Tilt needs parts that have an extent along each horizontal axis: give it more particles."
-            )
-        return weights[:, axes]
+        return np.linalg.pinv(rest - rest.mean(axis=0), rcond=1e-9).T[:, self.horizontal]
+
+    @property
+    def horizontal(self) -> list[int]:
+        """The horizontal axes, that from back to front first."""
+        return [self.along, *(k for k in range(self.rest.shape[1]) if k not in (self.along, self.up))]
+
+    @property
+    def vectors(self) -> np.ndarray:
+        """Vectors that these weights give at rest, shape (axis, dim): unit vectors, or in 2D another one of particles on a line."""
+        return self.level.T @ self.rest[self.parts]
 
     def value(self, path: Path) -> Tensor:
         """Squared change of the slope [-], mean over the states of the window, shape (world,)."""
@@ -195,14 +205,19 @@ class Tilt(Term):
         return math.degrees(self.angle(path).max().item())
 
     def angle(self, path: Path) -> Tensor:
-        """Inclination of the plane of the parts, in 2D of the line, that was horizontal at rest [rad], shape (state, world)."""
+        """Inclination of the plane that was horizontal at rest, in 2D the angle of that line to rest [rad], shape (state, world)."""
         first, *second = self.turned(path)
         if second:
             normal = first.cross(second[0], dim=-1)
             rises = normal[..., self.up] * (1.0 if (self.up - self.along) % 3 == 2 else -1.0)
             runs = (normal.square().sum(dim=-1) - rises.square()).clamp(min=0.0).sqrt()
             return runs.atan2(rises)
-        return first[..., self.up].abs().atan2(first[..., self.along])
+        (x, y), run, rise = (
+            self.vectors[0, [self.along, self.up]],
+            first[..., self.along],
+            first[..., self.up],
+        )
+        return (x * rise - y * run).abs().atan2(x * run + y * rise)
 
     def turned(self, path: Path) -> list[Tensor]:
         """Vectors that were unit vectors along the horizontal axes at rest [-], shape (state, world, dim) each."""

@@ -164,8 +164,16 @@ def test_a_robot_tilts_by_the_angle_that_it_has_turned_by():
         assert seen(rest, about(1, angle)) == pytest.approx((0.0, 0.0), abs=1e-3)
         assert seen(rest, about(0, angle))[1] == pytest.approx(math.sin(angle) ** 2, rel=1e-3)
         assert seen(rest[:, [0, 2, 1]], about(1, angle), up=2)[0] == want
-    with pytest.raises(ValueError, match="extent along each horizontal axis"):
-        seen(rest * [1.0, 1.0, 0.0], np.eye(3))
+    two = np.array([(3.0, 1.0), (4.0, 1.3)])
+    assert seen(two, np.eye(2))[0] == pytest.approx(0.0, abs=1e-3)
+    assert seen(two, about(2, 0.5)[:2, :2])[0] == pytest.approx(math.degrees(0.5), abs=1e-3)
+    for thin in (
+        rest * [1.0, 1.0, 0.0],
+        rest[:, [0, 1, 0]],
+        rest[:, [0, 0, 2]],
+    ):  # no width, or a plane that is not level
+        with pytest.raises(ValueError, match="extent along each horizontal axis"):
+            seen(thin, np.eye(3))
 
 
 def test_a_constraint_costs_what_is_beyond_it(path):
