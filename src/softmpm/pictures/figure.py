@@ -236,9 +236,8 @@ def _key(figure: Any, axes: list[Any], colouring: Colouring, room: float) -> Any
             for colour, name in zip(colouring.ramp, colouring.names, strict=True)
         ]
         title = STROKE if colouring.with_fibres else None
-        rows = [
-            max(1, int((72 * room / points - 1.0) / 1.6) - bool(title)) for points in TYPE
-        ]  # with the space between
+        lines = [int((72 * room / points - 1.0) / 1.6) for points in TYPE]  # with the space between
+        rows = [max(1, count - bool(title)) for count in lines]
         columns = [math.ceil(len(patches) / most) for most in rows]
         small = columns[0] > 2
         look: dict = dict(frameon=False, fontsize=TYPE[small], ncols=columns[small], columnspacing=1.0)

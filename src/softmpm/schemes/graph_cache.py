@@ -108,7 +108,7 @@ class GraphCache(ABC):
         return known[1]
 
     def shared(self, key: Any, make: Callable[[], T]) -> T:
-        """Buffers that chunks use in turn, made on first use.
+        """The buffers with this key, which chunks use one after the other; the first use makes them.
 
         A capture takes those of the cache, since its replays may run beside other calls.
         """

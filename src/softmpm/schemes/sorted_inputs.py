@@ -90,12 +90,6 @@ class SortedInputs:
                 dtype = torch.float64 if one.double else model.dtype
                 self.values[one.name] = tensor(*shape_of(model, one, self._rows), dtype=dtype)
 
-    @property
-    def bytes(self) -> int:
-        """Bytes of the buffers."""
-        own = (one for name, one in self.values.items() if self.model.fixed.get(name) is not one)
-        return sum(one.nbytes for one in own)
-
     def take(self, stream: wp.Stream | None, chunk: Chunk, values: Values, moved: bool) -> None:
         """Copy the inputs of a call into the buffers; ``moved`` is True if the particle order has changed since the last copy."""
         model = self.model

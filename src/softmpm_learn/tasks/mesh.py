@@ -91,10 +91,7 @@ def _muscles(conf: MeshConf, rest: np.ndarray) -> list[Muscular]:
     slabs = {f"slab{k}": [edges[k], 0.0, 0.0, edges[k + 1], math.inf, math.inf] for k in range(conf.slabs)}
     found, free = [], np.ones(len(rest), dtype=bool)
     for name, box in (conf.boxes or slabs).items():
-        lower, upper = (
-            np.array(box[:3]) - SLACK,
-            np.array(box[3:]) - SLACK,
-        )  # an upper face belongs to the next
+        lower, upper = np.array(box, dtype=float).reshape(2, 3) - SLACK  # an upper face belongs to the next
         upper[np.array(box[3:]) >= 1.0] = math.inf  # but the far one to the last
         chosen = np.flatnonzero(free & (share >= lower).all(axis=1) & (share < upper).all(axis=1))
         free[chosen] = False

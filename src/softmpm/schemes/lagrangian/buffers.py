@@ -16,7 +16,7 @@ from softmpm.schemes.buffers import clear, view
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import Accumulators, InputsAdj, Values
 from softmpm.schemes.lagrangian.bricks import empty_partial, rest_struct
-from softmpm.schemes.lagrangian.footprint import stored_nodes
+from softmpm.schemes.lagrangian.footprint import chunk_bytes, stored_nodes
 from softmpm.schemes.lagrangian.frame import frame_struct, shift_of
 from softmpm.schemes.lagrangian.mirror import Reflection, ReflectionAdj
 from softmpm.schemes.lagrangian.surface import SurfaceBuffersAdj, SurfaceContact, SurfaceContactAdj
@@ -97,9 +97,7 @@ class ChunkBuffers:
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        nodes, points = (self.u, self.v, self.low, self.w, self.mass, self.partial), (self.anchor, self.force)
-        contact = 0 if self.contact is None else self.contact.bytes
-        return sum(one.nbytes for one in (*nodes, *points, self.order)) + self.inputs.bytes + contact
+        return sum(one.nbytes for one in (self.u, self.v, self.w, self.anchor)) + chunk_bytes(self.model)
 
     def index(self, s: int) -> int:
         """Number of the state before substep ``s``."""

@@ -35,7 +35,7 @@ class LagrangianFootprint:
         inside, between = field + u + w + anchors, 4 * field + 2 * anchors + _reaction_bytes(model)
         shown = 2 * real * model.worlds * model.particle_count * (model.dim + model.dim**2)
         sizes = sizes_of(model, inside=inside, nodes=0, between=between)
-        apart = 2 * (field - u) + _chunk_bytes(model)  # two displacements that take turns
+        apart = 2 * (field - u) + chunk_bytes(model)  # two displacements that take turns
         return sizes._replace(start=shown + between, derived=field - u, apart=apart, passed_on=between)
 
     def buffers(self, model, horizon, chosen: Plan) -> Buffers:
@@ -45,7 +45,7 @@ class LagrangianFootprint:
         chunks, overlap = horizon.chunks(chosen.longest), overlap_bytes(model)
         # One runs, one is launched ahead, and one of another shape may be cached.
         at_once = min(len(chunks), 2 + (len({chunk.shape for chunk in chunks}) > 1))
-        graphs = at_once * (4 * field + 2 * anchors + _chunk_bytes(model))
+        graphs = at_once * (4 * field + 2 * anchors + chunk_bytes(model))
         low = 0 if stores_u(model.spec) else field
         reflected = 0 if model.mirror is None else 2 * field
         passed = 2 * (3 * field + anchors)  # adjoints of two states
@@ -53,7 +53,7 @@ class LagrangianFootprint:
         return Buffers(graphs + overlap, overlap + (0 if chosen.keep_all else graphs), backward)
 
 
-def _chunk_bytes(model) -> int:
+def chunk_bytes(model) -> int:
     """Bytes of the buffers of a chunk besides its states: low, masses, sums, inputs and their order, forces, contact."""
     order = 4 * model.worlds * model.particle_count
     nodes = 2 * _field_bytes(model) + _field_bytes(model) // model.dim + _sum_bytes(model)

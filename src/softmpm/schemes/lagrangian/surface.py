@@ -1,6 +1,5 @@
 """Contact of surface points in a chunk of the reference formulation: its buffers and launches."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -76,12 +75,6 @@ class SurfaceContact:
         self.D, self.rate_array = (
             view(one, types(model.spec.dim, model.spec.dtype).real) for one in (D, self.rate)
         )
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of the buffers."""
-        numbers = self.model.dim * math.prod(self.nodes) + (self.model.dim + 1) * math.prod(self.points)
-        return numbers * self.model.dtype.itemsize
 
     def tensor(self, *shape: int) -> Tensor:
         return torch.empty(shape, dtype=self.model.dtype, device=self.model.device)
