@@ -53,7 +53,8 @@ def polygon_outline(polygons: Sequence[np.ndarray], spacing: float, corner: floa
     """Closed polygons, the inside to the left, resampled in chords of about one spacing; None if there are none.
 
     Corners that turn by more than ``corner`` [rad] stay where they are; the default rounds all of them at the spacing, as suits the
-    steps of a picture. Islets and holes of less than a tenth of a lattice cell are left out.
+    steps of a picture. Without such corners the resampled polygon of a shape that is its own mirror image, left to right, is so too.
+    Islets and holes of less than a tenth of a lattice cell are left out.
 
     Points are the chords' middles, so that lengths, normals and the enclosed area are exactly those of the resampled polygons.
     """
@@ -63,13 +64,13 @@ def polygon_outline(polygons: Sequence[np.ndarray], spacing: float, corner: floa
         if abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2 < 0.1 * spacing**2:
             continue
         sharp = np.flatnonzero(np.abs(_turns(polygon)) > corner)
-        polygon = np.roll(polygon, -sharp[0], axis=0) if len(sharp) else polygon
+        polygon = np.roll(polygon, -sharp[0], axis=0) if len(sharp) else _from_above(polygon)
         closed = np.concatenate([polygon, polygon[:1]])
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
         fixed = [*arc[sharp - sharp[0]], arc[-1]] if len(sharp) else [0.0, arc[-1]]
-        least = 1 if len(sharp) > 2 else 4
+        multiple = 1 if len(sharp) > 2 else 4
         parts = [
-            np.linspace(a, b, max(least, round((b - a) / spacing)), endpoint=False)
+            np.linspace(a, b, multiple * max(1, round((b - a) / (multiple * spacing))), endpoint=False)
             for a, b in pairwise(fixed)
         ]
         places = np.concatenate([*parts, arc[-1:]])
@@ -83,6 +84,17 @@ def polygon_outline(polygons: Sequence[np.ndarray], spacing: float, corner: floa
     start, end, length = (values[length > 1e-6 * spacing] for values in (start, end, length))
     right = np.stack([(end - start)[:, 1], -(end - start)[:, 0]], axis=-1)
     return Outline((start + end) / 2, right / length[:, None], length)
+
+
+def _from_above(polygon: np.ndarray) -> np.ndarray:
+    """The polygon from the highest place halfway between its left and right ends, which its mirror image shares."""
+    ahead, (left, right) = np.roll(polygon, -1, axis=0), (polygon[:, 0].min(), polygon[:, 0].max())
+    before, after = polygon[:, 0] - (left + right) / 2, ahead[:, 0] - (left + right) / 2
+    across = np.flatnonzero((before > 0) != (after > 0))
+    share = before[across] / (before[across] - after[across])
+    places = polygon[across] + share[:, None] * (ahead - polygon)[across]
+    top = places[:, 1].argmax()
+    return np.concatenate([places[top : top + 1], np.roll(polygon, -across[top] - 1, axis=0)])
 
 
 def _turns(polygon: np.ndarray) -> np.ndarray:

@@ -106,6 +106,22 @@ def test_polygon():
     assert polygon_outline([0.01 * square], 0.1) is None and polygon_outline([], 0.1) is None
 
 
+@pytest.mark.parametrize("first", range(0, 40, 7))
+def test_a_polygon_without_corners_keeps_its_mirror_symmetry(first):
+    """Whichever vertex comes first: a bean, symmetric about x = 0.3, gets an outline symmetric about it, with normals and areas."""
+    t = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)
+    radius = 1.0 + 0.4 * np.sin(t) + 0.1 * np.cos(4 * t)
+    bean = np.stack([0.3 + radius * np.cos(t), 1.3 * radius * np.sin(t)], axis=1)
+    outline = polygon_outline([np.roll(bean, first, axis=0)], 0.13)
+    assert outline is not None
+    mirrored = outline.points * (-1, 1) + (0.6, 0)
+    apart = np.linalg.norm(outline.points[:, None] - mirrored, axis=2)
+    other = apart.argmin(axis=1)
+    assert apart.min(axis=1).max() < 1e-12
+    np.testing.assert_allclose(outline.normals[other] * (-1, 1), outline.normals, atol=1e-12)
+    np.testing.assert_allclose(outline.areas[other], outline.areas, rtol=1e-12)
+
+
 def test_polygon_converges():
     """Perimeter and area of a fine polygon around a circle tend to its own with spacing²."""
     t = np.linspace(0, 2 * np.pi, 10_000, endpoint=False)
