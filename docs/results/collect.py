@@ -1,53 +1,51 @@
-"""Write the tables comparison.ROBOT.h200.csv from a sweep: `python docs/results/collect.py outputs/sweep/experiment=comparison`. A row
-for each run; `comparison.py` prints what docs/results.md has of them."""
+"""Write tables NAME.ROBOT.h200.csv from folders of sweeps and of runs of several seeds.
+
+    python docs/results/collect.py NAME FOLDER...
+
+A row for each run. `comparison.py` and `twenty.py` print what docs/results.md has of them, `draw.py` draws it.
+"""
 
 import csv
-import json
 import math
 import sys
 from pathlib import Path
 
-FOUND = ["later", "kicked", "friction", "finer"]
-"""What the examination of every robot has, see docs/learning.md."""
-EXTREMES = {"arm": ["miss", "speed"]}
-"""What it has besides; of walkers the tilt."""
-Row = dict[str, str | int]
+JOBS = {"design": "design", "clock": "policy.clock", "observer": "observer"}
+"""Settings that tell apart the jobs of a sweep."""
+COLUMNS = {"best": "loss", "iteration": "iteration", "end": "end"}
+"""Columns of every table, and those of sweep.csv that they are."""
+EXAMINED = {name: name for name in ("later", "kicked", "friction", "finer")}
+EXTREMES = {"arm": {"miss": "largest_miss", "speed": "largest_speed"}}
+WALKER = {"tilt": "largest_tilt"}
+Row = dict[str, str]
 
 
-def number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.4g}"
+def number(text: str) -> str:
+    """Four digits of a number; nothing of one that is missing or not finite."""
+    return f"{float(text):.4g}" if text and math.isfinite(float(text)) else ""
 
 
-def row_of(folder: Path) -> tuple[str, Row]:
+def row_of(run: Row) -> tuple[str, Row]:
     """Robot and row of a run that has finished."""
-    outcome = json.loads((folder / "outcome.json").read_text())
-    if outcome["status"] != "finished":
-        raise ValueError(f"{folder} is {outcome['status']}: {outcome['error']}")
-    settings = dict(word.split("=", 1) for word in outcome["settings"].split())
-    with open(folder / "metrics.csv", newline="") as file:
-        restarts = sum(int(row["restarts"] or 0) for row in csv.DictReader(file))
+    if run["status"] != "finished":
+        raise ValueError(f"{run['folder']} is {run['status']}: {run['error']}")
+    settings = dict(word.split("=", 1) for word in run["settings"].split())
     robot = settings["task"]
-    row: Row = {
-        "design": settings["design"],
-        "clock": settings["policy.clock"].lower(),
-        "observer": settings["observer"],
-        "seed": outcome["seed"],
-        "best": number(outcome["loss"]),
-        "iteration": outcome["iteration"],
-        "end": number(outcome["end"]),
-        "restarts": restarts,
+    job = {name: settings[setting].lower() for name, setting in JOBS.items() if setting in settings}
+    return robot, {**job, "seed": run["seed"]} | {
+        name: number(run[column])
+        for name, column in (COLUMNS | EXAMINED | EXTREMES.get(robot, WALKER)).items()
     }
-    return robot, row | {name: number(outcome[name]) for name in FOUND + EXTREMES.get(robot, ["tilt"])}
 
 
-def main(sweep: str, out: str = str(Path(__file__).parent)):
-    jobs = sorted(Path(sweep).glob("[0-9]*"), key=lambda job: int(job.name))
+def main(table: str, *folders: str):
     tables: dict[str, list[Row]] = {}
-    for folder in (one for job in jobs for one in sorted(job.glob("seed_*"))):
-        robot, row = row_of(folder)
-        tables.setdefault(robot, []).append(row)
+    for folder in folders:
+        with open(Path(folder) / "sweep.csv", newline="") as file:
+            for robot, row in map(row_of, csv.DictReader(file)):
+                tables.setdefault(robot, []).append(row)
     for robot, rows in tables.items():
-        with open(Path(out) / f"comparison.{robot}.h200.csv", "w", newline="") as file:
+        with open(Path(__file__).parent / f"{table}.{robot}.h200.csv", "w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)

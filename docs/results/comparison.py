@@ -1,6 +1,6 @@
 """Print a table of docs/results.md that compares observers, from comparison.ROBOT.h200.csv beside this script:
 `python docs/results/comparison.py elephant`, or an earlier one: `... elephant before_settling`; `settled`, whose best motions were the
-farthest; or `lasting`, whose best motions had lasted."""
+farthest; `lasting`, whose best motions had lasted; or `aliased`, whose statistics of the latent were those of every fourth picture."""
 
 import csv
 import math
@@ -20,6 +20,7 @@ FIRST = "particle true latent"
 """The job that the others are compared with."""
 
 Row = dict[str, str]
+Jobs = dict[tuple[str, str, str], list[Row]]
 
 
 def shown(pair: dict | None, is_log: bool) -> str:
@@ -40,12 +41,9 @@ def lasts(row: Row) -> bool:
 
 
 def of_walkers(runs: Sequence[Row]) -> list[str]:
-    """How many walk, last, tore within 6 s, and began anew."""
+    """How many walk, last, and tore within 6 s."""
     walk = [row for row in runs if float(row["best"]) < WALKS]
-    anew = [row for row in runs if row["restarts"] != "0"]
-    return [
-        str(len(some)) for some in (walk, [*filter(lasts, walk)], [r for r in walk if r["later"] == ""], anew)
-    ]
+    return [str(len(some)) for some in (walk, [*filter(lasts, walk)], [r for r in walk if r["later"] == ""])]
 
 
 def of_arms(runs: Sequence[Row]) -> list[str]:
@@ -62,26 +60,47 @@ def print_ends(rows: Sequence[Row]) -> None:
     torn = sum(not end for end, _ in ends)
     fell = sum(float(end) > 0.8 * best for end, best in ends if end)
     gone = sum(row["later"] == "" for row in walking)
-    anew = [row for row in rows if row["restarts"] != "0"]
     print(f"{len(walking)} walk, {sum(map(lasts, walking))} of which last, and {gone} tear within 6 s")
     print(f"at their end {torn} of those that walk tear, and {fell} are below 0.8 of their best")
-    print(f"{len(anew)} began anew, {sum(row in walking for row in anew)} of which walk")
+
+
+def read(robot: str, folder: str = ".") -> Jobs:
+    """Rows of a comparison by job: co-design, clock, observer."""
+    jobs: Jobs = {}
+    with open(Path(__file__).parent / folder / f"comparison.{robot}.h200.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            jobs.setdefault((row["design"], row["clock"], row["observer"]), []).append(row)
+    return jobs
+
+
+def differences_of(jobs: Jobs, is_log: bool) -> dict[tuple[str, str], str]:
+    """Mean difference of the best evaluation between every two jobs, paired by seed, with its interval; of logarithms the quotient."""
+    value = (lambda text: math.log(float(text))) if is_log else float
+    values = {
+        " ".join(job): {int(row["seed"]): value(row["best"]) for row in runs} for job, runs in jobs.items()
+    }
+    return {(pair["first"], pair["second"]): shown(pair, is_log) for pair in pairs(values, "best")}
+
+
+def print_differences(jobs: Jobs, *found: dict[tuple[str, str], str], sign: str) -> None:
+    """Differences between jobs that differ in the observer, in co-design or in the clock alone, one column for each comparison."""
+    print(f"The latent {sign} another observer, with the same design and clock:")
+    for design, clock, observer in jobs:
+        pair = f"{design} {clock} latent", f"{design} {clock} {observer}"
+        if pair in found[0]:
+            print(
+                f"design={design} clock={clock} {observer}: {', before '.join(each[pair] for each in found)}"
+            )
+    print(f"With co-design {sign} without, and with the clock {sign} without, of each observer:")
+    for pair in found[0]:
+        (design, clock, observer), (other_design, other_clock, other_observer) = map(str.split, pair)
+        if observer == other_observer and (design == other_design) != (clock == other_clock):
+            print(f"{', '.join(pair)}: {', before '.join(each[pair] for each in found)}")
 
 
 def main(robot: str, folder: str = "."):
-    with open(Path(__file__).parent / folder / f"comparison.{robot}.h200.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    arm = robot == "arm"  # its losses, mean squares, lie decades apart
-    jobs: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        jobs.setdefault((row["design"], row["clock"], row["observer"]), []).append(row)
-    values = {
-        " ".join(job): {
-            int(row["seed"]): math.log(float(row["best"])) if arm else float(row["best"]) for row in runs
-        }
-        for job, runs in jobs.items()
-    }
-    differences = {(pair["first"], pair["second"]): shown(pair, is_log=arm) for pair in pairs(values, "best")}
+    jobs, arm = read(robot, folder), robot == "arm"  # losses of arms, mean squares, lie decades apart
+    differences = differences_of(jobs, is_log=arm)
     for job, runs in jobs.items():
         best = [(1e5 if arm else 1.0) * float(row["best"]) for row in runs]
         low, high = interval(best, np.median)
@@ -95,19 +114,10 @@ def main(robot: str, folder: str = "."):
             differences.get((FIRST, " ".join(job)), ""),
         ]
         print(f"| {' | '.join(cells)} |".replace("-", "−").replace("k−means", "k-means"))
-    sign = "divided by" if arm else "minus"
-    print(f"The latent {sign} another observer, with the same design and clock:")
-    for design, clock, observer in jobs:
-        difference = differences.get((f"{design} {clock} latent", f"{design} {clock} {observer}"))
-        if difference is not None:
-            print(f"design={design} clock={clock} {observer}: {difference}")
-    print(f"With co-design {sign} without, and with the clock {sign} without, of each observer:")
-    for (one, other), difference in differences.items():
-        (design, clock, observer), (other_design, other_clock, other_observer) = one.split(), other.split()
-        if observer == other_observer and (design == other_design) != (clock == other_clock):
-            print(f"{one}, {other}: {difference}")
+    before = [differences_of(read(robot, "aliased"), is_log=arm)] if folder == "." else []
+    print_differences(jobs, differences, *before, sign="divided by" if arm else "minus")
     if not arm:
-        print_ends(rows)
+        print_ends([row for runs in jobs.values() for row in runs])
 
 
 if __name__ == "__main__":

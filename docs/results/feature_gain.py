@@ -1,4 +1,4 @@
-"""Print the table of docs/results.md on the first weights of features, from the csv file beside this script:
+"""Print the table of docs/defaults.md on the first weights of features, from the csv file beside this script:
 `python docs/results/feature_gain.py`."""
 
 import csv

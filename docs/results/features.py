@@ -1,4 +1,4 @@
-"""Print the table of docs/results.md on the features of k-means and of the latent, from features.csv beside this script:
+"""Print the table of docs/defaults.md on the features of k-means and of the latent, from features.csv beside this script:
 `python docs/results/features.py`."""
 
 import csv

@@ -1,4 +1,4 @@
-"""Print the figures of "What lasts" and "What tears" in docs/results.md, from lasting.csv, tears.csv and the comparisons beside this
+"""Print the figures of "What lasts" and "What tears" in docs/defaults.md, from lasting.csv, tears.csv and the comparisons beside this
 script."""
 
 import math

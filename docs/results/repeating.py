@@ -1,4 +1,4 @@
-"""Print the figures of "What repeats itself" in docs/results.md, from the comparisons and lasting.csv beside this script."""
+"""Print the figures of "What repeats itself" in docs/defaults.md, from the comparisons and lasting.csv beside this script."""
 
 import numpy as np
 from comparison import WALKS, Row

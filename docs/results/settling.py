@@ -1,4 +1,4 @@
-"""Print the figures of docs/decisions/0013-settling.md and of "What settling changed" in docs/results.md, from the tables beside this
+"""Print the figures of docs/decisions/0013-settling.md and of "What settling changed" in docs/defaults.md, from the tables beside this
 script."""
 
 import csv

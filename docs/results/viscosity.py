@@ -1,4 +1,4 @@
-"""Print the figures of "Twenty seeds" and "A more viscous material" in docs/results.md, from lasting.csv and failed_evaluations.csv."""
+"""Print the figures of "Earlier twenties" and "A more viscous material" in docs/defaults.md, from lasting.csv and failed_evaluations.csv."""
 
 import numpy as np
 from comparison import Row

@@ -18,9 +18,9 @@ VIGOROUS = 3.0
 """Size of the first activations of a robot on legs, with which it steps from the beginning."""
 FAINT = 0.3
 """Influence of an encoder's features on these, in units of the clock's: standardised, the features of a body that shakes would drown
-its rhythm. Of twenty elephants fourteen got under way, with 1 eight (docs/results.md)."""
+its rhythm. Of twenty elephants fourteen got under way, with 1 eight (docs/defaults.md)."""
 BRISK = 1e-2
-"""Learning rate of a walker's policy. With half of it most of ten elephants still stood after 72 iterations (docs/results.md)."""
+"""Learning rate of a walker's policy. With half of it most of ten elephants still stood after 72 iterations (docs/defaults.md)."""
 WORTH = -0.1
 """Loss of a walker that is worth going on with, in units of its length: it has come forward by more than it costs."""
 ROOM = 1.0
