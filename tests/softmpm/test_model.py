@@ -351,7 +351,7 @@ def test_a_model_need_not_be_on_the_current_gpu(scheme, monkeypatch):
     del found, gradient
     start = there.rest()
     start.F[0, 3, 0] *= -1.0
-    for check in ("check_finite", "check_bounds"):  # which wait for the device
+    for check in ("check_finite", "check_inputs_bounds"):  # which wait for the device
         monkeypatch.setattr(autograd, check, lambda *_: None)
     with torch.cuda.device(1):
         torch.cuda._sleep(200_000_000)  # who reads too early reads what the calls above left: nothing failed
