@@ -1,4 +1,5 @@
-"""Print the figures of "Earlier twenties" and "A more viscous material" in docs/defaults.md, from lasting.csv and failed_evaluations.csv."""
+"""Print the figures of "Earlier twenties" and "A more viscous material" in docs/defaults.md, from lasting.csv and
+failed_evaluations.csv."""
 
 import numpy as np
 from comparison import Row
