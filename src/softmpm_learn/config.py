@@ -72,6 +72,10 @@ class RunConf:
     """Folder of an earlier run to continue; its configuration is used again."""
     files: list[str] = field(default_factory=list)
     """Files that registered robots, observers and policies of one's own; filled in by the program, to name them if one is missing."""
+    job: int = 0
+    """Number of the job in its sweep; filled in by the program, as is the next, for the tables that a resumed run writes."""
+    command_line: list[str] = field(default_factory=list)
+    """Settings on the command line, with those that changed when the run was resumed."""
 
     @property
     def settings(self) -> Settings:

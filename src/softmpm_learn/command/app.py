@@ -15,7 +15,7 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from softmpm_learn import plugins
 from softmpm_learn.command import seeds
@@ -112,7 +112,7 @@ def job(
         conf = _configured(config, out, group)
         (results,) = experiments([(conf, out)], group, signals)
         if conf.train.seeds > 1:
-            about = seeds.job_of(conf, out, hydra_config.overrides.task)
+            about = {"job": conf.job, "settings": " ".join(conf.command_line), "folder": str(out)}
             found = seeds.record(conf, out, results, group, about)
             if found and found.status == "failed":
                 end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
@@ -160,12 +160,14 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
     try:
         with group.fail_together():
             conf, hydra_config = to_run(config), HydraConfig.get()
+            conf.command_line = asked(config, hydra_config.overrides.task)
             conf.files = plugins.files()
             sweeps, begun = hydra_config.mode == RunMode.MULTIRUN, (out / "config.yaml").exists()
             if conf.resume is not None:
                 if sweeps:
                     raise ValueError("resume=FOLDER is for one run; the same command goes on with a sweep.")
                 return resumed(conf, hydra_config.overrides.task)
+            conf.job = int(hydra_config.job.num) if sweeps else 0
             if begun and not sweeps:
                 raise RefusedError(
                     f"{out} holds a run already; go on with resume={out}, or choose another folder."
@@ -186,7 +188,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
 def _fixed(conf: RunConf) -> dict:
     """Settings that a run keeps when it is resumed."""
     flat = dataclasses.asdict(conf)
-    for key in (*CHANGEABLE, "resume", "files"):
+    for key in (*CHANGEABLE, "resume", "files", "job", "command_line"):
         group, _, name = key.partition(".")
         del (flat[group] if name else flat)[name or group]
     return flat
@@ -231,10 +233,22 @@ def _key(text: str) -> str:
     return text.lstrip("+~").partition("=")[0]
 
 
+def asked(config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """Settings on the command line, without the folder to resume. One that refers to others has its value: a saved configuration has no
+    references.
+    """
+    pairs = ((_key(text), text) for text in overrides)
+    return [
+        f"{k}={OmegaConf.select(config, k)}" if "${" in text else text for k, text in pairs if k != "resume"
+    ]
+
+
 def resumed(conf: RunConf, overrides: Sequence[str]) -> RunConf:
     """The configuration of the run to go on with, with what the command line may change of it; see :func:`check_words`."""
     saved = saved_configuration(Path(str(conf.resume)))
     saved.files = conf.files
+    words = {_key(text): text for text in [*saved.command_line, *conf.command_line]}
+    saved.command_line = list(words.values())
     for group, _, name in (_key(text).partition(".") for text in overrides):
         if group == "device":
             saved.device = conf.device

@@ -45,25 +45,6 @@ def folder(out: Path, seed: int) -> Path:
     return out / f"{sweep.SEED}{seed}"
 
 
-def job_of(conf: RunConf, out: Path, words: Sequence[str]) -> dict[str, Any]:
-    """Job, settings and folder of an experiment, for its outcomes. One that is resumed keeps those of its earlier outcomes, with
-    what the command line changed; before it had any, only its task is known.
-
-    Args:
-        words: Settings on the command line.
-    """
-    changed = [text for text in words if not text.startswith("resume=")]
-    places = [out, *(folder(out, one.train.seed) for one in split(conf))]
-    before = next(filter(None, map(sweep.outcome, places)), None)
-    if before:
-        changed = [*before.settings.split(), *changed]
-    elif len(changed) < len(words):
-        changed = [f"task={conf.task.name}", *changed]
-    settings = {text.partition("=")[0]: text for text in changed}  # the last value of each counts
-    number = before.job if before else 0
-    return {"job": number, "settings": " ".join(settings.values()), "folder": str(out)}
-
-
 def record(
     conf: RunConf, out: Path, results: Sequence[Result], group: Group, about: dict[str, Any]
 ) -> sweep.Outcome | None:

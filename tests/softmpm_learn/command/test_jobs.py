@@ -84,7 +84,7 @@ def assert_same(rows: list[dict[str, str]], want: list[dict[str, str]]) -> None:
 
 def test_jobs_side_by_side_are_jobs_one_after_another(run, begun):
     """Four jobs of two seeds in one simulation: rows, losses and files of each; the same command begins nothing again."""
-    code, want = run("apart", *CHOICES)
+    code, want = run("apart", *CHOICES, "train.side_by_side=1")
     again, found = run("together", *CHOICES, "train.side_by_side=9")
     assert (code, again, begun) == (0, 0, [1, 1, 1, 1, 4]) and len(found) == 8
     assert_same(found, want)
