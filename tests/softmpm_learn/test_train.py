@@ -447,10 +447,9 @@ def test_a_failed_simulation_is_tried_again_from_halfway_back(
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, halfway, strict=True):
         torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
-    assert [r["retries"] for r in rows(tmp_path / "two")] == [
-        "0",
-        "1",
-    ] and "Going halfway back" in caplog.text
+    assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"]
+    at = "particle 3 is inverted. In control step 2 of 6, which began at 0.032 s. Going halfway back."
+    assert at in caplog.text
 
 
 def test_a_run_without_a_retry_left_goes_back_to_its_best(
@@ -464,9 +463,8 @@ def test_a_run_without_a_retry_left_goes_back_to_its_best(
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, first.safe, strict=True):
         assert torch.equal(now, want)
-    assert (
-        "The run is going back to iteration 0." in caplog.text and rows(tmp_path / "two")[1]["retries"] == "2"
-    )
+    assert "In control step 0 of 6, which began at 0 s. The run is going back to iteration 0." in caplog.text
+    assert rows(tmp_path / "two")[1]["retries"] == "2"
     now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
     assert now == pytest.approx(before * conf.optimizer.fallback_rate)
 

@@ -130,10 +130,10 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
     run, most = runs.all[k], runs.all[k].settings.optimizer.retries
     if run.safe and most and retries <= most and k in runs.active and run.best["iteration"] >= 0:
         if retries < most:
-            logger.warning("Iteration %d: %s Going halfway back.", run.iteration, error)
+            logger.warning("Iteration %d: %s Going halfway back.", run.iteration, in_full(error))
             run.backtrack()
         else:
-            logger.warning("Iteration %d: %s The run is %s.", run.iteration, error, run.fall_back())
+            logger.warning("Iteration %d: %s The run is %s.", run.iteration, in_full(error), run.fall_back())
         return
     ended = TrainingError(run.iteration, error)
     if k not in runs.active:
