@@ -57,7 +57,7 @@ def show(
 
     The figure shows itself in a notebook. Walls are drawn as the scene describes them; an arrow above the figure is the scale of their
     tractions. Driven particles have dark edges. Over the colours "muscle" and "activation" strokes show the fibres of muscles, which
-    deform with the body; in 3D those at the surface.
+    deform with the body; in 3D those at the surface. A 3D scene stands upright: against gravity, or without any with y up.
 
     Args:
         model: What ``state`` belongs to; a scene is drawn at rest.

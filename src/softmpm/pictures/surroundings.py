@@ -55,9 +55,8 @@ class Surroundings:
 
     @property
     def up(self) -> np.ndarray:
-        """Unit vector against gravity, or the axis 1 without any."""
-        size = float(np.linalg.norm(self.gravity))
-        return -self.gravity / size if size else np.eye(self.dim)[1]
+        """Unit vector that points up in the picture, shape (dim,)."""
+        return style.upward(self.gravity)
 
     @cached_property
     def neighbours(self) -> np.ndarray:

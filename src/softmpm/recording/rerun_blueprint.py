@@ -2,8 +2,6 @@
 :mod:`softmpm.recording.rerun_export` import rerun.
 """
 
-import numpy as np
-
 from softmpm.recording import style
 from softmpm.recording.reader import Recording
 from softmpm.recording.selection import Show
@@ -53,8 +51,7 @@ def _space(source: Recording, show: Show, name: str, contents: list[str]):
         return rrb.Spatial2DView(
             origin="/", contents=contents, name=name, visual_bounds=bounds, background=white
         )
-    gravity = source.static["gravity"].astype(float)
-    up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 1.0, 0.0])
+    up = style.upward(source.static["gravity"].astype(float))
     position, target = style.eye(show.low, show.high, up)
     return rrb.Spatial3DView(
         origin="/",

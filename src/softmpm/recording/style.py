@@ -152,6 +152,12 @@ def frame_box(low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> tuple[np.
     return np.maximum(low - room, -0.02 * upper.max()), np.minimum(high + room, upper * 1.02)
 
 
+def upward(gravity: np.ndarray) -> np.ndarray:
+    """Unit vector that points up in pictures and in Rerun, shape (dim,): against gravity, or without any along axis 1, y."""
+    size = float(np.linalg.norm(gravity))
+    return -gravity / size if size else np.eye(len(gravity))[1]
+
+
 def eye(low: np.ndarray, high: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Camera for a 3D box, a little from above: position and target [m]."""
     extent = high - low

@@ -88,6 +88,14 @@ def test_the_camera_stands_in_front_and_above(up):
     assert right[0] / np.linalg.norm(right) > 0.8
 
 
+@pytest.mark.parametrize(
+    ("gravity", "up"), [((0, 0, -9.81), (0, 0, 1)), ((0, 0, 0), (0, 1, 0)), ((3, -4, 0), (-0.6, 0.8, 0))]
+)
+def test_up_is_against_gravity(gravity, up):
+    """Whatever its axis; without any, up is y."""
+    assert style.upward(np.array(gravity, float)) == pytest.approx(up)
+
+
 def test_dots_grow_when_fewer_are_shown():
     """A quarter of the dots in 2D, an eighth in 3D, need twice the radius."""
     for dim in (2, 3):
