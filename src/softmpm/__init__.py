@@ -29,6 +29,7 @@ from softmpm.quantities import (
     momentum,
     von_mises_strain,
 )
+from softmpm.recording.fibres import fibre_strokes
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
@@ -94,6 +95,7 @@ __all__ = [
     "contact_forces",
     "displacement",
     "elastic_energy",
+    "fibre_strokes",
     "gravitational_energy",
     "green_strain",
     "image",

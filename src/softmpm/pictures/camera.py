@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 
-from softmpm.pictures.surroundings import Surroundings
 from softmpm.recording import style
+from softmpm.recording.surroundings import Surroundings
 
 AMBIENT = 0.6
 """Brightness of a surface that is turned away from the light."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm.pictures.instant import Instant
-from softmpm.pictures.surroundings import Surroundings
 from softmpm.recording import style
+from softmpm.recording.surroundings import Surroundings
 
 QUANTITIES = ("speed", "strain", "activation", "muscle", "body")
 LABELS = {"speed": "speed [m/s]", "strain": "size of the Green strain [-]", "activation": "activation [-]"}

@@ -15,7 +15,7 @@ from softmpm.pictures.camera import Camera
 from softmpm.pictures.colouring import QUANTITIES, Colouring, coloured, values_of
 from softmpm.pictures.instant import Instant, array, at_rest, of_state
 from softmpm.pictures.panel import Panel
-from softmpm.pictures.surroundings import Surroundings, of_scene
+from softmpm.recording.surroundings import Surroundings, of_scene
 from softmpm.scene.scene import Scene
 from softmpm.state import State
 

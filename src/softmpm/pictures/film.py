@@ -14,8 +14,8 @@ from softmpm.model import Model, check_model
 from softmpm.pictures.colouring import QUANTITIES, coloured, values_of
 from softmpm.pictures.figure import longest, panels_of
 from softmpm.pictures.instant import Instant, of_state, recorded
-from softmpm.pictures.surroundings import Surroundings, of_recording, of_scene
 from softmpm.recording.reader import Recording
+from softmpm.recording.surroundings import Surroundings, of_recording, of_scene
 from softmpm.state import State
 
 DPI = 100

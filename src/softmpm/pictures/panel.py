@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from softmpm.pictures.camera import Camera, round_below, round_length, tiles
-from softmpm.pictures.fibres import STROKES, Fibres, stroke_colours
 from softmpm.pictures.instant import Instant
-from softmpm.pictures.surroundings import Surroundings
 from softmpm.recording import style
+from softmpm.recording.fibres import STROKES, Fibres, stroke_colours
+from softmpm.recording.surroundings import Surroundings
 
 POINT = (44, 44, 52)
 """Colour of surface points and of the edges of driven particles."""

@@ -12,7 +12,7 @@ def blueprint(source: Recording, show: Show):
     import rerun.blueprint as rrb
 
     robot, walls = "/scene/robot", "/scene/walls/**"
-    main = _space(source, show, legend(source), [f"{robot}/activation", walls])
+    main = _space(source, show, legend(source), [f"{robot}/activation", f"{robot}/fibres", walls])
     rest = [_space(source, show, f"strain, 0 to {show.strain:.2g}", [f"{robot}/strain", walls])]
     if show.has["field"]:
         name = f"grid velocity, up to {show.speed:.2g} m/s"
@@ -64,9 +64,12 @@ def _space(source: Recording, show: Show, name: str, contents: list[str]):
 
 
 def legend(source: Recording) -> str:
-    """Meaning of red and blue."""
+    """Meaning of red and blue, and of strokes."""
     fibres = source.static["muscle_direction"].any(axis=1)  # zero for a pressure
-    muscles, pressures = "muscles: red pulls, blue pushes", "pressures: red expands, blue contracts"
+    muscles, pressures = (
+        "muscles: red pulls, blue pushes, strokes are fibres",
+        "pressures: red expands, blue contracts",
+    )
     if fibres.all():
         return muscles
     return f"{muscles}; {pressures}" if fibres.any() else pressures

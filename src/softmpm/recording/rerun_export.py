@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from softmpm.recording import style
+from softmpm.recording.fibres import DARK, STROKES, Fibres
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_blueprint import blueprint, curve
 from softmpm.recording.selection import Show, Simulation, plan
+from softmpm.recording.surroundings import of_recording
 
 _BLOCK_BYTES = 2**26  # of positions converted at a time
 
@@ -77,8 +79,12 @@ def to_rerun(
 
 def _log_all(stream, source: Recording, show: Show) -> None:
     _log_static(stream, source, show)
+    size = float(np.ptp(source.static["positions"], axis=0).max())
+    fibres = Fibres(of_recording(source), max(source.spacing, size / STROKES))
+    if len(fibres.particle):
+        _log_look_of_fibres(stream, source, fibres)
     for simulation in show.simulations:
-        _log_simulation(stream, source, show, simulation)
+        _log_simulation(stream, source, show, simulation, fibres)
     _log_scalars(stream, source, show)
 
 
@@ -104,6 +110,13 @@ def _log_static(stream, source: Recording, show: Show) -> None:
         if source.dim == 2:
             look["draw_order"] = 40.0  # before the particles, which have 30
         stream.log("scene/traction", _arrows(source).from_fields(**look), static=True)
+
+
+def _log_look_of_fibres(stream, source: Recording, fibres: Fibres) -> None:
+    look: dict = dict(colors=[DARK.astype(int)], radii=fibres.radius)
+    if source.dim == 2:
+        look["draw_order"] = 35.0  # between particles and tractions
+    stream.log("scene/robot/fibres", _strips(source).from_fields(**look), static=True)
 
 
 def _log_walls(stream, source: Recording) -> None:
@@ -142,7 +155,7 @@ def _times(simulation: Simulation, at: np.ndarray):
     ]
 
 
-def _log_simulation(stream, source: Recording, show: Show, simulation: Simulation) -> None:
+def _log_simulation(stream, source: Recording, show: Show, simulation: Simulation, fibres: Fibres) -> None:
     import rerun as rr
 
     points = rr.Points2D if source.dim == 2 else rr.Points3D
@@ -150,7 +163,8 @@ def _log_simulation(stream, source: Recording, show: Show, simulation: Simulatio
     block = max(1, _BLOCK_BYTES // (4 * source.dim * source.particle_count))
     for start in range(0, len(rows), block):
         at = np.arange(start, min(start + block, len(rows)))
-        x = source.read("x", rows[at])[1][:, show.particle]
+        every = source.read("x", rows[at])[1]
+        x = every[:, show.particle]
         activation = source.read("activation", rows[at])[1]
         colours = {
             "activation": style.activation_colours(source.static, activation)[:, show.particle],
@@ -161,6 +175,8 @@ def _log_simulation(stream, source: Recording, show: Show, simulation: Simulatio
             stream.send_columns(
                 f"scene/robot/{name}", _times(simulation, at), columns.partition([count] * len(at))
             )
+        if len(fibres.particle):
+            _send_fibres(stream, source, _times(simulation, at), fibres, every)
         if show.has["activation"]:
             _send_series(stream, "activation", _times(simulation, at), activation)
         _log_fields(stream, source, show, simulation, at)
@@ -177,6 +193,14 @@ def _send_series(stream, name: str, times: list, values: np.ndarray) -> None:
 
     columns = rr.Scalars.columns(scalars=values.ravel().astype(np.float64))
     stream.send_columns(name, times, columns.partition([values.shape[1]] * len(values)))
+
+
+def _send_fibres(stream, source: Recording, times: list, fibres: Fibres, x: np.ndarray) -> None:
+    """Strokes along the fibres of muscles in each frame; in 3D in front of the dots at the surface."""
+    raised = 1.5 * float(style.radii(source.static["volume"].max(), source.share, source.dim))
+    strips = np.concatenate([fibres.ends(one.astype(float), raised) for one in x])
+    columns = _strips(source).columns(strips=strips)
+    stream.send_columns("scene/robot/fibres", times, columns.partition([len(fibres.particle)] * len(x)))
 
 
 def _log_fields(stream, source: Recording, show: Show, simulation: Simulation, at: np.ndarray) -> None:
@@ -217,6 +241,13 @@ def _arrows(source: Recording):
     import rerun as rr
 
     return rr.Arrows2D if source.dim == 2 else rr.Arrows3D
+
+
+def _strips(source: Recording):
+    """Kind of lines in this dimension."""
+    import rerun as rr
+
+    return rr.LineStrips2D if source.dim == 2 else rr.LineStrips3D
 
 
 def _log_caption(stream, source: Recording, simulation: Simulation) -> None:

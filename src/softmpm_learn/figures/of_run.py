@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softmpm import Scene
+from softmpm import Scene, fibre_strokes
 from softmpm_learn.figures import canvas
 
 VALUES = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -16,6 +16,10 @@ AROUND = 0.3
 """Margin around the places where a robot comes, over the height of the picture."""
 GAP = 0.08
 """Gap between two latent pictures, over their longer side."""
+STROKES = 24
+"""Number of strokes along fibres that would follow each other along the longer side of a picture of the robot."""
+PALE = 0.6
+"""Activation from which on strokes are light, since the colours of muscles are dark."""
 SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
@@ -140,7 +144,9 @@ def robot_figure(
         panel.set_title(title, fontsize=8, loc="left")
     for panel in panels[len(frames) :]:
         panel.set_axis_off()
-    parts[0].supxlabel("m; muscles are red where they pull, blue where they push", fontsize=7)
+    parts[0].supxlabel(
+        "m; muscles are red where they pull, blue where they push; strokes: fibres", fontsize=7
+    )
     if design:
         _draw_design(parts[1], scene, design)
     canvas.save(figure, path, dpi=130)
@@ -182,7 +188,7 @@ def _draw_robot(
     *,
     inches: float,
 ) -> None:
-    """Particles in grey, muscles red where they pull and blue where they push, walls hatched."""
+    """Particles in grey, muscles red where they pull and blue where they push, with strokes along their fibres, and walls."""
     low, high = window
     value = np.zeros(len(positions))
     if activation is not None:
@@ -204,6 +210,15 @@ def _draw_robot(
         vmax=1.0,
         linewidths=0,
     )
+    gap = max(scene.grid.spacing, float((high - low).max()) / STROKES)
+    strokes, particle = fibre_strokes(scene, positions, gap)
+    for some, colour in (
+        (np.abs(value[particle]) > PALE, "#fafafa"),
+        (np.abs(value[particle]) <= PALE, "#2c2c34"),
+    ):
+        panel.plot(
+            *strokes[some, :, :2].transpose(2, 1, 0), color=colour, linewidth=72.0 * inches * 0.07 / STROKES
+        )
     for wall in scene.walls:
         if any(wall.normal[:2]):  # not beside the picture
             _draw_wall(panel, wall, low, high)

@@ -5,7 +5,7 @@ import pytest
 
 import softmpm
 from softmpm.pictures.camera import AMBIENT, Camera, round_length, tiles
-from softmpm.pictures.surroundings import of_scene
+from softmpm.recording.surroundings import of_scene
 
 LOW, HIGH, UP = np.zeros(3), np.array([1.0, 0.6, 0.4]), np.array([0.0, 1.0, 0.0])
 

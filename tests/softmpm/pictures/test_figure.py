@@ -13,8 +13,8 @@ from PIL import Image
 import softmpm
 from softmpm.pictures.colouring import CATEGORIES, PASSIVE, categories
 from softmpm.pictures.panel import _pascal
-from softmpm.pictures.surroundings import of_recording
 from softmpm.recording import style
+from softmpm.recording.surroundings import of_recording
 
 RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
 FLOOR, SIDE = 0.1, 0.15

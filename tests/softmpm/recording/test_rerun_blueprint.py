@@ -24,9 +24,12 @@ class Recorded:
 @pytest.mark.parametrize(
     ("directions", "title"),
     [
-        ([(0, 1), (1, 0)], "muscles: red pulls, blue pushes"),
+        ([(0, 1), (1, 0)], "muscles: red pulls, blue pushes, strokes are fibres"),
         ([(0, 0)], "pressures: red expands, blue contracts"),
-        ([(0, 0), (1, 0)], "muscles: red pulls, blue pushes; pressures: red expands, blue contracts"),
+        (
+            [(0, 0), (1, 0)],
+            "muscles: red pulls, blue pushes, strokes are fibres; pressures: red expands, blue contracts",
+        ),
     ],
 )
 def test_the_legend_names_the_actuators(directions, title):
@@ -51,7 +54,7 @@ def test_there_is_a_view_of_all_that_was_recorded(has):
     show: Any = type("Shown", (), about)
     assert set(about) <= set(Show.__annotations__)
     titles = [view.name for view in views(blueprint(recorded, show).root_container)]
-    want = ["muscles: red pulls, blue pushes", "strain, 0 to 0.5"]
+    want = ["muscles: red pulls, blue pushes, strokes are fibres", "strain, 0 to 0.5"]
     want += ["grid velocity, up to 2 m/s"] * ("field" in has)
     want += ["traction of the walls, up to 3 Pa"] * ("traction" in has)
     want += ["now playing", "loss", "odd/name"] + ["latent"] * ("latent" in has)

@@ -86,6 +86,19 @@ def test_particles_are_shown_twice(tmp_path, dim):
     assert np.array_equal(got, want.ravel()) and len(np.unique(got)) == 4  # grey, muscle at 0, 0.5 and 1
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_strokes_show_the_fibres(tmp_path, dim):
+    """Along the axis x of the muscle, in every frame where its particles are; a pressure has none."""
+    rrd = softmpm.to_rerun(make(tmp_path / "run.h5", dim))
+    parts = read(rrd, "/scene/robot/fibres")
+    ends = np.array([frame for part in parts for frame in part[f"LineStrips{dim}D:strips"].to_pylist()])
+    assert ends.shape[0] == 6 and ends.shape[2:] == (2, dim)
+    along = ends[0, :, 1] - ends[0, :, 0]
+    assert len(along) and np.allclose(along, along.max() * np.eye(dim)[0], atol=1e-6)
+    want = [0.0, 0.01, 0.02, 0.01, 0.02, 0.03]  # of each frame the way since the first
+    assert np.allclose(ends - ends[0], np.reshape(want, (6, 1, 1, 1)), atol=1e-6)
+
+
 def test_2d_stands_upright(tmp_path):
     """Rerun's 2D y axis points down, so that the scene is mirrored; a 3D scene is not."""
     for dim in (2, 3):
@@ -123,12 +136,12 @@ def test_fields_walls_latent_and_curves(tmp_path):
 @pytest.mark.parametrize(
     "kinds, names, title",
     [
-        ("m", ["muscle 0"], "muscles: red pulls, blue pushes"),
+        ("m", ["muscle 0"], "muscles: red pulls, blue pushes, strokes are fibres"),
         ("p", ["pressure 0"], "pressures: red expands, blue contracts"),
         (
             "mp",
             ["muscle 0", "pressure 1"],
-            "muscles: red pulls, blue pushes; pressures: red expands, blue contracts",
+            "muscles: red pulls, blue pushes, strokes are fibres; pressures: red expands, blue contracts",
         ),
     ],
 )

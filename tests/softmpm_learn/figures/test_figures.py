@@ -1,5 +1,6 @@
 """The pictures of a run: they are made, they have the right size and colours, and they tell their arrays."""
 
+import dataclasses
 import subprocess
 import sys
 
@@ -185,6 +186,19 @@ def test_robot_figure_shows_activation_and_design(tmp_path, scene):
         tmp_path / "design.png", scene, [("start", rest, None)] * 2, design, goal=np.array([0.7, 0.3])
     )
     assert pixels(tmp_path / "design.png").shape[0] > sizes["pull"][0] + 150
+
+
+def test_robot_figure_shows_fibres(tmp_path, scene):
+    """Strokes over the muscle: dark at rest, and light over the dark colours of one that works. A pressure has none."""
+    rest, counts = scene.bodies[0].particles.positions, {}
+    pressure = softmpm.Pressure(particles=scene.muscles[0].particles, strength=1.0)
+    other = dataclasses.replace(scene, muscles=[pressure])
+    for name, one, activation in (("none", other, 1.0), ("rest", scene, 0.0), ("works", scene, 1.0)):
+        robot_figure(tmp_path / "robot.png", one, [("", rest, np.array([activation]))], {})
+        image = pixels(tmp_path / "robot.png")[200:-100, 100:-20]
+        counts[name] = [(np.abs(image - level).max(-1) < 30).sum() for level in ((44, 44, 52), (250,) * 3)]
+    dark, light = np.transpose(list(counts.values()))
+    assert dark[0] == dark[2] == 0 and dark[1] > 50 and light[2] > light[0] + 50
 
 
 def test_a_goal_is_drawn_as_a_red_cross(tmp_path, scene):

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from softmpm.pictures.surroundings import Surroundings
+from softmpm.recording.surroundings import Surroundings, of_scene
+from softmpm.scene.scene import Scene
 
 STROKES = 24
 """Number of strokes that follow each other along the longest side of a picture."""
@@ -14,8 +15,25 @@ OUTSIDE = 0.6
 """Distance between a particle and the mean of its neighbours from which on it is at the surface, in its radii; at a plane it is 1.2."""
 
 
+def fibre_strokes(scene: Scene, positions: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Strokes along the fibres of muscles, for pictures of one's own; :func:`softmpm.show` draws the same.
+
+    They deform with the particles around them. In 3D they are near the surface, on all sides.
+
+    Args:
+        positions: Of the particles [m], shape (particle, dim).
+        gap: Distance between two strokes at rest [m].
+
+    Returns:
+        Both ends of each stroke [m], shape (stroke, 2, dim), not finite where particles around are not, and the particle in its middle,
+        shape (stroke,).
+    """
+    fibres = Fibres(of_scene(scene), gap)
+    return fibres.ends(np.asarray(positions, float)), fibres.particle
+
+
 class Fibres:
-    """Strokes along the fibres of all muscles of a picture: rows of dots, which a picture sorts by depth as it does particles.
+    """Strokes along the fibres of all muscles of a picture, each through the particle in its middle.
 
     Args:
         gap: Distance between two strokes [m].
@@ -40,9 +58,26 @@ class Fibres:
         self._shares = np.linspace(-0.5, 0.5, count)
 
     def dots(self, positions: np.ndarray) -> np.ndarray:
-        """Dots of each stroke [m], shape (stroke, dot, dim), not finite where particles around are not."""
+        """Rows of dots for strokes, which a picture sorts by depth as it does particles [m], shape (stroke, dot, dim), not finite where
+        particles around are not."""
+        return self._places(positions, self._shares)
+
+    def ends(self, positions: np.ndarray, raised: float = 0.0) -> np.ndarray:
+        """Both ends of each stroke [m], shape (stroke, 2, dim), not finite where particles around are not.
+
+        Args:
+            raised: Distance by which strokes stand away from the surface of a 3D body [m].
+        """
+        found = self._places(positions, np.array((-0.5, 0.5)))
+        if not raised or self._place.dim == 2:
+            return found
+        outward = positions[self.particle] - positions[self._place.neighbours[self.particle]].mean(1)
+        size = np.linalg.norm(outward, axis=-1, keepdims=True)
+        return found + (raised * outward / np.maximum(size, 1e-12))[:, None]
+
+    def _places(self, positions: np.ndarray, shares: np.ndarray) -> np.ndarray:
         along = (self._gradient(positions) @ self._along[..., None])[..., 0]
-        return positions[self.particle][:, None] + self._shares[:, None] * along[:, None]
+        return positions[self.particle][:, None] + shares[:, None] * along[:, None]
 
     def _gradient(self, positions: np.ndarray) -> np.ndarray:
         """Deformation gradient around each stroke: least squares over neighbours, and none along axes in which they have no extent."""

@@ -12,8 +12,8 @@ from scipy.ndimage import find_objects, label
 
 import softmpm
 from softmpm.pictures.colouring import CATEGORIES
-from softmpm.pictures.fibres import DARK, LIGHT, Fibres, stroke_colours
-from softmpm.pictures.surroundings import of_scene
+from softmpm.recording.fibres import DARK, LIGHT, Fibres, stroke_colours
+from softmpm.recording.surroundings import of_scene
 
 RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
 DIRECTION = {2: (math.cos(math.radians(30)), math.sin(math.radians(30))), 3: (0.0, 1.0, 0.0)}
