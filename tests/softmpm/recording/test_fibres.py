@@ -111,6 +111,17 @@ def test_strokes_of_a_solid_are_at_its_surface():
     np.testing.assert_allclose(np.median(found), 90.0, atol=6.0)
 
 
+def test_strokes_of_a_solid_are_near_its_surface():
+    """Of a block only the outermost layer of particles has strokes; raised ones, as Rerun has them, stand outside of it, or the dots of
+    the particles would hide them."""
+    scene = scene_of(3)
+    rest = scene.bodies[0].particles.positions
+    fibres = Fibres(of_scene(scene), 0.05)
+    np.testing.assert_allclose(np.abs(rest[fibres.particle] - 0.5).max(-1), 0.175)
+    outside = np.abs(fibres.ends(rest, 0.1).mean(1) - 0.5).max(-1) - 0.175
+    assert len(outside) > 50 and (outside > 0.05).all() and (outside < 0.1001).all()
+
+
 @pytest.mark.parametrize("change", [dict(colour="speed"), dict(colour="body"), dict(pressure=True)])
 def test_other_pictures_have_no_strokes(change):
     """Neither other colours than those of muscles, nor a pressure, which has no fibres."""
