@@ -39,6 +39,7 @@ class Run:
     Attributes:
         group: The processes that share the run; all but the first do without its replay buffer.
         out: Its folder.
+        name: That among the runs beside it, empty if there is none.
         worlds: Which of the worlds of the run are those of this process's model.
         iteration: Iterations done.
         observer, policy, design, optimizer: What is optimised, and how.
@@ -75,7 +76,7 @@ class Run:
         self.learner: Learner | None = None
         self.observer = self._make_observer(out)
         self.settings = settings = settings.suited(task, isinstance(self.observer, Latent))
-        self.iteration, self.motions = 0, Motions(settings.optimizer)
+        self.name, self.iteration, self.motions = "", 0, Motions(settings.optimizer)
         self.end: tuple[int, float] | None = None
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = Goals(task, model, settings.train, self.worlds)
@@ -121,6 +122,11 @@ class Run:
     def parameters(self) -> list[nn.Parameter]:
         """Parameters that the gradient updates: policy, then design."""
         return [*self.policy.parameters(), *self.design.parameters()]
+
+    @property
+    def now(self) -> str:
+        """Its iteration, and its name among several: how sentences of the log begin."""
+        return f"Iteration {self.iteration}" + (f" of {self.name}" if self.name else "")
 
     def snapshot(self) -> None:
         self.safe = [p.detach().clone() for p in self.parameters]

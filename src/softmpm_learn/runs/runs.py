@@ -46,6 +46,8 @@ class Runs:
         self.observer, self.policy, self.design = first.observer, first.policy, first.design
         self._together: tuple[Observers, Policies, Designs] | None = None
         if len(runs) > 1:
+            for k, run in enumerate(runs):
+                run.name = self.name(k)
             about = self.share, self._resting
             self._together = Observers(runs, self.share), Policies(runs, *about), Designs(runs, *about)
             self.observer, self.policy, self.design = self._together

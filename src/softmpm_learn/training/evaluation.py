@@ -86,8 +86,8 @@ def _repeats(run: Run, again: Evaluation) -> bool:
     repeats = run.recount(again.loss, again.lasts)
     if not repeats:
         logger.info(
-            "Iteration %d: evaluated again, the best has %.3g instead of %.3g%s; %s.",
-            run.iteration,
+            "%s: evaluated again, the best has %.3g instead of %.3g%s; %s.",
+            run.now,
             again.loss,
             before["loss"],
             " and does not last" if before["lasts"] and not again.lasts else "",
@@ -112,7 +112,7 @@ def simulate(runs: Runs, of: Collection[int], starts: Sequence[float]) -> dict[i
         if k not in of:
             continue
         start = f", from a start with {kick:g} m/s" if times > 1 else ""
-        logger.warning("Iteration %d: the evaluation failed%s: %s", runs.all[k].iteration, start, error)
+        logger.warning("%s: the evaluation failed%s: %s", runs.all[k].now, start, error)
         found[0][0, k] = math.inf
     means = runs.group.average(found)  # infinite in every process if it is in one
     # of each start the mean over the goals, shape (group of starts, 2, run, start)

@@ -146,8 +146,9 @@ def replayed(runs: Runs, task: Task, own: list[Path | None]) -> list[Path | None
 def _each(runs: Runs, name: str, failures: Failures, path: Path) -> list[Path | None]:
     """The part of a motion that each run has, None where one of its worlds failed, which the log tells."""
     failed = runs.failed(failures.errors)
-    for error in failed.values():
-        logger.warning("Examination, %s: %s", name, error)
+    for k, error in failed.items():
+        of = f" of {runs.all[k].name}" if runs.all[k].name else ""
+        logger.warning("Examination%s, %s: %s", of, name, error)
     return [None if k in failed else _of(path, runs.worlds(k)) for k in range(len(runs.all))]
 
 

@@ -97,9 +97,9 @@ def warn_of_saturation(run: Run, activation: float) -> None:
         return
     run.saturated = True
     logger.warning(
-        "Iteration %d: the activations are at their bounds (root mean square %.3f), where the policy has hardly any gradient and stays "
+        "%s: the activations are at their bounds (root mean square %.3f), where the policy has hardly any gradient and stays "
         "as it is. If the loss falls no further, begin again with a lower optimizer.policy_rate, which is %g here.",
-        run.iteration,
+        run.now,
         activation,
         run.settings.optimizer.policy_rate,
     )
@@ -130,10 +130,10 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
     run, most = runs.all[k], runs.all[k].settings.optimizer.retries
     if run.safe and most and retries <= most and k in runs.active and run.best["iteration"] >= 0:
         if retries < most:
-            logger.warning("Iteration %d: %s Going halfway back.", run.iteration, in_full(error))
+            logger.warning("%s: %s Going halfway back.", run.now, in_full(error))
             run.backtrack()
         else:
-            logger.warning("Iteration %d: %s The run is %s.", run.iteration, in_full(error), run.fall_back())
+            logger.warning("%s: %s The run is %s.", run.now, in_full(error), run.fall_back())
         return
     ended = TrainingError(run.iteration, error)
     if k not in runs.active:
@@ -183,7 +183,7 @@ def step(run: Run, loss: float, value: float, begins: bool = False) -> None:
         low = f"for {after} iterations " if after > 1 else ""
         low += f"the progress was below {share:g} of the best; {run.fall_back()}"
     if low:
-        logger.warning("Iteration %d: %s.", run.iteration, low)
+        logger.warning("%s: %s.", run.now, low)
     else:
         run.step()
 
@@ -194,9 +194,9 @@ def settle(run: Run, begins: bool) -> bool:
     elsewhere = run.best["iteration"] < run.iteration
     if begins and elsewhere:
         back = run.return_to_best(run.settings.optimizer.fallback_rate)
-        logger.info("Iteration %d: the run settles; %s.", run.iteration, back)
+        logger.info("%s: the run settles; %s.", run.now, back)
     elif ends and elsewhere:
-        logger.info("Iteration %d: the run ends; %s.", run.iteration, run.return_to_best())
+        logger.info("%s: the run ends; %s.", run.now, run.return_to_best())
     return ends or (begins and elsewhere)
 
 

@@ -278,7 +278,9 @@ def test_a_retry_of_one_seed_leaves_the_others_as_they_are(task, conf, tmp_path,
         assert_same(tmp_path / "together" / str(k), tmp_path / "alone" / str(k))
         retries = [row["retries"] for row in metrics(tmp_path / "together" / str(k))]
         assert retries == ([0, 0, 1, 0, 0] if k == 1 else [0] * 5)
-    assert "World 1 is world 0 of seed 5. Going halfway back." in caplog.text
+    among, single = (text for text in caplog.messages if text.endswith("Going halfway back."))
+    assert among.startswith("Iteration 2 of seed 5: ") and "World 1 is world 0 of seed 5." in among
+    assert single.startswith("Iteration 2: ")
 
 
 def test_seeds_that_fail_in_one_simulation_go_back_at_once(task, conf, tmp_path, monkeypatch):
