@@ -7,7 +7,7 @@ from softmpm.scene.scene import Scene
 
 STROKES = 24
 """Number of strokes that follow each other along the longest side of a picture."""
-LENGTH, RADIUS = 0.7, 0.035
+LENGTH, RADIUS = 0.7, 0.025
 """Length at rest and half the width of a stroke, in distances between two."""
 DARK, LIGHT = np.array((44, 44, 52), float), np.array((250, 250, 250), float)
 """Colours of strokes, on light and on dark particles."""
@@ -34,7 +34,7 @@ def fibre_strokes(scene: Scene, positions: np.ndarray, gap: float) -> tuple[np.n
 
 
 class Fibres:
-    """Strokes along the fibres of all muscles of a picture, each through the particle in its middle.
+    """Strokes along the fibres of all muscles of a picture, each through the particle in its middle, as far as the muscle goes.
 
     Args:
         gap: Distance between two strokes [m].
@@ -44,24 +44,27 @@ class Fibres:
     """
 
     def __init__(self, place: Surroundings, gap: float):
-        self._place = place
+        self._place, self.radius = place, RADIUS * gap
         seen = _outside(place) if place.dim == 3 else np.ones(len(place.rest), bool)
-        chosen = [
-            _spread(place.rest, np.flatnonzero(members & (seen if (members & seen).any() else members)), gap)
-            for members in place.muscle
-        ]
-        chosen = [part if fibre.any() else part[:0] for part, fibre in zip(chosen, place.fibre, strict=True)]
-        self.particle = np.concatenate([*chosen, np.empty(0)]).astype(np.int64)
-        along = np.repeat(place.fibre, [len(part) for part in chosen], axis=0)
-        self._along = LENGTH * gap * along / np.linalg.norm(along, axis=-1, keepdims=True)
-        self.radius = RADIUS * gap
         count = 2 * int(np.ceil(LENGTH / (2 * RADIUS))) + 1  # dots overlap by a half
-        self._shares = np.linspace(-0.5, 0.5, count)
+        shares, strokes = np.linspace(-0.5, 0.5, count)[:, None], [_none(count, place.dim)]
+        for members, fibre in zip(place.muscle, place.fibre, strict=True):
+            if fibre.any():
+                shown = members & seen if (members & seen).any() else members
+                middle = _spread(place.rest, np.flatnonzero(shown), gap)
+                line = place.rest[middle][:, None] + shares * LENGTH * gap * fibre / np.linalg.norm(fibre)
+                strokes.append((middle, *_within(place, np.flatnonzero(members), line)))
+        self.particle = np.concatenate([middle for middle, _, _ in strokes])
+        carrier = np.concatenate([carrier for _, _, carrier in strokes])
+        self._offset = np.concatenate([line for _, line, _ in strokes]) - place.rest[carrier]
+        self._carriers, row = np.unique(carrier, return_inverse=True)
+        self._row = row.reshape(carrier.shape)
 
     def dots(self, positions: np.ndarray) -> np.ndarray:
         """Rows of dots for strokes, which a picture sorts by depth as it does particles [m], shape (stroke, dot, dim), not finite where
         particles around are not."""
-        return self._places(positions, self._shares)
+        gradient = self._gradient(positions)[self._row]
+        return positions[self._carriers][self._row] + (gradient @ self._offset[..., None])[..., 0]
 
     def ends(self, positions: np.ndarray, raised: float = 0.0) -> np.ndarray:
         """Both ends of each stroke [m], shape (stroke, 2, dim), not finite where particles around are not.
@@ -69,24 +72,44 @@ class Fibres:
         Args:
             raised: Distance by which strokes stand away from the surface of a 3D body [m].
         """
-        found = self._places(positions, np.array((-0.5, 0.5)))
+        found = self.dots(positions)[:, [0, -1]]
         if not raised or self._place.dim == 2:
             return found
         outward = positions[self.particle] - positions[self._place.neighbours[self.particle]].mean(1)
         size = np.linalg.norm(outward, axis=-1, keepdims=True)
         return found + (raised * outward / np.maximum(size, 1e-12))[:, None]
 
-    def _places(self, positions: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        along = (self._gradient(positions) @ self._along[..., None])[..., 0]
-        return positions[self.particle][:, None] + shares[:, None] * along[:, None]
-
     def _gradient(self, positions: np.ndarray) -> np.ndarray:
-        """Deformation gradient around each stroke: least squares over neighbours, and none along axes in which they have no extent."""
-        near = self._place.neighbours[self.particle]
-        rest, now = (x[near] - x[self.particle][:, None] for x in (self._place.rest, positions))
+        """Deformation gradient around particles that carry dots: least squares over neighbours, and none along axes in which they have
+        no extent."""
+        near = self._place.neighbours[self._carriers]
+        rest, now = (x[near] - x[self._carriers][:, None] for x in (self._place.rest, positions))
         inverse = np.linalg.pinv(np.swapaxes(rest, 1, 2) @ rest, rcond=1e-6, hermitian=True)
         flat = np.eye(self._place.dim) - np.swapaxes(rest, 1, 2) @ rest @ inverse
         return np.swapaxes(now, 1, 2) @ rest @ inverse + flat
+
+
+def _none(count: int, dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """No stroke: particle in its middle, dots, and the particle nearest to each."""
+    return np.empty(0, int), np.empty((0, count, dim)), np.empty((0, count), int)
+
+
+def _within(place: Surroundings, members: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Dots of strokes, shape (stroke, dot, dim), which end where the muscle of these particles ends, and the particle nearest to each.
+
+    Dots beyond are where the last one inside is.
+    """
+    from scipy.spatial import KDTree
+
+    distance, nearest = KDTree(place.rest[members]).query(line)
+    inside = distance <= 1.01 * np.sqrt(place.dim) * place.radii[members[nearest]]
+    middle = line.shape[1] // 2
+    last = middle + np.cumprod(inside[:, middle + 1 :], axis=1).sum(axis=1)
+    first = middle - np.cumprod(inside[:, :middle][:, ::-1], axis=1).sum(axis=1)
+    kept = np.clip(np.arange(line.shape[1]), first[:, None], last[:, None])
+    return np.take_along_axis(line, kept[..., None], axis=1), members[
+        np.take_along_axis(nearest, kept, axis=1)
+    ]
 
 
 def stroke_colours(rgb: np.ndarray) -> np.ndarray:

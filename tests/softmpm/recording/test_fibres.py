@@ -83,6 +83,20 @@ def test_strokes_stretch_with_the_muscle(model):
     assert np.isfinite(fibres.dots(stretched)).any() and not np.isfinite(fibres.dots(stretched)[0]).any()
 
 
+def test_strokes_end_with_the_muscle():
+    """In a muscle that is shorter than they are, and where it bends: a stroke that stuck out would look like another part."""
+    scene = scene_of(2)
+    block = softmpm.box((0.3, 0.4), (0.7, 0.46), spacing=0.01)
+    muscle = softmpm.Muscle(particles=range(len(block)), direction=(0.0, 1.0), strength=1.0)
+    body = softmpm.Body(block, RUBBER)
+    fibres = Fibres(of_scene(dataclasses.replace(scene, bodies=[body], muscles=[muscle])), 0.1)
+    dots = fibres.dots(block.positions)
+    assert len(dots) > 2 and 0.396 < dots[..., 1].min() < 0.406 and 0.454 < dots[..., 1].max() < 0.464
+    bent = block.positions + 0.05 * np.sin(20.0 * block.positions[:, 1:]) * (1.0, 0.0)
+    x, y = np.moveaxis(fibres.dots(bent) - dots[:, :1] * (1.0, 0.0), -1, 0)
+    np.testing.assert_allclose(x, 0.05 * np.sin(20.0 * y), atol=2.5e-3)
+
+
 def test_a_row_of_particles_has_strokes_across_it():
     """Where neighbours lie on one line, they tell nothing of the fibre across, which stays as at rest."""
     scene = scene_of(2)
