@@ -1,5 +1,6 @@
 """A flat robot from masks: the pixels of each part of a picture, or the voxels of an array, become particles."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,8 +32,6 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
     Raises:
         ValueError: There is no pixel, or the robot is in several pieces.
     """
-    from scipy.ndimage import distance_transform_edt
-
     whole = np.any([part.mask for part in parts], axis=0) if parts else np.zeros((1, 1), dtype=bool)
     _check_pieces(conf, whole)
     rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))
@@ -40,43 +39,71 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
     height, width = whole[cut].shape
     pixel = conf.size / max(height, width)
     warn_of_thin_limbs(conf, whole[cut], pixel)
-    shapes, owners, taken = [], [], set[tuple[float, ...]]()
-    for stiffness in sorted({part.stiffness for part in parts}):
-        owner = np.full((height, width), -1)
-        for k, part in enumerate(parts):
-            if part.stiffness == stiffness:
-                owner[part.mask[cut]] = k
-        if (owner < 0).all():
-            continue
-        shape = softmpm.image(
-            owner >= 0,
-            (0.0, 0.0),
-            height=height * pixel,
-            spacing=conf.spacing / 2,
-            cut_cells=conf.on_surface or conf.formulation == "reference",
-        )
-        shape = _without(shape, taken)
-        near = np.asarray(distance_transform_edt(owner < 0, return_distances=False, return_indices=True))
-        x, y = np.floor(shape.positions / pixel).astype(int).T
-        column, row = np.clip(x, 0, width - 1), np.clip(height - 1 - y, 0, height - 1)
-        shapes.append((shape, stiffness))
-        owners.append(owner[tuple(near[:, row, column])])
-    of = np.concatenate(owners)
+    stiffnesses = sorted({part.stiffness for part in parts if part.mask.any()})
+    owners = [_owners(parts, stiffness)[cut] for stiffness in stiffnesses]
+    shapes = _shapes(conf, owners, pixel)
+    of = np.concatenate(
+        [_nearest(owner, shape.positions / pixel) for owner, shape in zip(owners, shapes, strict=True)]
+    )
     muscles = [
         Muscular(part.name, np.flatnonzero(of == k), part.direction or _fibres(part.mask))
         for k, part in enumerate(parts)
         if part.muscle and part.mask.any()
     ]
-    return walker(conf, shapes, muscles)
+    return walker(conf, list(zip(shapes, stiffnesses, strict=True)), muscles)
 
 
-def _without(shape: softmpm.Particles, taken: set[tuple[float, ...]]) -> softmpm.Particles:
-    """The shape without particles at places that are taken: a lattice cell of which two bodies have half each is one particle, of the
-    first. Its own places are taken from then on."""
-    places = [tuple(place) for place in shape.positions.tolist()]
-    free = [place not in taken for place in places]
-    taken.update(places)
-    return softmpm.Particles(shape.positions[free], np.asarray(shape.volume)[free], shape.outline)
+def _owners(parts: Sequence[Part], stiffness: float) -> np.ndarray:
+    """Number of the part of this stiffness that has each pixel, -1 where none has it."""
+    owner = np.full(parts[0].mask.shape, -1)
+    for k, part in enumerate(parts):
+        if part.stiffness == stiffness:
+            owner[part.mask] = k
+    return owner
+
+
+def _nearest(owner: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Part at each place, or the nearest one, shape (place,); places (place, 2) in pixels, y up."""
+    from scipy.ndimage import distance_transform_edt
+
+    near = np.asarray(distance_transform_edt(owner < 0, return_distances=False, return_indices=True))
+    (height, width), (x, y) = owner.shape, np.floor(places).astype(int).T
+    column, row = np.clip(x, 0, width - 1), np.clip(height - 1 - y, 0, height - 1)
+    return owner[tuple(near[:, row, column])]
+
+
+def _shapes(conf: OwnConf, owners: Sequence[np.ndarray], pixel: float) -> list[softmpm.Particles]:
+    """Shape of each body. Where cells are not cut, a particle of the whole robot belongs to the body that covers most of its cell, of
+    equal ones to the first: each body by itself would have one in a cell that two cover by halves, and none in a third of a cell.
+    """
+    masks, cut_cells = [owner >= 0 for owner in owners], conf.on_surface or conf.formulation == "reference"
+
+    def filled(mask: np.ndarray) -> softmpm.Particles:
+        height = len(mask) * pixel
+        return softmpm.image(mask, (0.0, 0.0), height=height, spacing=conf.spacing / 2, cut_cells=cut_cells)
+
+    shapes = [filled(mask) for mask in masks]
+    if cut_cells:
+        return shapes
+    whole = filled(np.any(masks, axis=0))
+    places, width = whole.positions / pixel, 0.5 * conf.spacing / pixel
+    of = np.argmax([_coverage(mask, places, width).round(6) for mask in masks], axis=0)
+    return [
+        softmpm.Particles(whole.positions[of == k], np.asarray(whole.volume)[of == k], shape.outline)
+        for k, shape in enumerate(shapes)
+    ]
+
+
+def _coverage(mask: np.ndarray, places: np.ndarray, width: float) -> np.ndarray:
+    """Share that a mask covers of the square around each place, shape (place,); in pixels, y up."""
+    from scipy.ndimage import map_coordinates
+
+    table = np.pad(mask[::-1].cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(float)  # (y, x)
+    covered = np.zeros(len(places))
+    for right, up in itertools.product((-1, 1), (-1, 1)):
+        corner = (places + 0.5 * width * np.array((right, up)))[:, ::-1].T
+        covered += right * up * map_coordinates(table, corner, order=1, mode="nearest")
+    return covered / width**2
 
 
 def _fibres(mask: np.ndarray) -> tuple[float, ...]:

@@ -196,6 +196,26 @@ def test_a_cell_that_two_bodies_share_by_halves_is_one_particle(folder):
     assert len(stiff.scene.bodies) == 2 and found[0] == found[1]
 
 
+def test_a_cell_that_three_bodies_share_by_thirds_is_one_particle(folder):
+    """Of the first of them, where nodes meet the floor; a hole was there. Cells have three pixels, the band between the stiff half and
+    the soft one is one pixel wide in its lower part."""
+    pixels = np.full((30, 60, 3), (255, 0, 0), dtype=np.uint8)
+    pixels[:, 31:] = (32, 32, 32)
+    pixels[:15, 30:33] = pixels[15:, 31] = (128, 128, 128)
+    Image.fromarray(pixels).save("bands.png")
+    legend = dict(red=dict(colour="#ff0000", muscle=True), stiff=dict(colour="#202020", stiffness=10.0))
+    legend["band"] = dict(colour="#808080", stiffness=3.0)
+    task = make_task(ImageConf(file="bands.png", size=0.25, cells=40, contact="nodes", legend=legend))
+    x, y = places(task).T
+    assert len(x) == 200 and len(task.scene.bodies) == 3
+    soft = len(task.scene.bodies[0].particles)
+    assert (
+        soft == 105
+        and x[:soft].max() == pytest.approx(10.5 * 0.0125)
+        and y[:soft][x[:soft] > 0.128].max() < 0.0625
+    )
+
+
 def test_a_limb_thinner_than_two_cells_is_named(folder, caplog):
     """Legs of 30 mm on cells of 12.5 mm are not; others are, with their width and the cells of which it has four."""
     for conf in (ImageConf(file="robot.png", size=0.2), VoxelsConf(file="robot.npy")):
