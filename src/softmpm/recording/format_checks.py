@@ -78,11 +78,14 @@ def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
 
 
 def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset]) -> None:
-    """Check that the rows that each frame refers to exist; frames of episodes that began after the index was read belong to none."""
+    """Check that the rows that each frame refers to exist and are its own: a recorder appends them, so they ascend. Frames of episodes
+    that began after the index was read belong to none."""
     for name, table in PARTS.items():
         count = len(tables[table]) if table in tables else 0
         if len(index) and not -1 <= index[name].min() <= index[name].max() < count:
             raise ValueError(f"{path}: frame/index names rows of {name} beyond the {count} that there are.")
+        if (np.diff(index[name][index[name] >= 0]) <= 0).any():
+            raise ValueError(f"{path}: frame/index names a row of {name} twice, or after a later one.")
     for name in PER_FRAME:
         if len(tables[f"frame/{name}"]) < len(index):
             raise ValueError(f"{path}: frame/{name} has fewer rows than frame/index.")

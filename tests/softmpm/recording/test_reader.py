@@ -206,6 +206,7 @@ def test_attributes_that_are_no_object_are_named(copy, text):
         ("scalar", dict(name=b"\xff\xfe"), "the name of a scalar is not UTF-8"),
         ("frame/index", dict(field=99), "rows of field beyond the 2"),
         ("frame/index", dict(latent=-7), "rows of latent beyond"),
+        ("frame/index", dict(field=1), "a row of field twice, or after a later one"),
         ("frame/index", dict(time=np.nan), "times in frame/index must be finite"),
     ],
 )
