@@ -182,7 +182,8 @@ class Task:
     """Hand-picked clusters of particles by name; they do not overlap. Indices into the model's particles."""
     objective: Objective
     body_length: float
-    """Extent of the robot at rest along x, or its reach [m]."""
+    """Scale of displacements: of a walker the extent of its particles at rest along x, which is a particle's spacing less than the body
+    is long, of an arm its reach [m]."""
     goal: np.ndarray | None = None
     """Goal position [m], shape (dim,), if the task has one."""
     fade: float = math.inf

@@ -45,7 +45,9 @@ class WalkerConf(TaskConf):
     upright: float = 1.0
     """Weight of the squared slope of the torso in the loss [m]; without it a walker ends on its head."""
     stretch: float = 5e4
-    """Weight of stretches beyond 1.6 in the loss [m]: a gait that overstretches the robot tears it sooner or later."""
+    """Weight of stretches beyond 1.6 in the loss [m]: a gait that overstretches the robot tears it sooner or later. It is large because
+    the term is a mean over thousands of pairs of particles and all moments, of which a few are overstretched; a gait that overstretches
+    none pays nothing (docs/learning.md)."""
     friction: float = 0.8
     """Coulomb friction of the floor [-]."""
     seconds: float = 2.0
