@@ -217,7 +217,7 @@ def _draw_robot(
         (np.abs(value[particle]) <= PALE, "#2c2c34"),
     ):
         panel.plot(
-            *strokes[some, :, :2].transpose(2, 1, 0), color=colour, linewidth=72.0 * inches * 0.07 / STROKES
+            *strokes[some, :, :2].transpose(2, 1, 0), color=colour, linewidth=72.0 * inches * 0.05 / STROKES
         )
     for wall in scene.walls:
         if any(wall.normal[:2]):  # not beside the picture
