@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
+from unittest import mock
 
 import torch
 import torch._dynamo  # any optimiser loads it, which here would take most of the time of each child
@@ -26,7 +27,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn.command import app, experiment
+from softmpm_learn.command import app, experiment, farewell
 from softmpm_learn.command.sentences import sentence
 from softmpm_learn.command.stop import SIGNALS, Signals
 from softmpm_learn.config import RunConf, conf_dir, to_run
@@ -141,10 +142,9 @@ def _training(conf: Callable[[], RunConf], folder: Path) -> Callable[[], None]:
     """As :func:`softmpm_learn.command.app.job`, without pictures."""
 
     def work() -> None:
-        experiment.draw, experiment.convert = lambda *_: None, lambda *_: "nothing"
         logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout, force=True)
         try:
-            with log_file() as begin:
+            with log_file() as begin, unconverted():
                 experiment.run_experiment(conf(), folder, begin=lambda: begin(folder / "softmpm_learn.log"))
         except Exception as error:
             print(f"softmpm_learn: {sentence(error)}", file=sys.stderr)
@@ -153,10 +153,16 @@ def _training(conf: Callable[[], RunConf], folder: Path) -> Callable[[], None]:
     return work
 
 
+def unconverted() -> contextlib.AbstractContextManager:
+    """Runs end without the conversion for Rerun."""
+    return mock.patch.object(farewell, "convert", return_value="nothing")
+
+
 @contextlib.contextmanager
 def workshop() -> Iterator[Path]:
     """An empty folder, removed at the end; a single thread, so that equal runs are bitwise identical."""
     torch.set_num_threads(1)
+    _rehearse()
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     here = os.getcwd()
     os.chdir(folder)
@@ -165,6 +171,13 @@ def workshop() -> Iterator[Path]:
     finally:
         os.chdir(here)
         shutil.rmtree(folder)
+
+
+@functools.cache
+def _rehearse() -> None:
+    """The smallest run in this process: its children inherit the kernels and imports, which would take most of their time."""
+    with tempfile.TemporaryDirectory(prefix="rehearsal-") as folder, unconverted():
+        experiment.run_experiment(_composed(*TINY), Path(folder))
 
 
 def fingerprint(folder: Path) -> dict[str, object]:
