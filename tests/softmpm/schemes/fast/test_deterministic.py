@@ -113,7 +113,7 @@ def test_units_follow_the_size_of_the_gradient_in_each_world():
 def test_a_crowd_on_one_node_does_not_overflow(dim):
     """5,000 particles in one cell, fast and of one velocity: the whole of them moves on as one."""
     place = np.random.default_rng(0).uniform(0.46, 0.54, (5000, dim))
-    body = softmpm.Body(softmpm.Particles(place, 1e-4), softmpm.FixedCorotated(density=1e3, young=1e-9))
+    body = softmpm.Body(softmpm.Particles(place, 1e-4), softmpm.NeoHookean(density=1e3, young=1e-9))
     scene = softmpm.Scene(grid=softmpm.Grid(shape=(12,) * dim, spacing=0.1), bodies=[body], dt=1e-3)
     model = softmpm.build(scene, device="cpu", deterministic=True)
     start = model.rest()

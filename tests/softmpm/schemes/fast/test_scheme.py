@@ -165,7 +165,8 @@ def test_what_new_memory_holds_leaves_no_trace(dim, deterministic, device, monke
 @pytest.mark.parametrize("scene", ["passive", "many blocks"])
 def test_fast_and_plain_agree_in(scene, device):
     """A scene without muscles and walls; more particles than a block has threads, in worlds that share a block."""
-    changes = dict(muscles=[], walls=[], gravity=None) if scene == "passive" else dict(per_law=75)
+    passive = dict(laws=("neo_hookean",), muscles=[], walls=[], gravity=None, damping=0.0)
+    changes = passive if scene == "passive" else dict(per_law=75)
     built = [
         softmpm.build(busy_scene(2, **changes), device=device, worlds=3, scheme=s, dtype=torch.float64)
         for s in ("fast", "plain")
