@@ -209,7 +209,7 @@ def test_a_seed_that_fails_is_a_row_that_says_so(main, monkeypatch, capsys):
 
 def test_a_job_that_fails_as_a_whole_is_a_row_among_older_seeds(main):
     """The outcomes of its seeds are of an earlier command: they are no longer shown as finished, here or in a summary."""
-    words = ("-m", *TINY, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
+    words = ("-m", *PLAIN, "train.seeds=2", "optimizer.policy_rate=0.01,0.02", "hydra.sweep.dir=sweep")
     assert main(*words)[0] == 0
     for path in Path("sweep/0/seed_0").glob("checkpoint*.pt"):
         path.write_bytes(b"nothing")
