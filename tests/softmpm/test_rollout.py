@@ -1,5 +1,6 @@
 """Whole rollouts against the float64 oracle, finite differences and themselves."""
 
+import dataclasses
 import itertools
 import math
 
@@ -30,6 +31,11 @@ def test_state_and_every_gradient_are_the_references(dim, laws, device, scheme):
     for name in INPUTS:
         assert wanted[name].abs().max() > 0, f"the test does not exercise {name}"
         assert_relative(found[name].cpu(), wanted[name], 1e-10, name)
+
+
+def out_of_reach(dim: int) -> softmpm.Wall:
+    """The second wall of ``busy_scene`` in a corner of the grid: the kernels are those of that scene, and nothing meets the wall."""
+    return dataclasses.replace(busy_scene(dim).walls[1], offset=-1.04)
 
 
 def special_start(model, kind: str) -> dict[str, torch.Tensor]:
@@ -77,8 +83,10 @@ POINTS = (
 @pytest.mark.parametrize("dim", [2, 3])
 def test_gradients_at_special_points(dim, law, kind, device, scheme):
     """F = I, rotations, equal stretches, det F < 0, friction at rest, cell edges, zero activation: ≤ 1e-10 each."""
-    gravity = (0.0, -9.8, 0.0)[:dim] if kind == "still under friction" else (0.3, -9.8, 0.2)[:dim]
-    walls = busy_scene(dim).walls[:1] if kind == "still under friction" else busy_scene(dim).walls
+    still = kind == "still under friction"
+    gravity = (0.0, -9.8, 0.0)[:dim] if still else (0.3, -9.8, 0.2)[:dim]
+    floor, side = busy_scene(dim).walls
+    walls = [floor, out_of_reach(dim) if still else side]
     scene = busy_scene(dim, (law,), per_law=8, gravity=gravity, walls=walls)
     off = {"inverted": {"collapse": None}, "cell edge": {"gap": None}}
     alarms = softmpm.Alarms(**off.get(kind, {}))
@@ -94,7 +102,7 @@ def test_gradients_at_special_points(dim, law, kind, device, scheme):
 
 
 def sliding_scene(dim: int) -> softmpm.Scene:
-    """A block of two materials and two muscles that slides on a rough floor: contact without chatter."""
+    """A block of two materials and two muscles that slides on a rough floor: contact without chatter. Features of ``busy_scene``."""
     count, h = (6, 4, 2)[:dim], 0.05
     lattice = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) for n in count)).numpy()
     halves = [lattice[lattice[:, 0] < 3], lattice[lattice[:, 0] >= 3]]
@@ -111,8 +119,9 @@ def sliding_scene(dim: int) -> softmpm.Scene:
             softmpm.Muscle(particles=every[: len(every) * 2 // 3], direction=up, strength=5.0),
             softmpm.Muscle(particles=every[len(every) // 3 :], direction=(1.0, 0.5, 0.2)[:dim], strength=4.0),
         ],
-        walls=[softmpm.Wall(normal=up, offset=0.31, friction=0.2)],
+        walls=[softmpm.Wall(normal=up, offset=0.31, friction=0.2), out_of_reach(dim)],
         gravity=(0.0, -9.8, 0.0)[:dim],
+        damping=0.7,
         dt=5e-4,
     )
 
