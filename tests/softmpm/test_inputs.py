@@ -29,6 +29,11 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     return softmpm.build(made, device=settings.pop("device", "cpu"), alarms=alarms, **settings)
 
 
+def scene_for(name: str) -> softmpm.Scene:
+    """:func:`full_scene` for calls that give this input alone, with driven particles where it moves them."""
+    return full_scene(2) if name in ("velocity", "position") else full_scene(2, driven=())
+
+
 def both(model: softmpm.Model, names, substeps=2, steps=STEPS):
     """Ends and gradients of ⟨weights, end⟩ by the model and by the oracle, with the leaves they belong to."""
     base, extra = busy_inputs(model, control_steps=steps), given(model, names, steps)
@@ -70,8 +75,7 @@ def test_every_input_is_the_references(dim, scheme, device):
 @pytest.mark.parametrize("name", [*GIVEN, "wall_velocity", "wall_offset", "strength", "velocity", "position"])
 def test_each_input_alone_is_the_references(name, scheme):
     """Kernels compiled for a single input: ≤ 1e-10."""
-    changes = {} if name in ("velocity", "position") else {"driven": ()}
-    model = build(full_scene(2, **changes), dtype=torch.float64, scheme=scheme, worlds=2, inputs=(name,))
+    model = build(scene_for(name), dtype=torch.float64, scheme=scheme, worlds=2, inputs=(name,))
     assert_equal(model, (name,), 1e-10)
 
 
@@ -175,7 +179,7 @@ def test_one_number_serves_every_world_and_control_step():
 @pytest.mark.parametrize("name", ["gravity", "wall_velocity", "direction", "force", "velocity"])
 def test_one_number_serves_every_component(name, formulation):
     """Along the axes of space a vector broadcasts too."""
-    model = build(full_scene(2), dtype=torch.float64, worlds=2, inputs=(name,), formulation=formulation)
+    model = build(scene_for(name), dtype=torch.float64, worlds=2, inputs=(name,), formulation=formulation)
     shape, params, found = model.shape_of(name, 1), model.params(), []
     activation = torch.full((1, 2, model.muscle_count), 0.3, dtype=torch.float64)
     number = torch.tensor(0.02, dtype=torch.float64, requires_grad=True)
