@@ -2,7 +2,7 @@
 
     python docs/results/collect.py NAME FOLDER...
 
-A row for each run. `comparison.py` and `twenty.py` print what docs/results.md has of them, `draw.py` draws it.
+A row for each run. `comparison.py`, `twenty.py` and `phases.py` print what docs/results.md has of them, `draw.py` draws it.
 """
 
 import csv
@@ -10,7 +10,13 @@ import math
 import sys
 from pathlib import Path
 
-JOBS = {"design": "design", "clock": "policy.clock", "observer": "observer"}
+JOBS = {
+    "design": "design",
+    "clock": "policy.clock",
+    "observer": "observer",
+    "every": "learning.every",
+    "target_rate": "learning.target_rate",
+}
 """Settings that tell apart the jobs of a sweep."""
 COLUMNS = {"best": "loss", "iteration": "iteration", "end": "end"}
 """Columns of every table, and those of sweep.csv that they are."""
