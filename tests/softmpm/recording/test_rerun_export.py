@@ -88,13 +88,13 @@ def test_particles_are_shown_twice(tmp_path, dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_strokes_show_the_fibres(tmp_path, dim):
-    """Along the axis x of the muscle, in every frame where its particles are; a pressure has none."""
+    """Along the axis x of the muscle, as far as it goes, in every frame where its particles are; a pressure has none."""
     rrd = softmpm.to_rerun(make(tmp_path / "run.h5", dim))
     parts = read(rrd, "/scene/robot/fibres")
     ends = np.array([frame for part in parts for frame in part[f"LineStrips{dim}D:strips"].to_pylist()])
     assert ends.shape[0] == 6 and ends.shape[2:] == (2, dim)
     along = ends[0, :, 1] - ends[0, :, 0]
-    assert len(along) and np.allclose(along, along.max() * np.eye(dim)[0], atol=1e-6)
+    assert len(along) and (along[:, 0] > 0.01).all() and np.allclose(along[:, 1:], 0.0, atol=1e-6)
     want = [0.0, 0.01, 0.02, 0.01, 0.02, 0.03]  # of each frame the way since the first
     assert np.allclose(ends - ends[0], np.reshape(want, (6, 1, 1, 1)), atol=1e-6)
 
