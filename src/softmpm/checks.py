@@ -65,14 +65,19 @@ def check_state(model: Sizes, state: State) -> None:
     shapes = {"x": (*lead, d), "v": (*lead, d), "C": (*lead, d, d), "F": (*lead, d, d)}
     for name in shapes:
         check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
+    for name, kind in (("low", Low), ("nodes", Nodal), ("surface", SurfaceState)):
+        part = getattr(state, name)
+        if not (part is None or isinstance(part, kind)):
+            raise TypeError(
+                f"state.{name} must be a softmpm.{kind.__name__} or None, got {type(part).__name__}; "
+                "state.of_worlds(...) takes some worlds of a state."
+            )
     if state.nodes is not None:
         _check_nodes(model, state.nodes)
     if state.surface is not None:
         _check_surface(model, state.surface)
     if state.low is None:
         return
-    if not isinstance(state.low, Low):
-        raise TypeError(f"state.low must be a softmpm.Low or None, got {type(state.low).__name__}.")
     if model.dtype != torch.float32:
         raise ValueError(
             f"state.low must be None in {model.dtype}, which has room for these remainders in x and F; take state.to({model.dtype}), "

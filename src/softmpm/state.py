@@ -181,6 +181,16 @@ class State(NamedTuple):
             return moved
         return moved._replace(x=moved.x + moved.low.x, F=moved.F + moved.low.F, low=None)
 
+    def of_worlds(self, worlds: slice | Sequence[int] | Tensor) -> "State":
+        """The state of some worlds, nodes and surface points included: a slice, or numbers or a mask of worlds. Differentiable."""
+
+        def some(part: Any) -> Any:
+            if isinstance(part, Tensor):
+                return part[worlds]
+            return type(part)(*(None if tensor is None else tensor[worlds] for tensor in part))
+
+        return self._each(some)
+
     def _each(self, change: Callable[[Any], Any]) -> "State":
         x, v, C, F = (change(tensor) for tensor in self[:4])
         others = (None if part is None else change(part) for part in self[4:])

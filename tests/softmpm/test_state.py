@@ -114,3 +114,36 @@ def test_low_must_be_low_order_parts(model):
         softmpm.simulate(model, rest._replace(low=rest.x), None, model.params(), substeps=1)
     with pytest.raises(TypeError, match="state must be a softmpm.State, got tuple"):
         softmpm.simulate(model, tuple(rest), None, model.params(), substeps=1)
+
+
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+def test_some_worlds_go_on_alone(formulation):
+    """In a model of their own, with friction that adheres: the bits that they have among the others, and their gradient."""
+    box = softmpm.box((0.3, 0.2), (0.5, 0.4), spacing=0.05)
+    body = softmpm.Body(box, softmpm.NeoHookean(density=1.0, young=100.0, viscosity=0.2))
+    floor = softmpm.Wall(normal=(0.0, 1.0), offset=0.2, friction=0.5)
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(12, 12), spacing=0.1),
+        bodies=[body],
+        walls=[floor],
+        gravity=(1.0, -9.8),
+        dt=1e-3,
+    )
+    many, two = (softmpm.build(scene, device="cpu", worlds=n, formulation=formulation) for n in (4, 2))
+    rest = many.rest()
+    speed = torch.linspace(0.0, 0.3, 4).view(4, 1, 1).requires_grad_()
+    params = many.params()
+    state = softmpm.simulate(many, rest._replace(v=rest.v + speed), None, params, substeps=20)
+    end = softmpm.simulate(many, state, None, params, substeps=20)
+    for worlds in (slice(1, 4, 2), [1, 3], torch.tensor([False, True, False, True])):
+        alone = softmpm.simulate(two, state.of_worlds(worlds), None, params, substeps=20)
+        for got, want in zip(
+            _pytree.tree_leaves(alone), _pytree.tree_leaves(end.of_worlds(worlds)), strict=True
+        ):
+            assert got is want is None or torch.equal(got, want)
+    (slope,) = torch.autograd.grad(alone.x[..., 0].sum(), speed, retain_graph=True)
+    (among,) = torch.autograd.grad(end.x[[1, 3], :, 0].sum(), speed)
+    torch.testing.assert_close(slope, among)
+    cut = softmpm.State(*(None if part is None else part[1:3] for part in state))
+    with pytest.raises(TypeError, match=r"got tuple; state.of_worlds\(...\) takes some worlds"):
+        softmpm.simulate(two, cut._replace(low=None), None, params, substeps=1)
