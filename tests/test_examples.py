@@ -77,8 +77,9 @@ def test_the_reference_has_every_public_name():
     assert sorted(names) == sorted(softmpm.__all__)
 
 
-def test_the_code_on_quantities_runs():
+def test_the_code_on_quantities_runs(tmp_path, monkeypatch):
     """A block that falls for 40 ms is 8 mm lower; a body that nothing holds is not strained."""
+    monkeypatch.chdir(tmp_path)
     names: dict = {}
     for code in re.findall(r"```python\n(.*?)```", QUANTITIES.read_text(), re.DOTALL):
         exec(code, names)
@@ -90,6 +91,7 @@ def test_the_code_on_quantities_runs():
     assert frames.shape == (10, 1, 2)
     assert abs(frames[-1] - softmpm.center_of_mass(model, end, names["params"])).max() < 1e-6
     assert abs(names["alone"].x - end.x).max() < 1e-6  # one of four worlds, in two calls
+    assert torch.equal(names["resumed"].x, names["state"].x)
 
 
 def test_the_code_on_shapes_runs(capsys):

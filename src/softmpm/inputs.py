@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 
@@ -47,6 +48,9 @@ class Inputs(NamedTuple):
     at a constant velocity. In place of ``velocity``."""
     force: Tensor | None = None
     """External force on each particle [N], shape (control_step, world, particle, dim)."""
+
+
+torch.serialization.add_safe_globals([Inputs])  # torch.load reads them with weights_only=True
 
 
 @dataclass(frozen=True, kw_only=True)

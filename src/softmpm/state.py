@@ -269,3 +269,8 @@ class ContactForces(NamedTuple):
 
     def __repr__(self) -> str:
         return _text(self)
+
+
+torch.serialization.add_safe_globals(
+    [State, Low, Nodal, SurfaceState, Params]
+)  # torch.load reads them with weights_only=True

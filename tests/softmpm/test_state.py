@@ -116,6 +116,25 @@ def test_low_must_be_low_order_parts(model):
         softmpm.simulate(model, tuple(rest), None, model.params(), substeps=1)
 
 
+def test_a_checkpoint_of_a_loop(moved, tmp_path):
+    """``torch.load`` reads with ``weights_only=True``, its default, what ``torch.save`` wrote: every part, and nothing but tensors."""
+    nodes = softmpm.Nodal(*(moved.v + k for k in range(4)))
+    state = moved._replace(nodes=nodes, surface=softmpm.SurfaceState(moved.x, moved.v))
+    content = {
+        "state": state,
+        "params": softmpm.Params(*moved.low, moved.x),
+        "inputs": softmpm.Inputs(gravity=moved.v),
+    }
+    torch.save(content, tmp_path / "loop.pt")
+    read = torch.load(tmp_path / "loop.pt", weights_only=True)
+    assert_same(read["state"], state)
+    assert {key: type(value) for key, value in read.items()} == {
+        key: type(value) for key, value in content.items()
+    }
+    for got, want in zip(_pytree.tree_leaves(read), _pytree.tree_leaves(content), strict=True):
+        assert got is want is None or torch.equal(got, want)
+
+
 @pytest.mark.parametrize("formulation", ["moving", "reference"])
 def test_some_worlds_go_on_alone(formulation):
     """In a model of their own, with friction that adheres: the bits that they have among the others, and their gradient."""
