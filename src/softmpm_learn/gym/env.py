@@ -32,6 +32,7 @@ class SoftRobotEnv(gymnasium.Env):
 
     Attributes:
         terminated, truncated: Flags of the last step, for users of :meth:`step_torch`.
+        worlds: The simulation; its ``params`` and ``inputs`` may be replaced when an episode begins (docs/gym.md).
     """
 
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012  (gymnasium's own declaration)

@@ -31,6 +31,7 @@ class SoftRobotVectorEnv(VectorEnv):
 
     Attributes:
         terminated, truncated: Flags of the last step, shape (num_envs,), for users of :meth:`step_torch`.
+        worlds: The simulation; its ``params`` and ``inputs`` may be replaced when an episode begins (docs/gym.md).
     """
 
     def __init__(

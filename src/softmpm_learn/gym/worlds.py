@@ -80,6 +80,9 @@ class Worlds:
     Attributes:
         model: Model of all worlds.
         size: Numbers in an observation.
+        params: Material, read in every step; shapes that broadcast to (world, particle).
+        inputs: Inputs, read in every step: those of ``conf.body``, for which the model was built.
+        state: State after the last step, that of :func:`softmpm.contact_forces`; ``shown`` has the particles after a reset too.
     """
 
     def __init__(self, task: Task, count: int, conf: EnvConf):
