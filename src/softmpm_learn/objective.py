@@ -303,9 +303,8 @@ class Objective:
 
     def __call__(self, path: Path) -> dict[str, Tensor]:
         """Each term with its weight, shape (world,), by its name; the loss is their sum."""
-        return {
-            name: term.weight * term.value(path) for name, term in zip(self.names, self.terms, strict=True)
-        }
+        values = [term.weight * term.value_of_each_world(path) for term in self.terms]
+        return dict(zip(self.names, values, strict=True))
 
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         """Outcome of the first term that has one, in words."""

@@ -97,6 +97,21 @@ class Term(Placed, ABC):
             path: All of the episode; the term counts what lies in its :meth:`window`.
         """
 
+    def value_of_each_world(self, path: Path) -> Tensor:
+        """The value, shape (world,).
+
+        Raises:
+            ValueError: It has another shape. One number for all would add to the loss of each world, and to the gradients of others.
+        """
+        value, wanted = self.value(path), tuple(path.states[0].x.shape[:1])
+        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        if got != wanted:
+            raise ValueError(
+                f"the value of the objective's term {self.name} must be a tensor of shape (world,) = {wanted}, a number for each "
+                f"world, got {got}; path.x has the axes (state, world, particle, dim)."
+            )
+        return value
+
     @property
     def name(self) -> str:
         """Column of metrics.csv."""

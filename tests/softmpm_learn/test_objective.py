@@ -1,6 +1,7 @@
 """Terms of objectives: values by hand, windows, names, and one that a user writes."""
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,6 +206,21 @@ def test_a_term_of_a_user(path):
 
     (got,) = Objective(Spread(weight=2.0, begin=1.5))(path).values()
     torch.testing.assert_close(got, 2.0 * path.x[3:].var(dim=2).sum(dim=-1).mean(dim=0))
+
+
+@pytest.mark.parametrize("axes, got", [((0, 1, 2, 3), "()"), ((2, 3), "(5, 2)"), ((0, 2), "(2, 2)")])
+def test_a_value_that_is_not_one_number_for_each_world(path, axes, got):
+    """It would be broadcast, so that each world counts what others do; also where it is the term of a constraint."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Broad(Term):
+        def value(self, path: Path) -> Tensor:
+            return path.x[self.window(path)].mean(dim=axes)
+
+    for term in (Broad(), AtMost(term=Broad(), most=0.0)):
+        rule = rf"term {term.name} must be a tensor of shape \(world,\) = \(2,\).* got {re.escape(got)};"
+        with pytest.raises(ValueError, match=rule):
+            Objective(Effort(), term)(path)
 
 
 def test_a_value_of_ones_own_declares_how_it_adds_up():

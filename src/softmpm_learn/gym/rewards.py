@@ -108,7 +108,7 @@ class Costs:
         for term, share in shares:
             if np.any(share):
                 factor = torch.as_tensor(term.weight * np.asarray(share), device=like.device).to(like.dtype)
-                total = total + factor * term.value(path)
+                total = total + factor * term.value_of_each_world(path)
         return total
 
     def _value(self, motions: list[tuple[Tensor, Path]]) -> Tensor:
@@ -117,7 +117,8 @@ class Costs:
         for worlds, path in motions:
             for term, states in self.wholes:
                 if len(path.states) >= states:
-                    total = total.index_add(0, worlds, (term.weight * term.value(path)).to(total.dtype))
+                    value = term.weight * term.value_of_each_world(path)
+                    total = total.index_add(0, worlds, value.to(total.dtype))
         return total
 
     def detach(self) -> None:
