@@ -52,6 +52,14 @@ class EnvConf:
         if not (math.isfinite(self.kick) and self.kick >= 0):
             raise ValueError(f"kick must be ≥ 0, got {self.kick}.")
         lengths("goal_spread", self.goal_spread)
+        body: Any = self.body
+        parts = [type(part) for part in body] if type(body) is tuple else None
+        if not (body is None or parts == [Params, Inputs]):
+            kind = type(body).__name__
+            got = kind if parts is None else f"{kind} of {', '.join(part.__name__ for part in parts)}"
+            raise TypeError(
+                f"body must be a pair of softmpm.Params and softmpm.Inputs, such as (params, softmpm.Inputs()), got {got}."
+            )
 
 
 class Outcome(NamedTuple):
@@ -161,7 +169,12 @@ class Worlds:
 
     def observe(self) -> Tensor:
         """Features and, if it is drawn at random, the goal in [-1, 1] along each axis of its box; shape (world, size)."""
-        features = self.observer(self.model, self.shown)
+        features, wanted = self.observer(self.model, self.shown), (self.count, self.observer.size)
+        if features.shape != wanted:
+            raise ValueError(
+                f"the observer must return features of shape (world, size) = {wanted}, got {tuple(features.shape)}; size is an "
+                f"attribute of {type(self.observer).__name__}."
+            )
         if self.goal is None:
             return features
         inverse = torch.where(self._spread > 0, 1 / self._spread, 0.0)
