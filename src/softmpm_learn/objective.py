@@ -24,7 +24,7 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
-from softmpm_learn.term import Path, Sum, Term
+from softmpm_learn.term import Path, Sum, Term, check_terms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,6 +289,7 @@ class Objective:
     terms: tuple[Term, ...]
 
     def __init__(self, *terms: Term):
+        check_terms(terms)
         object.__setattr__(self, "terms", terms)
 
     @property

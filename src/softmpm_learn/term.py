@@ -151,3 +151,24 @@ class Term(Placed, ABC):
     def outcome(self, x: np.ndarray, body_length: float) -> str:
         """Outcome in words, from the positions of a recorded episode, shape (frame, particle, dim); or nothing."""
         return ""
+
+
+def check_terms(terms: Sequence[Any]) -> None:
+    """Terms of an objective: one or more, each with a finite weight.
+
+    Raises:
+        TypeError: One is not a term, such as a list of terms, or the class of one.
+        ValueError: There is none, or a weight is not finite.
+    """
+    if not terms:
+        raise ValueError("an objective needs a term, such as Objective(Progress()).")
+    for term in terms:
+        if not isinstance(term, Term):
+            got = f"the class {term.__name__}" if isinstance(term, type) else type(term).__name__
+            raise TypeError(
+                f"an objective takes terms one by one, such as Objective(Progress(), Effort()), got {got}."
+            )
+        if not math.isfinite(term.weight):
+            raise ValueError(
+                f"the weight of the objective's term {term.name} must be finite, got {term.weight}."
+            )

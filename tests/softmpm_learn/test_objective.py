@@ -196,6 +196,17 @@ def test_an_objective_is_the_sum_of_its_terms(path):
     torch.testing.assert_close(parts["progress_2"], 0.5 * Progress(axis=1).value(path))
 
 
+def test_what_is_no_objective():
+    """Without terms, with a list or a class in place of terms, or with a weight that is no number: refused when it is made."""
+    with pytest.raises(ValueError, match=r"an objective needs a term, such as Objective\(Progress\(\)\)"):
+        Objective()
+    for terms, got in ((([Effort()],), "list"), ((Progress(), Effort), "the class Effort")):
+        with pytest.raises(TypeError, match=rf"terms one by one, .*, got {got}\."):
+            Objective(*terms)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="weight of the objective's term effort must be finite, got nan"):
+        Objective(Progress(), Effort(weight=math.nan))
+
+
 def test_a_term_of_a_user(path):
     """A frozen dataclass with a value."""
 
