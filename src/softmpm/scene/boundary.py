@@ -87,14 +87,18 @@ def polygon_outline(polygons: Sequence[np.ndarray], spacing: float, corner: floa
 
 
 def _from_above(polygon: np.ndarray) -> np.ndarray:
-    """The polygon from the highest place halfway between its left and right ends, which its mirror image shares."""
-    ahead, (left, right) = np.roll(polygon, -1, axis=0), (polygon[:, 0].min(), polygon[:, 0].max())
-    before, after = polygon[:, 0] - (left + right) / 2, ahead[:, 0] - (left + right) / 2
-    across = np.flatnonzero((before > 0) != (after > 0))
-    share = before[across] / (before[across] - after[across])
-    places = polygon[across] + share[:, None] * (ahead - polygon)[across]
+    """The polygon from the highest place halfway between its left and right ends, which its mirror image shares.
+
+    An edge may lie along the middle, up to rounding: of its two ends the upper one counts.
+    """
+    x, (left, right) = polygon[:, 0], (polygon[:, 0].min(), polygon[:, 0].max())
+    before = np.where(np.abs(2 * x - left - right) > 1e-9 * (right - left), x - (left + right) / 2, 0.0)
+    after = np.roll(before, -1)
+    met = np.flatnonzero(np.sign(before) != np.sign(after))
+    share = before[met] / (before[met] - after[met])
+    places = polygon[met] + share[:, None] * (np.roll(polygon, -1, axis=0) - polygon)[met]
     top = places[:, 1].argmax()
-    return np.concatenate([places[top : top + 1], np.roll(polygon, -across[top] - 1, axis=0)])
+    return np.concatenate([places[top : top + 1], np.roll(polygon, -met[top] - 1, axis=0)])
 
 
 def _turns(polygon: np.ndarray) -> np.ndarray:

@@ -122,6 +122,17 @@ def test_a_polygon_without_corners_keeps_its_mirror_symmetry(first):
     np.testing.assert_allclose(outline.areas[other], outline.areas, rtol=1e-12)
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-17, -1e-17])
+def test_an_edge_along_the_middle_keeps_the_mirror_symmetry(off):
+    """Two steps, mirror images of each other, whose riser lies halfway between their ends, up to rounding."""
+    step = np.array([(-1.0, 0.0), (1.0, 0.0), (1.0, 1.0), (off, 1.0), (-off, 2.0), (-1.0, 2.0)])
+    outline = polygon_outline([step - (2.0, 0.0), (step * (-1, 1) + (2.0, 0.0))[::-1]], 0.13)
+    assert outline is not None
+    left, right = np.split(outline.points, 2)
+    apart = np.linalg.norm(left[:, None] - right * (-1, 1), axis=2)
+    assert apart.min(axis=1).max() < 1e-12
+
+
 def test_polygon_converges():
     """Perimeter and area of a fine polygon around a circle tend to its own with spacing²."""
     t = np.linspace(0, 2 * np.pi, 10_000, endpoint=False)
