@@ -64,25 +64,26 @@ def merge_slivers(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and volumes of the parts of a lattice of ``count`` cells, shape (prod(count),); slivers join a neighbour.
 
-    Volume and centre of mass are preserved. Among neighbours that are equally full the nearest is taken. A sliver without a
-    neighbour that is none stays, as in sheets thinner than that.
+    Volume and centre of mass are preserved. Among neighbours that are equally full the nearest is taken; equally near ones share the
+    sliver, which keeps shapes symmetric. A sliver without a neighbour that is none stays, as in sheets thinner than that.
     """
     dim = len(count)
     shape = tuple(int(n) + 2 for n in count)  # with an empty cell around, so that all have neighbours
     inner = np.arange(np.prod(shape)).reshape(shape)[(slice(1, -1),) * dim].ravel()
     full, place = np.zeros(np.prod(shape)), np.zeros((np.prod(shape), dim))
     full[inner], place[inner] = np.where(share > NOTHING, share, 0.0), centroid
-    sliver = np.flatnonzero((full > 0) & (full < SLIVER))
+    small = np.round(full, 9) < SLIVER  # whatever its rounding
+    sliver = np.flatnonzero((full > 0) & small)
     steps = np.array([step for step in product((-1, 0, 1), repeat=dim) if any(step)])
     near = sliver[:, None] + steps @ np.array([np.prod(shape[axis + 1 :], dtype=int) for axis in range(dim)])
     apart = np.linalg.norm(place[near] - place[sliver, None], axis=2) / spacing
-    merit = np.where(full[near] < SLIVER, -np.inf, np.round(full[near], 6) - 1e-7 * apart)
-    found = np.isfinite(merit.max(axis=1, initial=-np.inf))
-    target = near[np.arange(len(sliver)), merit.argmax(axis=1)][found]
-    gone = sliver[found]
+    merit = np.where(small[near], -np.inf, np.round(full[near], 6) - 1e-7 * apart)
+    best = merit.max(axis=1, initial=-np.inf, keepdims=True)
+    chosen = np.isfinite(best) & (merit >= best - 1e-13)
+    part = chosen / np.maximum(chosen.sum(axis=1, keepdims=True), 1)
     moment = place * full[:, None]
-    np.add.at(moment, target, moment[gone])
-    np.add.at(full, target, full[gone])
-    full[gone] = 0.0
+    np.add.at(moment, near, part[:, :, None] * moment[sliver, None])
+    np.add.at(full, near, part * full[sliver, None])
+    full[sliver[chosen.any(axis=1)]] = 0.0
     kept = np.flatnonzero(full)
     return moment[kept] / full[kept, None], full[kept] * spacing**dim

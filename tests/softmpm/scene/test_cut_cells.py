@@ -62,6 +62,15 @@ def test_nearest_of_equal_neighbours():
     np.testing.assert_allclose(positions[:, 0], [0, 1, 2], atol=1e-15)
 
 
+def test_equal_neighbours_share_a_sliver():
+    """Between two full cells a sliver joins each by halves; one at the limit is none on either side, whatever its rounding."""
+    share = np.array([1.0, 0.2, 1.0, 0.0, SLIVER - 1e-15, 1.0, SLIVER + 1e-15])
+    centroid = np.stack([np.arange(7.0), np.zeros(7)], axis=1)
+    positions, volume = merge_slivers(share, centroid, np.array((7, 1)), 1.0)
+    np.testing.assert_allclose(volume, [1.1, 1.1, SLIVER, 1.0, SLIVER])
+    np.testing.assert_allclose(positions[:, 0], [0.1 / 1.1, 2 - 0.1 / 1.1, 4, 5, 6])
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (1.0, 0.5, 0.7)])
 def test_ball(dim, stretch):
