@@ -15,7 +15,7 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from softmpm_learn import plugins
 from softmpm_learn.command import seeds
@@ -160,7 +160,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
     try:
         with group.fail_together():
             conf, hydra_config = to_run(config), HydraConfig.get()
-            conf.command_line = asked(config, hydra_config.overrides.task)
+            conf.command_line = asked(hydra_config.overrides.task)
             conf.files = plugins.files()
             sweeps, begun = hydra_config.mode == RunMode.MULTIRUN, (out / "config.yaml").exists()
             if conf.resume is not None:
@@ -233,14 +233,11 @@ def _key(text: str) -> str:
     return text.lstrip("+~").partition("=")[0]
 
 
-def asked(config: DictConfig, overrides: Sequence[str]) -> list[str]:
-    """Settings on the command line, without the folder to resume. One that refers to others has its value: a saved configuration has no
-    references.
+def asked(overrides: Sequence[str]) -> list[str]:
+    """Settings on the command line, without the folder to resume. Those that refer to others have their values, which Hydra's list of
+    them gives: a saved configuration has no references.
     """
-    pairs = ((_key(text), text) for text in overrides)
-    return [
-        f"{k}={OmegaConf.select(config, k)}" if "${" in text else text for k, text in pairs if k != "resume"
-    ]
+    return [text for text in overrides if _key(text) != "resume"]
 
 
 def resumed(conf: RunConf, overrides: Sequence[str]) -> RunConf:

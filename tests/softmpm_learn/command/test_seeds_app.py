@@ -178,7 +178,7 @@ def test_a_job_that_is_resumed_keeps_its_number_and_settings(main):
 def test_a_run_that_is_resumed_before_a_seed_ended_has_its_settings(main, monkeypatch, caplog):
     """Its rows have those of an unbroken run, with what was changed and the value of one that referred to another. The line on the
     table says that only seeds that have ended have a row."""
-    real, words = experiment.train_side_by_side, [*PLAIN, "train.save_every=${train.iterations}"]
+    real, words = experiment.train_side_by_side, [*PLAIN, "train.goal_spread=[0.1,${train.iterations}]"]
     with monkeypatch.context() as patch, caplog.at_level("INFO", logger="softmpm_learn"):
         patch.setattr(
             experiment, "train_side_by_side", lambda *a, **k: real(*a, **k | {"stop": lambda: True})
@@ -186,7 +186,7 @@ def test_a_run_that_is_resumed_before_a_seed_ended_has_its_settings(main, monkey
         assert main(*words, "train.seeds=2", "hydra.run.dir=all")[0] == 0
     assert "a folder in all; those that have ended have a row in all/sweep.csv." in caplog.text
     assert main("resume=all", "train.side_by_side=3")[0] == 0
-    known = " ".join([*PLAIN, "train.save_every=2", "train.side_by_side=3"])
+    known = " ".join([*PLAIN, "train.goal_spread=[0.1,2]", "train.side_by_side=3"])
     assert [row["settings"] for row in rows(Path("all/sweep.csv"))] == [
         f"{known} train.seed={k}" for k in range(2)
     ]
