@@ -41,7 +41,7 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
     warn_of_thin_limbs(conf, whole[cut], pixel)
     stiffnesses = sorted({part.stiffness for part in parts if part.mask.any()})
     owners = [_owners(parts, stiffness)[cut] for stiffness in stiffnesses]
-    shapes = _shapes(conf, owners, pixel)
+    shapes = _shapes(conf, parts, owners, pixel)
     of = np.concatenate(
         [_nearest(owner, shape.positions / pixel) for owner, shape in zip(owners, shapes, strict=True)]
     )
@@ -72,22 +72,34 @@ def _nearest(owner: np.ndarray, places: np.ndarray) -> np.ndarray:
     return owner[tuple(near[:, row, column])]
 
 
-def _shapes(conf: OwnConf, owners: Sequence[np.ndarray], pixel: float) -> list[softmpm.Particles]:
+def _shapes(
+    conf: OwnConf, parts: Sequence[Part], owners: Sequence[np.ndarray], pixel: float
+) -> list[softmpm.Particles]:
     """Shape of each body. Where cells are not cut, a particle of the whole robot belongs to the body that covers most of its cell, of
     equal ones to the first: each body by itself would have one in a cell that two cover by halves, and none in a third of a cell.
+
+    Raises:
+        ValueError: No particle belongs to a body.
     """
     masks, cut_cells = [owner >= 0 for owner in owners], conf.on_surface or conf.formulation == "reference"
 
-    def filled(mask: np.ndarray) -> softmpm.Particles:
+    def filled(mask: np.ndarray, cut_cells: bool) -> softmpm.Particles:
         height = len(mask) * pixel
         return softmpm.image(mask, (0.0, 0.0), height=height, spacing=conf.spacing / 2, cut_cells=cut_cells)
 
-    shapes = [filled(mask) for mask in masks]
+    shapes = [filled(mask, cut_cells=True) for mask in masks]
     if cut_cells:
         return shapes
-    whole = filled(np.any(masks, axis=0))
+    whole = filled(np.any(masks, axis=0), cut_cells=False)
     places, width = whole.positions / pixel, 0.5 * conf.spacing / pixel
     of = np.argmax([_coverage(mask, places, width).round(6) for mask in masks], axis=0)
+    for k, owner in enumerate(owners):
+        if not (of == k).any():
+            names = ", ".join(parts[part].name for part in np.unique(owner[owner >= 0]))
+            raise ValueError(
+                f"{names} of {conf.file}: no cell of {conf.spacing / 2:.3g} m belongs mostly to this stiffness, so that it has no "
+                "particle. Draw it larger, or increase task.size or task.cells."
+            )
     return [
         softmpm.Particles(whole.positions[of == k], np.asarray(whole.volume)[of == k], shape.outline)
         for k, shape in enumerate(shapes)

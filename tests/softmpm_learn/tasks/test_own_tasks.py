@@ -216,6 +216,23 @@ def test_a_cell_that_three_bodies_share_by_thirds_is_one_particle(folder):
     )
 
 
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_stiff_part_smaller_than_a_particle_is_named(folder, rows):
+    """Where nodes meet the floor: one with half of its only cell or less has no particle; with more than half it has that one."""
+    pixels = np.full((16, 40, 3), (255, 0, 0), dtype=np.uint8)
+    pixels[4 : 4 + rows, 8:12] = (32, 32, 32)
+    Image.fromarray(pixels).save("dot.png")
+    legend = dict(red=dict(colour="#ff0000", muscle=True), dot=dict(colour="#202020", stiffness=10.0))
+    conf = ImageConf(file="dot.png", size=0.2, cells=25, contact="nodes", legend=legend)
+    if rows < 3:
+        with pytest.raises(
+            ValueError, match=r"dot of .*dot.png: no cell of 0.02 m .* increase task.size or task.cells"
+        ):
+            make_task(conf)
+    else:
+        assert [len(body.particles) for body in make_task(conf).scene.bodies] == [39, 1]
+
+
 def test_a_limb_thinner_than_two_cells_is_named(folder, caplog):
     """Legs of 30 mm on cells of 12.5 mm are not; others are, with their width and the cells of which it has four."""
     for conf in (ImageConf(file="robot.png", size=0.2), VoxelsConf(file="robot.npy")):
