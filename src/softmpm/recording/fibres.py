@@ -4,6 +4,7 @@ import numpy as np
 
 from softmpm.recording.surroundings import Surroundings, of_scene
 from softmpm.scene.scene import Scene
+from softmpm.validate import need
 
 STROKES = 24
 """Number of strokes that follow each other along the longest side of a picture."""
@@ -28,9 +29,18 @@ def fibre_strokes(scene: Scene, positions: np.ndarray, gap: float) -> tuple[np.n
     Returns:
         Both ends of each stroke [m], shape (stroke, 2, dim), not finite where particles around are not, and the particle in its middle,
         shape (stroke,).
+
+    Raises:
+        ValueError: The gap is not above 0, or positions are not those of the scene's particles.
     """
-    fibres = Fibres(of_scene(scene), gap)
-    return fibres.ends(np.asarray(positions, float)), fibres.particle
+    place, x = of_scene(scene), np.asarray(positions, float)
+    need(np.isfinite(gap) and gap > 0, f"gap must be > 0 m, got {gap}; good: a tenth of the robot.")
+    need(
+        x.shape == place.rest.shape,
+        f"positions are those of one world, shape {place.rest.shape}, but have shape {x.shape}; take x[0] of a state.",
+    )
+    fibres = Fibres(place, gap)
+    return fibres.ends(x), fibres.particle
 
 
 class Fibres:

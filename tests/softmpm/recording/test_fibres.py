@@ -97,6 +97,22 @@ def test_strokes_end_with_the_muscle():
     np.testing.assert_allclose(x, 0.05 * np.sin(20.0 * y), atol=2.5e-3)
 
 
+@pytest.mark.parametrize("gap", [0.0, -0.1, math.nan, math.inf])
+def test_strokes_need_a_distance(gap):
+    """Which was divided by, or gave a stroke that points backwards."""
+    scene = scene_of(2)
+    with pytest.raises(ValueError, match="gap must be > 0 m, got "):
+        softmpm.fibre_strokes(scene, scene.bodies[0].particles.positions, gap)
+
+
+def test_strokes_need_the_positions_of_one_world(model):
+    """The error says how a state has them."""
+    x = model.rest().x
+    with pytest.raises(ValueError, match=r"shape \(144, 2\), but have shape \(1, 144, 2\); take x\[0\]"):
+        softmpm.fibre_strokes(model.scene, x, 0.05)
+    assert len(softmpm.fibre_strokes(model.scene, x[0], 0.05)[1]) > 2
+
+
 def test_a_row_of_particles_has_strokes_across_it():
     """Where neighbours lie on one line, they tell nothing of the fibre across, which stays as at rest."""
     scene = scene_of(2)
