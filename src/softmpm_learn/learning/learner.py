@@ -27,7 +27,8 @@ class Learner:
         # It stores the moments between phases; within one they are in the lock step:
         self.optimizer = torch.optim.Adam(autoencoder.parameters(), lr=conf.rate)
         self.target = TargetNetwork(autoencoder.encoder) if conf.target_network else None
-        self.phases = 0
+        self.phases, self.name = 0, ""
+        """Learning phases done, and the name of its run among those beside it."""
         self.workspace: object = None
         """Kept by a learning phase for the next one: the tensors and the CUDA graph for this learner and those beside it."""
 

@@ -24,6 +24,7 @@ class EarlyStopping:
         loss: Validation loss before the first epoch.
         validates: False if nothing is held out yet: early stopping then allows ``conf.patience`` epochs, because more would fit the
             few pictures of the beginning alone.
+        name: That of the run among those beside it, for the log.
 
     Attributes:
         epochs: Epochs that were run.
@@ -32,8 +33,8 @@ class EarlyStopping:
         validation: Loss of the weights to go back to; nan if nothing is held out.
     """
 
-    def __init__(self, conf: LearningConf, loss: float, validates: bool):
-        self.stops = conf.early_stopping and validates
+    def __init__(self, conf: LearningConf, loss: float, validates: bool, name: str = ""):
+        self.name, self.stops = name, conf.early_stopping and validates
         self.most = min(conf.epochs, conf.patience) if conf.early_stopping and not validates else conf.epochs
         self.conf, self.validates = conf, validates
         self.training = math.nan
@@ -50,7 +51,9 @@ class EarlyStopping:
         self.epochs, self.training, self._finite = self.epochs + 1, training, finite
         if not finite:
             logger.warning(
-                "The autoencoder's weights are not finite after epoch %d; going back.", self.epochs
+                "The weights of the autoencoder%s are not finite after epoch %d; going back.",
+                f" of {self.name}" if self.name else "",
+                self.epochs,
             )
             return False
         better = not self.stops or validation < self.validation
@@ -110,7 +113,7 @@ def _train(learners: Sequence[Learner], capture: bool) -> list[EarlyStopping]:
         lockstep = learners[0].workspace = LockStep(learners, capture)
     lockstep.load(learners)
     stops = [
-        EarlyStopping(learner.conf, loss, validates=len(learner.replay.places("validation")) > 0)
+        EarlyStopping(learner.conf, loss, len(learner.replay.places("validation")) > 0, learner.name)
         for learner, loss in zip(learners, lockstep.validation_losses(), strict=True)
     ]
     while not all(stop.done for stop in stops):

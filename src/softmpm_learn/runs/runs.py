@@ -48,6 +48,8 @@ class Runs:
         if len(runs) > 1:
             for k, run in enumerate(runs):
                 run.name = self.name(k)
+                if run.learner is not None:
+                    run.learner.name = run.name
             about = self.share, self._resting
             self._together = Observers(runs, self.share), Policies(runs, *about), Designs(runs, *about)
             self.observer, self.policy, self.design = self._together

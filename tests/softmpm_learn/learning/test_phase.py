@@ -144,9 +144,9 @@ CONTENTS = (
 
 
 @pytest.mark.parametrize("variational", [True, False])
-def test_together_each_learns_what_it_learns_alone(tmp_path, variational):
+def test_together_each_learns_what_it_learns_alone(tmp_path, variational, caplog):
     """Learners with other pictures, held-out pictures in other numbers, other seeds and other ends, one of them not finite: figures,
-    weights, moments, targets and random streams of two phases are those of single phases."""
+    weights, moments, targets and random streams of two phases are those of single phases; the log names the spoilt one."""
     conf = LearningConf(
         epochs=12, batches=3, batch=5, rate=1e-2, patience=4, improvement=0.0, variational=variational
     )
@@ -157,6 +157,7 @@ def test_together_each_learns_what_it_learns_alone(tmp_path, variational):
             for k, content in enumerate(CONTENTS)
         ]
         spoil(learners[2], 2, math.nan)
+        learners[2].name = f"seed 5 {name}"
         learners[2].autoencoder.standardise = lambda pictures, quiet: None  # of spoilt pictures
         phases = []
         for phase in range(2):
@@ -167,6 +168,8 @@ def test_together_each_learns_what_it_learns_alone(tmp_path, variational):
         results[name] = phases, [copy.deepcopy(learner.state_dict()) for learner in learners]
     print(results["alone"][0], results["together"][0])
     assert_close(results["together"], results["alone"])
+    for name in results:
+        assert f"The weights of the autoencoder of seed 5 {name} are not finite after epoch 3" in caplog.text
     first = [figures.get("epochs") for figures in results["alone"][0][0]]
     lockstep = learners[0].workspace
     assert len(lockstep.memories) == 4 and torch.equal(lockstep.rows, lockstep.kept)  # nothing goes on alone

@@ -114,7 +114,10 @@ CASES = {
 def test_three_seeds_side_by_side_are_three_runs(task, conf, tmp_path, case):
     """Five iterations with learning phases: metrics and weights agree to 1e-9, whatever is observed, designed or drawn."""
     conf = changed(conf, **CASES[case])
-    together(task, conf, tmp_path / "together")
+    results = together(task, conf, tmp_path / "together")
+    learners = [result.run.learner for result in results]
+    seeds = [f"seed {conf.train.seed + k}" for k in range(SEEDS)]
+    assert [learner.name for learner in learners if learner] in (seeds, [])  # for the log
     alone(task, conf, tmp_path / "alone")
     losses = [metrics(tmp_path / "together" / str(k))[-1]["loss"] for k in range(SEEDS)]
     assert len(set(losses)) == SEEDS
