@@ -212,11 +212,8 @@ class Tilt(Term):
             rises = normal[..., self.up] * (1.0 if (self.up - self.along) % 3 == 2 else -1.0)
             runs = (normal.square().sum(dim=-1) - rises.square()).clamp(min=0.0).sqrt()
             return runs.atan2(rises)
-        (x, y), run, rise = (
-            self.vectors[0, [self.along, self.up]],
-            first[..., self.along],
-            first[..., self.up],
-        )
+        x, y = self.vectors[0, [self.along, self.up]]
+        run, rise = first[..., self.along], first[..., self.up]
         return (x * rise - y * run).abs().atan2(x * run + y * rise)
 
     def turned(self, path: Path) -> list[Tensor]:

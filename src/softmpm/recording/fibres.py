@@ -12,6 +12,8 @@ LENGTH, RADIUS = 0.7, 0.025
 """Length at rest and half the width of a stroke, in distances between two."""
 DARK, LIGHT = np.array((44, 44, 52), float), np.array((250, 250, 250), float)
 """Colours of strokes, on light and on dark particles."""
+FILLED = 0.73
+"""Distance from a particle up to which a dot is in its muscle, in √dim of its radii: half the diagonal of a lattice cell is 0.71."""
 OUTSIDE = 0.6
 """Distance between a particle and the mean place of it and its neighbours from which on it is at the surface, in its radii. On a
 lattice it is 0.84 at a plane, and one layer below at most 0.59, at a corner."""
@@ -112,14 +114,13 @@ def _within(place: Surroundings, members: np.ndarray, line: np.ndarray) -> tuple
     from scipy.spatial import KDTree
 
     distance, nearest = KDTree(place.rest[members]).query(line)
-    inside = distance <= 1.01 * np.sqrt(place.dim) * place.radii[members[nearest]]
+    inside = distance <= FILLED * np.sqrt(place.dim) * place.radii[members[nearest]]
     middle = line.shape[1] // 2
     last = middle + np.cumprod(inside[:, middle + 1 :], axis=1).sum(axis=1)
     first = middle - np.cumprod(inside[:, :middle][:, ::-1], axis=1).sum(axis=1)
     kept = np.clip(np.arange(line.shape[1]), first[:, None], last[:, None])
-    return np.take_along_axis(line, kept[..., None], axis=1), members[
-        np.take_along_axis(nearest, kept, axis=1)
-    ]
+    carrier = members[np.take_along_axis(nearest, kept, axis=1)]
+    return np.take_along_axis(line, kept[..., None], axis=1), carrier
 
 
 def stroke_colours(rgb: np.ndarray) -> np.ndarray:

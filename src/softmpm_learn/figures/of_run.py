@@ -16,8 +16,9 @@ AROUND = 0.3
 """Margin around the places where a robot comes, over the height of the picture."""
 GAP = 0.08
 """Gap between two latent pictures, over their longer side."""
-STROKES = 24
-"""Number of strokes along fibres that would follow each other along the longer side of a picture of the robot."""
+STROKES, WIDTH = 24, 0.05
+"""Number of strokes along fibres that would follow each other along the longer side of a picture of the robot, and the width of one in
+distances between two."""
 PALE = 0.6
 """Activation from which on strokes are light, since the colours of muscles are dark."""
 SIGNED = "RdBu"
@@ -212,13 +213,9 @@ def _draw_robot(
     )
     gap = max(scene.grid.spacing, float((high - low).max()) / STROKES)
     strokes, particle = fibre_strokes(scene, positions, gap)
-    for some, colour in (
-        (np.abs(value[particle]) > PALE, "#fafafa"),
-        (np.abs(value[particle]) <= PALE, "#2c2c34"),
-    ):
-        panel.plot(
-            *strokes[some, :, :2].transpose(2, 1, 0), color=colour, linewidth=72.0 * inches * 0.05 / STROKES
-        )
+    strong, width = np.abs(value[particle]) > PALE, 72.0 * inches * WIDTH / STROKES
+    for some, colour in ((strong, "#fafafa"), (~strong, "#2c2c34")):
+        panel.plot(*strokes[some, :, :2].transpose(2, 1, 0), color=colour, linewidth=width)
     for wall in scene.walls:
         if any(wall.normal[:2]):  # not beside the picture
             _draw_wall(panel, wall, low, high)
