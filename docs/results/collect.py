@@ -2,7 +2,7 @@
 
     python docs/results/collect.py NAME FOLDER...
 
-A row for each run. `comparison.py`, `twenty.py` and `phases.py` print what docs/results.md has of them, `draw.py` draws it.
+A row for each run. `comparison.py`, `twenty.py` and `jobs.py` print what docs/results.md has of them, `draw.py` draws it.
 """
 
 import csv
