@@ -45,11 +45,13 @@ def silhouette(source: Any, inside: Inside, threshold: float) -> np.ndarray:
     return values < threshold if inside == "dark" else values > threshold
 
 
-def coverage(mask: np.ndarray, left: np.ndarray, bottom: np.ndarray, width: float) -> np.ndarray:
-    """Share of each square that the mask covers, shape (x, y) with y up.
+def coverage(mask: np.ndarray, begin: np.ndarray, count: np.ndarray, step: float, width: float) -> np.ndarray:
+    """Share of each square of a lattice that the mask covers, shape (x, y) with y up.
 
-    The squares are ``width`` wide, with their lower corners at all pairs of ``left`` and ``bottom``; all in pixels.
+    The squares are ``width`` wide and ``step`` apart, ``count`` along each axis; the first has its lower corner at ``begin``. All in
+    pixels.
     """
+    left, bottom = (b + step * np.arange(n) for b, n in zip(begin, count, strict=True))
     across = _overlap(left, width, mask.shape[1])
     up = _overlap(bottom, width, mask.shape[0])
     return across @ mask[::-1].T @ up.T
@@ -59,12 +61,14 @@ def mask_contours(mask: np.ndarray, width: float) -> list[np.ndarray]:
     """Closed polygons around the places whose square of this width is at least half covered; all in pixels, y up.
 
     The square smooths the steps of the pixels and rounds corners at its own width; a straight edge along an axis stays where it is,
-    because the coverage is linear within half a width of it and is sampled twice for each.
+    because the coverage is linear within half a width of it and is sampled twice for each. Samples are symmetric about the middle of
+    the picture.
     """
-    step = width / 2
-    places = [step * np.arange(-1, np.ceil(pixels / step) + 2) for pixels in mask.shape[::-1]]
-    covered = coverage(mask, places[0] - width / 2, places[1] - width / 2, width)
-    return [step * (polygon - 1.0) for polygon in contours(covered, 0.5)]
+    step, size = width / 2, np.array(mask.shape[::-1])
+    steps = np.ceil(size / step) + 2
+    begin = (size - step * steps) / 2
+    covered = coverage(mask, begin - width / 2, steps + 1, step, width)
+    return [begin + step * polygon for polygon in contours(covered, 0.5)]
 
 
 def _overlap(left: np.ndarray, width: float, pixels: int) -> np.ndarray:

@@ -160,7 +160,8 @@ def image(
         lower: Where the picture's lower left corner comes to lie [m].
         height: Height of the whole picture, margins included [m]; its width follows from its pixels.
         spacing: Distance of neighbouring particles [m]. A particle is made where at least half of its
-            cell is inside: with spacing = height / rows, one for each pixel inside.
+            cell is inside: with spacing = height / rows, one for each pixel inside. The lattice begins at the bottom
+            of the picture and is centred in its width, so that symmetric pictures have symmetric particles.
         inside: ``dark`` takes what is dark on white paper (transparent is paper), ``light`` what is light on
             black, ``opaque`` what is not transparent.
         threshold: Grey or opacity, between 0 and 1, that parts the inside from the outside.
@@ -174,12 +175,13 @@ def image(
     pixel = height / len(mask)
     size, width = np.array(mask.shape[::-1]) * pixel, spacing / pixel
     count = (_cover if cut_cells else _count)(size, spacing)  # (x, y)
-    middles = _lattice(corner + count * spacing / 2, count, spacing)
+    begin = np.array([(mask.shape[1] - width * count[0]) / 2, 0.0])  # of the lattice [pixels]
+    middles = _lattice(corner + pixel * begin + count * spacing / 2, count, spacing)
     if cut_cells:
-        parts = _cut_image(mask, middles, count, spacing, width)
+        parts = _cut_image(mask, middles, begin, count, spacing, width)
         positions, volume = merge_slivers(*parts, count, spacing)
     else:
-        covered = coverage(mask, width * np.arange(count[0]), width * np.arange(count[1]), width).ravel()
+        covered = coverage(mask, begin, count, width, width).ravel()
         half = covered >= 0.5 - 1e-9  # a half-covered cell counts, whatever its rounding
         positions, volume = middles[half], spacing**2
     need(
@@ -193,12 +195,11 @@ def image(
 
 
 def _cut_image(
-    mask: np.ndarray, middles: np.ndarray, count: np.ndarray, spacing: float, width: float
+    mask: np.ndarray, middles: np.ndarray, begin: np.ndarray, count: np.ndarray, spacing: float, width: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Share of each cell that is inside, and centroid of that part."""
     fine = width / SAMPLES
-    across, up = (fine * np.arange(SAMPLES * n) for n in count)
-    covered = coverage(mask, across, up, fine).reshape(count[0], SAMPLES, count[1], SAMPLES)
+    covered = coverage(mask, begin, SAMPLES * count, fine, fine).reshape(count[0], SAMPLES, count[1], SAMPLES)
     weights = covered.transpose(0, 2, 1, 3).reshape(len(middles), -1)
     return inner_parts(middles, weights, spacing)
 

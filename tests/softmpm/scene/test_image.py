@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import PIL.Image
 import pytest
+from scipy.spatial import KDTree
 
 from softmpm.scene.image import MOST_PIXELS
 from softmpm.scene.shapes import box, image
@@ -46,6 +47,24 @@ def test_half_covered_cells_count(height):
     particles = image(mask, (0.0, 0.0), height=height, spacing=height / 3)
     columns = np.round(particles.positions[:, 0] * 3 / height - 0.5).astype(int)
     assert len(particles) == 9 and (columns % 2 == 0).all()
+
+
+@pytest.mark.parametrize("cut_cells", [False, True])
+@pytest.mark.parametrize("spacing", [0.01, 0.023, 0.031])
+def test_symmetric_pictures_have_symmetric_particles(spacing, cut_cells):
+    """Places, volumes and outline mirror themselves, left to right, also where the width is no multiple of the spacing; upwards the
+    lattice begins at the bottom."""
+    half = np.random.default_rng(3).random((7, 9)) < 0.7
+    mask = np.kron(np.hstack([half, half[:, ::-1]]), np.ones((5, 5))).astype(bool)  # a pixel is 0.01
+    particles = image(mask, (1.0, 2.0), height=0.35, spacing=spacing, cut_cells=cut_cells)
+    outline = particles.outline
+    assert outline is not None
+    for points, sizes in ((particles.positions, particles.volume), (outline.points, outline.areas)):
+        apart, other = KDTree(points).query(points * (-1, 1) + (2 * 1.45, 0))
+        assert apart.max() < 1e-12
+        np.testing.assert_allclose(np.asarray(sizes)[other], sizes, rtol=1e-9)
+    rows = (particles.positions[:, 1] - 2.0) / spacing - 0.5
+    assert cut_cells or rows == pytest.approx(rows.round(), abs=1e-9)
 
 
 def test_full_picture_is_a_box():
