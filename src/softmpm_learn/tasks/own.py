@@ -18,7 +18,7 @@ from softmpm_learn.tasks.task import Source, Task, material
 from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 START = 0.2
-"""Rear end of the robot on the track [m]."""
+"""Rear end of the robot on the track, to a quarter of a cell [m]."""
 HEADROOM = 0.1
 """Free height above the robot [m]."""
 RUNWAY = 1.0
@@ -109,9 +109,14 @@ def walker(
                 f"the muscle {muscle.name} of {conf.file} is smaller than a particle, {conf.spacing / 2:.3g} m: "
                 "make it or task.size larger, or increase task.cells."
             )
-    place: tuple[float, ...] = (START, height)
+    half, middle = conf.spacing / 2, (rest.min(axis=0) + rest.max(axis=0)) / 2
+    forward = half * round(
+        (START + middle[0]) / half
+    )  # the grid is symmetric about it, or it would turn the robot
+    place = [forward - middle[0], height]
     if rest.shape[1] == 3:
-        grid, walls, place = _widened(grid, walls, place, rest[:, 2])
+        grid, walls, sideways = _widened(grid, walls, float(np.ptp(rest[:, 2])))
+        place.append(sideways - middle[2])
     solid = material(conf)
     bodies = [
         softmpm.Body(shape.moved(place), dataclasses.replace(solid, young=factor * solid.young))
@@ -171,17 +176,15 @@ def _check_size(conf: OwnConf, rest: np.ndarray, grid: softmpm.Grid, height: flo
 
 
 def _widened(
-    grid: softmpm.Grid, walls: Sequence[softmpm.Wall], place: tuple[float, ...], across: np.ndarray
-) -> tuple[softmpm.Grid, list[softmpm.Wall], tuple[float, ...]]:
-    """The track in 3D, with a wall on either side: its grid, its walls, and the place of the lower corner of a robot.
-
-    The robot, with its particles at these places along z [m], stands in the middle, on a plane of nodes: a grid that is not symmetric
-    about it would turn it to one side.
+    grid: softmpm.Grid, walls: Sequence[softmpm.Wall], width: float
+) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
+    """The track in 3D, for a robot whose particles span this width [m], with a wall on either side: its grid, its walls, and the place
+    of its middle along z [m], on a plane of nodes.
     """
-    margin, width = 4 * grid.spacing, float(np.ptp(across)) + grid.spacing
-    side = math.ceil((width / 2 + SIDES + margin) / grid.spacing) * grid.spacing  # from the middle
+    margin = 4 * grid.spacing
+    side = math.ceil(((width + grid.spacing) / 2 + SIDES + margin) / grid.spacing) * grid.spacing
     wide = softmpm.Grid(shape=(*grid.shape, round(2 * side / grid.spacing) + 1), spacing=grid.spacing)
     found = [dataclasses.replace(wall, normal=(*wall.normal, 0.0)) for wall in walls]
     found.append(softmpm.Wall(normal=(0.0, 0.0, 1.0), offset=margin))
     found.append(softmpm.Wall(normal=(0.0, 0.0, -1.0), offset=margin - 2 * side))
-    return wide, found, (*place, side - float(across.min() + across.max()) / 2)
+    return wide, found, side
