@@ -49,7 +49,8 @@ class CarriedPoints(SurfacePoints):
     """Surface points that particles carry, on the moving grid.
 
     Attributes:
-        nearest: The particle of the same body nearest at rest to each point, shape (point,), int64.
+        nearest: The particle of the same body nearest at rest to each point, shape (point,), int64. Of equally near ones it is the one
+            closer to the middle of the body, which symmetric bodies share.
         arms: Positions of the points from these particles at rest [m], shape (point, dim), float64.
     """
 
@@ -61,7 +62,8 @@ class CarriedPoints(SurfacePoints):
         for body in scene.bodies:
             outline, positions = body.particles.outline, body.particles.positions
             assert outline is not None
-            found = KDTree(positions).query(outline.points)[1]
+            inward = 1e-6 * (positions.mean(axis=0) - outline.points)
+            found = KDTree(positions).query(outline.points + inward)[1]
             nearest.append(first + found)
             arms.append(outline.points - positions[found])
             first += len(positions)

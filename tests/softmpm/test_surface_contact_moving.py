@@ -415,6 +415,17 @@ def test_places_are_exact_for_affine_motion():
         torch.testing.assert_close(points_of(model).shown(state)[0], want, rtol=0, atol=1e-13)
 
 
+def test_of_two_particles_equally_near_the_inner_one_carries_a_point():
+    """Four by four particles and two points on each side, halfway between two of them: the carriers are as symmetric as the body."""
+    coarse, fine = (softmpm.box((0.0, 0.0), (1.0, 1.0), spacing) for spacing in (0.5, 0.25))
+    shape = softmpm.Particles(fine.positions, fine.volume, coarse.outline).moved((0.3, 0.4))
+    scene = slab()
+    body = dataclasses.replace(scene.bodies[0], particles=shape)
+    carried = CarriedPoints(dataclasses.replace(scene, bodies=[body]), torch.device("cpu"))
+    away = np.abs(shape.positions[carried.nearest] - (0.8, 0.9))
+    np.testing.assert_allclose(np.sort(away, axis=1), [(0.125, 0.375)] * 8, atol=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_depth_of_a_start_is_that_of_its_points(dtype, device):
     """Of a body that is turned and sheared: the alarm is that of the first point that is too deep, and of no point a little higher."""
