@@ -192,6 +192,20 @@ def test_the_grid_is_symmetric_about_a_symmetric_robot(folder, kind, file, size)
     assert KDTree(x).query(mirrored)[0].max() < 1e-7
 
 
+@pytest.mark.parametrize("rows", [[[4, 2, 2, 4]] * 2, [[3, 2, 2, 2, 3], [4, 0, 0, 0, 4], [4, 0, 0, 0, 4]]])
+def test_muscles_of_symmetric_voxels_are_symmetric(folder, rows):
+    """Also with particles on the edge of two voxels, or in an empty one as near to the one beside it as to the one above."""
+    np.save("robot.npy", np.array(rows))
+    task = make_task(VoxelsConf(file="robot.npy", size=0.275, cells=40, contact="nodes"))
+    x = places(task)
+    mirrored = x * (-1, 1) + (x[:, 0].min() + x[:, 0].max(), 0)
+    other = KDTree(x).query(mirrored)[1]
+    for row, column in np.argwhere(np.array(rows) >= 3):
+        left = task.regions[f"voxel_{row}_{column}"]
+        right = task.regions[f"voxel_{row}_{len(rows[0]) - 1 - column}"]
+        assert sorted(other[left].tolist()) == sorted(right.tolist())
+
+
 def test_a_symmetric_robot_at_rest_stays_in_its_place(folder):
     """Within 0.1 s on the floor it drifts by less than 0.1 µm in float32; by 93 µm a quarter of a cell further on."""
     task = make_task(VoxelsConf(file="robot.npy", size=0.25, cells=50))
