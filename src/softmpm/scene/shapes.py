@@ -277,9 +277,9 @@ def _count(extent: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _cover(extent: np.ndarray, spacing: float) -> np.ndarray:
-    """Whole number of cells that covers the extent along each axis, whatever its rounding."""
+    """Whole number of cells that covers the extent along each axis, whatever its rounding, also in single precision."""
     with np.errstate(over="ignore"):
-        return _whole(np.ceil(extent / spacing - 1e-9))
+        return _whole(np.ceil(extent / spacing * (1.0 - 1e-6)))
 
 
 def _whole(count: np.ndarray) -> np.ndarray:

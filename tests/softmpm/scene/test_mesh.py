@@ -21,6 +21,16 @@ def test_box_mesh_is_a_box():
     np.testing.assert_allclose(got.volume, want.volume, rtol=1e-14)
 
 
+@pytest.mark.parametrize("cut_cells", [False, True])
+def test_sides_may_be_multiples_of_the_spacing_in_single_precision(cut_cells):
+    """As in STL files: a box of 12 x 4 x 4 cells, larger by rounding, has no layer of cells that begins or ends on its faces."""
+    solid = trimesh.creation.box((0.3, 0.1, 0.1))
+    solid.vertices = solid.vertices * (1 + 1e-7)
+    particles = mesh(solid, 0.025, cut_cells=cut_cells)
+    assert len(particles) == 12 * 4 * 4
+    np.testing.assert_allclose(particles.volume, 0.025**3, rtol=1e-4)
+
+
 @pytest.mark.parametrize("spacing, tolerance", [(0.2, 0.08), (0.07, 0.005)])
 def test_volume_converges(spacing, tolerance):
     """The lattice's volume tends to the mesh's own."""
