@@ -108,7 +108,7 @@ class Costs:
         for term, share in shares:
             if np.any(share):
                 factor = torch.as_tensor(term.weight * np.asarray(share), device=like.device).to(like.dtype)
-                total = total + factor * term.value_of_each_world(path)
+                total = total + factor * _finite(term, path)
         return total
 
     def _value(self, motions: list[tuple[Tensor, Path]]) -> Tensor:
@@ -117,10 +117,26 @@ class Costs:
         for worlds, path in motions:
             for term, states in self.wholes:
                 if len(path.states) >= states:
-                    value = term.weight * term.value_of_each_world(path)
+                    value = term.weight * _finite(term, path)
                     total = total.index_add(0, worlds, value.to(total.dtype))
         return total
 
     def detach(self) -> None:
         """Cut the gradient."""
         self._whole = self._whole.detach()
+
+
+def _finite(term: Term, path: Path) -> Tensor:
+    """Value of the term, shape (world,).
+
+    Raises:
+        ValueError: It is infinite or no number: so would be a reward, and with it all parameters of a policy that learns from it.
+    """
+    value = term.value_of_each_world(path)
+    if not bool(value.isfinite().all()):
+        raise ValueError(
+            f"the value of the objective's term {term.name} must be finite after each control step, for which an environment gives "
+            f"a reward, got {value.detach().tolist()} on a motion of {len(path.activation)} control step(s), {path.times[-1]:g} s; "
+            "return a finite number for the first part of an episode too, such as 0 where it is too short for the value."
+        )
+    return value

@@ -1,7 +1,6 @@
 """Terms that need the whole of an episode, in environments: constraints, and terms of one's own that do not say how they add up."""
 
 import dataclasses
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -230,16 +229,15 @@ def test_the_motion_of_a_failed_world_stands_still_until_the_horizon(task, make_
     torch.testing.assert_close(fresh.states[0].x, env.worlds.model.rest().x[:1])
 
 
-def test_the_loss_needs_no_value_of_a_part(task):
-    """A value that is no number for the first part of an episode is right at its end; rewards of that part are no numbers either."""
-    own = dataclasses.replace(task, objective=Objective(Swing(begin=task.control_period)))
-    env = SoftRobotEnv(own, EnvConf(reward="objective", **DOUBLE))
+@pytest.mark.parametrize("reward", KINDS)
+def test_a_value_that_is_no_number_for_a_part_is_refused(task, reward):
+    """A reward that is no number would make those of the policy none: the error names the term and the part of the episode."""
+    own = dataclasses.replace(task, objective=Objective(Progress(), Swing(begin=task.control_period)))
+    env = SoftRobotEnv(own, EnvConf(reward=reward, **DOUBLE))
     env.reset()
-    rows = activations(task.control_steps, 1, 2)
-    results = [env.step(row[0].numpy()) for row in rows]
-    with torch.no_grad():
-        assert results[-1][4]["loss"] == pytest.approx(float(loss_of(env, rows)), rel=1e-12)
-    assert [math.isnan(result[1]) for result in results[:3]] == [True, True, False]
+    message = r"term swing must be finite after each control step.*\[nan\] on a motion of 1 control step\(s\).*return a finite number"
+    with pytest.raises(ValueError, match=message):
+        env.step(np.zeros(2))
 
 
 def test_motions_are_stored_only_for_terms_that_need_them(task, whole):
