@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -22,6 +23,9 @@ DPI = 100
 """Pixels per inch: a film is 700 pixels wide, and wider with names of colours."""
 MOST_OF_A_GIF = 50
 """Pictures per second: viewers slow down shorter ones than two hundredths of a second."""
+
+EXACT = 128
+"""Colours of a picture of a GIF that are exact, of 256; the others are covered by the rest."""
 
 
 def to_video(
@@ -182,16 +186,30 @@ def _pictures(
         yield pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]  # MP4 needs even sizes
 
 
-def _write_gif(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
+def _quantised(picture: np.ndarray) -> Any:
+    """The picture in 256 colours. The most frequent ones are exact, so that plain areas do not change from picture to picture."""
     try:
         from PIL import Image
     except ImportError as error:
         raise ImportError("a GIF needs the package Pillow: pip install pillow") from error
-    most = Image.Quantize.MAXCOVERAGE  # the median cut would lose the colours of small things, such as arrows
-    frames = [
-        Image.fromarray(np.ascontiguousarray(picture)).quantize(256, most, dither=Image.Dither.NONE)
-        for picture in pictures
-    ]
+    packed, places, counts = np.unique(
+        picture @ np.array([1 << 16, 1 << 8, 1]), return_inverse=True, return_counts=True
+    )
+    colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=1).astype(np.uint8)
+    order = np.argsort(-counts, kind="stable")
+    palette, others = colours[order[:EXACT]], colours[order[EXACT:]]
+    if len(others):  # the median cut would lose the colours of small things, such as arrows
+        covered = Image.fromarray(others[None]).quantize(256 - EXACT, Image.Quantize.MAXCOVERAGE)
+        palette = np.concatenate([palette, np.reshape(covered.getpalette(), (-1, 3))]).astype(np.uint8)
+    one, other = colours.astype(float), palette.astype(float)
+    nearest = (np.square(other).sum(axis=1) - 2 * one @ other.T).argmin(axis=1).astype(np.uint8)
+    image = Image.fromarray(nearest[places].reshape(picture.shape[:2]))
+    image.putpalette(palette.tobytes())
+    return image
+
+
+def _write_gif(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
+    frames = [_quantised(picture) for picture in pictures]
     ends = [round(100 * k / fps) for k in range(len(frames) + 1)]  # a GIF counts in hundredths of a second
     lasting = [10 * (end - begin) for begin, end in itertools.pairwise(ends)]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=lasting, loop=0)

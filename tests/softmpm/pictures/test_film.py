@@ -78,6 +78,22 @@ def test_a_gif_has_a_picture_for_each_state(model, states, tmp_path):
     assert steps.min() > 10 and np.ptp(steps) < 3
 
 
+def test_plain_areas_do_not_flicker(model, states, tmp_path):
+    """The inside of a wall has one colour in all pictures of a GIF, though each picture has colours of its own."""
+    speeds = torch.linspace(0.0, 3.0, len(states))
+    waves = [
+        state._replace(v=state.v + speed * torch.rand_like(state.v))
+        for state, speed in zip(states, speeds, strict=True)
+    ]
+    film = pictures(softmpm.to_video(waves, tmp_path / "block.gif", model=model))
+    commonest = set()
+    for picture in film:
+        colours, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
+        plain = colours[counts.argsort()[-2:]]  # the background and the inside of the wall
+        commonest.add(tuple(map(tuple, plain.tolist())))
+    assert len(commonest) == 1
+
+
 def test_a_film_plays_at_its_rate(model, states, tmp_path):
     """States 0.1 s apart last 0.9 s; at half the rate twice as long, with each state in two pictures."""
     times = resampled(0.1 * np.arange(10), fps=10, rate=1.0)
