@@ -183,11 +183,19 @@ class State(NamedTuple):
 
     def of_worlds(self, worlds: slice | Sequence[int] | Tensor) -> "State":
         """The state of some worlds, nodes and surface points included: a slice, or numbers or a mask of worlds. Differentiable."""
+        return self._at(worlds)
+
+    def of_frame(self, frame: int) -> "State":
+        """The state in one of the frames of a :func:`softmpm.trajectory`, nodes and surface points included. Differentiable."""
+        return self._at(frame)
+
+    def _at(self, index: Any) -> "State":
+        """The state at an index of the first axis."""
 
         def some(part: Any) -> Any:
             if isinstance(part, Tensor):
-                return part[worlds]
-            return type(part)(*(None if tensor is None else tensor[worlds] for tensor in part))
+                return part[index]
+            return type(part)(*(None if tensor is None else tensor[index] for tensor in part))
 
         return self._each(some)
 

@@ -29,7 +29,7 @@ EXACT = 128
 
 
 def to_video(
-    source: Recording | str | Path | Sequence[State],
+    source: Recording | str | Path | Sequence[State] | State,
     path: str | Path,
     *,
     model: Model | None = None,
@@ -50,7 +50,7 @@ def to_video(
         softmpm.to_video(states, "jump.mp4", model=model, period=20 * scene.dt, rate=0.2)
 
     Args:
-        source: A recording, or states one after the other.
+        source: A recording, states one after the other, or the frames of a :func:`softmpm.trajectory`, which are a state each.
         path: File to write, ``.gif`` (Pillow) or ``.mp4`` (``pip install softmpm[video]``). An older one is replaced.
         model: What the states belong to.
         activation: Activation [-] of each state, shape (state, world, muscle).
@@ -88,7 +88,7 @@ def to_video(
     elif isinstance(source, Recording):
         place, instants = _of_recording(source, iteration, fps, rate)
     else:
-        place, instants = _of_states(source, model, activation, world, period, fps, rate)
+        place, instants = _of_states(_listed(source), model, activation, world, period, fps, rate)
     draft = path.with_name(f"{path.stem}.new{path.suffix}")
     try:
         WRITERS[path.suffix.lower()](draft, _pictures(place, instants, colour, limits), fps)
@@ -121,8 +121,20 @@ def _filled(instants: list[Instant]) -> list[Instant]:
     return instants
 
 
+def _listed(states: Sequence[State] | State) -> list[State]:
+    """The states one after the other; frames of a trajectory are one state with an axis more."""
+    if isinstance(states, State) and states.x.dim() == 4:
+        return [states.of_frame(k) for k in range(len(states.x))]
+    listed: list[Any] = list(states)
+    if not listed or not all(isinstance(state, State) for state in listed):
+        raise TypeError(
+            "a film needs a recording, at least one softmpm.State in a list, or the frames of a softmpm.trajectory."
+        )
+    return listed
+
+
 def _of_states(
-    states: Sequence[State],
+    states: list[State],
     model: Model | None,
     activation: Tensor | None,
     world: int,
@@ -132,9 +144,6 @@ def _of_states(
 ) -> tuple[Surroundings, list[Instant]]:
     check_model(model, "a film of states")
     assert model is not None
-    states = list(states)
-    if not states or not all(isinstance(state, State) for state in states):
-        raise TypeError("a film needs a recording or a sequence of at least one softmpm.State.")
     for state in states:
         check_state(model, state)
     if not 0 <= world < model.worlds:
@@ -200,7 +209,7 @@ def _quantised(picture: np.ndarray) -> Any:
     palette, others = colours[order[:EXACT]], colours[order[EXACT:]]
     if len(others):  # the median cut would lose the colours of small things, such as arrows
         covered = Image.fromarray(others[None]).quantize(256 - EXACT, Image.Quantize.MAXCOVERAGE)
-        palette = np.concatenate([palette, np.reshape(covered.getpalette(), (-1, 3))]).astype(np.uint8)
+        palette = np.concatenate([palette, np.reshape(covered.getpalette() or [], (-1, 3))]).astype(np.uint8)
     one, other = colours.astype(float), palette.astype(float)
     nearest = (np.square(other).sum(axis=1) - 2 * one @ other.T).argmin(axis=1).astype(np.uint8)
     image = Image.fromarray(nearest[places].reshape(picture.shape[:2]))

@@ -78,6 +78,20 @@ def test_a_gif_has_a_picture_for_each_state(model, states, tmp_path):
     assert steps.min() > 10 and np.ptp(steps) < 3
 
 
+def test_the_frames_of_a_trajectory_become_a_film(model, tmp_path):
+    """The pictures are those of the states one by one."""
+    way = softmpm.trajectory(model, model.rest(), torch.ones(3, 1, 1), model.params(), substeps=5)
+    states = [model.rest()]
+    for row in torch.ones(3, 1, 1):
+        states.append(softmpm.simulate(model, states[-1], row[None], model.params(), substeps=5))
+    torch.testing.assert_close(way.frames.of_frame(1).surface, states[2].surface)
+    films = [
+        softmpm.to_video(one, tmp_path / "block.gif", model=model).read_bytes()
+        for one in (way.frames, states[1:])
+    ]
+    assert films[0] == films[1]
+
+
 def test_plain_areas_do_not_flicker(model, states, tmp_path):
     """The inside of a wall has one colour in all pictures of a GIF, though each picture has colours of its own."""
     speeds = torch.linspace(0.0, 3.0, len(states))
