@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 from softmpm.errors import UnstableError
+from softmpm.summary import counted
 from softmpm.validate import need
 
 Policy = Literal["freeze", "reset"]
@@ -82,6 +83,9 @@ class Failures:
 
     def __len__(self) -> int:
         return len(self.errors)
+
+    def __repr__(self) -> str:
+        return f"Failures({self.policy}: {counted(len(self), 'failure')} in worlds {self.worlds})"
 
     @property
     def worlds(self) -> list[int]:

@@ -357,6 +357,7 @@ def test_a_particle_that_collapses_is_named():
     failures = softmpm.Failures("freeze")
     end = softmpm.simulate(model, state, None, model.params(), substeps=40, failures=failures)
     assert len(failures.errors) == 1 and torch.isfinite(end.x).all()
+    assert repr(failures) == "Failures(freeze: 1 failure in worlds [1])"
     alone = softmpm.simulate(model, model.rest(), None, model.params(), substeps=40)
     assert torch.equal(end.x[0], alone.x[0])
 
