@@ -107,6 +107,19 @@ def test_a_muscle_shortens_a_free_block_to_the_exact_equilibrium():
     assert abs(got[0, 0] - a) < 1e-6 and abs(got[1, 1] - b) < 1e-6
 
 
+@pytest.mark.parametrize(("dim", "poisson"), [(2, 0.0), (2, 0.45), (3, 0.3)])
+def test_a_pressure_swells_a_free_block_against_its_bulk_modulus(dim, poisson):
+    """By the strain (1 − 2ν) p/E, in plane strain by 1 + ν times that: hardly where ν is near 0.5."""
+    scene = block(dim, muscles=[softmpm.Pressure(particles=np.arange(6**dim), strength=50.0)], damping=20.0)
+    model = softmpm.build(scene, device="cpu", dtype=torch.float64, formulation="reference")
+    params = model.params()
+    params = params._replace(poisson=torch.full_like(params.poisson, poisson))
+    activation = torch.full((1, 1, 1), 1e-4, dtype=torch.float64)
+    end = softmpm.simulate(model, model.rest(), activation, params, substeps=500)
+    want = 1e-4 * (1 - 2 * poisson) * (1 + poisson if dim == 2 else 1)
+    assert (end.F[..., 0, 0].mean() - 1).item() == pytest.approx(want, rel=1e-3)
+
+
 def test_walls_do_what_their_names_say(device):
     """On the nodes of a wall: stick stops, slip keeps the tangent, separate lets nodes leave, friction slows by c vₙ."""
     for contact, friction, inward, outward in (

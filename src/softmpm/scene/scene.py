@@ -176,6 +176,9 @@ class Pressure(Actuator):
     """Pressure that expands (activation > 0) or contracts (< 0) alike in all directions: τ −= a s J I, a Cauchy stress of −a s.
 
     A pneumatic chamber filled with a soft material, or tissue that swells. In a plane-strain scene it also presses out of the plane.
+    It acts against the bulk modulus of its particles: a free body swells by the small strain (1 − 2ν) p/E of p = a s, in plane strain
+    by 1 + ν times that. So a chamber needs a small Poisson's ratio, as a body of its own that shares nodes with the wall around it, or
+    in ``params``.
     """
 
     __setstate__ = restore
