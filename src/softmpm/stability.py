@@ -140,9 +140,9 @@ def need_stable(scene: Scene, most: float) -> None:
     limit = stable_dt(scene)
     need(
         scene.dt <= most * limit,
-        f"dt = {scene.dt:.4g} s is above the largest stable one, {limit.dt:.4g} s, set by {limit.limit}. "
-        f"Use a dt of about {0.5 * limit:.2g} s, which leaves room for stretch, or a coarser grid; "
-        "build(..., alarms=softmpm.Alarms(step=None)) runs it all the same.",
+        f"dt = {scene.dt:.4g} s is {scene.dt / limit:.7g} times the largest stable one, {limit.dt:.4g} s, set by {limit.limit}; "
+        f"that ratio must stay within {most:.7g}. Use a dt of about {0.5 * most * limit:.2g} s, which leaves room for stretch, "
+        "or a coarser grid; build(..., alarms=softmpm.Alarms(step=None)) runs it all the same.",
     )
 
 

@@ -284,11 +284,31 @@ def test_refuses_only_above():
     need_stable(dataclasses.replace(made, dt=limit.dt), 1.0)
     above = dataclasses.replace(made, dt=1.0001 * limit.dt)
     with pytest.raises(
-        ValueError, match=r"dt = .* above the largest stable one, .* set by body 0 .*Use a dt of about"
+        ValueError,
+        match=r"dt = .* is 1.0001 times the largest stable one, .* set by body 0 .*within 1\. Use a dt of about",
     ):
         softmpm.build(above, device="cpu")
     softmpm.build(above, device="cpu", alarms=softmpm.Alarms(step=None))
     softmpm.build(above, device="cpu", alarms=softmpm.Alarms(step=1.1))
+    careful, below = softmpm.Alarms(step=0.4), dataclasses.replace(made, dt=0.5 * limit.dt)
+    with pytest.raises(
+        ValueError, match=r"is 0.5 times the largest .* within 0.4\. Use a dt of about"
+    ) as refused:
+        softmpm.build(below, device="cpu", alarms=careful)
+    advised = float(str(refused.value).split("dt of about ")[1].split(" s")[0])
+    softmpm.build(dataclasses.replace(made, dt=advised), device="cpu", alarms=careful)
+
+
+def test_a_ratio_just_above_its_limit_is_told_from_it():
+    """A message of a ratio of 1 that must stay within 1 would explain nothing."""
+    made = scene(NeoHookean(density=RHO, young=100.0))
+    made = dataclasses.replace(made, dt=stable_dt(made))
+    model = softmpm.build(made, device="cpu", dtype=torch.float64)
+    params = model.params()
+    with pytest.raises(softmpm.UnstableError, match=r"1\.00005 times its running stable step .* within 1\."):
+        softmpm.simulate(
+            model, model.rest(), None, params._replace(density=params.density / 1.0001), substeps=1
+        )
 
 
 def test_is_a_number():

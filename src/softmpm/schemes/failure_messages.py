@@ -112,10 +112,10 @@ class Case:
         largest, viscosity = self._running_limit(), self._viscosity()
         F = self.end.F[self.world, self.particle].detach().double()
         stretches = ", ".join(f"{s:.3g}" for s in torch.linalg.svdvals(F.cpu()).tolist())
-        value = f"makes dt = {scene.dt:.4g} s {scene.dt / largest:.4g} times its running stable step of {largest:.4g} s"
+        value = f"makes dt = {scene.dt:.4g} s {scene.dt / largest:.7g} times its running stable step of {largest:.4g} s"
         viscous = f", viscosity {viscosity:.4g} Pa s" if viscosity > 0 else ""
         value += f" (principal stretches {stretches}{viscous})"
-        limit = f"that ratio must stay within {most:.4g}"
+        limit = f"that ratio must stay within {most:.7g}"
         other = "a softer, denser or less viscous" if viscosity > 0 else "a softer or denser"
         advice = f"Use a dt of at most {0.8 * most * largest:.2g} s, {other} material, or a weaker activation"
         return "step", value, limit, advice + "; alarms=softmpm.Alarms(step=None) runs it all the same."
