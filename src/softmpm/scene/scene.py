@@ -130,7 +130,8 @@ class Actuator:
     """Particles with a stress that follows an activation. Use one of its kinds, the subclasses below; their stresses add."""
 
     particles: np.ndarray
-    """Indices into the model's particles: the bodies' particles in the order of the bodies."""
+    """Indices into the model's particles: the bodies' particles in the order of the bodies; copied, read-only. PyTorch warns of
+    indices that are read-only: ``params.young[..., torch.tensor(muscle.particles)]``."""
     strength: float
     """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger ones
     stretch a body until it fractures (docs/results.md, Lessons). Differentiable."""
