@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import softmpm
 from softmpm import Inputs, Model, Params, State
@@ -108,8 +108,10 @@ def run_episode(
             activation from then on, or it would fail again and again.
 
     Raises:
+        ValueError: Parameters or buffers of the observer or the policy have another precision than the model.
         softmpm.UnstableError: With a note that names the control step, as those have that are collected.
     """
+    _check_precision(model, observer=observer, policy=policy)
     state = model.rest() if start is None else start
     period, times = task.control_period, times_of(task, model)
     made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
@@ -153,6 +155,18 @@ def run_episode(
         decisions=made,
         path=path,
     )
+
+
+def _check_precision(model: Model, **parts: Policy | Observer) -> None:
+    """Raise ValueError unless the real parameters and buffers of these parts, where they are modules, have the model's precision."""
+    for what, part in parts.items():
+        tensors = [*part.parameters(), *part.buffers()] if isinstance(part, nn.Module) else []
+        for tensor in tensors:
+            if tensor.is_floating_point() and tensor.dtype != model.dtype:
+                raise ValueError(
+                    f"the {what} must be {model.dtype} like the model, has {tensor.dtype}; use {what}.to({model.dtype}), or build the "
+                    "model with another dtype, as run.model_of does for a run."
+                )
 
 
 @contextlib.contextmanager

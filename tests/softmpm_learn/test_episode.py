@@ -98,6 +98,27 @@ def test_frames_and_pictures(task, model):
     assert torch.equal(frames[-1].state.x, episode.end.x)
 
 
+def test_observer_and_policy_have_the_precision_of_the_model(task, model):
+    """Others are refused, each by name; the remedy of the message helps."""
+    exact = softmpm.build(task.scene, device="cpu", dtype=torch.float64)
+    observer, policy = (
+        Centroids(model, [np.arange(4)], 1.0),
+        make_policy(PolicyConf(name="linear"), 4, 2, 0.1, seed=0),
+    )
+    about = task, exact, observer, policy, exact.params()
+    with pytest.raises(
+        ValueError, match=r"the observer must be torch.float64 .* use observer.to\(torch.float64\)"
+    ):
+        run_episode(*about)
+    observer.to(torch.float64)
+    with pytest.raises(
+        ValueError, match=r"the policy must be torch.float64 .* use policy.to\(torch.float64\)"
+    ):
+        run_episode(*about)
+    policy.to(torch.float64)
+    assert run_episode(*about).loss.dtype == torch.float64
+
+
 def test_a_failure_names_the_control_step(task, model):
     """An unstable simulation says in which control step; a fast throw out of the grid is one."""
     thrown = dataclasses.replace(task, substeps=400, objective=Objective(Progress()))
