@@ -6,6 +6,7 @@ a file names is ever imported or called.
 
 import dataclasses
 import difflib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from pathlib import Path
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from softmpm_learn.register import CHOICES
+from softmpm_learn.setting_checks import typed
 from softmpm_learn.settings import (
     DesignConf,
     LearningConf,
@@ -47,12 +49,13 @@ class DeviceConf:
     or task.contact=nodes."""
 
     def __post_init__(self):
+        typed("device", self)
         for name, value, known in (("name", self.name, DEVICES), ("dtype", self.dtype, DTYPES)):
             if value not in known:
                 raise ValueError(f"device.{name} must be one of {', '.join(known)}; got {value!r}.")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"device.threads must be at least 1 or null, got {self.threads}.")
-        if self.memory is not None and not self.memory > 0:
+        if self.memory is not None and not 0 < self.memory < math.inf:
             raise ValueError(f"device.memory must be > 0 MB or null, got {self.memory}.")
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from softmpm_learn.register import OPTIMIZERS
-from softmpm_learn.setting_checks import positive, share
+from softmpm_learn.setting_checks import positive, share, typed
 
 
 @dataclass(kw_only=True)
@@ -50,6 +50,7 @@ class OptimizerConf:
     """Further arguments of the optimiser, such as betas of adam: +optimizer.options.betas=[0.9,0.99]."""
 
     def __post_init__(self):
+        typed("optimizer", self)
         OPTIMIZERS.need(self.name, self.options)
         positive("optimizer", self, "design_rate")
         for name in ("policy_rate", "halving", "max_norm"):

@@ -1,8 +1,31 @@
 """Checks that settings share: a wrong value fails where the settings are made, in a sentence."""
 
+import dataclasses
 import math
-from collections.abc import Iterable
-from numbers import Real
+from collections.abc import Callable, Iterable, Sequence
+from numbers import Integral, Real
+from typing import Any
+
+TYPES: dict[Any, tuple[str, Callable[[Any], bool]]] = {
+    bool: ("True or False", lambda value: isinstance(value, bool)),
+    int: ("a whole number", lambda value: isinstance(value, Integral)),
+    float: ("a number", lambda value: isinstance(value, Real)),
+    list[int]: (
+        "a list of whole numbers",
+        lambda value: isinstance(value, Sequence) and all(isinstance(one, Integral) for one in value),
+    ),
+}
+"""Rule of the values of a field by its type."""
+
+
+def typed(group: str, settings) -> None:
+    """Raise ValueError for the first of all settings that is not of the type of its field, such as a fraction for a whole number."""
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        for kind, (rule, fits) in TYPES.items():
+            needed = field.type == kind or (field.type == kind | None and value is not None)
+            if needed and not fits(value):
+                raise ValueError(f"{group}.{field.name} must be {rule}, got {value!r}.")
 
 
 def one_of(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
-from softmpm_learn.setting_checks import lengths, one_of, positive, share
+from softmpm_learn.setting_checks import lengths, one_of, positive, share, typed
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
@@ -45,6 +45,7 @@ class ObserverConf:
     """Options of an observer of one's own."""
 
     def __post_init__(self):
+        typed("observer", self)
         OBSERVERS.need(self.name, self.options)
         positive("observer", self, "clusters", "latent_size")
         if not self.channels or min(self.channels) < 1:
@@ -81,6 +82,7 @@ class PolicyConf:
     """Options of a policy of one's own."""
 
     def __post_init__(self):
+        typed("policy", self)
         POLICIES.need(self.name, self.options)
         positive("policy", self, "period", "harmonics")
         if not self.hidden or min(self.hidden) < 1:
@@ -125,6 +127,7 @@ class DesignConf:
     """Lowest and highest viscosity, in units of the scene's. Our choice: a higher one takes a smaller step."""
 
     def __post_init__(self):
+        typed("design", self)
         one_of("design.per", self.per, DESIGNS)
         for name, quantity in QUANTITIES.items():
             if hasattr(self, f"{name}_factor"):
@@ -187,6 +190,7 @@ class LearningConf:
     change; null: never. Our choice: four of five arms ended at a lower loss with it."""
 
     def __post_init__(self):
+        typed("learning", self)
         positive("learning", self, "every", "batches", "batch", "rate", "patience")
         positive("learning", self, "simulations", "megabytes", "frame_every")
         share("learning", self, "target_rate")
@@ -245,6 +249,7 @@ class TrainConf:
     """Loggers beside the files of the run: tensorboard, wandb, or registered ones."""
 
     def __post_init__(self):
+        typed("train", self)
         for name in self.log:
             if name not in LOGGERS or self.log.count(name) > 1:
                 raise ValueError(

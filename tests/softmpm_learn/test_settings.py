@@ -1,6 +1,9 @@
+import numpy as np
 import pytest
 
 from softmpm_learn import settings
+from softmpm_learn.config import DeviceConf
+from softmpm_learn.tasks.image import ImageConf
 
 
 @pytest.mark.parametrize(
@@ -39,6 +42,10 @@ from softmpm_learn import settings
             {"goal_spread": 0.05},
             r"goal_spread must be a list of lengths .*\[0.05, 0.05\], got 0.05",
         ),
+        ("ObserverConf", {"channels": [4, 4.5]}, r"channels must be a list of whole numbers, got \[4, 4.5\]"),
+        ("TrainConf", {"seeds": 2.5}, "train.seeds must be a whole number, got 2.5"),
+        ("TrainConf", {"pictures": "false"}, "train.pictures must be True or False, got 'false'"),
+        ("OptimizerConf", {"policy_rate": "1e-2"}, "optimizer.policy_rate must be a number, got '1e-2'"),
         ("TrainConf", {"goal_spread": ["a"]}, r"goal_spread must be a list of lengths .* got \['a'\]"),
     ],
 )
@@ -52,3 +59,25 @@ def test_settings_do_not_share_lists():
     """Changing a list of one object leaves the next one's alone."""
     settings.ObserverConf().channels.append(99)
     assert 99 not in settings.ObserverConf().channels
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"cells": 33.3}, "task.cells must be a whole number, got 33.3"),
+        ({"overlap": "no"}, "task.overlap must be True or False"),
+        ({"resolution": "fine"}, "task.resolution must be one of Resolution.draft, .* got 'fine'"),
+        ({"poisson": -1.0}, r"task.poisson must lie in \(-1, 0.5\), got -1.0"),
+    ],
+)
+def test_a_wrong_setting_of_a_task_fails_too(wrong, says):
+    """Those of the right kind do not, in any type of NumPy or Python."""
+    with pytest.raises(ValueError, match=says):
+        ImageConf(**wrong)
+    assert ImageConf(cells=np.int64(33), size=np.float32(0.5), seconds=1, track=None).cells == 33
+
+
+def test_memory_is_finite():
+    """It becomes a number of bytes."""
+    with pytest.raises(ValueError, match="device.memory must be > 0 MB or null, got inf"):
+        DeviceConf(memory=float("inf"))

@@ -12,6 +12,7 @@ import numpy as np
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Objective
+from softmpm_learn.setting_checks import typed
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
@@ -96,6 +97,10 @@ class TaskConf:
     gradients were usable (docs/gait.md)."""
 
     def __post_init__(self):
+        typed("task", self)
+        if not isinstance(self.resolution, Resolution):
+            known = ", ".join(map(str, Resolution))
+            raise ValueError(f"task.resolution must be one of {known}; got {self.resolution!r}.")
         for name, known in (("formulation", FORMULATIONS), ("contact", CONTACTS), ("law", tuple(LAWS))):
             if getattr(self, name) not in known:
                 raise ValueError(
@@ -106,6 +111,8 @@ class TaskConf:
                 f"task.viscosity = {self.viscosity} and task.retardation = {self.retardation} are two names for one thing; "
                 "set one of them to 0."
             )
+        if not -1.0 < self.poisson < 0.5:
+            raise ValueError(f"task.poisson must lie in (-1, 0.5), got {self.poisson}.")
         positive = ("seconds", "control_period", "young", "density", "strength", "safety")
         for name in positive:
             value = getattr(self, name)
