@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,11 +88,15 @@ class Run:
         self.safe: list[Tensor] = []
         self.saturated = False
 
-    def model_of(self, task: "Task", worlds: int) -> Model:
-        """Model of another task, or with other worlds, built as the task says; for simulations without a gradient."""
-        own, inputs = self.model, declared_inputs(self.settings.design)
+    def model_of(self, task: "Task", worlds: int, inputs: Iterable[str] = ()) -> Model:
+        """Model of another task, or with other worlds, built as the task says; for simulations without a gradient.
+
+        Args:
+            inputs: Names of inputs that calls will give beside those of the design, as for :func:`softmpm.build`.
+        """
+        own, given = self.model, (*declared_inputs(self.settings.design), *inputs)
         settings: dict[str, Any] = dict(device=own.device, dtype=own.dtype, threads=own.threads)
-        settings |= dict(deterministic=own.deterministic, inputs=inputs, worlds=worlds)
+        settings |= dict(deterministic=own.deterministic, inputs=given, worlds=worlds)
         return softmpm.build(task.scene, **settings, **task.build)
 
     def _make_policy(self, name: str) -> nn.Module:

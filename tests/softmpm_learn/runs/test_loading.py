@@ -76,6 +76,23 @@ def test_a_run_of_a_program_is_loaded_with_its_task_and_settings(finished, tmp_p
         softmpm_learn.load(tmp_path, device="cpu", task=steps, settings=settings)
 
 
+def test_worlds_of_a_loaded_run_may_differ_in_friction(finished):
+    """In one simulation, with the muscles that were designed: each world has the loss of a scene with its friction."""
+    out, _ = finished
+    run = softmpm_learn.load(out, device="cpu")
+    model, (params, inputs) = run.model_of(run.task, worlds=2, inputs=["friction"]), run.design()
+    frictions = torch.tensor([[0.1, 0.0], [0.8, 0.0]])  # of the floor and of the wall behind
+    with torch.no_grad():
+        given = inputs._replace(friction=frictions)
+        found = run_episode(run.task, model, run.observer, run.policy, params, inputs=given).loss
+    assert found[1].item() == pytest.approx(losses(run).item(), rel=1e-5)
+    floor, behind = run.task.scene.walls
+    scene = dataclasses.replace(run.task.scene, walls=[dataclasses.replace(floor, friction=0.1), behind])
+    run.task = dataclasses.replace(run.task, scene=scene)
+    run.model = run.model_of(run.task, worlds=1)
+    assert found[0].item() == pytest.approx(losses(run).item(), rel=1e-5) and abs(found[0] - found[1]) > 1e-6
+
+
 def test_an_environment_has_the_trained_body(finished):
     """With observer and body of the run, the policy has the loss of the episode; the scene's body has another."""
     out, _ = finished
