@@ -138,10 +138,16 @@ def _run_dir(resume: str | None, fresh: str) -> str:
     if resume is None:
         return fresh
     if not (Path(resume) / "config.yaml").is_file():
-        inside = sorted(Path(resume).glob("*/config.yaml"), key=lambda path: path.stat().st_mtime)
-        latest = f"; the latest run in it: resume={inside[-1].parent}" if inside else ""
-        raise ValueError(f"there is no run to resume in {resume}: it has no config.yaml{latest}.")
+        raise ValueError(no_run(Path(resume)))
     return resume
+
+
+def no_run(folder: Path) -> str:
+    """The sentence for a folder without a run, with the latest of the runs in it, which may be of several tasks."""
+    inside = list(folder.glob("*/config.yaml")) or list(folder.glob("*/*/config.yaml"))
+    latest = max(inside, key=lambda path: path.stat().st_mtime, default=None)
+    named = f"; the latest run in it is {latest.parent}" if latest else ""
+    return f"{folder} holds no run: there is no config.yaml in it{named}."
 
 
 def to_run(config: DictConfig) -> RunConf:

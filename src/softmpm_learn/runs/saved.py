@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from softmpm_learn import plugins
-from softmpm_learn.config import RunConf, to_run
+from softmpm_learn.config import RunConf, no_run, to_run
 from softmpm_learn.register import CHOICES, LOGGERS
 from softmpm_learn.storage import files
 from softmpm_learn.tasks import TASKS
@@ -37,7 +37,7 @@ def load(folder: Path) -> RunConf:
     files.check_folder(folder)
     path = folder / NAME
     if not path.exists():
-        raise ValueError(f"{folder} holds no run to resume: there is no {NAME} in it.")
+        raise ValueError(no_run(folder))
     data = files.read(path, _MOST + 1)
     try:
         text = data.decode()

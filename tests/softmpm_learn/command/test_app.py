@@ -271,7 +271,7 @@ def test_help_does_not_wait_for_pytorch():
         ("train.goal_spread=0.05", "train.goal_spread must be a list, got 0.05: write 'train.goal_spread=[0.05]', with a"),
         ("train.log=wandb", "train.log must be a list, got wandb: write 'train.log=[wandb]', with a comma between"),
         ("task.goal=[1", "cannot read 'task.goal=[1': write key=value"),
-        ("resume=nowhere", "there is no run to resume in nowhere"),
+        ("resume=nowhere", "nowhere holds no run: there is no config.yaml in it."),
         ("experiment=nope", "there is no experiment called nope; choose one of comparison, smoke."),
     ],
 )  # fmt: skip
@@ -400,7 +400,7 @@ def test_the_latest_run_in_a_folder_is_named(monkeypatch, capsys, tmp_path):
         os.utime(tmp_path / name / "config.yaml", (when, when))
     said = refusal(monkeypatch, capsys, f"resume={tmp_path}")
     assert said.endswith(
-        f"it has no config.yaml; the latest run in it: resume={tmp_path}/2026-01-02_09-00-00."
+        f"there is no config.yaml in it; the latest run in it is {tmp_path}/2026-01-02_09-00-00."
     )
 
 

@@ -113,10 +113,16 @@ def test_an_environment_has_the_trained_body(finished):
 
 
 def test_what_is_no_run_is_refused(finished, tmp_path):
-    """An empty folder, one without a checkpoint, one of several seeds, one of a robot that is not registered, a damaged checkpoint."""
+    """An empty folder, one of runs of several tasks, one without a checkpoint, one of several seeds, one of a robot that is not
+    registered, a damaged checkpoint."""
     out, _ = finished
     with pytest.raises(ValueError, match="there is no config.yaml in it"):
         softmpm_learn.load(tmp_path)
+    other = tmp_path / "outputs" / "arm" / "today"
+    other.mkdir(parents=True)
+    (other / "config.yaml").touch()
+    with pytest.raises(ValueError, match=f"outputs holds no run: .*; the latest run in it is {other}."):
+        softmpm_learn.load(tmp_path / "outputs")
     text = (out / "config.yaml").read_text()
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(ValueError, match=r"must have a checkpoint.pt, and has none\.$"):

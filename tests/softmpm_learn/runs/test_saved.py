@@ -84,5 +84,5 @@ def test_a_link_or_a_pipe_is_refused(tmp_path, text):
             load(run)
         (run / name).unlink()
     (run / NAME).unlink()
-    with pytest.raises(ValueError, match="holds no run to resume"):
+    with pytest.raises(ValueError, match="holds no run: there is no config.yaml in it"):
         load(run)
