@@ -154,11 +154,11 @@ class Term(Placed, ABC):
 
 
 def check_terms(terms: Sequence[Any]) -> None:
-    """Terms of an objective: one or more, each with a finite weight.
+    """Terms of an objective: one or more, each with a finite weight and a window that begins before it ends.
 
     Raises:
         TypeError: One is not a term, such as a list of terms, or the class of one.
-        ValueError: There is none, or a weight is not finite.
+        ValueError: There is none, a weight is not finite, or a window ends before it begins.
     """
     if not terms:
         raise ValueError("an objective needs a term, such as Objective(Progress()).")
@@ -171,4 +171,9 @@ def check_terms(terms: Sequence[Any]) -> None:
         if not math.isfinite(term.weight):
             raise ValueError(
                 f"the weight of the objective's term {term.name} must be finite, got {term.weight}."
+            )
+        if not term.begin <= term.end:
+            raise ValueError(
+                f"the window of the objective's term {term.name} must not end before it begins, got begin={term.begin:g} and "
+                f"end={term.end:g} [s]."
             )

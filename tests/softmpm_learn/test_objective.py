@@ -1,5 +1,6 @@
 """Terms of objectives: values by hand, windows, names, and one that a user writes."""
 
+import dataclasses
 import math
 import re
 from dataclasses import dataclass
@@ -267,6 +268,24 @@ def test_a_window_without_states_is_refused(path):
     """The message has the window and the end of the episode."""
     with pytest.raises(ValueError, match="window from 2.5 to inf s without a state; the episode ends at 2 s"):
         Effort(begin=2.5).value(path)
+
+
+@pytest.mark.parametrize(("begin", "end"), [(1.0, 0.5), (math.nan, 1.0), (0.0, math.nan)])
+def test_a_window_that_ends_before_it_begins_is_refused(begin, end):
+    """When the objective is made; one that ends where it begins has a state."""
+    with pytest.raises(
+        ValueError, match=f"effort must not end before it begins, got begin={begin:g} and end={end:g}"
+    ):
+        Objective(Progress(), Effort(begin=begin, end=end))
+    Objective(Effort(begin=0.5, end=0.5))
+
+
+def test_a_window_outside_of_the_episode_is_refused_when_the_task_is_made(task):
+    """An episode of 0.096 s: a run would begin with a simulation, to no avail."""
+    for window in ({"begin": 0.2}, {"begin": -0.2, "end": -0.1}):
+        with pytest.raises(ValueError, match="without a state; the episode ends at 0.096 s"):
+            dataclasses.replace(task, objective=Objective(Progress(), Effort(**window)))
+    dataclasses.replace(task, objective=Objective(Effort(begin=0.096)))
 
 
 def test_outcomes_in_words():

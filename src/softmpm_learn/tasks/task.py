@@ -8,11 +8,13 @@ from enum import Enum
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import torch
 
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Objective
 from softmpm_learn.setting_checks import typed
+from softmpm_learn.term import Path
 
 FORMULATIONS = ("moving", "reference")
 CONTACTS = ("auto", "nodes", "surface")
@@ -214,6 +216,11 @@ class Task:
     """Arguments of :func:`softmpm.build` that the task decides: formulation and contact."""
     source: Source | None = None
     """File of the robot, None if it is made by code."""
+
+    def __post_init__(self):
+        path = Path([k * self.control_period for k in range(self.control_steps + 1)], [], torch.empty(0))
+        for term in self.objective.terms:
+            term.window(path)  # raises if no state of the episode lies in it
 
     @property
     def seconds(self) -> float:
