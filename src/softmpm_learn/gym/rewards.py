@@ -21,6 +21,66 @@ from softmpm_learn.tasks import Task
 from softmpm_learn.term import Path, Term
 
 REWARDS = ("dense", "objective")
+ROUNDING = 1e-3
+"""Largest difference of a term from the sum of its shares, relative to these: rounding in float32 is below 1e-4."""
+
+
+def shared(term: Term, path: Path) -> tuple[Term, float, np.ndarray]:
+    """A term that adds up on the state after a step or on the way there, the share of the first state, and that of each step."""
+    states = term.window(path)
+    share = np.zeros(len(path.times) - 1)
+    if term.adds_up == "way":
+        share[states.start : states.stop - 1] = 1.0
+        return dataclasses.replace(term, begin=0.0, end=math.inf), 0.0, share
+    alone = dataclasses.replace(term, begin=path.times[1], end=math.inf)
+    if term.adds_up == "steps":
+        steps = term.steps(path)
+        share[steps] = 1.0 / (steps.stop - steps.start)
+        return alone, 0.0, share
+    share[max(states.start - 1, 0) : states.stop - 1] = 1.0 / (states.stop - states.start)
+    return alone, (1.0 / (states.stop - states.start) if states.start == 0 else 0.0), share
+
+
+@torch.no_grad()
+def check_sums(task: Task, rest: State, activation: Tensor, goal: Tensor | None) -> None:
+    """Compare each term that adds up with the sum of its shares, in three control steps at random near the initial state.
+
+    Args:
+        rest: Initial state of every world.
+        activation: Gives the shape (world, muscle).
+        goal: Goal of each world [m], shape (world, dim), or None.
+
+    Raises:
+        ValueError: They differ, so that the return of an episode would not be minus its loss.
+    """
+    generator, times = torch.Generator().manual_seed(0), [k * task.control_period for k in range(4)]
+
+    def random(like: Tensor, scale: float) -> Tensor:
+        return scale * torch.randn(like.shape, generator=generator).to(like)
+
+    def moved() -> State:
+        """Strained and displaced all over, and moving."""
+        strain, middle = random(rest.F[:, 0], 0.02), rest.x.mean(dim=1, keepdim=True)
+        x = rest.x + (rest.x - middle) @ strain.mT + random(middle, 0.25 * task.scene.grid.spacing)
+        return State(x, random(rest.v, task.body_length), rest.C, rest.F + strain[:, None] @ rest.F)
+
+    states, steps = [moved() for _ in times], torch.stack([random(activation, 0.5) for _ in times[1:]])
+    for one in task.objective.terms:
+        if not one.adds_up:
+            continue
+        term = dataclasses.replace(one, begin=0.0, end=math.inf)
+        motion = Path(times, states, steps, goal)
+        alone, first, share = shared(term, motion)
+        single = [Path(times[:2], states[:1] * 2, steps[:1], goal)]
+        single += [Path(times[:2], states[k : k + 2], steps[k : k + 1], goal) for k in range(len(share))]
+        pairs = zip([first, *share], single, strict=True)
+        parts = [part * alone.value_of_each_world(path) for part, path in pairs]
+        away = (term.value_of_each_world(motion) - sum(parts)).abs().max()
+        if away > ROUNDING * sum(part.abs().max() for part in parts):
+            raise ValueError(
+                f"{type(term).__name__} says adds_up = {term.adds_up!r}, but its value in a window is not the "
+                f"{'sum' if term.adds_up == 'way' else 'mean'} of its values on these; leave adds_up out, which costs more time."
+            )
 
 
 class Costs:
@@ -42,24 +102,9 @@ class Costs:
         if reward == "dense":
             terms = tuple(dataclasses.replace(term, begin=0.0, end=math.inf) for term in terms)
         path: Any = Path([k * self.period for k in range(self.horizon + 1)], [], torch.empty(0))
-        self._terms = [self._shared(term, path) for term in terms if term.adds_up]
+        self._terms = [shared(term, path) for term in terms if term.adds_up]
         self.wholes = [(term, term.window(path).start + 1) for term in terms if not term.adds_up]
         self.total = self._added = self._whole = like.new_zeros(like.shape[0])
-
-    def _shared(self, term: Term, path: Path) -> tuple[Term, float, np.ndarray]:
-        """The term on the state after a step or on the way there, the share of the first state, and that of each step."""
-        states = term.window(path)
-        share = np.zeros(self.horizon)
-        if term.adds_up == "way":
-            share[states.start : states.stop - 1] = 1.0
-            return dataclasses.replace(term, begin=0.0, end=math.inf), 0.0, share
-        alone = dataclasses.replace(term, begin=self.period, end=math.inf)
-        if term.adds_up == "steps":
-            steps = term.steps(path)
-            share[steps] = 1.0 / (steps.stop - steps.start)
-            return alone, 0.0, share
-        share[max(states.start - 1, 0) : states.stop - 1] = 1.0 / (states.stop - states.start)
-        return alone, (1.0 / (states.stop - states.start) if states.start == 0 else 0.0), share
 
     def begin(self, worlds: Tensor, state: State, activation: Tensor, goal: Tensor | None) -> None:
         """Begin new episodes.

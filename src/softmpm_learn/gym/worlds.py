@@ -16,7 +16,7 @@ from torch import Tensor
 import softmpm
 from softmpm import Failures, Inputs, Model, Params, State, UnstableError
 from softmpm_learn.gym.motions import Motions, Step
-from softmpm_learn.gym.rewards import REWARDS, Costs
+from softmpm_learn.gym.rewards import REWARDS, Costs, check_sums
 from softmpm_learn.observe import Centroids, Observer
 from softmpm_learn.setting_checks import lengths
 from softmpm_learn.tasks import Task
@@ -119,6 +119,7 @@ class Worlds:
         self.steps = np.zeros(count, dtype=int)
         self.activation = self._tensor(np.zeros((count, self.model.muscle_count)))
         self._fresh = np.ones(count, dtype=bool)
+        check_sums(task, self.origin, self.activation, self.goal)
         self._costs = {reward: Costs(task, reward, self.activation) for reward in ("objective", conf.reward)}
         self._motions = Motions(task) if self._costs["objective"].wholes else None
 

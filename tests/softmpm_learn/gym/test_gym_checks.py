@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from softmpm_learn.gym import EnvConf, SoftRobotEnv, make
-from softmpm_learn.objective import Objective, Path, Term
+from softmpm_learn.objective import Effort, Objective, Path, Progress, Term
 from softmpm_learn.observe import Observer
 from softmpm_learn.tasks import ArmConf, make_task
 
@@ -17,7 +17,7 @@ SHORT = dict(seconds=0.05, device="cpu")
 
 @pytest.mark.parametrize("declared", ["states", None])
 def test_a_value_that_is_not_one_number_for_each_world(declared):
-    """It is refused in the reward too, as a share of each step and as a value of the whole motion."""
+    """It is refused by environments too, as a share of each step and as a value of the whole motion."""
 
     @dataclass(frozen=True, kw_only=True)
     class Broad(Term):
@@ -27,9 +27,9 @@ def test_a_value_that_is_not_one_number_for_each_world(declared):
             return path.x.mean()
 
     task = dataclasses.replace(make_task(ArmConf(seconds=0.05)), objective=Objective(Broad()))
-    env = SoftRobotEnv(task, EnvConf(device="cpu"))
 
     def one_step():
+        env = SoftRobotEnv(task, EnvConf(device="cpu"))
         env.reset()
         env.step(np.zeros(6))
 
@@ -37,6 +37,55 @@ def test_a_value_that_is_not_one_number_for_each_world(declared):
         ValueError, match=r"term broad must be a tensor of shape \(world,\) = \(1,\).* got \(\);"
     ):
         one_step()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Farthest(Term):
+    """The largest distance of the mean position from the first wall, of all states: no mean over them."""
+
+    adds_up = "states"
+
+    def value(self, path: Path) -> torch.Tensor:
+        return path.x[self.window(path)].mean(dim=2)[..., 0].amax(dim=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jumps(Term):
+    """Changes of the activation from step to step: none in a single one."""
+
+    adds_up = "steps"
+
+    def value(self, path: Path) -> torch.Tensor:
+        activation = path.activation[self.steps(path)]
+        return (activation[1:] - activation[:-1]).square().mean(dim=-1).sum(dim=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed(Progress):
+    """A mean speed, which is no sum of those of the steps."""
+
+    adds_up = "way"
+
+    def value(self, path: Path) -> torch.Tensor:
+        return super().value(path) / (path.times[-1] - path.times[0])
+
+
+@pytest.mark.parametrize("term", [Farthest, Jumps, Speed])
+def test_a_term_that_does_not_add_up_as_it_says(term):
+    """It would give another return than minus the loss; without the declaration it is accepted."""
+    task = dataclasses.replace(
+        make_task(ArmConf(seconds=0.05)), objective=Objective(Effort(), term(begin=0.02))
+    )
+    with pytest.raises(
+        ValueError, match=f"{term.__name__} says adds_up = '{term.adds_up}', but its value in a"
+    ):
+        SoftRobotEnv(task, EnvConf(device="cpu"))
+
+    class Whole(term):
+        adds_up = None
+
+    task = dataclasses.replace(task, objective=Objective(Effort(), Whole(begin=0.02)))
+    SoftRobotEnv(task, EnvConf(device="cpu"))
 
 
 def test_a_body_is_material_and_inputs():
