@@ -55,9 +55,8 @@ def record(
         results: Those of the seeds of this process.
         about: Job, settings and folder.
     """
-    words = [
-        text for text in about["settings"].split() if not text.startswith(("train.seed=", "train.seeds="))
-    ]
+    words = about["settings"].split(" ")  # not at all white space, of which a value may have several
+    words = [text for text in words if not text.startswith(("train.seed=", "train.seeds="))]
     for result in results:
         seed = result.run.settings.train.seed
         place = folder(out, seed)

@@ -16,6 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 import softmpm
 from softmpm_learn.command import app, experiment, jobs, seeds
 from softmpm_learn.config import RunConf
+from softmpm_learn.distributed import Group
 from softmpm_learn.figures import __main__ as figures
 from softmpm_learn.runs.saved import load
 from softmpm_learn.settings import TrainConf
@@ -295,3 +296,25 @@ def test_no_process_is_without_a_seed():
     said = "train.seeds must be 1, or at least the 3 processes that share the seeds; got 2"
     with pytest.raises(ValueError, match=said):
         seeds.share(conf, Path("all"), SimpleNamespace(size=3, rank=0))
+
+
+def test_a_setting_with_spaces_stays_as_it_is(tmp_path):
+    """In the rows of the seeds, where its own seed takes the place of theirs."""
+    conf, file = RunConf(train=TrainConf(seeds=2)), "task.file='my  robot.png'"
+    results: list = [
+        SimpleNamespace(
+            run=SimpleNamespace(settings=one, iteration=1),
+            error=None,
+            finished=True,
+            best_loss=1.0,
+            best_iteration=0,
+            examination={},
+        )
+        for one in seeds.split(conf.settings)
+    ]
+    about = {"job": 0, "settings": f"task=image {file} train.seeds=2", "folder": str(tmp_path)}
+    for one in (0, 1):
+        seeds.folder(tmp_path, one).mkdir()
+    seeds.record(conf, tmp_path, results, Group(), about)
+    found = [row["settings"] for row in rows(tmp_path / "sweep.csv")]
+    assert found == [f"task=image {file} train.seed={one}" for one in (0, 1)]
