@@ -19,7 +19,16 @@ from omegaconf import DictConfig
 
 from softmpm_learn import plugins
 from softmpm_learn.command import seeds
-from softmpm_learn.command.jobs import Job, JobError, RefusedError, experiments, fail, run_jobs, side_by_side
+from softmpm_learn.command.jobs import (
+    Job,
+    JobError,
+    RefusedError,
+    experiments,
+    fail,
+    outcome,
+    run_jobs,
+    side_by_side,
+)
 from softmpm_learn.command.sentences import end, give_up, sentence
 from softmpm_learn.command.stop import Signals
 from softmpm_learn.config import RunConf, conf_dir, register, to_run
@@ -111,11 +120,12 @@ def job(
     try:
         conf = _configured(config, out, group)
         (results,) = experiments([(conf, out)], group, signals)
-        if conf.train.seeds > 1:
-            about = {"job": conf.job, "settings": " ".join(conf.command_line), "folder": str(out)}
-            found = seeds.record(conf, out, results, group, about)
-            if found and found.status == "failed":
-                end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
+        about = {"job": conf.job, "settings": " ".join(conf.command_line), "folder": str(out)}
+        found = outcome(conf, out, results, group, about)
+        if found:
+            group.once(sweep.update, out, found)
+        if found and found.status == "failed":
+            end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
         return seeds.median_loss(results)
     except JobError as failure:
         end(1, str(failure))

@@ -102,13 +102,18 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
     return [run_jobs([one], group, signals, failed)[0] for one in jobs]
 
 
+def outcome(
+    conf: RunConf, out: Path, results: Sequence[Result], group: Group, about: dict
+) -> sweep.Outcome | None:
+    """Outcome of a run or of seeds side by side, None if it was stopped; arguments as of :func:`softmpm_learn.command.seeds.record`."""
+    if conf.train.seeds > 1:
+        return seeds.record(conf, out, results, group, about)
+    return seeds.outcome(results[0], about) if results[0].finished or results[0].error else None
+
+
 def _judged(mine: Job, results: Sequence[Result], group: Group, failed: dict[int, Path]) -> float | None:
     """Write the outcome of a job, unless it was stopped; gives its loss."""
-    if mine.conf.train.seeds > 1:
-        found = seeds.record(mine.conf, mine.out, results, group, mine.about)
-    else:
-        done = results[0].finished or results[0].error
-        found = seeds.outcome(results[0], mine.about) if done else None
+    found = outcome(mine.conf, mine.out, results, group, mine.about)
     if found is None:
         return None
     if found.status == "failed":

@@ -87,6 +87,19 @@ def record(folder: Path, found: Outcome) -> None:
     files.replace(folder / OUTCOME, json.dumps(dataclasses.asdict(found), indent=1).encode())
 
 
+def update(folder: Path, found: Outcome) -> None:
+    """Replace the outcome in the folder of a job, or of a seed, by that of the run that went on alone, in the tables above it too; one
+    without an outcome is left to the command of its sweep."""
+    before = outcome(folder)
+    if before is None:
+        return
+    own = dict(job=before.job, seed=before.seed, settings=before.settings, folder=before.folder)
+    record(folder, dataclasses.replace(found, **own))
+    for above in (folder.parent, folder.parent.parent):
+        if (above / TABLE).exists():
+            tabulate(above)
+
+
 def tabulate(sweep: Path) -> None:
     """Write the table of all jobs of the sweep that have an outcome; of a job with several seeds, a row for each of them, unless it
     failed before any of them did: then they have the outcomes of an earlier command, and the job's own takes their place."""

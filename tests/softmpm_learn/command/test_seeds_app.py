@@ -298,6 +298,25 @@ def test_no_process_is_without_a_seed():
         seeds.share(conf, Path("all"), SimpleNamespace(size=3, rank=0))
 
 
+@pytest.mark.parametrize(("alone", "several"), [("1", 1), ("1", 2), ("1/seed_1", 2)])
+def test_what_goes_on_alone_has_its_row_in_the_table_of_the_sweep(main, alone, several):
+    """A job, with one seed or more, and a seed of one; the others stay as they are, and a run without a sweep has no table."""
+    words = ("train.iterations=1", f"train.seeds={several}", "optimizer.policy_rate=0.01,0.02")
+    assert main("-m", *PLAIN, *words, "hydra.sweep.dir=sweep")[0] == 0
+    before = rows(Path("sweep/sweep.csv"))
+    assert main(f"resume=sweep/{alone}", "train.iterations=3")[0] == 0
+    after = rows(Path("sweep/sweep.csv"))
+    assert [(row["job"], row["seed"]) for row in after] == [(row["job"], row["seed"]) for row in before]
+    changed = [row["job"] == "1" and (row["seed"] == "1" or alone == "1") for row in after]
+    assert [row["iterations"] for row in after] == ["3" if new else "1" for new in changed]
+    assert [row for row, new in zip(after, changed, strict=True) if not new] == before[: changed.count(False)]
+    assert main("-m", *PLAIN, *words, "hydra.sweep.dir=sweep")[0] == 0
+    assert rows(Path("sweep/sweep.csv")) == after
+    assert main(*PLAIN, "hydra.run.dir=lone/run")[0] == 0 and {
+        path.name for path in Path("lone").iterdir()
+    } == {"run"}
+
+
 def test_a_setting_with_spaces_stays_as_it_is(tmp_path):
     """In the rows of the seeds, where its own seed takes the place of theirs."""
     conf, file = RunConf(train=TrainConf(seeds=2)), "task.file='my  robot.png'"
