@@ -72,12 +72,14 @@ class Fibres:
         self._carriers, row = np.unique(carrier, return_inverse=True)
         self._row = row.reshape(carrier.shape)
 
+    @np.errstate(invalid="ignore")  # the difference of two infinite positions is no number
     def dots(self, positions: np.ndarray) -> np.ndarray:
         """Rows of dots for strokes, which a picture sorts by depth as it does particles [m], shape (stroke, dot, dim), not finite where
         particles around are not."""
         gradient = self._gradient(positions)[self._row]
         return positions[self._carriers][self._row] + (gradient @ self._offset[..., None])[..., 0]
 
+    @np.errstate(invalid="ignore")
     def ends(self, positions: np.ndarray, raised: float = 0.0) -> np.ndarray:
         """Both ends of each stroke [m], shape (stroke, 2, dim), not finite where particles around are not.
 

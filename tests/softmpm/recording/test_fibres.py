@@ -81,6 +81,7 @@ def test_strokes_stretch_with_the_muscle(model):
     np.testing.assert_allclose(longer, 1.5 * rows, atol=1e-9)
     stretched[fibres.particle[0]] = np.nan
     assert np.isfinite(fibres.dots(stretched)).any() and not np.isfinite(fibres.dots(stretched)[0]).any()
+    assert not np.isfinite(fibres.ends(np.full_like(stretched, np.inf), raised=0.01)).any()
 
 
 def test_strokes_end_with_the_muscle():
