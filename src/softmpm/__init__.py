@@ -11,7 +11,7 @@ from softmpm.alarms import Alarms, Failures
 from softmpm.autograd import rasterize, simulate
 from softmpm.building import build
 from softmpm.cuda_graph import Graph
-from softmpm.errors import UnstableError
+from softmpm.errors import UnstableError, noted
 from softmpm.forces import clamp_forces, contact_forces
 from softmpm.inputs import QUANTITIES, Inputs, Quantity
 from softmpm.model import Model
@@ -106,6 +106,7 @@ __all__ = [
     "mesh",
     "momentum",
     "neighbour_pairs",
+    "noted",
     "polygons",
     "presets",
     "rasterize",

@@ -69,7 +69,6 @@ class Failures:
     Attributes:
         policy: ``freeze`` or ``reset``.
         errors: What would have been raised, in the order in which it was found; ``world`` and ``substep`` say where and when.
-        note: Added to the errors of the calls that are made while it is set, such as the place of a call among others.
     """
 
     def __init__(self, policy: Policy):
@@ -79,7 +78,6 @@ class Failures:
         )
         self.policy: Policy = policy
         self.errors: list[UnstableError] = []
-        self.note = ""
 
     def __len__(self) -> int:
         return len(self.errors)

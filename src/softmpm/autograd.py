@@ -1,7 +1,7 @@
 """The PyTorch boundary: what a user calls, as functions with an explicit adjoint; no kernel is launched here."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from softmpm.batches import FirstOrder, FirstOrderAdjoint, refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
 from softmpm.checks import check_activation, check_finite, check_horizon, check_state
 from softmpm.compiling import opaque
+from softmpm.errors import at, place
 from softmpm.inputs import Inputs, differentiable
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import RequestedGrads
@@ -179,6 +180,8 @@ class _Call:
     names: tuple[str, ...]
     differentiable: bool
     failures: Failures | None
+    place: str = field(default_factory=place)
+    """Notes for the errors of its backward pass."""
     trail: Trail | None = None
 
     def state(self, tensors: Sequence) -> Any:
@@ -253,7 +256,7 @@ class _SimulateBackward(FirstOrderAdjoint):
         kind: Any = Nodal if call.model.formulation == "reference" else State
         pairs = zip(state[-call.count :], state[: call.count], strict=True)
         adj_end = kind.of([torch.zeros_like(like) if adj is None else adj for adj, like in pairs])
-        with explain_out_of_memory(call.model, call.horizon, gradient=True):
+        with explain_out_of_memory(call.model, call.horizon, gradient=True), at(call.place):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
         found = (adj_inputs.tensors.get(name) for name in call.names)
         exact = (

@@ -5,6 +5,9 @@ failure has the smallest word and stays. From then on that world is left as it i
 word is read, and nothing is written out of bounds. Other worlds go on, unchanged.
 """
 
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 from enum import IntEnum
 from typing import Any
 
@@ -33,6 +36,35 @@ class Kind(IntEnum):
     COLLAPSED = 8
     IN_WALL = 9
     OVERLAP = 10
+
+
+_PLACE: ContextVar[str] = ContextVar("place", default="")
+
+
+def place() -> str:
+    """The notes of the blocks of :func:`noted` around, empty outside."""
+    return _PLACE.get()
+
+
+@contextmanager
+def at(place: str) -> Iterator[None]:
+    """Make errors in the block with these notes, and no others."""
+    token = _PLACE.set(place)
+    try:
+        yield
+    finally:
+        _PLACE.reset(token)
+
+
+def noted(note: str) -> AbstractContextManager[None]:
+    """Add a note, such as the place of a call among others, to every :class:`UnstableError` of the calls that are made in the block:
+    raised, collected, or met in a backward pass later.
+
+    Example:
+        >>> with softmpm.noted("In control step 3."):
+        ...     state = softmpm.simulate(model, state, activation, params, substeps=10)
+    """
+    return at(f"{note} {place()}".strip())
 
 
 class UnstableError(RuntimeError):
@@ -67,6 +99,8 @@ class UnstableError(RuntimeError):
         self.kind = kind
         self.world, self.particle, self.substep = world, particle, substep
         self.value, self.limit, self.state = value, limit, state
+        if place():
+            self.add_note(place())
 
     def __reduce__(self):
         """For pickle and copy, so that a failure in another process arrives whole; the state arrives on the CPU."""

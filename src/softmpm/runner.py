@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from softmpm.alarms import Failures
-from softmpm.errors import FROZEN, NEVER, UnstableError
+from softmpm.errors import FROZEN, NEVER, UnstableError, at, place
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
@@ -106,15 +106,8 @@ class Runner:
             finally:
                 # The error would refer to itself through this frame, and keep the objects of the frame alive.
                 del error
-        self._note(error, self.failures.note)
-        self.frozen[error.world] = first
-
-    def _note(self, error: UnstableError, note: str) -> None:
-        """Collect a failure."""
-        assert self.failures is not None
-        if note:
-            error.add_note(note)
         self.failures.errors.append(error)
+        self.frozen[error.world] = first
 
     def _located(self, run: Run, words: list[int]) -> UnstableError:
         """The first failure of a chunk, found by running it substep by substep with all alarms checked after each."""
@@ -167,17 +160,17 @@ class Runner:
         failed = words < FROZEN
         self.failed = failed if self.failed is None else self.failed | failed
         about |= {"first": first, "values": stiffest(self.model, about.get("values", self.values))}
-        defer_status_check(words, outgrow, functools.partial(self._collect, about, self.failures.note))
+        defer_status_check(words, outgrow, functools.partial(self._collect, about, place()))
 
-    def _collect(self, about: dict[str, Any], note: str, words: list[int]) -> None:
+    def _collect(self, about: dict[str, Any], notes: str, words: list[int]) -> None:
         """Collect the first failure of each world in the last replay."""
         assert self.failures is not None
         new = [world for world in failed_worlds(words) if world not in self.failures.worlds]
         if not new:
             return
         end = self.scheme.particles(self._end)
-        for world in new:
-            self._note(failure(self.model, words, world, end, **about), note)
+        with at(notes):
+            self.failures.errors += [failure(self.model, words, world, end, **about) for world in new]
 
     def captured(self, end: Any) -> Any:
         """The final state of a captured call that collects failures, as :class:`Failures` has it."""

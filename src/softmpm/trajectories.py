@@ -1,7 +1,6 @@
 """Trajectories: states of a simulation, or what is observed of them, at every so many control steps."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +12,7 @@ from softmpm.batches import refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, steps_of
 from softmpm.check_inputs import control_steps as steps_of_call
 from softmpm.checks import check_activation, check_finite, check_horizon, check_state, check_whole
-from softmpm.errors import UnstableError
+from softmpm.errors import noted
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.kernel_inputs import expanded, velocity_to
 from softmpm.model import Model, check_model
@@ -91,7 +90,7 @@ def trajectory(
         last = first + every
         part = Inputs(**{name: _rows(name, value, first, last) for name, value in given.items()})
         row = None if activation is None else activation[first:last]
-        with _counted_from(first, failures):
+        with noted(f"softmpm.trajectory: the substep counts from the beginning of control step {first}."):
             state = simulate(model, state, row, params, substeps=substeps, inputs=part, failures=failures)
         frames.append(state if observe is None else observe(state))
     return Trajectory(state, stacked(frames))
@@ -127,20 +126,6 @@ def _rows(name: str, value: Tensor, first: int, last: int) -> Tensor:
     if steps_of(name, value) is None:
         return value
     return value[first : last + (QUANTITIES[name].axes[0] == "pose")]
-
-
-@contextmanager
-def _counted_from(first: int, failures: Failures | None) -> Iterator[None]:
-    """Add to the errors inside that their substeps count from this control step."""
-    note = f"softmpm.trajectory: the substep counts from the beginning of control step {first}."
-    before = 0 if failures is None else len(failures)
-    try:
-        yield
-    except UnstableError as error:
-        error.add_note(note)
-        raise
-    for error in () if failures is None else failures.errors[before:]:
-        error.add_note(note)
 
 
 def stacked(frames: Sequence[Any]) -> Any:

@@ -1,8 +1,7 @@
 """Closed-loop simulation: observe → act → simulate in each control step, differentiable end to end."""
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -109,7 +108,7 @@ def run_episode(
 
     Raises:
         ValueError: Parameters or buffers of the observer or the policy have another precision than the model.
-        softmpm.UnstableError: With a note that names the control step, as those have that are collected.
+        softmpm.UnstableError: With a note that names the control step, as those have that are collected or met in a backward pass.
     """
     _check_precision(model, observer=observer, policy=policy)
     state = model.rest() if start is None else start
@@ -126,9 +125,8 @@ def run_episode(
             activation = activation.index_fill(0, failed, 0.0)
         if on_frame:
             on_frame(Frame(step * period, state, features, activation))
-        with _placed(
-            f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s.", failures
-        ):
+        at = f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s."
+        with softmpm.noted(at):
             state = softmpm.simulate(
                 model,
                 state,
@@ -167,22 +165,6 @@ def _check_precision(model: Model, **parts: Policy | Observer) -> None:
                     f"the {what} must be {model.dtype} like the model, has {tensor.dtype}; use {what}.to({model.dtype}), or build the "
                     "model with another dtype, as run.model_of does for a run."
                 )
-
-
-@contextlib.contextmanager
-def _placed(place: str, failures: softmpm.Failures | None) -> Iterator[None]:
-    """Errors in the block, raised or collected, have a note of its place."""
-    before = "" if failures is None else failures.note
-    try:
-        if failures is not None:
-            failures.note = f"{place} {before}".rstrip()
-        yield
-    except softmpm.UnstableError as error:
-        error.add_note(place)
-        raise
-    finally:
-        if failures is not None:
-            failures.note = before
 
 
 def kicked(state: State, kicks: Tensor) -> State:

@@ -181,11 +181,10 @@ def gradient(model, start, failures):
     v, params = start.v.clone().requires_grad_(), model.params()
     young = params.young.expand(2, -1).clone().requires_grad_()
     state = start._replace(v=v)
-    for note in ("Call 0.", ""):
-        if failures is not None:
-            failures.note = note
-        params = params._replace(young=young)
+    params = params._replace(young=young)
+    with softmpm.noted("Call 0."):
         state = softmpm.simulate(model, state, None, params, substeps=20, failures=failures)
+    state = softmpm.simulate(model, state, None, params, substeps=20, failures=failures)
     weights = torch.linspace(1.0, 2.0, state.x.numel(), device=state.x.device).view_as(state.x)
     loss = (state.x * weights).sum()
     return torch.autograd.grad(loss, (v, young))

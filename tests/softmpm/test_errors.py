@@ -117,6 +117,30 @@ def test_a_gradient_that_is_not_finite_is_an_error(device):
     assert "look at the loss" in str(caught.value)
 
 
+def test_errors_have_the_notes_of_their_call():
+    """Of the blocks around it, the inner one first; in the backward pass of the call too, wherever that is made."""
+    model = single()
+    state, ends = model.rest(), []
+    state.v.requires_grad_()
+    with softmpm.noted("Outer."):
+        for k in range(3):
+            with softmpm.noted(f"Call {k}."):
+                state = softmpm.simulate(model, state, None, model.params(), substeps=4)
+            ends.append(state)
+    for k in (1, 2):
+        with pytest.raises(softmpm.UnstableError) as caught, softmpm.noted("Elsewhere."):
+            (ends[k].x.sum() * 3e38 * 10).backward(retain_graph=True)
+        assert caught.value.__notes__ == [f"Call {k}. Outer."]
+    start = model.rest()
+    start.v.fill_(1e30)
+    with pytest.raises(softmpm.UnstableError) as caught, softmpm.noted("Elsewhere."):
+        softmpm.simulate(model, start, None, model.params(), substeps=4)
+    assert caught.value.__notes__ == ["Elsewhere."]
+    with pytest.raises(softmpm.UnstableError) as caught:
+        softmpm.simulate(model, start, None, model.params(), substeps=4)
+    assert not hasattr(caught.value, "__notes__")
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_bad_numbers_are_refused_before_any_launch(dtype, scheme, device, monkeypatch):
     """NaN and infinity in every input, with its name and index."""

@@ -126,3 +126,15 @@ def test_a_failure_names_the_control_step(task, model):
     with pytest.raises(softmpm.UnstableError) as caught:
         run_episode(thrown, model, observer, Constant([40.0, -40.0]), model.params())
     assert "control step 0 of 6" in caught.value.__notes__[0]
+
+
+def test_a_failure_of_the_gradient_names_the_control_step(task, model):
+    """That in which it overflows: of a loss of states two and five, whose own gradient does, the later one is met first."""
+    observer = Centroids(model, [np.arange(4)], 1.0)
+    params = model.params()._replace(young=model.params().young.clone().requires_grad_())
+    path = run_episode(task, model, observer, Constant([0.5, -0.3]), params).path
+    with pytest.raises(softmpm.UnstableError) as caught:
+        (path.x[[2, 5]].sum() * 3e38 * 10).backward()
+    assert (
+        caught.value.kind == "gradient" and "control step 4 of 6, which began at" in caught.value.__notes__[0]
+    )
