@@ -178,10 +178,11 @@ def _finite(term: Term, path: Path) -> Tensor:
         ValueError: It is infinite or no number: so would be a reward, and with it all parameters of a policy that learns from it.
     """
     value = term.value_of_each_world(path)
-    if not bool(value.isfinite().all()):
+    wrong = value[~value.isfinite()]
+    if len(wrong) > 0:
         raise ValueError(
             f"the value of the objective's term {term.name} must be finite after each control step, for which an environment gives "
-            f"a reward, got {value.detach().tolist()} on a motion of {len(path.activation)} control step(s), {path.times[-1]:g} s; "
+            f"a reward, got {wrong[0].item()} on a motion of {len(path.activation)} control step(s), {path.times[-1]:g} s; "
             "return a finite number for the first part of an episode too, such as 0 where it is too short for the value."
         )
     return value

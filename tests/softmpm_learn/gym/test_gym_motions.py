@@ -235,7 +235,7 @@ def test_a_value_that_is_no_number_for_a_part_is_refused(task, reward):
     own = dataclasses.replace(task, objective=Objective(Progress(), Swing(begin=task.control_period)))
     env = SoftRobotEnv(own, EnvConf(reward=reward, **DOUBLE))
     env.reset()
-    message = r"term swing must be finite after each control step.*\[nan\] on a motion of 1 control step\(s\).*return a finite number"
+    message = r"term swing must be finite after each control step.*got nan on a motion of 1 control step\(s\).*return a finite number"
     with pytest.raises(ValueError, match=message):
         env.step(np.zeros(2))
 
