@@ -13,7 +13,7 @@ from common import Table, arguments
 import softmpm
 
 LONG, YOUNG, FRICTION, SLOPE = 0.2, 5e4, 0.6, math.radians(20.0)
-CORNERS = ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.25, 0.25))
+CORNERS = ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.25, 0.25), (0.1, 0.1))
 """Lower left corner in the cell of the grid [cells]."""
 BLOCKS = [
     *itertools.product((6, 7, 8, 9, 12, 16, 32), CORNERS[:1], ("reference", "moving")),

@@ -134,7 +134,7 @@ def given(model: softmpm.Model, names, steps: int, seed=7) -> dict[str, torch.Te
     made = {
         "gravity": lambda: random("gravity", -9.0, 3.0),
         "damping": lambda: random("damping", 0.2, 3.0),
-        "friction": lambda: random("friction", 0.05, 0.4),
+        "friction": lambda: random("friction", 0.02, 0.2),
         "direction": lambda: random("direction", 0.2, 1.5),
         "strength": lambda: random("strength", 5.0, 12.0),
         "viscosity": lambda: random("viscosity", 0.01, 0.05),

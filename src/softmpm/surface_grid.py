@@ -1,8 +1,8 @@
 """Interpolation at the surface points of bodies in the reference formulation, found once when a model is built.
 
-The weights divide a pressure among the nodes as the stress of the particles behind it is divided. Those of nodes that hold next to no
-mass are dropped, since such a node would move far at the touch of a wall, and the others corrected by an affine function of the
-distance, so that affine fields stay exact. Derivation: docs/math/contact.md.
+The weights divide a pressure among the nodes as the stress of the particles behind it is divided. Those of nodes that would move much
+farther than the point at the touch of a wall are dropped, and the others corrected by an affine function of the distance, so that
+affine fields stay exact. Derivation: docs/math/contact.md.
 """
 
 import itertools
@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from softmpm.rest_grid import RestGrid, bases, flat, stencils
-from softmpm.scene.scene import MIRRORS, Scene
+from softmpm.scene.scene import MIRRORS, Particles, Scene
 from softmpm.state import State
 from softmpm.surface_points import SurfacePoints
 from softmpm.validate import need
 
-LEAST = 1e-3
-"""Least mass of a node that takes part, in units of that of a full cell."""
+FARTHEST = 10.0
+"""Farthest way of a node that takes part at the touch of a wall, in units of the way of the point."""
 
 
 class SurfaceGrid(SurfacePoints):
@@ -38,12 +38,15 @@ class SurfaceGrid(SurfacePoints):
     def __init__(self, scene: Scene, rest: RestGrid, device: torch.device):
         super().__init__(scene, device)
         grid, dim = scene.grid, scene.grid.dim
-        points, areas, density = (one.cpu().numpy() for one in (self.points, self.areas, self.density))
+        points, areas = self.points.cpu().numpy(), self.areas.cpu().numpy()
         outlines = [body.particles.outline for body in scene.bodies if body.particles.outline is not None]
         offsets = np.array(list(itertools.product(range(3), repeat=dim)))
         base, f = bases(points / grid.spacing)
         arms = offsets - f[:, None]
-        weights = face_weights(arms, np.concatenate([outline.normals for outline in outlines]))
+        normals = np.concatenate([outline.normals for outline in outlines])
+        cells = [layers_of(body.particles, grid.spacing) for body in scene.bodies]
+        layers = np.repeat(cells, [len(outline) for outline in outlines])
+        weights = face_weights(arms, normals, layers)
         at = flat(base[:, None] + offsets, grid.shape)
         index = rest.index.cpu().numpy()
         sorting = np.argsort(index)
@@ -54,7 +57,11 @@ class SurfaceGrid(SurfacePoints):
             near, _, share = stencils(body.particles.positions / grid.spacing, offsets)
             share *= body.material.density * np.asarray(body.particles.volume)[:, None]
             np.add.at(mass, np.searchsorted(index, flat(near[:, None] + offsets, grid.shape)), share)
-        held = (index[numbers] == at) & (mass[numbers] > LEAST * density[:, None] * grid.spacing**dim)
+        held = (index[numbers] == at) & (mass[numbers] > 0.0)
+        weights = consistent(np.where(held, weights, 0.0), arms)
+        ways = nodal_loads(weights, areas, numbers, len(index)) / np.where(mass > 0.0, mass, np.inf)
+        ways = ways[numbers]  # of each node at the same pressure on all points
+        held &= ways <= FARTHEST * (np.abs(weights) * ways).sum(axis=1, keepdims=True)
         weights = consistent(np.where(held, weights, 0.0), arms)
         main = np.take_along_axis(numbers, np.abs(weights).argmax(axis=1)[:, None], axis=1)
         numbers = sorting[
@@ -69,8 +76,7 @@ class SurfaceGrid(SurfacePoints):
         members = np.flatnonzero(weights)
         owners = numbers.reshape(-1)[members]
         order = np.argsort(owners, kind="stable")
-        loads = np.zeros(len(index))
-        np.add.at(loads, numbers, np.abs(weights) * areas[:, None])
+        loads = nodal_loads(weights, areas, numbers, len(index))
         members, owners = members[order], owners[order]
         constrained = len(scene.driven) > 0 or any(wall.contact in MIRRORS for wall in scene.walls)
         touched = np.arange(len(index)) if constrained else np.unique(owners)
@@ -99,19 +105,40 @@ class SurfaceGrid(SurfacePoints):
         return x if shift is None else (x + shift[:, None]).to(u.dtype)
 
 
-def face_weights(arms: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Shares of the nodes in a pressure on a face, (K11), shape (point, node). They sum to one and are exact for affine fields.
+def layers_of(particles: Particles, spacing: float) -> int:
+    """Layers of particles in a cell of the grid, of a lattice as dense as these particles on average."""
+    cell = spacing ** particles.positions.shape[1]
+    return max(1, round((cell / np.mean(particles.volume)) ** (1 / particles.positions.shape[1])))
+
+
+def nodal_loads(weights: np.ndarray, areas: np.ndarray, numbers: np.ndarray, count: int) -> np.ndarray:
+    """L of (K1) [m²], shape (node,); ``numbers`` are those of each point's nodes, shape (point, node)."""
+    loads = np.zeros(count)
+    np.add.at(loads, numbers, np.abs(weights) * areas[:, None])
+    return loads
+
+
+def spline(r: np.ndarray) -> np.ndarray:
+    """Quadratic B-spline of a distance in cells."""
+    d = np.abs(r)
+    return np.where(d < 0.5, 0.75 - d**2, np.maximum(1.5 - d, 0.0) ** 2 / 2)
+
+
+def face_weights(arms: np.ndarray, normals: np.ndarray, layers: np.ndarray) -> np.ndarray:
+    """Shares of the nodes in a pressure on a face, (K11), shape (point, node). They sum to one.
 
     Args:
         arms: Distance of each node from the point in cells, shape (point, node, dim).
         normals: Unit normals of the face, shape (point, dim).
+        layers: Layers of particles in a cell behind each point, shape (point,).
     """
-    d = np.abs(arms)
-    t = np.maximum(1.5 - d, 0.0)
-    along = np.where(d < 0.5, 0.75 - d**2, t**2 / 2)
-    across = np.where(d < 0.5, 13 / 16 - 1.5 * d**2 + d**4, t**3 - t**4 / 2)
+    each = layers[:, None, None]
+    across = np.zeros_like(arms)
+    for k in range(3 * layers.max()):
+        deep = arms + (k + 0.5) / each
+        across += 4 / each * deep * spline(deep)
     axes = np.eye(arms.shape[-1], dtype=bool)
-    shares = np.stack([np.where(axis, across, along).prod(axis=-1) for axis in axes], axis=-1)
+    shares = np.stack([np.where(axis, across, spline(arms)).prod(axis=-1) for axis in axes], axis=-1)
     return np.einsum("pna,pa->pn", shares, normals**2)
 
 

@@ -17,7 +17,6 @@ class SurfacePoints:
         points: Rest positions [m], shape (point, dim), float64.
         areas: Area of each point [m²], shape (point,), float64.
         stiffness: Stiffness of the spring that a sticking point hangs on [Pa/m], shape (point,), float64.
-        density: Density of the material of each point [kg/m³], shape (point,), float64.
         waves: Speed of pressure waves at each point [m/s], shape (point,), float64.
         walls: Number of each separating wall in ``scene.walls``, for the axis ``wall`` of :func:`softmpm.contact_forces`.
         normals: Unit normals of these walls, shape (wall, dim), float64.
@@ -34,7 +33,7 @@ class SurfacePoints:
         self.points = self._tensor(np.concatenate([outline.points for outline in outlines]))
         self.areas = self._tensor(np.concatenate([outline.areas for outline in outlines]))
         self.stiffness = self._tensor(4.0 * modulus / scene.grid.spacing)
-        self.density, self.waves = self._tensor(density), self._tensor(np.sqrt(modulus / density))
+        self.waves = self._tensor(np.sqrt(modulus / density))
         self.normals = self._tensor(normals)
 
     def shown(self, state: State) -> Tensor:
