@@ -49,9 +49,10 @@ def test_a_disc_breathes():
     assert abs(waves.disc("reference", 32, 2)["error %"]) <= 0.7
 
 
-def test_a_disc_rests_as_hertz_says():
+@pytest.mark.parametrize("formulation", ["reference", "moving"])
+def test_a_disc_rests_as_hertz_says(formulation):
     """Its centre sinks by the exact amount to 1 %, its largest pressure is exact to 3 %, with 1.7 cells in half of the contact."""
-    found = contact.hertz(32, 2)
+    found = contact.hertz(32, 2, formulation)
     assert abs(found["sinking"]["error %"]) <= 1.0
     assert abs(found["pressure"]["error %"]) <= 3.0
 

@@ -49,7 +49,9 @@ def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hertz(cells: int, per_cell: int, formulation: str = "reference") -> dict[str, dict]:
-    """A disc of the radius 1/4 that is put on the floor and comes to rest: its largest pressure, and how far its centre sinks."""
+    """A disc of the radius 1/4 that is put on the floor and comes to rest: its largest pressure, against Hertz' at the place of that
+    point, and how far its centre sinks.
+    """
     radius, h, weight = 0.25, 1.0 / cells, DENSITY * GRAVITY
     floor = 3.5 * h
     center = ((math.ceil(radius / h) + 3) * h, floor + radius)
@@ -67,8 +69,10 @@ def hertz(cells: int, per_cell: int, formulation: str = "reference") -> dict[str
         return -float((state.x[0].cpu().numpy() - center)[near, 1].mean())
 
     sinking = result(one, one.settled(16 / frequency, sunk), want.sinking)
-    _, pressure = pressures(one)
-    return {"sinking": sinking, "pressure": result(one, (pressure.max(), 0.0), want.pressure)}
+    places, pressure = pressures(one)
+    most = pressure.argmax()
+    there = want.pressure * math.sqrt(1.0 - ((places[most, 0] - center[0]) / want.width) ** 2)
+    return {"sinking": sinking, "pressure": result(one, (pressure[most], 0.0), there)}
 
 
 def gap(cells: int, per_cell: int, formulation: str = "reference") -> dict:
