@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from softmpm.scene.actuators import Muscle
 from softmpm.scene.materials import FixedCorotated, NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 from softmpm.state import Params, State
 
 DX = 0.1

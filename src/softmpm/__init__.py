@@ -34,12 +34,13 @@ from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_export import to_rerun
 from softmpm.recording.writer import Recorder
 from softmpm.scene import presets
+from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.file import load_scene, save_scene
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.neighbours import neighbour_pairs
 from softmpm.scene.outline import Outline
 from softmpm.scene.polygons import inside
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh, polygons
 from softmpm.stability import StabilityWarning, StableDt, stable_dt
 from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State, SurfaceState

@@ -64,6 +64,23 @@ def array(name: str, values: object, kinds: str = "iuf", of: str = "real numbers
     return array
 
 
+def indices(name: str, particles: object, least: int = 1) -> np.ndarray:
+    """Indices of particles, shape (k,), int64, read-only; at least so many, none twice."""
+    what = f"{name.removeprefix('a ')} particles"
+    found = array(what, particles, "biufO", "whole numbers")
+    need(
+        found.ndim == 1 and found.size >= least,
+        f"{name} needs a list of particle indices{', not empty,' * (least > 0)} got an array of shape {found.shape}; "
+        "np.flatnonzero(mask) makes one.",
+    )
+    need(
+        np.issubdtype(found.dtype, np.integer),
+        f"{what} must be whole numbers, got {found.dtype}; np.flatnonzero(mask) makes them.",
+    )
+    need(len(np.unique(found)) == found.size, f"{name} names a particle twice; give each index once.")
+    return read_only(found.astype(np.int64))
+
+
 def read_only(array: np.ndarray) -> np.ndarray:
     """A scene is checked once: what could be written to later would escape that."""
     array.flags.writeable = False

@@ -12,8 +12,9 @@ import torch
 
 import softmpm
 from softmpm.oracle import moving
+from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import FixedCorotated, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene
+from softmpm.scene.scene import Body, Grid, Particles, Scene
 from softmpm.stability import StabilityWarning, need_stable, running_limit, stable_dt
 
 DX, RHO = 0.1, 2.0

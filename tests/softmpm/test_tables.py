@@ -10,8 +10,8 @@ from softmpm import energy_density
 from softmpm.inputs import Input, Inputs
 from softmpm.oracle import step_limit, stress
 from softmpm.scene import file
+from softmpm.scene.actuators import Actuator
 from softmpm.scene.materials import Material
-from softmpm.scene.scene import Actuator
 
 KERNELS = Path(softmpm.__file__).parent / "kernels" / "physics"
 

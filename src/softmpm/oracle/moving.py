@@ -30,7 +30,8 @@ from softmpm.oracle.stress import (
 )
 from softmpm.oracle.transfer import g2p, p2g, stencil
 from softmpm.oracle.walls import inside, respond, surface, wall_velocity
-from softmpm.scene.scene import CONTACTS, Actuator, Scene
+from softmpm.scene.actuators import Actuator
+from softmpm.scene.scene import CONTACTS, Scene
 from softmpm.state import GridField, Params, State
 
 __all__ = [

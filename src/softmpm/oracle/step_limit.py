@@ -13,8 +13,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from softmpm.scene.actuators import Actuator, Muscle, Pressure
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Actuator, Muscle, Pressure, Scene
+from softmpm.scene.scene import Scene
 
 
 def _no_volume(J: Tensor, mu: Tensor, lam: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from softmpm.scene.actuators import Actuator, Muscle, Pressure
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Actuator, Muscle, Pressure
 
 
 def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
 """Every rule that needs a whole scene: bodies in the grid, muscles in the bodies, walls in reach, values in the precision.
 
-Each message names the rule, the value received and a remedy. Rules of one object stand in ``scene.py``.
+Each message names the rule, the value received and a remedy. Rules of one object stand with its class.
 """
 
 from collections.abc import Sequence
@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from softmpm.scene.actuators import Actuator
 from softmpm.scene.check_mirrors import check_mirrors
 from softmpm.scene.outline import Outline
-from softmpm.scene.scene import Actuator, Grid, Particles, Scene
+from softmpm.scene.scene import Grid, Particles, Scene
 from softmpm.validate import need
 
 SAME_PLACE = 1e-6

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.outline import Outline
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 from softmpm.validate import need
 
 FORMAT, VERSION = "softmpm scene", 1

@@ -1,4 +1,4 @@
-"""Scene description: grid, bodies with a material, actuators, walls. Plain SI numbers, checked at once.
+"""Scene description: grid, bodies with a material, walls, and the actuators of ``actuators.py``. Plain SI numbers, checked at once.
 
 A scene holds no tensors and knows no device; :func:`softmpm.build` turns it into a :class:`softmpm.Model`.
 Rules that need the whole scene (particles inside the grid, muscle indices) live in ``check_scene.py``.
@@ -10,10 +10,11 @@ from typing import Literal
 
 import numpy as np
 
+from softmpm.scene.actuators import Actuator
 from softmpm.scene.materials import Material
 from softmpm.scene.outline import Outline
 from softmpm.summary import counted, table
-from softmpm.validate import array, need, need_kind, numbers, read_only, restore, store_numbers, unit
+from softmpm.validate import array, indices, need, need_kind, numbers, read_only, restore, store_numbers, unit
 
 Contact = Literal["stick", "slip", "separate", "clamp", "symmetry"]
 CONTACTS: tuple[Contact, ...] = ("stick", "slip", "separate", "clamp", "symmetry")
@@ -125,83 +126,6 @@ class Body:
         need_kind("body material", self.material, Material)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Actuator:
-    """Particles with a stress that follows an activation. Use one of its kinds, the subclasses below; their stresses add."""
-
-    particles: np.ndarray
-    """Indices into the model's particles: the bodies' particles in the order of the bodies; copied, read-only. PyTorch warns of
-    indices that are read-only: ``params.young[..., torch.tensor(muscle.particles)]``."""
-    strength: float
-    """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger ones
-    stretch a body until it fractures (docs/results.md, Lessons). Differentiable."""
-
-    def __post_init__(self):
-        need(type(self) is not Actuator, "an actuator needs a kind: use Muscle or Pressure.")
-        object.__setattr__(self, "particles", _indices(f"a {self._name}", self.particles))
-        store_numbers(self, self._name, "strength")
-
-    @property
-    def _name(self) -> str:
-        return type(self).__name__.lower()
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({counted(len(self.particles), 'particle')}, strength={self.strength:g} Pa)"
-
-    __setstate__ = restore
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False, repr=False)
-class Muscle(Actuator):
-    """Fibres that pull (activation > 0) or push (< 0) along one material direction: τ += a s (Fd)(Fd)ᵀ.
-
-    Muscles may overlap: their stresses add. Source: Spielberg et al. 2021 (Robotica), section on actuation.
-    """
-
-    direction: Sequence[float]
-    """Fibre direction d in the rest shape; normalised here. Differentiable."""
-
-    def __post_init__(self):
-        Actuator.__post_init__(self)  # super() does not know a class with slots
-        object.__setattr__(self, "direction", unit("muscle direction", self.direction)[0])
-
-    def __repr__(self) -> str:
-        count = counted(len(self.particles), "particle")
-        return f"Muscle({count}, direction={self.direction}, strength={self.strength:g} Pa)"
-
-    __setstate__ = restore
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False, repr=False)
-class Pressure(Actuator):
-    """Pressure that expands (activation > 0) or contracts (< 0) alike in all directions: τ −= a s J I, a Cauchy stress of −a s.
-
-    A pneumatic chamber filled with a soft material, or tissue that swells. In a plane-strain scene it also presses out of the plane.
-    It acts against the bulk modulus of its particles: a free body swells by the small strain (1 − 2ν) p/E of p = a s, in plane strain
-    by 1 + ν times that. So a chamber needs a small Poisson's ratio, as a body of its own that shares nodes with the wall around it, or
-    in ``params``.
-    """
-
-    __setstate__ = restore
-
-
-def _indices(name: str, particles: object, least: int = 1) -> np.ndarray:
-    """Indices of particles, shape (k,), int64, read-only; at least so many, none twice."""
-    what = f"{name.removeprefix('a ')} particles"
-    index = array(what, particles, "biufO", "whole numbers")
-    need(
-        index.ndim == 1 and index.size >= least,
-        f"{name} needs a list of particle indices{', not empty,' * (least > 0)} got an array of shape {index.shape}; "
-        "np.flatnonzero(mask) makes one.",
-    )
-    need(
-        np.issubdtype(index.dtype, np.integer),
-        f"{what} must be whole numbers, got {index.dtype}; np.flatnonzero(mask) makes them.",
-    )
-    need(len(np.unique(index)) == index.size, f"{name} names a particle twice; give each index once.")
-    return read_only(index.astype(np.int64))
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Wall:
     """Half space n·x ≤ offset that a body cannot enter; acts on the nodes inside it.
@@ -282,7 +206,7 @@ class Scene:
             object.__setattr__(self, name, parts)
         need(len(self.bodies) > 0, "a scene needs at least one body.")
         driven = self.driven if np.size(self.driven) else np.zeros(0, dtype=np.int64)
-        object.__setattr__(self, "driven", _indices("scene driven", driven, least=0))
+        object.__setattr__(self, "driven", indices("scene driven", driven, least=0))
         dim = self.grid.dim
         gravity = (0.0,) * dim if self.gravity is None else numbers("gravity", self.gravity)
         need(len(gravity) == dim, f"gravity needs {dim} numbers, one per axis, got {self.gravity}.")

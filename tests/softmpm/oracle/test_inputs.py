@@ -9,7 +9,8 @@ from oracle_scenes import DIMS, f64, full, masses, randn, rest, shaken, slopes, 
 
 from softmpm.inputs import Inputs
 from softmpm.oracle import moving
-from softmpm.scene.scene import Pressure, Scene
+from softmpm.scene.actuators import Pressure
+from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
 

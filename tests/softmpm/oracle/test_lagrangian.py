@@ -10,8 +10,9 @@ from oracle_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, 
 
 from softmpm.inputs import Inputs
 from softmpm.oracle import lagrangian, moving, walls
+from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
-from softmpm.scene.scene import Body, Muscle, Particles, Pressure, Scene, Wall
+from softmpm.scene.scene import Body, Particles, Scene, Wall
 from softmpm.state import State
 
 LAWS = (NeoHookean, StableNeoHookean, FixedCorotated, BarrierCorotated)

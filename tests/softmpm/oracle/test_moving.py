@@ -10,8 +10,9 @@ from oracle_scenes import DIMS, DX, f64, full, masses, randn, rest, shaken, slop
 
 from softmpm.inputs import Inputs
 from softmpm.oracle import moving
+from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Wall
+from softmpm.scene.scene import Body, Grid, Particles, Wall
 from softmpm.state import Params, State
 
 

@@ -9,9 +9,10 @@ import torch
 
 import softmpm
 from softmpm.scene import check_scene as checks
+from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.check_scene import check_precision, check_scene
 from softmpm.scene.materials import NeoHookean
-from softmpm.scene.scene import Body, Grid, Muscle, Particles, Pressure, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 from softmpm.scene.shapes import ball, box
 
 SOFT = NeoHookean(density=1.0, young=10.0)

@@ -12,9 +12,9 @@ import pytest
 from helpers import full_scene
 
 import softmpm
+from softmpm.scene.actuators import Actuator
 from softmpm.scene.file import TYPES
 from softmpm.scene.materials import Material
-from softmpm.scene.scene import Actuator
 
 
 def drawn(**changes) -> softmpm.Scene:

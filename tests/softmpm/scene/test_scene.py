@@ -6,9 +6,10 @@ import pickle
 import numpy as np
 import pytest
 
+from softmpm.scene.actuators import Actuator, Muscle, Pressure
 from softmpm.scene.materials import FixedCorotated, Material, NeoHookean
 from softmpm.scene.presets import ECOFLEX_00_30
-from softmpm.scene.scene import Actuator, Body, Grid, Muscle, Particles, Pressure, Scene, Wall
+from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 
 SOFT = dict(density=1.0, young=10.0)
 
