@@ -1,11 +1,15 @@
 """A model in words: what was compiled for its scene, what was left out, and the memory of a call."""
 
+import textwrap
+
 from softmpm.checks import check_whole
 from softmpm.inputs import groups
 from softmpm.planning.chunks import Horizon
 from softmpm.planning.memory import memory
 from softmpm.scene.scene import CONTACTS
 from softmpm.stability import stable_dt
+
+NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
 def describe(model, substeps: int) -> str:
@@ -16,7 +20,7 @@ def describe(model, substeps: int) -> str:
     def has(flag: bool) -> str:
         return "compiled" if flag else "left out"
 
-    muscles = f"{model.muscle_count}, at most {spec.muscle_slots} on one particle"
+    muscles = f"{model.muscle_count}, at most {spec.muscle_slots} on one particle{_names(model)}"
     counts = {kind: spec.contacts.count(kind) for kind in CONTACTS if kind in spec.contacts}
     contacts = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     lines = [
@@ -41,6 +45,14 @@ def describe(model, substeps: int) -> str:
         f"  memory     {_memory(model, substeps)}",
     ]
     return "\n".join(lines)
+
+
+def _names(model) -> str:
+    """Labels of the actuators in their order, on lines of their own; none if no actuator has a name."""
+    if not any(actuator.name for actuator in model.scene.muscles):
+        return ""
+    text = "; ".join(name.replace(" ", NO_BREAK) for name in model.scene.muscle_names)
+    return "\n" + textwrap.indent(textwrap.fill(text, 120), 13 * " ").replace(NO_BREAK, " ")
 
 
 def _driven(model) -> str:

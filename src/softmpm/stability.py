@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from softmpm.oracle.stress import actuator_tangent, lame, law_of, tangent, viscous_tangent
+from softmpm.scene.actuators import title
 from softmpm.scene.check_scene import check_scene
 from softmpm.scene.materials import Material
 from softmpm.scene.scene import Scene
@@ -304,10 +305,8 @@ def _describe(
     text += ")"
     stretch, activation = loads
     if group.muscles:
-        muscles = [
-            (type(scene.muscles[m]).__name__.lower(), m, scene.muscles[m].strength) for m in group.muscles
-        ]
-        names = " + ".join(f"{kind} {m} ({strength:.4g} Pa)" for kind, m, strength in muscles)
+        muscles = [(title(scene.muscles[m], m), scene.muscles[m].strength) for m in group.muscles]
+        names = " + ".join(f"{name} ({strength:.4g} Pa)" for name, strength in muscles)
         how = "full activation" if activation == 1.0 else f"activation {activation:.4g}"
         text += f" under {names} at {how}, as at particle {particle}"
     if np.ndim(stretch) > 0:

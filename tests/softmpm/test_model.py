@@ -139,6 +139,9 @@ def test_modules_are_shared_by_scenes_alike_and_compiled_once():
     assert fused(a).g2p2g[SizeClass.SOME] is not fused(a).g2p2g[SizeClass.FEW]
     kernels = [fused(a).clear, fused(a).grid_velocity, fused(a).p2g_first, *fused(a).g2p2g.values()]
     assert all(list(kernel.module.kernels.values()) == [kernel] for kernel in kernels)
+    named = busy_scene(2)
+    muscles = [dataclasses.replace(muscle, name="leg") for muscle in named.muscles]
+    assert softmpm.build(dataclasses.replace(named, muscles=muscles), device="cpu").spec == a
     less, more = (fused_adj(a, RequestedGrads(wanted)) for wanted in ((), ("material",)))
     assert less.g2p2g_adj[False] is not more.g2p2g_adj[False]
 
@@ -163,6 +166,25 @@ def test_describe_says_what_was_compiled_and_left_out():
         "500 substeps",
     ):
         assert phrase in busy, phrase
+
+
+def test_describe_lists_the_names_of_muscles():
+    """In their order, not broken, on lines of their own; a scene without names has no such line. The muscle that sets dt is named."""
+    scene = busy_scene(2)
+    plain = softmpm.build(scene, device="cpu").describe()
+    muscles = [
+        dataclasses.replace(scene.muscles[k % 2], name="left hind leg, front" * (k != 1)) for k in range(9)
+    ]
+    text = softmpm.build(dataclasses.replace(scene, muscles=muscles), device="cpu").describe()
+    begin, end = text.index("on one particle\n") + len("on one particle\n"), text.index("  driven")
+    lines = text[begin:end].splitlines()
+    assert all(line.startswith(13 * " ") and len(line) < 136 for line in lines)
+    names = [name.strip() for line in lines for name in line.removesuffix(";").split(";")]
+    assert (
+        names[:3] == ["left hind leg, front (0)", "muscle 1", "left hind leg, front (2)"] and len(names) == 9
+    )
+    assert "under muscle 0 'left hind leg, front' (10 Pa) + muscle 1 (8 Pa)" in text
+    assert "on one particle\n  driven" in plain and "under muscle 0 (10 Pa) + muscle 1 (8 Pa)" in plain
 
 
 def test_describe_names_every_alarm_and_the_order_of_sums():

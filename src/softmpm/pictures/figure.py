@@ -231,10 +231,7 @@ def _key(figure: Any, axes: list[Any], colouring: Colouring, room: float) -> Any
     from matplotlib.patches import Patch
 
     if colouring.names:
-        patches = [
-            Patch(facecolor=colour / 255, label=name)
-            for colour, name in zip(colouring.ramp, colouring.names, strict=True)
-        ]
+        patches = [Patch(facecolor=colour / 255) for colour in colouring.ramp]
         title = STROKE if colouring.with_fibres else None
         lines = [int((72 * room / points - 1.0) / 1.6) for points in TYPE]  # with the space between
         rows = [max(1, count - bool(title)) for count in lines]
@@ -242,7 +239,10 @@ def _key(figure: Any, axes: list[Any], colouring: Colouring, room: float) -> Any
         small = columns[0] > 2
         look: dict = dict(frameon=False, fontsize=TYPE[small], ncols=columns[small], columnspacing=1.0)
         look |= dict(title=title, title_fontsize=TYPE[small], alignment="left")
-        return axes[-1].legend(handles=patches, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
+        key = axes[-1].legend(handles=patches, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
+        for text, name in zip(key.get_texts(), colouring.names, strict=True):
+            text.set(text=name, parse_math=False)  # a name may have the signs that matplotlib gives a meaning
+        return key
     ramp = LinearSegmentedColormap.from_list(colouring.label or "values", colouring.ramp / 255)
     bar = figure.colorbar(
         ScalarMappable(Normalize(*colouring.limits), ramp), ax=axes, shrink=0.85, pad=0.02, aspect=25

@@ -61,9 +61,9 @@ def begin(
 def _copy(
     old: Recording, file: h5py.File, static: dict[str, np.ndarray], before: int, content: Content
 ) -> None:
-    """Copy everything of the iterations before ``before``."""
+    """Copy everything of the iterations before ``before``. The names of muscles are labels, and may have changed."""
     for name in stored(STATIC, old.version):
-        if not np.array_equal(static[name], old.static[name]):
+        if name != "muscle_name" and not np.array_equal(static[name], old.static[name]):
             raise ValueError(f"{old.path} records another scene ({name} differs); record to another path.")
     for name in ("dt", "spacing"):
         if file.attrs[name] != getattr(old, name):

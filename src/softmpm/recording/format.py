@@ -15,7 +15,7 @@
     static/*                                        rest shape, muscles, walls, surface points
 
 A row of a table with names is complete when its first number is not negative; HDF5 shows the fill value -1
-until then. Version 1 has no forces and no surface points.
+until then. Version 1 has no forces and no surface points, and before version 3 muscles have no names.
 """
 
 from typing import cast
@@ -24,14 +24,15 @@ import h5py
 import numpy as np
 
 from softmpm.model import Model
+from softmpm.scene.actuators import LONGEST_NAME
 from softmpm.scene.scene import CONTACTS
 
-FORMAT, VERSION = "softmpm recording", 2
+FORMAT, VERSION = "softmpm recording", 3
 EPISODE = np.dtype([("iteration", "<i8"), ("attributes", "S4096")])
 SCALAR = np.dtype([("iteration", "<i8"), ("name", "S64"), ("value", "<f8")])
 _FIRST_FRAME = [("episode", "<i8"), ("time", "<f8"), ("field", "<i8"), ("latent", "<i8")]
 FRAME = np.dtype([*_FIRST_FRAME, ("force", "<i8"), ("traction", "<i8"), ("places", "<i8")])
-FRAMES = {1: np.dtype(_FIRST_FRAME), 2: FRAME}
+FRAMES = {1: np.dtype(_FIRST_FRAME), 2: FRAME, 3: FRAME}
 """Rows of ``frame/index`` by version."""
 REAL, INDEX = np.dtype("<f4"), np.dtype("<i8")
 Layout = tuple[np.dtype, str]
@@ -46,6 +47,7 @@ STATIC = {  # name: type, axes. p particles, d dim, m muscles, w walls, k separa
     "muscle": (np.dtype("u1"), "mp"),
     "muscle_direction": (REAL, "md"),
     "muscle_strength": (REAL, "m"),
+    "muscle_name": (np.dtype(f"S{4 * LONGEST_NAME}"), "m"),  # UTF-8
     "wall_normal": (REAL, "wd"),
     "wall_offset": (REAL, "w"),
     "wall_friction": (REAL, "w"),
@@ -69,8 +71,12 @@ TABLES = {  # as above; r rows, n the nodes of the grid (dim axes), l the size o
     "force/traction": (REAL, "rksd"),
     "force/places": (REAL, "rsd"),
 }
-SINCE_2 = ("surface_wall", "surface_point", "surface_area", "force/total", "force/traction", "force/places")
-"""Names that version 1 does not have."""
+SINCE = {
+    **dict.fromkeys(("surface_wall", "surface_point", "surface_area"), 2),
+    **dict.fromkeys(("force/total", "force/traction", "force/places"), 2),
+    "muscle_name": 3,
+}
+"""Version since which files have a name of :data:`STATIC` or :data:`TABLES`; others have been there from the first."""
 PER_FRAME = ("x", "v", "strain", "activation")
 PARTS = {
     "field": "field/velocity",
@@ -85,7 +91,7 @@ _LATENT_CHUNK, _LATENT_MOST = 64, 65536
 
 def stored(names: dict[str, Layout], version: int) -> dict[str, Layout]:
     """Those of :data:`STATIC` or :data:`TABLES` that files of a version have."""
-    found = {name: layout for name, layout in names.items() if version > 1 or name not in SINCE_2}
+    found = {name: layout for name, layout in names.items() if version >= SINCE.get(name, 1)}
     return found | ({"frame/index": (FRAMES[version], "r")} if "frame/index" in found else {})
 
 
@@ -115,6 +121,7 @@ def static_values(model: Model, max_particles: int | None, max_points: int | Non
         "muscle": member[:, particle],
         "muscle_direction": np.array([getattr(m, "direction", none) for m in scene.muscles]).reshape(-1, dim),
         "muscle_strength": [m.strength for m in scene.muscles],
+        "muscle_name": [m.name.encode() for m in scene.muscles],
         "wall_normal": np.array([w.normal for w in scene.walls]).reshape(-1, dim),
         "wall_offset": [w.offset for w in scene.walls],
         "wall_friction": [w.friction for w in scene.walls],

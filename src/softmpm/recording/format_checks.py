@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from softmpm.recording.format import FRAMES, PARTS, PER_FRAME, SCALAR, STATIC, TABLES
+from softmpm.scene.actuators import NAMES, is_name
 
 _CHECKSUM = {h5py.h5z.FILTER_FLETCHER32}
 _PACKED = _CHECKSUM | {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
@@ -73,8 +74,15 @@ def check_values(path: Path, static: dict[str, np.ndarray]) -> None:
     walls, known = static["surface_wall"], len(static["wall_offset"])
     if len(walls) and not 0 <= walls.min() <= walls.max() < known:
         raise ValueError(f"{path}: static/surface_wall names a wall beyond the {known} that there are.")
+    if not all(map(is_name, names_of(static))):
+        raise ValueError(f"{path}: each row of static/muscle_name must have {NAMES}.")
     if static["grid_shape"].min() < 2:
         raise ValueError(f"{path}: static/grid_shape must be at least 2, got {static['grid_shape']}.")
+
+
+def names_of(static: dict[str, np.ndarray]) -> list[str]:
+    """Names of the muscles, empty for one without; what is not UTF-8 becomes characters that are not printable."""
+    return [name.decode(errors="surrogateescape") for name in static["muscle_name"].tolist()]
 
 
 def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset]) -> None:

@@ -27,8 +27,9 @@ from softmpm.recording.format import (
     complete,
     stored,
 )
-from softmpm.recording.format_checks import check_frames, check_shapes, check_values, plain_dataset
+from softmpm.recording.format_checks import check_frames, check_shapes, check_values, names_of, plain_dataset
 from softmpm.recording.superblock import readable
+from softmpm.scene.actuators import labels
 from softmpm.summary import table
 
 _DAMAGE = (OSError, RuntimeError, LookupError, TypeError, AttributeError, OverflowError, MemoryError)
@@ -49,7 +50,8 @@ class Recording:
             ``particle`` (the model's index of each recorded particle), ``muscle`` (muscle, particle) 0 or 1,
             ``wall_normal``, ``grid_shape``, ``surface_wall`` (number of each separating wall in the scene),
             ``surface_point`` (the model's index of each recorded surface point), ``surface_area`` [m²], ...
-        version: Of the format: 2, or 1, which has no forces.
+        muscle_names: Labels of the muscles and pressures, as of :attr:`softmpm.Scene.muscle_names`.
+        version: Of the format: 3; 2, which has no names of muscles; or 1, which has no forces either.
         dt, spacing: Substep [s] and grid spacing [m].
         share: Part of the model's particles that was recorded, 1 for all.
         episodes: Iterations of the recorded simulations, in the order of the run.
@@ -131,13 +133,17 @@ class Recording:
             name: self._dataset(f"static/{name}", dtype)[()]
             for name, (dtype, _) in stored(STATIC, self.version).items()
         }
-        self.static: dict[str, np.ndarray] = {
-            name: np.zeros(0, dtype) for name, (dtype, _) in STATIC.items()
-        } | found
+        absent = {
+            name: np.zeros(found["muscle"].shape[:1] if axes == "m" else 0, dtype)
+            for name, (dtype, axes) in STATIC.items()
+        }
+        self.static: dict[str, np.ndarray] = absent | found
         tables = stored(TABLES, self.version).items()
         self._tables = {name: self._dataset(name, dtype) for name, (dtype, _) in tables}
         check_shapes(self.path, self.static, self._tables)
         check_values(self.path, self.static)
+        kinds = ("muscle" if fibre.any() else "pressure" for fibre in self.static["muscle_direction"])
+        self.muscle_names = labels(kinds, names_of(self.static))
         episodes = complete(self._tables["episode"].fields(["iteration"])[()])
         self._newest = {int(iteration): row for row, iteration in enumerate(episodes["iteration"])}
         self.episodes = tuple(self._newest)

@@ -99,9 +99,8 @@ def _log_static(stream, source: Recording, show: Show) -> None:
     for name in ("activation", "strain"):
         stream.log(f"scene/robot/{name}", points.from_fields(radii=radii), static=True)
     _log_walls(stream, source)
-    names = style.actuator_names(source.static["muscle_direction"])
-    if names:
-        stream.log("activation", rr.SeriesLines(names=names), static=True)
+    if source.muscle_names:
+        stream.log("activation", rr.SeriesLines(names=source.muscle_names), static=True)
     if show.has["force"]:
         names = [f"wall {k} {axis}" for k in source.static["surface_wall"] for axis in "xyz"[: source.dim]]
         stream.log("force", rr.SeriesLines(names=names), static=True)

@@ -25,11 +25,6 @@ def pack(rgb: np.ndarray) -> np.ndarray:
     return (r << 24) | (g << 16) | (b << 8) | np.uint32(255)
 
 
-def actuator_names(directions: np.ndarray) -> tuple[str, ...]:
-    """Names of actuators with their numbers, from their fibre directions, shape (muscle, dim), which are zero for pressures."""
-    return tuple(f"{'muscle' if fibre.any() else 'pressure'} {k}" for k, fibre in enumerate(directions))
-
-
 def activation_colours(static: dict[str, np.ndarray], activation: np.ndarray) -> np.ndarray:
     """Red where the activation is positive, as of muscles that pull, blue where it is negative, the body's grey at rest.
 

@@ -29,6 +29,8 @@ class Surroundings:
     """Membership of each actuator, shape (muscle, particle), boolean."""
     fibre: np.ndarray
     """Fibre direction of each actuator at rest [-], shape (muscle, dim); zero of one without fibres, such as a pressure."""
+    actuators: tuple[str, ...]
+    """Label of each actuator."""
     driven: np.ndarray
     """Driven particles, shape (particle,), boolean; a recording does not contain them."""
     normals: np.ndarray
@@ -47,11 +49,6 @@ class Surroundings:
     @property
     def dim(self) -> int:
         return self.rest.shape[1]
-
-    @property
-    def actuators(self) -> tuple[str, ...]:
-        """Names of the actuators, with their numbers."""
-        return style.actuator_names(self.fibre)
 
     @property
     def up(self) -> np.ndarray:
@@ -105,6 +102,7 @@ def of_scene(scene: Scene) -> Surroundings:
         body=np.repeat(np.arange(len(parts)), count),
         muscle=muscle,
         fibre=fibre.reshape(-1, dim),
+        actuators=scene.muscle_names,
         driven=driven,
         normals=np.array([wall.normal for wall in scene.walls]).reshape(-1, dim),
         offsets=np.array([wall.offset for wall in scene.walls], float),
@@ -124,6 +122,7 @@ def of_recording(recording: Recording) -> Surroundings:
         body=static["body"],
         muscle=static["muscle"].astype(bool),
         fibre=static["muscle_direction"].astype(float),
+        actuators=recording.muscle_names,
         driven=np.zeros(recording.particle_count, bool),
         normals=static["wall_normal"].astype(float),
         offsets=static["wall_offset"].astype(float),

@@ -1,12 +1,18 @@
 """Actuators of a scene: muscles and pressures. Plain SI numbers, checked at once; the scene checks their indices."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from softmpm.summary import counted
 from softmpm.validate import indices, need, restore, store_numbers, unit
+
+LONGEST_NAME = 64
+"""Most characters of the name of an actuator."""
+NAMES = f"at most {LONGEST_NAME} printable characters, and no space at either end"
+"""Rule of :func:`is_name` in words."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -19,18 +25,26 @@ class Actuator:
     strength: float
     """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger ones
     stretch a body until it fractures (docs/results.md, Lessons). Differentiable."""
+    name: str = ""
+    """Label in pictures, recordings and messages, such as "left hind leg, front": at most 64 characters. It changes no number. Several
+    actuators may have the same; one without is "muscle 3" or "pressure 3", by its place in the scene, counted from 0."""
 
     def __post_init__(self):
         need(type(self) is not Actuator, "an actuator needs a kind: use Muscle or Pressure.")
-        object.__setattr__(self, "particles", indices(f"a {self._name}", self.particles))
-        store_numbers(self, self._name, "strength")
-
-    @property
-    def _name(self) -> str:
-        return type(self).__name__.lower()
+        kind = kind_of(self)
+        object.__setattr__(self, "particles", indices(f"a {kind}", self.particles))
+        store_numbers(self, kind, "strength")
+        if not isinstance(self.name, str):
+            raise TypeError(f"{kind} name must be a text, got {self.name!r}; leave it out for none.")
+        need(is_name(self.name), f"{kind} name must have {NAMES}, got {self.name!r:.100}.")
+        object.__setattr__(self, "name", str(self.name))  # not one of NumPy's
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({counted(len(self.particles), 'particle')}, strength={self.strength:g} Pa)"
+        return f"{type(self).__name__}({self._summary()}, strength={self.strength:g} Pa)"
+
+    def _summary(self) -> str:
+        """The name, if there is one, and the number of particles."""
+        return f"{self.name!r}, " * bool(self.name) + counted(len(self.particles), "particle")
 
     __setstate__ = restore
 
@@ -50,8 +64,7 @@ class Muscle(Actuator):
         object.__setattr__(self, "direction", unit("muscle direction", self.direction)[0])
 
     def __repr__(self) -> str:
-        count = counted(len(self.particles), "particle")
-        return f"Muscle({count}, direction={self.direction}, strength={self.strength:g} Pa)"
+        return f"Muscle({self._summary()}, direction={self.direction}, strength={self.strength:g} Pa)"
 
     __setstate__ = restore
 
@@ -67,3 +80,27 @@ class Pressure(Actuator):
     """
 
     __setstate__ = restore
+
+
+def is_name(text: str) -> bool:
+    """True for a text that may be the name of an actuator; the empty one is none."""
+    return len(text) <= LONGEST_NAME and text.isprintable() and text == text.strip()
+
+
+def kind_of(actuator: Actuator) -> str:
+    """Kind of an actuator in words, such as "muscle"."""
+    return type(actuator).__name__.lower()
+
+
+def title(actuator: Actuator, place: int) -> str:
+    """Kind, place in the scene and name of an actuator, for messages: "muscle 3", or "muscle 3 'left leg'"."""
+    return f"{kind_of(actuator)} {place}" + f" {actuator.name!r}" * bool(actuator.name)
+
+
+def labels(kinds: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
+    """Different labels for all actuators of a scene: each one's name, or kind and place such as "muscle 3"; to equal ones the place is
+    added, "leg (3)"."""
+    found = [name or f"{kind} {place}" for place, (kind, name) in enumerate(zip(kinds, names, strict=True))]
+    while len(count := Counter(found)) < len(found):
+        found = [f"{label} ({place})" if count[label] > 1 else label for place, label in enumerate(found)]
+    return tuple(found)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from softmpm.scene.actuators import Actuator
+from softmpm.scene.actuators import title
 from softmpm.scene.check_mirrors import check_mirrors
 from softmpm.scene.outline import Outline
 from softmpm.scene.scene import Grid, Particles, Scene
@@ -84,7 +84,7 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
                 most,
             )
     for m, muscle in enumerate(scene.muscles):
-        within(f"strength of {_kind(muscle)} {m}", muscle.strength, -most, most)
+        within(f"strength of {title(muscle, m)}", muscle.strength, -most, most)
     for axis, gravity in enumerate(scene.gravity or ()):
         within(f"gravity along axis {axis}", gravity, -most, most)
     for w, wall in enumerate(scene.walls):
@@ -222,10 +222,10 @@ def _suspects(bins: np.ndarray) -> np.ndarray:
 
 def _check_muscles(scene: Scene) -> None:
     for m, muscle in enumerate(scene.muscles):
-        _check_indices(f"{_kind(muscle)} {m}", muscle.particles, scene)
+        _check_indices(title(muscle, m), muscle.particles, scene)
         direction = getattr(muscle, "direction", None)
         if direction is not None:
-            _check_axes(f"muscle {m} direction", direction, scene.grid)
+            _check_axes(f"{title(muscle, m)} direction", direction, scene.grid)
 
 
 def _check_indices(name: str, particles: np.ndarray, scene: Scene) -> None:
@@ -236,10 +236,6 @@ def _check_indices(name: str, particles: np.ndarray, scene: Scene) -> None:
         f"{name} names particle {low if low < 0 else high}, but the scene's {count} particles are "
         f"0 to {count - 1}, counted through the bodies in their order.",
     )
-
-
-def _kind(actuator: Actuator) -> str:
-    return type(actuator).__name__.lower()
 
 
 def _check_walls(scene: Scene) -> None:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from softmpm.scene.actuators import Actuator
+from softmpm.scene.actuators import Actuator, kind_of, labels
 from softmpm.scene.materials import Material
 from softmpm.scene.outline import Outline
 from softmpm.summary import counted, table
@@ -218,6 +218,12 @@ class Scene:
         need(self.dt > 0, f"dt must be > 0 s, got {self.dt}.")
 
     __setstate__ = restore
+
+    @property
+    def muscle_names(self) -> tuple[str, ...]:
+        """Labels of the muscles and pressures in pictures, all different: names, and "muscle 3" or "pressure 3" for those without one.
+        Of equal names each is followed by its place, "leg (3)"."""
+        return labels(map(kind_of, self.muscles), (actuator.name for actuator in self.muscles))
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(f'{name}: {text}' for name, text in self._rows().items())})"

@@ -195,6 +195,21 @@ def test_a_pressure_is_called_one(tmp_path):
         assert of_recording(recording).actuators == ("muscle 0", "pressure 1")
 
 
+def test_names_are_in_the_key(model):
+    """As given, also with signs that matplotlib has a meaning for; equal ones with their places. The figure has room for long ones."""
+    given = ["_leg", r"$\foo$", "", "trunk", "trunk", 64 * "W"]
+    muscles = [
+        softmpm.Muscle(particles=range(20 * k, 20 * k + 20), direction=(0.0, 1.0), strength=1.0, name=name)
+        for k, name in enumerate(given)
+    ]
+    figure = softmpm.show(scene_of(muscles=muscles))
+    key = figure.axes[-1].get_legend()
+    shown = [text.get_text() for text in key.get_texts()]
+    assert shown == ["_leg", r"$\foo$", "muscle 2", "trunk (3)", "trunk (4)", 64 * "W"]
+    figure.canvas.draw()
+    assert key.get_window_extent().x1 < figure.bbox.x1
+
+
 @pytest.mark.parametrize("count, least", [(12, 30), (24, 30), (60, 30), (500, 10)])
 def test_categories_can_be_told_apart(count, least):
     """From each other, from white and from the grey of no muscle, in at least one of red, green and blue."""

@@ -230,6 +230,17 @@ def test_a_scene_that_is_not_finite_is_refused(copy):
             softmpm.Recording(copy)
 
 
+@pytest.mark.parametrize("name", [b"\xff\xfe", b"two\nlines", b" ", 65 * b"x"])
+def test_a_name_that_no_muscle_has_is_refused(copy, name):
+    """No UTF-8, a line end, spaces, too long: it would spoil the texts that show it."""
+    with h5py.File(copy, "r+") as file:
+        file["static/muscle_name"][0] = name
+    with pytest.raises(
+        ValueError, match=r"copy\.h5: each row of static/muscle_name must have at most 64 printable"
+    ):
+        softmpm.Recording(copy)
+
+
 @pytest.mark.parametrize("group", ["frame", "static"])
 def test_a_group_of_another_file_is_refused(recorded, copy, group):
     """A whole group cannot come from elsewhere either."""

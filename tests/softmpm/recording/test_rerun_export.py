@@ -140,20 +140,20 @@ def test_fields_walls_latent_and_curves(tmp_path):
         ("p", ["pressure 0"], "pressures: red expands, blue contracts"),
         (
             "mp",
-            ["muscle 0", "pressure 1"],
+            ["leg", "pressure 1"],
             "muscles: red pulls, blue pushes, strokes are fibres; pressures: red expands, blue contracts",
         ),
     ],
 )
 def test_pressures_are_no_muscles(tmp_path, monkeypatch, kinds, names, title):
-    """A pressure is named as one, and its positive activation expands."""
+    """A pressure is called one, and its positive activation expands; curves have the names of the scene."""
     titles, space = [], rerun_blueprint._space
     monkeypatch.setattr(rerun_blueprint, "_space", lambda *given: titles.append(given[2]) or space(*given))
     body = softmpm.Body(
         softmpm.box((0.3, 0.3), (0.6, 0.6), spacing=0.1), softmpm.NeoHookean(density=1.0, young=1.0)
     )
     actuators = [
-        softmpm.Muscle(particles=[k], direction=(0.0, -1.0), strength=1.0)
+        softmpm.Muscle(particles=[k], direction=(0.0, -1.0), strength=1.0, name="leg" * (kinds == "mp"))
         if kind == "m"
         else softmpm.Pressure(particles=[k], strength=1.0)
         for k, kind in enumerate(kinds)

@@ -30,8 +30,8 @@ from softmpm.recording.writer import strain
 COUNT, NODES = 400, (16, 16)
 
 
-def small_model() -> softmpm.Model:
-    """A cloud with two muscles that overlap. Nothing here runs a kernel."""
+def small_model(*names: str) -> softmpm.Model:
+    """A cloud with two muscles that overlap, of these names. Nothing here runs a kernel."""
     positions = np.random.default_rng(0).uniform(0.2, 0.6, (COUNT, 2))
     scene = softmpm.Scene(
         grid=softmpm.Grid(shape=NODES, spacing=1 / 16),
@@ -39,8 +39,10 @@ def small_model() -> softmpm.Model:
             softmpm.Body(softmpm.Particles(positions, 1e-4), softmpm.NeoHookean(density=1.0, young=10.0))
         ],
         muscles=[
-            softmpm.Muscle(particles=np.arange(0, 100), direction=(0, 1), strength=1.0),
-            softmpm.Muscle(particles=np.arange(50, 150), direction=(1, 0), strength=2.0),
+            softmpm.Muscle(
+                particles=np.arange(50 * k, 100 + 50 * k), direction=direction, strength=k + 1.0, name=name
+            )
+            for k, (direction, name) in enumerate(zip(((0, 1), (1, 0)), names or ("", ""), strict=True))
         ],
         walls=[softmpm.Wall(normal=(0, 1), offset=0.1)],
         gravity=(0, -9.8),
@@ -293,6 +295,43 @@ def test_resume_keeps_what_came_before(tmp_path):
             assert check(got, model, iteration) == check(want, model, iteration)
         assert np.array_equal(got.scalar_rows, want.scalar_rows)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.h5", "whole.h5"]
+
+
+def without_names(path) -> None:
+    """Make a recording one of version 2."""
+    with h5py.File(path, "r+") as file:
+        del file["static/muscle_name"]
+        file.attrs["version"] = 2
+
+
+def test_names_of_muscles_are_recorded(tmp_path):
+    """Read as the scene has them, up to 64 characters of any script; files of version 2 have none, and say the place."""
+    model, path = small_model("Vorderbein № 1", 64 * "脚"), tmp_path / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        record(recorder, model, 0)
+    with softmpm.Recording(path) as recording:
+        assert recording.muscle_names == model.scene.muscle_names == ("Vorderbein № 1", 64 * "脚")
+    without_names(path)
+    with softmpm.Recording(path) as recording:
+        assert recording.version == 2 and recording.muscle_names == ("muscle 0", "muscle 1")
+        assert check(recording, model, 0) == 4
+
+
+@pytest.mark.parametrize("before", [("a", "b"), ("", ""), None])
+def test_other_names_do_not_hinder_resuming(tmp_path, before):
+    """Nor does a file without any. The resumed file has the new names, and the digest of the old ones."""
+    model, path = small_model("left", "right"), tmp_path / "run.h5"
+    old = small_model(*(before or ("", "")))
+    with softmpm.Recorder(path, old) as recorder:
+        record(recorder, old, 0)
+        digest = recorder.digest
+    if before is None:
+        without_names(path)
+    with softmpm.Recorder(path, model, resume_before=1, resume_digest=digest) as recorder:
+        record(recorder, model, 1)
+    with softmpm.Recording(path) as recording:
+        assert recording.muscle_names == ("left", "right") and recording.version == 3
+        assert [check(recording, model, iteration) for iteration in (0, 1)] == [4, 4]
 
 
 def test_a_digest_tells_one_recording_from_another(tmp_path):

@@ -118,8 +118,8 @@ def test_muscles_name_particles_of_the_scene():
     """A muscle's indices run through the bodies in their order, from 0 to the last."""
     bodies = [body((0.5, 0.5), (0.6, 0.5)), body((0.5, 0.7))]
 
-    def muscle(*index):
-        return Muscle(particles=index, direction=(0, 1), strength=1.0)
+    def muscle(*index, name=""):
+        return Muscle(particles=index, direction=(0, 1), strength=1.0, name=name)
 
     check_scene(scene(*bodies, muscles=[muscle(0, 1, 2), muscle(2)]))
     refused(
@@ -130,6 +130,7 @@ def test_muscles_name_particles_of_the_scene():
     refused(scene(*bodies, muscles=[muscle(0, -1)]), "muscle 0 names particle -1")
     chamber = Pressure(particles=[3], strength=1.0)
     refused(scene(*bodies, muscles=[muscle(0), chamber]), "pressure 1 names particle 3")
+    refused(scene(*bodies, muscles=[muscle(0), muscle(3, name="leg")]), "muscle 1 'leg' names particle 3")
     check_scene(scene(*bodies, driven=[2, 0]))
     refused(scene(*bodies, driven=[0, 3]), "scene driven names particle 3")
     refused(scene(*bodies, driven=[-1]), "scene driven names particle -1")

@@ -42,7 +42,8 @@ def drawn(**changes) -> softmpm.Scene:
         ),
     ]
     muscles = [
-        softmpm.Muscle(particles=[5, 2, 9], direction=(k, 3.0), strength=-0.1 * k) for k in range(1, 20)
+        softmpm.Muscle(particles=[5, 2, 9], direction=(k, 3.0), strength=-0.1 * k, name=f"№ {k % 3} 'a'")
+        for k in range(1, 20)
     ]
     settings = dict(
         grid=softmpm.Grid(shape=(33, 40), spacing=1 / 30),
@@ -283,9 +284,11 @@ def test_a_file_by_hand(tmp_path):
         "volume": 0.01,
     }
     structure["scene"]["walls"] = [{"type": "Wall", "normal": [0, 2], "offset": 0.2}]
+    structure["scene"]["muscles"] = [{"type": "Pressure", "particles": {"array": "p"}, "strength": 1}]
     del structure["scene"]["gravity"], structure["scene"]["driven"]
-    write(path, {"scene.json": json.dumps(structure).encode()})
+    write(path, {"scene.json": json.dumps(structure).encode(), "p.npy": npy(np.array([0]))})
     loaded = softmpm.load_scene(path)
+    assert loaded.muscle_names == ("pressure 0",)
     assert loaded.walls[0] == softmpm.Wall(normal=(0, 1), offset=0.1) and loaded.gravity == (0, 0)
     assert len(loaded.bodies[0].particles) == 1
 

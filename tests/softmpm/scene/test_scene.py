@@ -57,6 +57,14 @@ def scene(**changes) -> Scene:
         (lambda: Actuator(particles=[0], strength=1), "an actuator needs a kind: use Muscle or Pressure"),
         (lambda: pressure(particles=[]), "a pressure needs a list of particle indices, not empty"),
         (
+            lambda: pressure(name="  "),
+            "pressure name must have at most 64 printable characters, and no space",
+        ),
+        (lambda: pressure(name="leg "), "no space at either end, got 'leg '"),
+        (lambda: pressure(name="two\nlines"), r"printable characters, .* got 'two\\nlines'"),
+        (lambda: pressure(name="\ud800"), "printable characters"),
+        (lambda: pressure(name=65 * "x"), "at most 64"),
+        (
             lambda: pressure(particles=np.zeros((5, 2))),
             r"particle indices, not empty, got an array of shape \(5, 2\); np.flatnonzero\(mask\) makes one",
         ),
@@ -113,6 +121,7 @@ def test_refuses_values(make, message):
         (lambda: scene(muscles=[None]), r"muscles\[0\] must be a Muscle or Pressure, got NoneType"),
         (lambda: scene(muscles=pressure()), "muscles must be a list of Muscle or Pressure, got Pressure"),
         (lambda: Pressure(particles=[0], strength="p"), "pressure strength must be one number, got 'p'"),
+        (lambda: pressure(name=None), "pressure name must be a text, got None; leave it out for none"),
         (lambda: scene(walls=3), "walls must be a list of Wall, got int"),
         (lambda: Particles(np.zeros((3, 2)), "a"), "volume must be real numbers, got <U1"),
         (lambda: Particles("abc", 1.0), "positions must be real numbers, got <U3"),
@@ -192,6 +201,25 @@ def test_arrays_cannot_be_written_to(again):
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 7
     assert muscle.direction == Muscle(particles=[0], direction=direction, strength=1).direction
+
+
+def test_names_of_actuators():
+    """A name is in the text of its actuator, also of a copy. Labels are names, or kind and place; all of a scene differ, whatever the
+    names."""
+    leg = Muscle(particles=[0], direction=(1, 0), strength=2, name=np.str_("left hind leg, front"))
+    assert repr(leg) == "Muscle('left hind leg, front', 1 particle, direction=(1.0, 0.0), strength=2 Pa)"
+    assert pickle.loads(pickle.dumps(leg)).name == copy.deepcopy(leg).name == leg.name
+    assert repr(pressure(name="Ballon № 1")) == "Pressure('Ballon № 1', 1 particle, strength=2 Pa)"
+    assert pressure(name=64 * "x").name == 64 * "x" and pressure().name == ""
+    for names, labels in (
+        ([], ()),
+        (["", "leg", ""], ("pressure 0", "leg", "pressure 2")),
+        (["leg", "", "leg"], ("leg (0)", "pressure 1", "leg (2)")),
+        (["a", "a", "a (0)"], ("a (0) (0)", "a (1)", "a (0) (2)")),
+        (["pressure 1", ""], ("pressure 1 (0)", "pressure 1 (1)")),
+    ):
+        assert scene(muscles=[pressure(name=name) for name in names]).muscle_names == labels
+    assert scene(muscles=[leg, pressure(), leg]).muscle_names[1] == "pressure 1"
 
 
 def test_driven_particles():
