@@ -25,8 +25,8 @@ shape = softmpm.image("robot.png", corner, height=height, spacing=cell / 2, thre
 pixel = ((shape.positions - corner) / (height / drawing.height)).astype(int)
 red, _, blue = np.asarray(drawing)[drawing.height - 1 - pixel[:, 1], pixel[:, 0]].T.astype(int)
 muscles = [
-    softmpm.Muscle(particles=np.flatnonzero(mask), direction=(0.0, 1.0), strength=1e4)
-    for mask in (red > blue + 100, blue > red + 100)
+    softmpm.Muscle(particles=np.flatnonzero(mask), direction=(0.0, 1.0), strength=1e4, name=name)
+    for name, mask in (("red", red > blue + 100), ("blue", blue > red + 100))
 ]
 scene = softmpm.Scene(
     grid=softmpm.Grid(shape=(64, 24), spacing=cell),

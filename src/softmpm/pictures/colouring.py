@@ -25,6 +25,12 @@ CATEGORIES = np.array(
     float,
 )
 """The colours of Okabe and Ito (2008), which colour-blind people can tell apart, and darker ones; :func:`categories` has more."""
+NAMED = {
+    **dict(red=(214, 39, 40), green=(44, 160, 44), blue=(31, 90, 200), yellow=(240, 228, 66)),
+    **dict(cyan=(23, 190, 207), magenta=(220, 50, 200), orange=(255, 127, 14), purple=(110, 60, 170)),
+    **dict(brown=(120, 70, 20), pink=(247, 160, 200), black=(20, 20, 24)),
+}
+"""Colours of categories that have the name of one: something blue in a picture must not be called red."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +61,19 @@ class Colouring:
         return np.where(known[:, None], colours, PASSIVE)
 
 
-def categories(count: int) -> np.ndarray:
-    """Different colours, shape (count, 3), 0 to 255: the fixed ones, then the farthest from all before, paper and grey."""
-    taken = CATEGORIES[:count]
-    if count <= len(CATEGORIES):
+def of_names(names: Sequence[str]) -> np.ndarray:
+    """Different colours of categories, shape (name, 3), 0 to 255; those called by a colour have it."""
+    words = [name.lower() for name in names]
+    own = [NAMED.get(word) if words.count(word) == 1 else None for word in words]
+    given = np.array([colour for colour in own if colour], float)
+    others = iter(categories(len(names), given if len(given) else CATEGORIES)[len(given) :])
+    return np.array([colour or next(others) for colour in own], float).reshape(-1, 3)
+
+
+def categories(count: int, first: np.ndarray = CATEGORIES) -> np.ndarray:
+    """Different colours, shape (count, 3), 0 to 255: the first ones, then the farthest from all before, paper and grey."""
+    taken = first[:count]
+    if count <= len(first):
         return taken
     levels = np.linspace(0.0, 255.0, max(9, math.ceil((8 * count) ** (1 / 3))))
     every = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
@@ -108,7 +123,7 @@ def coloured(
     if colour in ("muscle", "body"):
         bodies = (f"body {k}" for k in range(int(place.body.max()) + 1))
         names = place.actuators if colour == "muscle" else tuple(bodies)
-        return Colouring("", categories(len(names)), names=names, with_fibres=with_fibres)
+        return Colouring("", of_names(names), names=names, with_fibres=with_fibres)
     if limits is not None and not (np.isfinite(limits).all() and limits[0] < limits[1]):
         raise ValueError(f"limits must be two numbers in ascending order, got {limits}.")
     if colour == "activation":

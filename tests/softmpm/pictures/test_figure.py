@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import softmpm
-from softmpm.pictures.colouring import CATEGORIES, PASSIVE, categories
+from softmpm.pictures.colouring import CATEGORIES, NAMED, PASSIVE, categories, of_names
 from softmpm.pictures.panel import _pascal
 from softmpm.recording import style
 from softmpm.recording.surroundings import of_recording
@@ -208,6 +208,21 @@ def test_names_are_in_the_key(model):
     assert shown == ["_leg", r"$\foo$", "muscle 2", "trunk (3)", "trunk (4)", 64 * "W"]
     figure.canvas.draw()
     assert key.get_window_extent().x1 < figure.bbox.x1
+
+
+def test_a_muscle_called_by_a_colour_has_it():
+    """Something red is not called blue; others get colours that differ from it, from paper and from the body."""
+    names = ["Blue", "muscle 1", "red", "leg"]
+    colours = of_names(names)
+    np.testing.assert_array_equal(colours[[0, 2]], [NAMED["blue"], NAMED["red"]])
+    for some in (names, list(NAMED), ["red"], ["Red", "red"]):
+        every = np.vstack([of_names(some), np.full(3, 255.0), PASSIVE])
+        assert (np.abs(every[:, None] - every[None]).max(-1) + 255.0 * np.eye(len(every))).min() >= 30
+    np.testing.assert_array_equal(of_names(["a", "b"]), CATEGORIES[:2])
+    assert of_names([]).shape == (0, 3)
+    half = softmpm.Muscle(particles=range(20), direction=(0.0, 1.0), strength=1.0, name="red")
+    image = pixels(softmpm.show(scene_of(muscles=[half])))
+    assert len(where(image, NAMED["red"])[0]) > 50
 
 
 @pytest.mark.parametrize("count, least", [(12, 30), (24, 30), (60, 30), (500, 10)])
