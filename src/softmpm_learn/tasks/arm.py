@@ -77,9 +77,10 @@ def arm(conf: ArmConf) -> Task:
             particles=limb.part(rest, start, end, side),
             direction=(0.0, 1.0),
             strength=conf.strength,
+            name=f"{segment} segment, {half}",
         )
-        for start, end in SEGMENTS.values()
-        for side in (1, -1)
+        for segment, (start, end) in SEGMENTS.items()
+        for side, half in ((1, "left"), (-1, "right"))
     ]
     nodes = conf.cells
     scene = Scene(

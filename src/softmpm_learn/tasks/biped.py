@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle
-from softmpm_learn.tasks.outline import Limb, foot, smooth
+from softmpm_learn.tasks.outline import HALVES, Limb, foot, smooth
 from softmpm_learn.tasks.task import Task, filled, material
 from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
@@ -42,9 +42,10 @@ def biped(conf: BipedConf) -> Task:
             particles=limb.part(rest, *LEG_MUSCLE, side),
             direction=limb.direction(*LEG_MUSCLE),
             strength=conf.strength,
+            name=f"{name} leg, {half}",
         )
-        for limb in limbs.values()
-        for side in (1, -1)
+        for name, limb in limbs.items()
+        for side, half in HALVES.items()
     ]
     regions["body"] = np.setdiff1d(np.arange(len(rest)), np.concatenate(list(regions.values())))
     grid, walls, height = track(conf)

@@ -24,6 +24,8 @@ class Part:
     """Fibre direction of a muscle, None for along its longer axis."""
     stiffness: float = 1.0
     """Young's modulus in units of the setting's."""
+    label: str = ""
+    """As of :class:`Muscular`."""
 
 
 def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
@@ -46,7 +48,7 @@ def drawn(conf: OwnConf, parts: Sequence[Part]) -> Task:
         [_nearest(owner, shape.positions / pixel) for owner, shape in zip(owners, shapes, strict=True)]
     )
     muscles = [
-        Muscular(part.name, np.flatnonzero(of == k), part.direction or _fibres(part.mask))
+        Muscular(part.name, np.flatnonzero(of == k), part.direction or _fibres(part.mask), part.label)
         for k, part in enumerate(parts)
         if part.muscle and part.mask.any()
     ]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle
-from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
+from softmpm_learn.tasks.outline import HALVES, Limb, foot, smooth, smooth_line
 from softmpm_learn.tasks.task import Task, filled, material
 from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
@@ -58,8 +58,14 @@ LEGS = {
 LEG_WIDTH = np.array(
     [(0.0, 0.130), (0.5, 0.100), (0.8, 0.095), (0.94, 0.103), (1.0, 0.106), (1.1, 0.106)]
 )  # way down from the hip, width; below the sole it is cut off
-LEG_MUSCLES = ((0.10, 1.01),)  # way along the leg, from below the hip to the sole
-TRUNK_MUSCLES = ((0.25, 0.60), (0.60, 1.01))  # way along the trunk
+LEG = (0.10, 1.01)  # way along a leg, from below the hip to the sole
+MUSCLES = {
+    "leg1": {"hind leg 1": LEG},
+    "leg2": {"hind leg 2": LEG},
+    "leg3": {"foreleg 1": LEG},
+    "leg4": {"foreleg 2": LEG},
+    "trunk": {"upper trunk": (0.25, 0.60), "lower trunk": (0.60, 1.01)},
+}  # parts of each limb that have a pair of muscles, and their ways along it
 
 
 @dataclass(kw_only=True)
@@ -83,17 +89,22 @@ def elephant(conf: ElephantConf) -> Task:
 def actuate(
     rest: np.ndarray, limbs: dict[str, Limb], strength: float
 ) -> tuple[dict[str, np.ndarray], list[Muscle]]:
-    """A region for each limb and one for the rest of the body; muscles in pairs, left and right of a limb's line."""
+    """A region for each limb and one for the rest of the body; muscles in pairs, in the front and the back half of a limb."""
     regions, muscles, free = {}, [], np.ones(len(rest), dtype=bool)
     for name, limb in limbs.items():
-        for start, end in TRUNK_MUSCLES if name == "trunk" else LEG_MUSCLES:
-            for side in (1, -1):
-                index = limb.part(rest, start, end, side)
+        for part, way in MUSCLES[name].items():
+            for side, half in HALVES.items():
+                index = limb.part(rest, *way, side)
                 index = index[free[index]]  # at the hips two legs meet
                 muscles.append(
-                    Muscle(particles=index, direction=limb.direction(start, end), strength=strength)
+                    Muscle(
+                        particles=index,
+                        direction=limb.direction(*way),
+                        strength=strength,
+                        name=f"{part}, {half}",
+                    )
                 )
-        taken = limb.part(rest, TRUNK_MUSCLES[0][0] if name == "trunk" else LEG_MUSCLES[0][0], 1.01)
+        taken = limb.part(rest, min(start for start, _ in MUSCLES[name].values()), 1.01)
         regions[name] = taken[free[taken]]
         free[taken] = False
     return regions | {"body": np.flatnonzero(free)}, muscles

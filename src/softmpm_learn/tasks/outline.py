@@ -67,6 +67,10 @@ def foot(outline: np.ndarray, edge: float) -> np.ndarray:
     return np.concatenate([up, ring[(way > edge) & (way < way[-1] - edge)], down[::-1]])
 
 
+HALVES = {1: "front", -1: "back"}
+"""Names of the two sides of a limb that hangs down from a robot that faces right, whose left side is then the front."""
+
+
 @dataclass(frozen=True, eq=False)
 class Limb:
     """A stroke of changing width along a line: a leg, a trunk, an arm."""

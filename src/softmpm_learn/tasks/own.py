@@ -83,6 +83,8 @@ class Muscular:
     """Indices into all particles."""
     direction: tuple[float, ...]
     """Unit fibre direction."""
+    label: str = ""
+    """Name of the muscle in pictures and recordings; empty for that of the part."""
 
 
 def walker(
@@ -132,7 +134,9 @@ def walker(
         walls,
         bodies,
         [
-            softmpm.Muscle(particles=m.particles, direction=m.direction, strength=conf.strength)
+            softmpm.Muscle(
+                particles=m.particles, direction=m.direction, strength=conf.strength, name=m.label or m.name
+            )
             for m in muscles
         ],
         rest=rest,

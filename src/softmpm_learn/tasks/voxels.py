@@ -13,7 +13,8 @@ from softmpm_learn.tasks.own import OwnConf
 from softmpm_learn.tasks.task import Task
 
 EMPTY, RIGID, SOFT, HORIZONTAL, VERTICAL = range(5)
-DIRECTIONS = {HORIZONTAL: (1.0, 0.0), VERTICAL: (0.0, 1.0)}
+ACTUATORS = {HORIZONTAL: ("horizontal", (1.0, 0.0)), VERTICAL: ("vertical", (0.0, 1.0))}
+"""Word and fibre direction of each kind of actuator."""
 MOST = 100
 """Most voxels along an axis."""
 
@@ -46,8 +47,9 @@ def voxels(conf: VoxelsConf) -> Task:
     for row, column in np.argwhere(array >= HORIZONTAL):
         mask = np.zeros(array.shape, dtype=bool)
         mask[row, column] = True
-        direction = DIRECTIONS[int(array[row, column])]
-        parts.append(Part(f"voxel_{row}_{column}", mask, True, direction))
+        word, direction = ACTUATORS[int(array[row, column])]
+        label = f"{word} actuator [{row}, {column}]"
+        parts.append(Part(f"voxel_{row}_{column}", mask, True, direction, label=label))
     return drawn(conf, parts)
 
 

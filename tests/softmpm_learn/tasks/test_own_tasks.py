@@ -146,7 +146,7 @@ def test_a_picture_is_a_robot(folder):
     assert stiff.material.young == 10 * soft.material.young
     assert stiff.particles.volume.sum() == pytest.approx(40 * 10 * pixel**2, rel=0.02)
     assert soft.particles.volume.sum() == pytest.approx((200 * 60 - 400 + 2 * 1200) * pixel**2, rel=0.01)
-    assert list(task.regions) == ["red", "green", "body"] and len(task.scene.muscles) == 2
+    assert list(task.regions) == ["red", "green", "body"] and task.scene.muscle_names == ("red", "green")
     x = places(task)
     for name, middle in (("red", 35), ("green", 165)):
         leg = x[task.regions[name]]
@@ -402,6 +402,7 @@ def test_voxels_are_those_of_evolution_gym(folder):
             "voxel_2_0": ([0.5, 0.5], up),
             "voxel_2_2": ([2.5, 0.5], up),
         }
+        assert task.scene.muscle_names[2:4] == ("horizontal actuator [0, 2]", "vertical actuator [2, 0]")
 
 
 def test_a_picture_is_read_as_viewers_show_it(folder):
@@ -427,12 +428,14 @@ def test_a_mesh_stands_on_the_floor_in_3d(folder):
     assert np.ptp(particles.outline.points, axis=0) == pytest.approx((0.4, 0.12, 0.16), abs=0.03)
     assert particles.outline.points[:, 1].min() == pytest.approx(task.scene.walls[0].offset, abs=1e-6)
     x = places(task)
+    assert task.scene.muscle_names == ("slab0", "slab1", "slab2", "slab3")
     for k in range(4):
         slab = x[task.regions[f"slab{k}"]]
         assert len(slab) == len(x) / 4 and 0.1 * k < slab[:, 0].min() < slab[:, 0].max() < 0.1 * (k + 1)
     boxes = {"left": [0, 0, 0.5, 1, 1, 1], "right": [0, 0, 0, 1, 0.4, 0.5]}
     task = make_task(MeshConf(file="robot.stl", up="y", boxes=boxes))
     x, muscle = places(task), task.scene.muscles[0]
+    assert task.scene.muscle_names == ("left", "right")
     assert np.ptp(x[:, 1]) > np.ptp(x[:, 2]) and x[muscle.particles, 2].min() > x[:, 2].mean() - 0.01
     assert muscle.direction == pytest.approx((1, 0, 0), abs=1e-3) and list(task.regions) == [
         "left",

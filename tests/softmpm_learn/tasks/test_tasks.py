@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import softmpm
+from softmpm_learn.runs.identity import identity
+from softmpm_learn.settings import Settings
 from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
 from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
 from softmpm_learn.tasks.task import LAWS, Resolution, Task, TaskConf
@@ -58,6 +60,29 @@ def test_regions_and_muscles_are_particles_of_the_robot(task):
     assert all(len(region) > 20 for region in task.regions.values())
     assert all(len(muscle.particles) > 20 for muscle in task.scene.muscles)
     assert len(task.scene.muscles) % 2 == 0
+
+
+def test_muscles_have_telling_names(task):
+    """Different ones, whose front half is in front and whose left half is on the left."""
+    names = task.scene.muscle_names
+    assert names == tuple(muscle.name for muscle in task.scene.muscles)
+    places = np.concatenate([body.particles.positions for body in task.scene.bodies])
+    for k in range(0, len(names), 2):
+        limb, first = names[k].split(", ")
+        assert names[k + 1].split(", ") == [limb, {"front": "back", "left": "right"}[first]]
+        ahead, behind = (places[task.scene.muscles[k + j].particles, 0].mean() for j in range(2))
+        assert (ahead > behind) == (first == "front")
+
+
+def test_names_are_no_part_of_a_run(task):
+    """A run of before there were names goes on: its identity does not see them."""
+    muscles = [dataclasses.replace(muscle, name="") for muscle in task.scene.muscles]
+    nameless = dataclasses.replace(task, scene=dataclasses.replace(task.scene, muscles=muscles))
+    named, plain = (
+        identity(one, softmpm.build(one.scene, device="cpu", **one.build), Settings())
+        for one in (task, nameless)
+    )
+    assert named == plain
 
 
 def test_a_pair_of_muscles_splits_a_limb(task):
