@@ -204,11 +204,11 @@ def check_broadcasts(name: str, value: Tensor, axis: str, want: tuple[int, int])
         )
 
 
-def check_whole(name: str, value: Any) -> None:
-    """A whole number of at least 1."""
+def check_whole(name: str, value: Any, least: int = 1) -> None:
+    """A whole number of at least ``least``."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or value < 1:
-        raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+    if not whole or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from softmpm.checks import check_whole
 from softmpm.recording import style
 from softmpm.recording.fibres import DARK, STROKES, Fibres
 from softmpm.recording.reader import Recording
@@ -52,9 +53,8 @@ def to_rerun(
             "a Rerun file needs the package rerun-sdk (pip install rerun-sdk). Nothing is lost without it: "
             f"{recording} can be converted later, on any machine, with: python -m softmpm {recording}"
         ) from error
-    for name, value in (("every", every), ("max_particles", max_particles)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}.")
+    check_whole("every", every)
+    check_whole("max_particles", 1 if max_particles is None else max_particles)
     rrd = Path(recording).with_suffix(".rrd") if rrd is None else Path(rrd)
     if rrd.resolve() == Path(recording).resolve():
         raise ValueError(

@@ -8,6 +8,7 @@ followed its data. Layout: ``format.py``.
 
 import contextlib
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -16,10 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softmpm.checks import check_whole
 from softmpm.model import Model
 from softmpm.recording.digest import Content, Hash
 from softmpm.recording.file import begin, open_to_append, put_in_place, room
 from softmpm.recording.format import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
+from softmpm.recording.format_checks import check_values
 from softmpm.state import ContactForces, GridField, State
 
 FURTHER_FRAME = 2**16
@@ -66,19 +69,16 @@ class Recorder:
         max_particles: int | None = None,
         max_points: int | None = None,
     ):
-        for name, value, least in (
-            ("every", every, 1),
-            ("max_particles", max_particles, 1),
-            ("max_points", max_points, 0),
-        ):
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}.")
+        check_whole("every", every)
+        check_whole("max_particles", 1 if max_particles is None else max_particles)
+        check_whole("max_points", 0 if max_points is None else max_points, least=0)
         self.path, self.every = Path(path), every
         if resume_before is None and self.path.exists():
             raise FileExistsError(
                 f"{self.path} exists; choose another path, or go on with resume_before=<iteration>."
             )
         static = static_values(model, max_particles, max_points)
+        check_values(self.path, static)  # as readers do
         self._particles, self._points = (
             torch.from_numpy(static[name]) for name in ("particle", "surface_point")
         )
@@ -249,6 +249,8 @@ class Episode:
         recorder._need_open()
         if (self._calls - 1) % recorder.every:
             return
+        if not math.isfinite(time):
+            raise ValueError(f"the time of a frame must be finite, got {time}.")
         if tuple(state.x.shape[1:]) != recorder._shape:
             raise ValueError(
                 f"state.x must have shape (world, *{recorder._shape}), got {tuple(state.x.shape)}."
@@ -259,14 +261,14 @@ class Episode:
         row = {name: table.shape[1:] for name, table in recorder._tables.items()}
         values["activation"] = np.full(row["frame/activation"], np.nan, np.float32)
         if activation is not None:
-            values["activation"] = _one_world("activation", activation, world, row["frame/activation"])
+            values["activation"] = _one_world("activation", activation, state, world, row["frame/activation"])
         parts = {}
         if field is not None:
             velocity = field.velocity if isinstance(field, GridField) else field
-            parts["field"] = _one_world("field", velocity, world, row["field/velocity"])
+            parts["field"] = _one_world("field", velocity, state, world, row["field/velocity"])
         if latent is not None:  # the first one decides the size
             size = row["latent/value"] if row["latent/value"] != (0,) else tuple(latent.shape[-1:])
-            parts["latent"] = _one_world("latent", latent, world, size)
+            parts["latent"] = _one_world("latent", latent, state, world, size)
         if forces is not None:
             parts |= recorder._contact(forces, world)
         recorder._frame(_Waiting(self, float(time), values, parts))
@@ -294,11 +296,11 @@ def _numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().to("cpu", torch.float32).numpy()
 
 
-def _one_world(name: str, tensor: Tensor, world: int, shape: tuple[int, ...]) -> np.ndarray:
-    one = tensor[world] if tensor.ndim == len(shape) + 1 else tensor
-    if tuple(one.shape) != shape:
+def _one_world(name: str, tensor: Tensor, state: State, world: int, shape: tuple[int, ...]) -> np.ndarray:
+    every = (len(state.x), *shape)
+    if tuple(tensor.shape) not in (shape, every):
         raise ValueError(
-            f"{name} must have shape {shape}, or that after a first axis world, got {tuple(tensor.shape)}; a frame is one instant, "
+            f"{name} must have shape {shape}, or {every} with a first axis world, got {tuple(tensor.shape)}; a frame is one instant, "
             "so of many control steps it takes one."
         )
-    return _numpy(one)
+    return _numpy(tensor[world] if tensor.ndim > len(shape) else tensor)

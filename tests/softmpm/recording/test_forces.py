@@ -92,7 +92,7 @@ def test_forces_that_do_not_fit_are_refused(tmp_path):
         episode.frame(0.0, rest)
     with softmpm.Recording(tmp_path / "run.h5") as first, softmpm.Recording(tmp_path / "nodes.h5") as second:
         assert len(first.rows(0)) == 0 and set(second.frames(0)) == {"time", "x", "v", "strain", "activation"}
-    with pytest.raises(ValueError, match="max_points must be at least 0"):
+    with pytest.raises(ValueError, match="max_points must be a whole number of at least 0"):
         softmpm.Recorder(tmp_path / "new.h5", model, max_points=-1)
 
 

@@ -175,7 +175,7 @@ def test_less_can_be_shown(tmp_path):
     """``every`` and ``max_particles`` thin out frames and particles."""
     rrd = softmpm.to_rerun(make(tmp_path / "run.h5"), tmp_path / "less.rrd", every=2, max_particles=10)
     assert len(column(rrd, "/scene/robot/strain", "Points2D:positions")) == 2 * 2 * 10 * 2
-    with pytest.raises(ValueError, match="max_particles must be at least 1"):
+    with pytest.raises(ValueError, match="max_particles must be a whole number of at least 1"):
         softmpm.to_rerun(tmp_path / "run.h5", max_particles=0)
 
 

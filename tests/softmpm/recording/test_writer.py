@@ -385,11 +385,23 @@ def test_nothing_is_overwritten_by_accident(tmp_path):
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
+def test_a_scene_that_readers_would_refuse(tmp_path):
+    """A strength beyond float32 is refused before there is a file, which no reader would open."""
+    scene = small_model().scene
+    strong = [dataclasses.replace(muscle, strength=1e39) for muscle in scene.muscles]
+    scene = dataclasses.replace(scene, muscles=strong, dt=1e-30)
+    model = softmpm.build(scene, device="cpu", dtype=torch.float64)
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match="static/muscle_strength must be finite"):
+        softmpm.Recorder(tmp_path / "run.h5", model)
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_use_is_explained(tmp_path):
     """Shapes, sizes and names that do not fit raise before anything is written."""
     model, path = small_model(), tmp_path / "run.h5"
-    with pytest.raises(ValueError, match="every must be at least 1"):
-        softmpm.Recorder(path, model, every=0)
+    for name, value in (("every", 0), ("every", 2.5), ("max_particles", 10.0), ("max_points", -1)):
+        with pytest.raises(ValueError, match=f"{name} must be a whole number of at least"):
+            softmpm.Recorder(path, model, **{name: value})
     recorder = softmpm.Recorder(path, model)
     with pytest.raises(ValueError, match="4096 bytes"):
         recorder.episode(0, note="x" * 5000)
@@ -407,6 +419,13 @@ def test_wrong_use_is_explained(tmp_path):
     for name, arguments in wrong.items():
         with pytest.raises(ValueError, match=f"{name} must have shape"):
             episode.frame(0.0, **({"state": rest} | arguments))
+    with pytest.raises(
+        ValueError, match=r"\(2,\), or \(1, 2\) with a first axis world, got \(5, 2\); a frame is one instant"
+    ):
+        episode.frame(0.0, rest, torch.zeros(5, 2))  # of five control steps
+    for when in (math.nan, math.inf):  # no reader would open the file any more
+        with pytest.raises(ValueError, match=f"the time of a frame must be finite, got {when}"):
+            episode.frame(when, rest)
     episode.frame(0.0, rest, latent=torch.zeros(8))
     with pytest.raises(ValueError, match=r"latent must have shape \(8,\)"):
         episode.frame(0.1, rest, latent=torch.zeros(9))
