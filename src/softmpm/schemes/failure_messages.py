@@ -52,8 +52,6 @@ class Case:
         kind = "start"
         if self._away() > 0:
             return kind, self._left_grid()[1], self._box(), GRID
-        if self._bad():
-            return kind, self._not_finite()[1], self._not_finite()[2], "Start from other values."
         if self._det() <= self._least():
             _, value, limit, _ = self._collapsed()
             return (
@@ -62,13 +60,9 @@ class Case:
                 limit,
                 "Start from a deformation gradient F that is not inverted and less compressed.",
             )
-        if not self._neighbours():
-            return (
-                kind,
-                "has values too large to square",
-                "every value must be finite, and its square",
-                "Start from other values.",
-            )
+        if self._bad() or not self._neighbours():
+            _, value, limit, _ = self._not_finite()
+            return kind, value, limit, "Start from finite and smaller values."
         _, value, limit, _ = self._torn()
         return kind, value, limit, "Start from positions nearer to the rest shape."
 
@@ -123,7 +117,9 @@ class Case:
     def _not_finite(self) -> tuple[str, str, str, str]:
         bad = self._bad()
         what = (
-            f"has a value in {', '.join(bad)} that is not finite" if bad else "has values too large to square"
+            f"has a value in {', '.join(bad)} that is not finite or too large to square"
+            if bad
+            else "has values too large to square"
         )
         return "not_finite", what, "every value must be finite, and its square", f"Use {FINER}. {GENTLER}."
 
@@ -159,7 +155,9 @@ class Case:
     def _bad(self) -> list[str]:
         fields = zip("xvCF", (self.end.x, self.end.v, self.end.C, self.end.F), strict=True)
         return [
-            name for name, value in fields if not bool(torch.isfinite(value[self.world, self.particle]).all())
+            name
+            for name, value in fields
+            if not bool(torch.isfinite(value[self.world, self.particle].square().sum()))
         ]
 
     def _running_limit(self) -> float:

@@ -134,3 +134,20 @@ def test_an_inverted_start():
         softmpm.simulate(model, start, None, model.params(), substeps=1)
     start.F[0, 3] = torch.tensor(np.diag([0.5, 1.0]))
     softmpm.simulate(model, start, None, model.params(), substeps=1)
+
+
+@pytest.mark.parametrize("name", ["v", "C", "F"])
+def test_a_start_whose_values_are_too_large(name, scheme):
+    """Its square is no number of float32: the value is named, not a neighbour that is where it should be. A smaller one passes."""
+    model = softmpm.build(bar(muscles=()), device="cpu", scheme=scheme)
+    start = model.rest()
+    value = getattr(start, name)[0, 3].view(-1)
+    value[0], usual = 1e20, float(value[0])
+    with pytest.raises(softmpm.UnstableError) as caught:
+        softmpm.simulate(model, start, None, model.params(), substeps=1)
+    assert f"has a value in {name} that is not finite or too large to square in the start state" in str(
+        caught.value
+    )
+    assert "Start from finite and smaller values." in str(caught.value)
+    value[0] = usual + 0.1
+    softmpm.simulate(model, start, None, model.params(), substeps=1)
