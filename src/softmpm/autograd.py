@@ -84,7 +84,7 @@ def _simulate(
         with torch.inference_mode(False), torch.no_grad():
             return _simulate(model, start, activation, params, substeps, inputs, failures)
     check_model(model, "simulate")
-    start, activation, params = _cast(model, start), _cast(model, activation), _cast(model, params)
+    start, activation, params = cast(model, start), cast(model, activation), cast(model, params)
     check_state(model, start)
     check_activation(model, activation)
     given = check_inputs(model, inputs)
@@ -150,13 +150,13 @@ def rasterize(model: Model, state: State) -> GridField:
 @opaque
 def _rasterize(model: Model, state: State) -> GridField:
     check_model(model, "rasterize")
-    state = _cast(model, state)
+    state = cast(model, state)
     check_state(model, state)
     refuse_batches(state[:3])
     return GridField(*_Rasterize.apply(model, state.x, state.v, state.C))
 
 
-def _cast(model: Model, value: Any) -> Any:
+def cast(model: Model, value: Any) -> Any:
     """Under autocast, tensors in the model's precision: a policy then gives half precision without being asked."""
     if value is None or not torch.is_autocast_enabled(model.device.type):
         return value
@@ -164,7 +164,7 @@ def _cast(model: Model, value: Any) -> Any:
         return value.to(model.dtype) if value.is_floating_point() else value
     if isinstance(value, (Nodal, SurfaceState)):
         return value.to(model.dtype)
-    return type(value)(*(_cast(model, part) for part in value))
+    return type(value)(*(cast(model, part) for part in value))
 
 
 @dataclass(eq=False)

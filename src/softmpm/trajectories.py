@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from softmpm.alarms import Failures
-from softmpm.autograd import simulate
+from softmpm.autograd import cast, simulate
 from softmpm.batches import refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, steps_of
 from softmpm.check_inputs import control_steps as steps_of_call
@@ -67,6 +67,7 @@ def trajectory(
         UnstableError: As of ``simulate``, with a note of the control step from which its ``substep`` counts.
     """
     check_model(model, "trajectory")
+    start, activation = cast(model, start), cast(model, activation)
     check_state(model, start)
     check_activation(model, activation)
     check_whole("every", every)

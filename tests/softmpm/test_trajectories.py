@@ -210,3 +210,14 @@ def test_in_a_graph(device):
         want_frames, want_slope = work()
         torch.testing.assert_close(frames, want_frames, rtol=1e-5, atol=0)
         torch.testing.assert_close(slope, want_slope, rtol=1e-3, atol=1e-7)
+
+
+def test_half_precision_under_autocast():
+    """The activation that a policy gives there is taken, as by ``simulate``, with the same bits."""
+    model = build(busy_scene(2))
+    start, activation, params, _ = arguments(leaves_of(model))
+    half = activation.detach().bfloat16()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = softmpm.trajectory(model, start, half, params, substeps=SUBSTEPS).end
+        want = softmpm.simulate(model, start, half, params, substeps=SUBSTEPS)
+    assert all(torch.equal(a, b) for a, b in zip(found[:4], want[:4], strict=True))
