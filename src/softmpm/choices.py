@@ -9,6 +9,7 @@ import torch
 
 from softmpm.alarms import Alarms
 from softmpm.inputs import QUANTITIES, Inputs
+from softmpm.scene.check_scene import lacks_nodes
 from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.schemes.registry import SCHEMES
 
@@ -68,8 +69,7 @@ def check_reach(scene: Scene) -> None:
     points = np.concatenate(
         [b.particles.outline.points for b in scene.bodies if b.particles.outline is not None]
     )
-    base = np.floor(points / grid.spacing - 0.5)
-    outside = ((base < 0) | (base > np.array(grid.shape) - 3)).any(axis=1)
+    outside = lacks_nodes(points, grid)
     if outside.any():
         raise ValueError(
             f"surface points need the nodes around them, from half a cell to one and a half cells inside the grid, but one is at "

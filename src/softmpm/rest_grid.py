@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from softmpm.kernels.lagrangian.bricks import LARGEST_LATTICE, bricks_for
+from softmpm.scene.check_scene import SAME
 from softmpm.scene.scene import Grid, Scene
 
 
@@ -155,10 +156,6 @@ def lattice_of(base: np.ndarray, fraction: np.ndarray) -> tuple[np.ndarray | Non
     number = np.asarray(np.ravel_multi_index(tuple(indices), (count,) * len(axes)))
     keys = np.unique(np.column_stack([base, number]), axis=0)
     return (None, None) if len(keys) < len(base) else (np.array(axes), number)
-
-
-SAME = 1e-11
-"""Distance within which two places in a cell are the same [cells]: the rounding of positions."""
 
 
 def packed(brick: np.ndarray, cell: np.ndarray) -> np.ndarray:

@@ -232,6 +232,25 @@ def at_the_edge(made: softmpm.Scene) -> softmpm.Scene:
     return dataclasses.replace(made, bodies=[body], walls=made.walls[:1])
 
 
+@pytest.mark.parametrize(
+    ("upper", "contact", "said"),
+    [(7.5, "surface", "surface points need the nodes"), (7.75, "nodes", "body 0 leaves the grid")],
+)
+def test_the_upper_edge_of_the_grid(upper, contact, said):
+    """Surface points, or particles, below it by rounding alone are refused by name; those below it by 1e-9 cells are taken."""
+    for below in (0.0, 1e-13, 1e-12, 1e-9):
+        top = (upper - below) / 8
+        body = softmpm.Body(softmpm.box((top - 0.375, 0.2), (top, 0.5), 1 / 16), block(2).bodies[0].material)
+        floor = softmpm.Wall(normal=(0.0, 1.0), offset=0.1)
+        grid = softmpm.Grid(shape=(9, 9), spacing=1 / 8)
+        scene = softmpm.Scene(grid=grid, bodies=[body], walls=[floor], dt=1e-4)
+        if below < 1e-10:
+            with pytest.raises(ValueError, match=said):
+                softmpm.build(scene, "cpu", formulation="reference", contact=contact)
+        else:
+            softmpm.build(scene, "cpu", formulation="reference", contact=contact)
+
+
 def test_what_is_asked_for_must_be_possible():
     """Contact of surfaces needs outlines, a separating wall and, in the fast scheme, sums in any order; nodes are always possible."""
     made = block(2)

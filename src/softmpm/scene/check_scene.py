@@ -14,6 +14,8 @@ from softmpm.scene.outline import Outline
 from softmpm.scene.scene import Grid, Particles, Scene
 from softmpm.validate import need
 
+SAME = 1e-11
+"""Distance within which two places in a cell are the same [cells]: the rounding of positions."""
 SAME_PLACE = 1e-6
 """Two particles nearer than this share of a cell are one particle twice."""
 OPEN = 0.05
@@ -101,8 +103,7 @@ def _check_bodies(scene: Scene) -> None:
             f"body {b} has {positions.shape[1]}D particles, but the grid {grid.shape} has {grid.dim} axes; "
             "make both 2D or both 3D.",
         )
-        base = np.floor(positions / grid.spacing - 0.5)  # first of the three nodes that a particle reaches
-        outside = ((base < 0) | (base > np.array(grid.shape) - 3)).any(axis=1)
+        outside = lacks_nodes(positions, grid)
         if outside.any():
             particle = int(np.argmax(outside))
             raise ValueError(
@@ -110,6 +111,12 @@ def _check_bodies(scene: Scene) -> None:
                 f"{outside.sum() - 1} more of its {len(positions)}; all must lie in {_room(grid)} m, "
                 "so that the nodes around them exist. Move the body or enlarge the grid."
             )
+
+
+def lacks_nodes(places: np.ndarray, grid: Grid) -> np.ndarray:
+    """True for each place [m], shape (place, dim), without all 3^dim nodes around it; one midway between nodes has the upper ones."""
+    base = places / grid.spacing - 0.5  # rounded down, the first of three nodes along each axis
+    return np.asarray(((base < 0) | (base + SAME >= np.array(grid.shape) - 2)).any(axis=1))
 
 
 def _room(grid: Grid) -> str:

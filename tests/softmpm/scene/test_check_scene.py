@@ -38,7 +38,15 @@ def test_particles_keep_three_nodes():
     """A particle may be wherever ⌊x/dx − 0.5⌋ and the two nodes after it exist, and nowhere else."""
     inside = np.array([(0.5, 0.5), (7.5 - 1e-9, 9.5 - 1e-9), (0.5, 9.4), (7.4, 0.5)]) * DX
     check_scene(scene(body(*inside)))
-    for outside in [(0.5 - 1e-9, 5), (5, 0.5 - 1e-9), (7.5, 5), (5, 9.5), (-3, 5), (5, 100)]:
+    for outside in [
+        (0.5 - 1e-9, 5),
+        (5, 0.5 - 1e-9),
+        (7.5, 5),
+        (7.5 - 1e-12, 5),
+        (5, 9.5),
+        (-3, 5),
+        (5, 100),
+    ]:
         refused(scene(body((0.5, 0.5), np.multiply(outside, DX))), "body 0 leaves the grid: particle 1 at (")
 
 
