@@ -132,6 +132,11 @@ def _rows(name: str, value: Tensor, first: int, last: int) -> Tensor:
 def stacked(frames: Sequence[Any]) -> Any:
     """Values of the same structure as one, whose tensors have a first axis of these values."""
     one = frames[0]
+    for other in frames:
+        need(
+            _form(other) == _form(one),
+            f"observe must return the same in each frame, got {_form(one)} and later {_form(other)}.",
+        )
     if one is None:
         return None
     if isinstance(one, Tensor):
@@ -145,3 +150,14 @@ def stacked(frames: Sequence[Any]) -> Any:
         f"observe must return tensors, or tuples, lists or dictionaries of tensors, got {type(one).__name__}; give numbers by "
         "torch.as_tensor."
     )
+
+
+def _form(value: Any) -> str:
+    """Type of a value, with the shape of a tensor, the keys of a dictionary or the length of a sequence."""
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {tuple(value.shape)}"
+    if isinstance(value, dict):
+        return f"a dictionary of {', '.join(sorted(map(str, value))) or 'nothing'}"
+    if isinstance(value, (tuple, list)):
+        return f"a {type(value).__name__} of length {len(value)}"
+    return "None" if value is None else f"a {type(value).__name__}"

@@ -174,6 +174,26 @@ def test_what_does_not_fit_is_refused():
         softmpm.trajectory(model.scene, start, activation, params, substeps=1)
 
 
+@pytest.mark.parametrize(
+    ("first", "later", "message"),
+    [
+        (None, torch.zeros(2), "None and later a tensor of shape \\(2,\\)"),
+        ({"a": torch.zeros(2)}, {"a": torch.zeros(2), "b": None}, "a dictionary of a and later .* of a, b"),
+        (torch.zeros(2), torch.zeros(3), "a tensor of shape \\(2,\\) and later .* \\(3,\\)"),
+        ([torch.zeros(2)], [], "a list of length 1 and later .* 0"),
+    ],
+)
+def test_observations_that_change_their_structure(first, later, message):
+    """They are refused: what the first frame has not was left out of all."""
+    model = build(busy_scene(2))
+    start, activation, params, _ = arguments(leaves_of(model))
+    frames = iter([first])
+    with pytest.raises(ValueError, match=f"observe must return the same in each frame, got {message}"):
+        softmpm.trajectory(
+            model, start, activation, params, substeps=1, observe=lambda _: next(frames, later)
+        )
+
+
 @pytest.mark.parametrize("name", ["activation", "force", "position"])
 def test_a_number_that_is_not_finite_is_refused_at_once(name):
     """By its name and its row in the whole trajectory, before the first frame."""
