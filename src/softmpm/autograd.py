@@ -60,7 +60,7 @@ def simulate(
         State after ``control_step * substeps * dt`` seconds, in new tensors.
 
     Raises:
-        TypeError: ``model`` is not a :class:`softmpm.Model`.
+        TypeError: ``model`` is not a :class:`softmpm.Model`, or ``failures`` no :class:`softmpm.Failures`.
         ValueError: An argument has a wrong shape, precision or device; names the rule and the value received.
         UnstableError: A particle became non-finite, collapsed or left the grid, numerical fracture occurred, dt is above the running
             stable step, a surface point is deep in a wall, or bodies overlap although ``body_contact=False`` (:class:`softmpm.Alarms`);
@@ -84,6 +84,10 @@ def _simulate(
         with torch.inference_mode(False), torch.no_grad():
             return _simulate(model, start, activation, params, substeps, inputs, failures)
     check_model(model, "simulate")
+    if not isinstance(failures, Failures | None):
+        raise TypeError(
+            f"failures must be a softmpm.Failures or None, got {failures!r}; softmpm.Failures('freeze') makes one."
+        )
     start, activation, params = cast(model, start), cast(model, activation), cast(model, params)
     check_state(model, start)
     check_activation(model, activation)

@@ -24,6 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from softmpm.checks import demand
+from softmpm.inputs import QUANTITIES
 from softmpm.oracle.stress import actuator_tangent, lame, law_of, tangent, viscous_tangent
 from softmpm.scene.actuators import title
 from softmpm.scene.check_scene import check_scene
@@ -187,6 +189,8 @@ def _rows(params: Params, particles: int) -> Params:
             value.ndim == 2 and value.shape[1] in (1, particles),
             f"params.{name} must broadcast to (world, {particles}), got shape {tuple(value.shape)}.",
         )
+        known = QUANTITIES[name]
+        demand(f"params.{name}", value, (value > known.low) & (value < known.high), known.rule)
         rows.append(value)
     worlds = max(len(value) for value in rows)
     return Params(*(value.expand(worlds, particles) for value in rows))

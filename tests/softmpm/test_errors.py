@@ -154,6 +154,16 @@ def test_bad_numbers_are_refused_before_any_launch(dtype, scheme, device, monkey
                 run(softmpm.simulate, model, inputs, 1)
 
 
+def test_failures_of_another_type_are_refused():
+    """At once: the name of a policy would be taken until the first failure."""
+    model = single()
+    for wrong in ("freeze", [], softmpm.Failures):
+        with pytest.raises(
+            TypeError, match=r"failures must be a softmpm.Failures or None, got .*\('freeze'\) makes one"
+        ):
+            softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, failures=wrong)  # pyright: ignore
+
+
 def test_a_bad_activation_is_refused_at_whatever_control_step(scheme, device):
     """In the last row, in one muscle of one world of a deterministic model."""
     deterministic = scheme == "fast"

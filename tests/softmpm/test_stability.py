@@ -348,3 +348,18 @@ def test_a_stiffness_beyond_all_numbers_is_named():
         ValueError, match=r"stiffness of body 0 is beyond .* active stress of up to 1e\+308 Pa"
     ):
         stable_dt(scene(NeoHookean(density=1.0, young=10.0), muscles=[fibres, fibres]))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("young", -1.0), ("young", math.nan), ("poisson", 0.5), ("poisson", -1.0), ("density", 0.0)],
+)
+def test_a_material_outside_its_bounds_has_no_step(name, value):
+    """It is refused by the name of the parameter, as by ``simulate``."""
+    made = scene(NeoHookean(density=1.0, young=100.0))
+    params = softmpm.Params(torch.tensor(100.0), torch.tensor(0.3), torch.tensor(1.0))
+    stable_dt(made, params)
+    with pytest.raises(
+        ValueError, match=rf"params.{name} must be .*, but params.{name}\[0, 0\] is {value:g}"
+    ):
+        stable_dt(made, params._replace(**{name: torch.tensor(value)}))
