@@ -322,6 +322,52 @@ def test_the_thinnest_limb_is_found(width):
         assert thinnest(mask, 0.001, 0.016) is None
 
 
+def pictures(neck: float) -> dict[str, np.ndarray]:
+    """Squares of 16 cells, of 8 pixels each, with necks of this width [cells]: beside holes, between two, between notches or slits."""
+    x, y = (np.mgrid[:128, :128] - 63.5) / 8
+    found = {f"hole {r}": np.hypot(x, y - 8 + neck + r) > r for r in (1.25, 2.0, 5.0)}
+    found["holes"] = np.hypot(abs(x) - 2 - neck / 2, y) > 2
+    found["notches"] = abs(y) > abs(x) - neck / 2
+    found["slits"] = (abs(y) > 0.6) | (abs(x) < neck / 2)
+    found["slit"] = (abs(y) > 0.6) | (x > 8 - neck)
+    return found
+
+
+@pytest.mark.parametrize("neck", [0.5, 1.0, 1.5])
+def test_necks_beside_holes_and_notches_are_found(neck):
+    """Each is short, and at most as wide as said, to an eighth of two cells and the pixels; discs as wide as it pass through."""
+    for name, mask in pictures(neck).items():
+        assert neck <= thinnest(mask, 0.125, 2.0) <= neck + 0.5, name
+        assert thinnest(mask, 0.125, neck) is None, name
+    for name, mask in pictures(2.0).items():
+        assert thinnest(mask, 0.125, 2.0) is None, name
+
+
+@pytest.mark.parametrize("neck", [0.5, 1.0, 1.5, 2.0])
+def test_thin_walls_beside_holes_are_found(neck):
+    """In 3D: beside a hole through a block and a cavity in it, and in a tube that is thicker elsewhere. Voxels are half a cell."""
+    x, y, z = (np.mgrid[:24, :24, :24] - 11.5) / 2
+    hole = np.hypot(x, y - 4 + neck) > 2
+    cavity = np.hypot(np.hypot(x, y - 4 + neck), z) > 2
+    tube = (np.hypot(x, y) < 6) & (np.hypot(x, y - 3 + neck) > 3)
+    for mask in (hole, cavity, tube):
+        found = thinnest(mask, 0.5, 2.0)
+        assert found is None if neck == 2.0 else found == pytest.approx(neck, abs=0.25)
+
+
+def test_edges_and_notches_are_no_necks():
+    """Cones and narrow notches at any place and angle to the pixels, of which some at tips and edges share a corner alone."""
+    rng = np.random.default_rng(0)
+    grid, flat = (np.mgrid[:40, :40, :40] - 19.5) / 2, (np.mgrid[:96, :96] - 47.5) / 4
+    for angle in np.radians([60, 60, 75, 75, 75]):
+        x, y, z = np.tensordot(np.linalg.qr(rng.normal(size=(3, 3)))[0], grid, 1) + rng.random((3, 1, 1, 1))
+        assert thinnest((abs(z) < 4) & (np.hypot(x, y) < (4 - z) * np.tan(angle / 2)), 0.5, 2.0) is None
+    for angle in np.radians([2, 5, 20, 60]):
+        x, y = np.tensordot(np.linalg.qr(rng.normal(size=(2, 2)))[0], flat, 1) + rng.random((2, 1, 1))
+        whole = (abs(x) < 7) & (abs(y) < 7)
+        assert thinnest(whole & (abs(y) > x * np.tan(angle / 2)), 0.25, 2.0) is None
+
+
 def test_blurred_edges_belong_to_the_nearest_part(folder):
     """A smaller copy with blended edges, transparent around, and a JPEG give the same areas to 6 %."""
     want = make_task(ImageConf(file="robot.png"))
