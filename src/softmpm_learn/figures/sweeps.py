@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,8 @@ INDIFFERENT = *SEEDS, "train.log", "train.record_every", "train.frame_every", "t
 """Settings by which runs do not become others, the seed apart."""
 EXAMINED = ["end", "later", "kicked", "friction", "finer", "largest_tilt", "largest_miss", "largest_speed"]
 """Answers of the examination, as the columns of sweep.csv and of the last row of metrics.csv are called."""
+PIECE = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|\\[\\()[\]{}:=, \t]|.""", re.DOTALL)
+"""A quoted text, an escaped character or another one."""
 
 
 @dataclass(kw_only=True)
@@ -166,19 +169,17 @@ def _add_metrics(run: SweptRun, path: Path) -> None:
 
 
 def parse(words: str) -> dict[str, str]:
-    """Settings from a command line, by key; white space within brackets and quotes does not separate, and the last value counts."""
-    found, word, depth, quote = [], "", 0, ""
-    for letter in f"{words} ":
-        if letter.isspace() and not depth and not quote:
+    """Settings from a command line, by key, in Hydra's grammar, whose parser reads one at a time; the last value counts.
+
+    White space within brackets and quotes, and after a backslash, does not separate.
+    """
+    found, word, depth = [], "", 0
+    for piece in PIECE.findall(f"{words}\n"):
+        if piece.isspace() and not depth:
             found, word = found + [word] * bool(word), ""
             continue
-        word += letter
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "'\"":
-            quote = letter
-        else:
-            depth += (letter in "([{") - (letter in ")]}")
+        word += piece
+        depth += (piece in "([{") - (piece in ")]}")
     pairs = (text.partition("=") for text in found)
     return {key.lstrip("+~"): value for key, _, value in pairs}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.stats
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -434,3 +435,20 @@ def test_command_lines_are_read_with_their_brackets():
         "train.seed": "2",
     }
     assert parse("") == {}
+
+
+def test_escaped_characters_are_read_as_hydra_reads_them():
+    """Quotes within quotes, brackets and white space outside of them; the value stays as it was written."""
+    written = [
+        r"'robot\'s 1.png'",
+        r'"a \"b\" \\"',
+        r"a\(b",
+        r"a\ b",
+        r"'\\'",
+        r"{a: 'it\'s ]', b: [1, 2]}",
+        "''",
+    ]
+    for value in written:
+        assert parse(f"task.file={value} train.seed=1") == {"task.file": value, "train.seed": "1"}
+        assert OverridesParser.create().parse_override(f"task.file={value}").get_value_string() == value
+    assert parse("train.seed=1 task.file=C:\\robots\\") == {"train.seed": "1", "task.file": "C:\\robots\\"}
