@@ -277,13 +277,14 @@ class _Rasterize(FirstOrder):
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.model = inputs[0]
+        ctx.model, ctx.place = inputs[0], place()
         ctx.save_for_backward(*inputs[1:], *output)
 
     @staticmethod
     def backward(ctx, adj_mass, adj_velocity):
         refuse_batches((adj_mass, adj_velocity))
-        return None, *_RasterizeBackward.apply(ctx.model, adj_mass, adj_velocity, *ctx.saved_tensors)
+        with at(ctx.place):
+            return None, *_RasterizeBackward.apply(ctx.model, adj_mass, adj_velocity, *ctx.saved_tensors)
 
 
 class _RasterizeBackward(FirstOrderAdjoint):

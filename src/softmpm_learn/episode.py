@@ -115,18 +115,18 @@ def run_episode(
     period, times = task.control_period, times_of(task, model)
     made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
     for step in range(task.control_steps):
-        observation = observer.observe(model, state)
-        if keep_every and step % keep_every == 0:
-            observations.append(observation.detach())
-        features = observer.encode(observation)
-        activation = policy(features, times[step], goal)
-        if failures:
-            failed = torch.tensor(failures.worlds, device=activation.device)
-            activation = activation.index_fill(0, failed, 0.0)
-        if on_frame:
-            on_frame(Frame(step * period, state, features, activation))
         at = f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s."
         with softmpm.noted(at):
+            observation = observer.observe(model, state)
+            if keep_every and step % keep_every == 0:
+                observations.append(observation.detach())
+            features = observer.encode(observation)
+            activation = policy(features, times[step], goal)
+            if failures:
+                failed = torch.tensor(failures.worlds, device=activation.device)
+                activation = activation.index_fill(0, failed, 0.0)
+            if on_frame:
+                on_frame(Frame(step * period, state, features, activation))
             state = softmpm.simulate(
                 model,
                 state,

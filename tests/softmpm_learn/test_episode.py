@@ -138,3 +138,14 @@ def test_a_failure_of_the_gradient_names_the_control_step(task, model):
     assert (
         caught.value.kind == "gradient" and "control step 4 of 6, which began at" in caught.value.__notes__[0]
     )
+
+
+def test_a_failure_of_the_gradient_of_an_observation_names_the_control_step(task, model):
+    """A learned observer sees the grid, whose adjoint overflows."""
+    picture = VelocityImage(model)
+    net = nn.Sequential(nn.Flatten(), nn.Linear(2 * math.prod(picture.shape), 3))
+    params = model.params()._replace(young=model.params().young.clone().requires_grad_())
+    made = run_episode(task, model, Latent(picture, net, size=3), Constant([0.5, -0.3]), params).decisions
+    with pytest.raises(softmpm.UnstableError, match="in the backward pass of rasterize") as caught:
+        (made.features[3].sum() * 3e38 * 10).backward()
+    assert "control step 3 of 6, which began at" in caught.value.__notes__[0]
