@@ -123,11 +123,10 @@ def running_limit(
         for muscle, stress, fibre in zip(scene.muscles, active_stress, fibres, strict=True):
             if particle in muscle.particles:
                 A = A + stress * actuator_tangent(muscle, F, fibre)
-        V = viscosity * viscous_tangent(F)
-        if not bool(torch.isfinite(A).all() and torch.isfinite(V).all()):
-            return math.nan
         inertia = torch.tensor(density * scene.grid.spacing**2, dtype=torch.float64)
-        K = _stiffness(A, V, inertia).item()
+        K = _stiffness(A, viscosity * viscous_tangent(F), inertia).item()
+    if math.isnan(K):
+        return math.nan
     return scene.grid.spacing * math.sqrt(density / K) if K > 0 else math.inf
 
 
@@ -236,15 +235,17 @@ def _limit(
         rows = Params(*(value[:, torch.from_numpy(group.particles)] for value in given))
     mu, lam = (value[..., None, None] for value in lame(rows.young, rows.poisson))
     A, V = mu * A_mu + lam * A_lam + A_active, material.viscosity * viscous_tangent(F)
-    need(
-        bool(torch.isfinite(A).all() and torch.isfinite(V).all()),
-        f"the stiffness of body {group.body} is beyond what a number holds; use a smaller young's modulus, strength of its muscles, "
-        f"activation or viscosity, got young {rows.young.max():.4g} Pa, viscosity {material.viscosity:.4g} Pa s and an active stress "
-        f"of up to {max((abs(activation * scene.muscles[m].strength) for m in group.muscles), default=0.0):.4g} Pa.",
-    )
     K = _stiffness(A, V, rows.density * scene.grid.spacing**2)  # (world, particle)
     K, density = torch.broadcast_tensors(K, rows.density)
-    squared = torch.where(K > 0, density / K, math.inf)
+    squared = torch.where(K <= 0, math.inf, density / K)
+    active = max((abs(activation * scene.muscles[m].strength) for m in group.muscles), default=0.0)
+    need(
+        bool((squared > 0).all()),
+        f"the stiffness of body {group.body}, or that by its density, is beyond what a number holds; use a smaller young's modulus, "
+        f"strength of its muscles, activation or viscosity, or other units, got young {rows.young.max():.4g} Pa, viscosity "
+        f"{material.viscosity:.4g} Pa s, an active stress of up to {active:.4g} Pa, density {rows.density.min():.4g} kg/m³ and cells "
+        f"of {scene.grid.spacing:.4g} m.",
+    )
     world, particle = divmod(int(squared.argmin()), squared.shape[1])
     dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
     return dt, K[world, particle].item(), int(group.particles[particle])
@@ -281,18 +282,26 @@ def _stiffness(A: Tensor, V: Tensor, inertia: Tensor) -> Tensor:
     Args:
         A, V: Stiffness [Pa] and damping [Pa s], shapes (..., k, k) that broadcast.
         inertia: ρ dx² [Pa s²], shape that broadcasts to (...).
+
+    Returns:
+        K, NaN where it is beyond what a number holds.
     """
-    K = torch.linalg.eigvalsh(A)[..., -1]
-    damping = torch.linalg.eigvalsh(V)[..., -1]
+    K, damping = _largest(A), _largest(V)
     if not bool((damping > 0).any()):
-        return K
+        return K + damping  # 0, or NaN
     rate = (damping + torch.hypot(damping, (K.clamp(min=0) * inertia).sqrt())) / inertia
     for _ in range(200):
-        K = torch.linalg.eigvalsh(A + 2 * rate[..., None, None] * V)[..., -1]
+        K = _largest(A + 2 * rate[..., None, None] * V)
         last, rate = rate, (K.clamp(min=0) / inertia).sqrt()
-        if bool((last - rate <= 1e-14 * last).all()):
+        if not bool((last - rate > 1e-14 * last).any()):
             break
     return K
+
+
+def _largest(matrix: Tensor) -> Tensor:
+    """Largest eigenvalue of symmetric matrices, NaN where one is not finite; shape (..., k, k) to (...)."""
+    finite = torch.isfinite(matrix).all(-1).all(-1)
+    return torch.linalg.eigvalsh(matrix.where(finite[..., None, None], 0.0))[..., -1].where(finite, math.nan)
 
 
 def _describe(

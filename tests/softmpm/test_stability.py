@@ -345,7 +345,7 @@ def test_a_stiffness_beyond_all_numbers_is_named():
     """Instead of an error of the eigenvalue solver."""
     fibres = muscle((1, 0), 1e308)
     with pytest.raises(
-        ValueError, match=r"stiffness of body 0 is beyond .* active stress of up to 1e\+308 Pa"
+        ValueError, match=r"stiffness of body 0, .* is beyond .* active stress of up to 1e\+308 Pa"
     ):
         stable_dt(scene(NeoHookean(density=1.0, young=10.0), muscles=[fibres, fibres]))
 
@@ -363,3 +363,16 @@ def test_a_material_outside_its_bounds_has_no_step(name, value):
         ValueError, match=rf"params.{name} must be .*, but params.{name}\[0, 0\] is {value:g}"
     ):
         stable_dt(made, params._replace(**{name: torch.tensor(value)}))
+
+
+@pytest.mark.parametrize(
+    "young, density, viscosity",
+    [(10.0, 1.0, 1e200), (10.0, 1e-308, 1.0), (1e308, 1.0, 1.0), (1e300, 1e-300, 0.0)],
+)
+def test_a_step_beyond_all_numbers_is_named(young, density, viscosity):
+    """A rate or a stiffness that overflows, and a step that vanishes, by which build would divide."""
+    made = scene(NeoHookean(density=density, young=young, viscosity=viscosity))
+    with pytest.raises(ValueError, match="or that by its density, is beyond") as caught:
+        stable_dt(made)
+    assert f"got young {young:.4g} Pa, viscosity {viscosity:.4g} Pa s, an active stress" in str(caught.value)
+    assert f"got young {young:.4g} Pa, viscosity {viscosity:.4g} Pa s, an active stress" in str(caught.value)

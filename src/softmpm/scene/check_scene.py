@@ -44,10 +44,12 @@ def check_scene(scene: Scene) -> None:
 def check_precision(scene: Scene, dtype: torch.dtype) -> None:
     """Raise ValueError if rounding to ``dtype`` takes a value of the scene out of its bounds.
 
-    What must not vanish has to be a normal number: below, digits are lost one after the other, and a mass of 0 does not move.
+    What must not vanish has to be a normal number: below, digits are lost one after the other, and a mass of 0 does not move. That
+    includes the stress at a strain of a rounding error.
     """
     real = np.dtype(str(dtype).removeprefix("torch.")).type
     least, most = float(np.finfo(real).tiny), float(np.finfo(real).max)
+    strain = float(np.finfo(real).eps)
 
     def within(name: str, value: float, low: float, high: float) -> None:
         with np.errstate(over="ignore", under="ignore"):
@@ -68,6 +70,8 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
             within(f"{name} of body {b}", getattr(material, name), least, most)
         half = float(np.nextafter(real(0.5), real(0)))
         within(f"poisson of body {b}", material.poisson, -2 * half, half)
+        stress, about = material.young * strain, f"the stress of body {b} at a strain of {strain:.2g}"
+        within(f"{about} [Pa]", stress, least, most)
         if material.viscosity > 0:
             within(f"viscosity of body {b}", material.viscosity, least, most)
         for value in ends:
@@ -79,12 +83,10 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
                 least,
                 most,
             )
-            within(
-                f"the smallest or largest volume of body {b} per unit of mass [m³/kg]",
-                value / heaviest,
-                least,
-                most,
-            )
+            per_mass, by = value / heaviest, f"the smallest or largest volume of body {b} per unit of mass"
+            within(f"{by} [m³/kg]", per_mass, least, most)
+            within(f"{by} times dt [m³ s/kg]", scene.dt * per_mass, least, most)
+            within(f"{about} times {by} [J/kg]", stress * per_mass, least, most)
     for m, muscle in enumerate(scene.muscles):
         within(f"strength of {title(muscle, m)}", muscle.strength, -most, most)
     for axis, gravity in enumerate(scene.gravity or ()):

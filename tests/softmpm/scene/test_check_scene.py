@@ -251,6 +251,15 @@ def soft(**changes) -> Body:
         ),
         (lambda: scene(soft(viscosity=1e39)), "viscosity of body 0 of 1e+39 is inf"),
         (lambda: scene(soft(viscosity=1e-50)), "viscosity of body 0 of 1e-50 is 0"),
+        (lambda: scene(soft(young=1e-33)), "the stress of body 0 at a strain of 1.2e-07 [Pa] of 1.19"),
+        (
+            lambda: scene(soft(density=1e30, young=1e30), dt=1e-9),
+            "smallest or largest volume of body 0 per unit of mass times dt [m³ s/kg] of 5e-40 is",
+        ),
+        (
+            lambda: scene(soft(density=1e36), dt=1.0),
+            "smallest or largest volume of body 0 per unit of mass [J/kg] of ",
+        ),
     ],
 )
 def test_what_single_precision_takes_away(made, said):
