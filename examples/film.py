@@ -1,6 +1,7 @@
 """A jelly cube falls onto another: a recording, a film of it in MP4 or GIF, and a file for the Rerun viewer."""
 
 import dataclasses
+import math
 import sys
 from pathlib import Path
 
@@ -21,9 +22,9 @@ scene = softmpm.Scene(
     gravity=(0.0, -9.81),
     dt=1e-6,
 )
-scene = dataclasses.replace(scene, dt=0.4 * softmpm.stable_dt(scene))
+substeps = math.ceil(period / (0.4 * softmpm.stable_dt(scene)))
+scene = dataclasses.replace(scene, dt=period / substeps)
 model = softmpm.build(scene)
-substeps = round(period / scene.dt)
 
 # The recorder writes each frame at once, so that a long run can be looked at while it goes on, and after a crash.
 Path("film.h5").unlink(missing_ok=True)  # a recorder does not overwrite
@@ -32,7 +33,7 @@ with softmpm.Recorder("film.h5", model) as recorder, recorder.episode(iteration=
     episode.frame(0.0, state)
     for k in range(round(seconds / period)):
         state = softmpm.simulate(model, state, None, model.params(), substeps=substeps)
-        episode.frame((k + 1) * substeps * scene.dt, state)
+        episode.frame((k + 1) * period, state)
 
 softmpm.to_video("film.h5", "film.gif", colour="strain", rate=0.25)  # a quarter of the speed
 try:

@@ -1,6 +1,7 @@
 """A soft finger in 3D learns the activation of its four muscles that brings the tip to a place. Leaves gripper_finger.png."""
 
 import dataclasses
+import math
 import sys
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 import softmpm
 
 cell, iterations = (0.015, 6) if "--quick" in sys.argv else (0.0075, 15)  # [m]; 2 or 4 cells across it
+period = 0.05  # length of a control step [s]
 target = (0.125, 0.085, 0.045)  # [m]; the tip at rest is at (0.15, 0.06, 0.06)
 
 # The finger is 120 mm long and 30 mm thick, and begins in the plane of the wall that clamps it.
@@ -23,11 +25,11 @@ scene = softmpm.Scene(
     damping=40.0,  # so that it comes to rest within the time simulated
     dt=1e-6,
 )
-scene = dataclasses.replace(scene, dt=0.5 * softmpm.stable_dt(scene))
+substeps = math.ceil(period / (0.5 * softmpm.stable_dt(scene)))
+scene = dataclasses.replace(scene, dt=period / substeps)
 model = softmpm.build(scene, formulation="reference")  # which clamps need
 print(model.describe())
 
-substeps = round(0.05 / scene.dt)
 tip = torch.from_numpy(np.flatnonzero(x > x.max() - cell)).to(model.device)
 goal = torch.tensor(target, device=model.device)
 control = torch.full((4,), 0.05, device=model.device, requires_grad=True)

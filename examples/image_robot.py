@@ -1,6 +1,7 @@
 """A robot from a picture: dark pixels are its body, red and blue ones its muscles. It learns to crawl. Leaves image_robot.png."""
 
 import dataclasses
+import math
 import sys
 
 import numpy as np
@@ -37,19 +38,18 @@ scene = softmpm.Scene(
     body_contact=False,
     dt=1e-6,
 )
-scene = dataclasses.replace(scene, dt=0.4 * softmpm.stable_dt(scene))
+substeps = math.ceil(period / (0.4 * softmpm.stable_dt(scene)))
+scene = dataclasses.replace(scene, dt=period / substeps)
 model = softmpm.build(scene, formulation="auto", contact_width=0.01)
-params, substeps = model.params(), round(period / scene.dt)
 
 # A small wave in both legs, one ahead of the other, is a start that gradients can improve.
 phase = 2 * torch.pi * torch.arange(control_steps, device=model.device) / 12
 control = 0.3 * torch.stack([phase.sin(), phase.cos()], dim=-1)[:, None]  # (control step, world, muscle)
 control.requires_grad_()
-optimizer = torch.optim.Adam([control], lr=0.1)
+optimizer, distances = torch.optim.Adam([control], lr=0.1), []
 
-distances = []
 for iteration in range(iterations):
-    end = softmpm.simulate(model, model.rest(), torch.tanh(control), params, substeps=substeps)
+    end = softmpm.simulate(model, model.rest(), torch.tanh(control), model.params(), substeps=substeps)
     distance = (end.x - model.positions)[..., 0].mean()
     optimizer.zero_grad()
     (-distance).backward()

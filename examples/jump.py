@@ -1,6 +1,7 @@
 """Co-design of a jump: Young's modulus of three regions is learned with the activation of two muscles. Leaves jump.png."""
 
 import dataclasses
+import math
 import sys
 
 import matplotlib.pyplot as plt
@@ -10,7 +11,7 @@ import torch
 import softmpm
 
 iterations = 12 if "--quick" in sys.argv else 40
-cell, gravity = 0.0125, 9.81
+cell, gravity, period = 0.0125, 9.81, 0.0125  # [m], [m/s²], [s]
 
 # A table on two legs. The muscle of the legs pulls along them, and pushes where its activation is negative.
 table = [(0.15, 0.11), (0.35, 0.11), (0.35, 0.16), (0.15, 0.16)]
@@ -26,10 +27,11 @@ scene = softmpm.Scene(
     gravity=(0.0, -gravity),
     dt=1e-6,
 )
-scene = dataclasses.replace(scene, dt=0.3 * softmpm.stable_dt(scene))  # room for a body twice as stiff
+substeps = math.ceil(period / (0.3 * softmpm.stable_dt(scene)))  # room for a body twice as stiff
+scene = dataclasses.replace(scene, dt=period / substeps)
 model = softmpm.build(scene, formulation="reference", contact_width=0.01)
 region = torch.from_numpy(np.digitize(height, (0.08, 0.11))).to(model.device)  # feet, legs, table
-base, substeps = model.params(), round(0.0125 / scene.dt)
+base = model.params()
 
 curves, (figure, (left, right)) = {}, plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
 for name, rate in (("activation", 0.0), ("activation and E", 0.1)):
@@ -38,9 +40,7 @@ for name, rate in (("activation", 0.0), ("activation and E", 0.1)):
     optimizer = torch.optim.Adam([{"params": [design], "lr": rate}, {"params": [control], "lr": 0.05}])
     curves[name] = []
     for _ in range(iterations):
-        params = base._replace(
-            young=base.young * (2.0 ** torch.tanh(design))[region]
-        )  # within a factor of two
+        params = base._replace(young=base.young * (2.0 ** design.tanh())[region])  # within a factor of two
         activation = torch.cat([torch.tanh(control), torch.zeros_like(control)])  # and 0.15 s to take off
         end = softmpm.simulate(model, model.rest(), activation, params, substeps=substeps)
         upward = softmpm.mean_velocity(model, end, params)[0, 1]  # in flight it rises by another v²/2g:

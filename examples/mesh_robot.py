@@ -28,9 +28,10 @@ scene = softmpm.Scene(
     body_contact=False,
     dt=1e-6,
 )
-scene = dataclasses.replace(scene, dt=0.5 * softmpm.stable_dt(scene))
+substeps = math.ceil(period / (0.5 * softmpm.stable_dt(scene)))
+scene = dataclasses.replace(scene, dt=period / substeps)
 model = softmpm.build(scene, formulation="auto")
-params, substeps = model.params(), round(period / scene.dt)
+params = model.params()
 
 
 def observe(state):
@@ -45,7 +46,7 @@ with torch.no_grad():
     )
 force, momentum = way.frames["force"][:, 2].cpu(), way.frames["momentum"][:, 2].cpu()
 weight = 9.81 * model.mass.sum().item()
-impulse = (force - weight).sum() * substeps * scene.dt  # what the floor and gravity gave the ring [N s]
+impulse = (force - weight).sum() * period  # what the floor and gravity gave the ring [N s]
 print(f"weight {weight:.2f} N, largest force {force.max():.1f} N")
 print(f"impulse {impulse:.5f} N s, momentum at the end {momentum[-1]:.5f} kg m/s")
 

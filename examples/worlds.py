@@ -1,9 +1,9 @@
 """One feedback policy learns in 32 worlds, each with a random goal, and is then tried on a row of goals. Leaves worlds.png."""
 
 import dataclasses
+import math
 import sys
 
-import numpy as np
 import torch
 
 import softmpm
@@ -12,7 +12,7 @@ torch.manual_seed(0)
 worlds, iterations, control_steps = (8, 20, 6) if "--quick" in sys.argv else (32, 40, 12)
 finger = softmpm.box((0.05, 0.135), (0.20, 0.165), spacing=0.005)
 x, y = finger.positions.T
-sides = np.flatnonzero(y > 0.155), np.flatnonzero(y < 0.145)
+sides = (y > 0.155).nonzero()[0], (y < 0.145).nonzero()[0]
 scene = softmpm.Scene(
     grid=softmpm.Grid(shape=(26, 31), spacing=0.01),
     bodies=[softmpm.Body(finger, softmpm.NeoHookean(density=1000.0, young=5e4, poisson=0.3, viscosity=20.0))],
@@ -21,10 +21,10 @@ scene = softmpm.Scene(
     damping=10.0,
     dt=1e-6,
 )
-scene = dataclasses.replace(scene, dt=0.5 * softmpm.stable_dt(scene))
+substeps = math.ceil(0.02 / (0.5 * softmpm.stable_dt(scene)))  # in a control step of 20 ms
+scene = dataclasses.replace(scene, dt=0.02 / substeps)
 model = softmpm.build(scene, worlds=worlds, formulation="reference", calls=control_steps)
-substeps, params = round(0.02 / scene.dt), model.params()
-tip = torch.from_numpy(np.flatnonzero(x > 0.19)).to(model.device)
+tip = torch.from_numpy((x > 0.19).nonzero()[0]).to(model.device)
 layers = torch.nn.Linear(5, 32), torch.nn.Tanh(), torch.nn.Linear(32, 2), torch.nn.Tanh()
 policy = torch.nn.Sequential(*layers).to(model.device)
 
@@ -35,7 +35,7 @@ def episode(goal):
     for _ in range(control_steps):
         moved, velocity = softmpm.displacement(model, state)[:, tip].mean(1), state.v[:, tip].mean(1)
         seen = torch.cat([moved / 0.05, velocity, goal / 0.05], dim=1)  # numbers of about one
-        state = softmpm.simulate(model, state, policy(seen)[None], params, substeps=substeps)
+        state = softmpm.simulate(model, state, policy(seen)[None], model.params(), substeps=substeps)
         missed.append((softmpm.displacement(model, state)[:, tip, 1].mean(1) - goal[:, 0]).square())
     return torch.stack(missed), state
 
