@@ -91,6 +91,7 @@ def test_the_code_on_quantities_runs(tmp_path, monkeypatch):
     assert frames.shape == (10, 1, 2)
     assert abs(frames[-1] - softmpm.center_of_mass(model, end, names["params"])).max() < 1e-6
     assert abs(names["alone"].x - end.x).max() < 1e-6  # one of four worlds, in two calls
+    assert names["succeeded"] == [0, 1, 2, 3] and torch.isfinite(names["loss"])
     assert torch.equal(names["resumed"].x, names["state"].x)
 
 
