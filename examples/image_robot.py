@@ -22,7 +22,7 @@ pen.rectangle((155, 45, 190, 119), fill="blue")
 drawing.save("robot.png")
 
 corner, height = (0.1, 0.05), 0.12  # of the picture [m]
-shape = softmpm.image("robot.png", corner, height=height, spacing=cell / 2, threshold=0.9)
+shape = softmpm.image("robot.png", corner, height=height, spacing=cell / 2, threshold=0.9, cut_cells=True)
 pixel = ((shape.positions - corner) / (height / drawing.height)).astype(int)
 red, _, blue = np.asarray(drawing)[drawing.height - 1 - pixel[:, 1], pixel[:, 0]].T.astype(int)
 muscles = [

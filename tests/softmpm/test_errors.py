@@ -117,18 +117,6 @@ def test_a_gradient_that_is_not_finite_is_an_error(device):
     assert "look at the loss" in str(caught.value)
 
 
-def test_a_start_too_fast_to_square_is_named():
-    """Not as numerical fracture, although the particle has neighbours."""
-    box = softmpm.box((0.4, 0.4), (0.7, 0.7), spacing=0.05)
-    body = softmpm.Body(box, softmpm.NeoHookean(density=1.0, young=10.0))
-    scene = softmpm.Scene(grid=softmpm.Grid(shape=(12, 12), spacing=0.1), bodies=[body], dt=1e-3)
-    model = softmpm.build(scene, device="cpu")
-    start = model.rest()
-    start.v.fill_(1e20)
-    error = fails(model, start)
-    assert error.kind == "start" and error.value == "has values too large to square"
-
-
 def test_errors_have_the_notes_of_their_call():
     """Of the blocks around it, the inner one first; in the backward pass of the call too, wherever that is made."""
     model = single()
