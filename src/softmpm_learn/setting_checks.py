@@ -6,13 +6,19 @@ from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
+
+def _is(kind: type, value: Any) -> bool:
+    """True for a number of a kind; True and False are none, although Python counts them as whole numbers."""
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
 TYPES: dict[Any, tuple[str, Callable[[Any], bool]]] = {
     bool: ("True or False", lambda value: isinstance(value, bool)),
-    int: ("a whole number", lambda value: isinstance(value, Integral)),
-    float: ("a number", lambda value: isinstance(value, Real)),
+    int: ("a whole number", lambda value: _is(Integral, value)),
+    float: ("a number", lambda value: _is(Real, value)),
     list[int]: (
         "a list of whole numbers",
-        lambda value: isinstance(value, Sequence) and all(isinstance(one, Integral) for one in value),
+        lambda value: isinstance(value, Sequence) and all(_is(Integral, one) for one in value),
     ),
 }
 """Rule of the values of a field by its type."""

@@ -44,6 +44,7 @@ from softmpm_learn.tasks.image import ImageConf
         ),
         ("ObserverConf", {"channels": [4, 4.5]}, r"channels must be a list of whole numbers, got \[4, 4.5\]"),
         ("TrainConf", {"seeds": 2.5}, "train.seeds must be a whole number, got 2.5"),
+        ("TrainConf", {"seeds": True}, "train.seeds must be a whole number, got True"),
         ("TrainConf", {"pictures": "false"}, "train.pictures must be True or False, got 'false'"),
         ("OptimizerConf", {"policy_rate": "1e-2"}, "optimizer.policy_rate must be a number, got '1e-2'"),
         ("TrainConf", {"goal_spread": ["a"]}, r"goal_spread must be a list of lengths .* got \['a'\]"),
