@@ -61,8 +61,8 @@ class Failures:
 
     A world that fails stops at the start of the chunk in which it failed, at most 128 substeps before the failure, and takes no part
     in the rest of the call. It returns in that state (``freeze``) or in the rest state (``reset``), and contributes no gradient. The
-    other worlds are the same as without it, to the last bit where sums have a fixed order. A loss leaves out ``worlds``
-    (docs/quantities.md), or it takes these states for results.
+    other worlds are the same as without it, to the last bit where sums have a fixed order. A loss must leave out
+    ``worlds`` (docs/quantities.md); it would take these states for results.
 
     It works inside a :class:`softmpm.Graph` too: after each replay ``errors`` has the first failure of each world that is not in it
     yet, so clear it before the next. There a world stops where it failed, and one that is frozen stays there.

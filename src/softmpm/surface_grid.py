@@ -18,7 +18,7 @@ from softmpm.surface_points import SurfacePoints
 from softmpm.validate import need
 
 FARTHEST = 10.0
-"""Farthest way of a node that takes part at the touch of a wall, in units of the way of the point."""
+"""Largest displacement that the touch of a wall may give a node that takes part, in units of that of the point."""
 
 
 class SurfaceGrid(SurfacePoints):

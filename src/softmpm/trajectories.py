@@ -135,7 +135,7 @@ def stacked(frames: Sequence[Any]) -> Any:
     for other in frames:
         need(
             _form(other) == _form(one),
-            f"observe must return the same in each frame, got {_form(one)} and later {_form(other)}.",
+            f"observe must return values of one structure in all frames, got {_form(one)} and later {_form(other)}.",
         )
     if one is None:
         return None

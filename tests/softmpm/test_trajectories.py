@@ -188,7 +188,9 @@ def test_observations_that_change_their_structure(first, later, message):
     model = build(busy_scene(2))
     start, activation, params, _ = arguments(leaves_of(model))
     frames = iter([first])
-    with pytest.raises(ValueError, match=f"observe must return the same in each frame, got {message}"):
+    with pytest.raises(
+        ValueError, match=f"observe must return values of one structure in all frames, got {message}"
+    ):
         softmpm.trajectory(
             model, start, activation, params, substeps=1, observe=lambda _: next(frames, later)
         )

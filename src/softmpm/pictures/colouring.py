@@ -30,7 +30,7 @@ NAMED = {
     **dict(cyan=(23, 190, 207), magenta=(220, 50, 200), orange=(255, 127, 14), purple=(110, 60, 170)),
     **dict(brown=(120, 70, 20), pink=(247, 160, 200), black=(20, 20, 24)),
 }
-"""Colours of categories that have the name of one: something blue in a picture must not be called red."""
+"""Colours of categories that are called by one: a muscle called red must not be drawn blue."""
 
 
 @dataclass(frozen=True)

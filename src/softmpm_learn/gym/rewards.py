@@ -79,7 +79,7 @@ def check_sums(task: Task, rest: State, activation: Tensor, goal: Tensor | None)
         if away > ROUNDING * sum(part.abs().max() for part in parts):
             raise ValueError(
                 f"{type(term).__name__} says adds_up = {term.adds_up!r}, but its value in a window is not the "
-                f"{'sum' if term.adds_up == 'way' else 'mean'} of its values on these; leave adds_up out, which costs more time."
+                f"{'sum' if term.adds_up == 'way' else 'mean'} of its values on its parts; leave adds_up out, which costs more time."
             )
 
 

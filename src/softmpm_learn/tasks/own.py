@@ -112,9 +112,8 @@ def walker(
                 "make it or task.size larger, or increase task.cells."
             )
     half, middle = conf.spacing / 2, (rest.min(axis=0) + rest.max(axis=0)) / 2
-    forward = half * round(
-        (START + middle[0]) / half
-    )  # the grid is symmetric about it, or it would turn the robot
+    # The grid is symmetric about a multiple of half a cell; about another place it would turn the robot.
+    forward = half * round((START + middle[0]) / half)
     place = [forward - middle[0], height]
     if rest.shape[1] == 3:
         grid, walls, sideways = _widened(grid, walls, float(np.ptp(rest[:, 2])))

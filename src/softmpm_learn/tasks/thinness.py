@@ -27,7 +27,7 @@ def warn_of_thin_limbs(conf: OwnConf, mask: np.ndarray, pixel: float) -> None:
 
 
 def thinnest(mask: np.ndarray, pixel: float, least: float) -> float | None:
-    """Width of the thinnest limb or neck below a least width, at most, to an eighth of that [m]; None if there is none.
+    """Upper bound of the width of the thinnest limb or neck below a least width, within an eighth of that [m]; None if there is none.
 
     Discs, or balls, of the least width fill a robot but for what is thinner and for its corners. Only what is more than one such width
     away from them is a limb, which is as wide as its widest place: corners of more than 40° are not. Shorter necks are found by
@@ -85,8 +85,8 @@ def _has_neck(depth: np.ndarray, away: np.ndarray, width: float) -> bool:
     label(away < width / 4, output=pieces)
     if pieces.max() > np.count_nonzero(with_disc):
         return True
-    pairs, axes = ((whole, opened), (~whole, ~opened)), depth.ndim
-    return all(_euler(one, axes) != _euler(other, axes) for one, other in pairs)
+    axes = depth.ndim
+    return _euler(whole, axes) != _euler(opened, axes) and _euler(~whole, axes) != _euler(~opened, axes)
 
 
 def _euler(mask: np.ndarray, axes: int) -> int:
