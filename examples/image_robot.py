@@ -46,7 +46,7 @@ model = softmpm.build(scene, formulation="auto", contact_width=0.01)
 phase = 2 * torch.pi * torch.arange(control_steps, device=model.device) / 12
 control = 0.3 * torch.stack([phase.sin(), phase.cos()], dim=-1)[:, None]  # (control step, world, muscle)
 control.requires_grad_()
-optimizer, distances = torch.optim.Adam([control], lr=0.1), []
+optimizer, distances = torch.optim.Adam([control], lr=0.07), []
 
 for iteration in range(iterations):
     end = softmpm.simulate(model, model.rest(), torch.tanh(control), model.params(), substeps=substeps)
