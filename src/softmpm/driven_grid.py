@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from softmpm.mirror_grid import MirrorGrid
-from softmpm.rest_grid import RestGrid, bases, flat, stencils
+from softmpm.rest_grid import RestGrid, bases, flat, spline, stencils
 from softmpm.scene.scene import Scene
 from softmpm.validate import need
 
@@ -95,11 +95,11 @@ def _entries(
         shape: Nodes of the grid.
     """
     node, particle, r = _pairs(places, held, shape, 0)
-    value, spreads = _weights(node, r, _spline(r), len(held))
+    value, spreads = _weights(node, r, spline(r).prod(axis=-1), len(held))
     few = np.flatnonzero(~spreads)
     keep = spreads[node]
     far, others, r = _pairs(places, held[few], shape, 1)
-    wide, _ = _weights(far, r, _spline(r / STRETCH), len(few))
+    wide, _ = _weights(far, r, spline(r / STRETCH).prod(axis=-1), len(few))
     parts = (node[keep], few[far]), (particle[keep], others), (value[keep], wide)
     row, column, value = (np.concatenate(pair) for pair in parts)
     return row, column, value
@@ -116,13 +116,6 @@ def _pairs(
     found = np.searchsorted(nodes, number).clip(max=max(len(nodes) - 1, 0))
     particle, which = np.nonzero(inside & np.isin(number, nodes))
     return found[particle, which], particle, places[particle] - at[particle, which]
-
-
-def _spline(r: np.ndarray) -> np.ndarray:
-    """The quadratic B-spline of distances in cells, the product over their last axis."""
-    far = np.abs(r)
-    inner, outer = 0.75 - far**2, 0.5 * np.maximum(1.5 - far, 0.0) ** 2
-    return np.where(far < 0.5, inner, outer).prod(axis=-1)
 
 
 def _weights(node: np.ndarray, r: np.ndarray, omega: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

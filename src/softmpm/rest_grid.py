@@ -195,6 +195,12 @@ def flat(coordinates: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(coordinates, -1, 0)), shape))
 
 
+def spline(r: np.ndarray) -> np.ndarray:
+    """Quadratic B-spline of distances in cells."""
+    d = np.abs(r)
+    return np.where(d < 0.5, 0.75 - d**2, 0.5 * np.maximum(1.5 - d, 0.0) ** 2)
+
+
 def stencils(places: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Base node, distance from it, and B-spline weights of the 3^dim nodes around each place, all in cells.
 

@@ -151,7 +151,7 @@ def need_stable(scene: Scene, most: float) -> None:
 def warn_sparse(scene: Scene, *, stacklevel: int = 3) -> None:
     """Warn of bodies whose particles are so far apart that numerical fracture occurs."""
     for b, body in enumerate(scene.bodies):
-        apart = float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim)
+        apart = body.particles.spacing
         if len(body.particles) > 1 and apart > APART * scene.grid.spacing:
             warnings.warn(
                 f"body {b}: the mean particle spacing is {apart / scene.grid.spacing:.3g} cells (from particle volumes). Above {APART} "

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softmpm.rest_grid import RestGrid, bases, flat, stencils
-from softmpm.scene.scene import MIRRORS, Particles, Scene
+from softmpm.rest_grid import RestGrid, bases, flat, spline, stencils
+from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.state import State
 from softmpm.surface_points import SurfacePoints
 from softmpm.validate import need
@@ -44,7 +44,7 @@ class SurfaceGrid(SurfacePoints):
         base, f = bases(points / grid.spacing)
         arms = offsets - f[:, None]
         normals = np.concatenate([outline.normals for outline in outlines])
-        cells = [layers_of(body.particles, grid.spacing) for body in scene.bodies]
+        cells = [max(1, round(grid.spacing / body.particles.spacing)) for body in scene.bodies]
         layers = np.repeat(cells, [len(outline) for outline in outlines])
         weights = face_weights(arms, normals, layers)
         at = flat(base[:, None] + offsets, grid.shape)
@@ -105,23 +105,11 @@ class SurfaceGrid(SurfacePoints):
         return x if shift is None else (x + shift[:, None]).to(u.dtype)
 
 
-def layers_of(particles: Particles, spacing: float) -> int:
-    """Layers of particles in a cell of the grid, of a lattice as dense as these particles on average."""
-    cell = spacing ** particles.positions.shape[1]
-    return max(1, round((cell / np.mean(particles.volume)) ** (1 / particles.positions.shape[1])))
-
-
 def nodal_loads(weights: np.ndarray, areas: np.ndarray, numbers: np.ndarray, count: int) -> np.ndarray:
     """L of (K1) [m²], shape (node,); ``numbers`` are those of each point's nodes, shape (point, node)."""
     loads = np.zeros(count)
     np.add.at(loads, numbers, np.abs(weights) * areas[:, None])
     return loads
-
-
-def spline(r: np.ndarray) -> np.ndarray:
-    """Quadratic B-spline of a distance in cells."""
-    d = np.abs(r)
-    return np.where(d < 0.5, 0.75 - d**2, np.maximum(1.5 - d, 0.0) ** 2 / 2)
 
 
 def face_weights(arms: np.ndarray, normals: np.ndarray, layers: np.ndarray) -> np.ndarray:

@@ -54,7 +54,8 @@ def to_rerun(
             f"{recording} can be converted later, on any machine, with: python -m softmpm {recording}"
         ) from error
     check_whole("every", every)
-    check_whole("max_particles", 1 if max_particles is None else max_particles)
+    if max_particles is not None:
+        check_whole("max_particles", max_particles)
     rrd = Path(recording).with_suffix(".rrd") if rrd is None else Path(rrd)
     if rrd.resolve() == Path(recording).resolve():
         raise ValueError(

@@ -70,8 +70,9 @@ class Recorder:
         max_points: int | None = None,
     ):
         check_whole("every", every)
-        check_whole("max_particles", 1 if max_particles is None else max_particles)
-        check_whole("max_points", 0 if max_points is None else max_points, least=0)
+        for name, most, least in (("max_particles", max_particles, 1), ("max_points", max_points, 0)):
+            if most is not None:
+                check_whole(name, most, least)
         self.path, self.every = Path(path), every
         if resume_before is None and self.path.exists():
             raise FileExistsError(

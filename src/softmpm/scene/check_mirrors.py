@@ -69,7 +69,7 @@ def check_mirrors(scene: Scene) -> None:
         plane = 0.5 * one.twice * dx
         for body in scene.bodies:
             heights = one.side * (body.particles.positions[:, one.axis] - plane)
-            spacing = float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim)
+            spacing = body.particles.spacing
             least, nearest = min(least, heights.min()), min(nearest, heights.min() / spacing)
         need(
             least > EXACT * dx,
@@ -102,7 +102,7 @@ def _check_faces(scene: Scene, mirror: Mirror) -> None:
     plane, axis = 0.5 * mirror.twice * scene.grid.spacing, mirror.axis
     for b, body in enumerate(scene.bodies):
         outline = body.particles.outline
-        spacing = float(np.mean(body.particles.volume)) ** (1 / scene.grid.dim)
+        spacing = body.particles.spacing
         nearest = (mirror.side * (body.particles.positions[:, axis] - plane)).min()
         if outline is None or nearest >= spacing:
             continue
@@ -124,9 +124,7 @@ def _check_gaps(scene: Scene, mirror: Mirror) -> None:
     # Distance from which on a particle reaches no node on the plane or with an image behind it [cells]:
     reach = 1.5 if mirror.twice % 2 == 0 else 1.0
     x = np.concatenate([body.particles.positions for body in scene.bodies]) / dx
-    spacing = np.concatenate(
-        [np.full(len(b.particles), np.mean(b.particles.volume) ** (1 / scene.grid.dim)) for b in scene.bodies]
-    )
+    spacing = np.concatenate([np.full(len(b.particles), b.particles.spacing) for b in scene.bodies])
     heights = mirror.side * (x[:, axis] - 0.5 * mirror.twice)
     near = np.flatnonzero(heights < reach - EXACT)
     columns = np.floor(np.delete(x[near], axis, axis=1)).astype(int)  # of cells along the normal

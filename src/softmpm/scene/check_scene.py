@@ -143,7 +143,7 @@ def _check_place(name: str, outline: Outline, particles: Particles, grid: Grid) 
             f"{name} leaves the grid: point {point} at {_tuple(outline.points[point])} m, and {outside.sum() - 1} more of its "
             f"{len(outline)}; all must lie between the nodes, from 0 to {_tuple(reach)} m. Move the body or enlarge the grid."
         )
-    slack = _apart(particles)
+    slack = particles.spacing
     low, high = outline.points.min(axis=0) - slack, outline.points.max(axis=0) + slack
     beyond = ((particles.positions < low) | (particles.positions > high)).any(axis=1)
     if 2 * beyond.sum() > len(beyond):  # specks of a picture may be particles without an outline
@@ -170,18 +170,13 @@ def _check_closed(name: str, outline: Outline, particles: Particles) -> None:
     )
     inside, volume = outline.enclosed_volume, float(np.sum(particles.volume))
     need(inside > 0, f"{name} must have normals out of the body, got normals into it; use -normals.")
-    room = (1 + 0.5 * _apart(particles) * area / (outline.dim * inside)) ** outline.dim - 1
+    room = (1 + 0.5 * particles.spacing * area / (outline.dim * inside)) ** outline.dim - 1
     need(
         abs(volume - inside) <= room * inside,
         f"{name} must enclose the volume of its particles, {volume:.4g}, to half a particle spacing along the surface, "
         f"got {inside:.4g} (± {room * inside:.2g} allowed). Give both in metres and each particle the volume of its cell, or "
         "leave the outline out: Particles(positions, volume).",
     )
-
-
-def _apart(particles: Particles) -> float:
-    """Mean particle spacing [m], from the volumes."""
-    return float(np.mean(particles.volume)) ** (1 / particles.positions.shape[1])
 
 
 def _check_distinct(scene: Scene) -> None:

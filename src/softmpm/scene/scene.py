@@ -88,6 +88,11 @@ class Particles:
         object.__setattr__(self, "positions", read_only(positions))
         object.__setattr__(self, "volume", read_only(np.broadcast_to(volume, (len(positions),)).copy()))
 
+    @property
+    def spacing(self) -> float:
+        """Mean distance of neighbours [m], that of a lattice as dense as the particles on average."""
+        return float(np.mean(self.volume)) ** (1 / self.positions.shape[1])
+
     def moved(self, by: Sequence[float]) -> "Particles":
         """The same shape, with its outline, displaced by a vector [m]."""
         shift, outline = array("by", by).astype(np.float64), self.outline
