@@ -24,6 +24,9 @@ class VoxelsConf(OwnConf):
     """A walker made of voxels: 0 empty, 1 rigid, 2 soft, 3 horizontal and 4 vertical actuator; each actuator is a muscle."""
 
     name: str = "voxels"
+    strength: float = 1.2e4
+    """Stress of an actuator at full activation [Pa]: voxels are as high as wide, and with half of it many such robots stand still
+    (docs/results.md)."""
     stiffness: float = 10.0
     """Young's modulus of rigid voxels in units of task.young. Our choice: the step shrinks with its root."""
 
