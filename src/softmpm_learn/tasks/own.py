@@ -165,10 +165,10 @@ def longer_axis(points: np.ndarray, piece: np.ndarray | None = None) -> tuple[fl
 
 def _check_size(conf: OwnConf, rest: np.ndarray, grid: softmpm.Grid, height: float) -> None:
     length, tall = np.ptp(rest[:, :2], axis=0) + conf.spacing / 2
-    most = conf.length - RUNWAY, (grid.shape[1] - 1) * grid.spacing - height - HEADROOM
+    most = conf.track_length - RUNWAY, (grid.shape[1] - 1) * grid.spacing - height - HEADROOM
     if length > most[0] or tall > most[1]:
         raise ValueError(
-            f"the robot of {conf.file} is {length:.3g} m long and {tall:.3g} m high; the track of {conf.length:g} m has room for "
+            f"the robot of {conf.file} is {length:.3g} m long and {tall:.3g} m high; the track of {conf.track_length:g} m has room for "
             f"{most[0]:.3g} m and {most[1]:.3g} m: make task.size = {conf.size:g} smaller."
         )
     if len(np.unique(np.round(rest[:, 0] / conf.spacing))) < 4 or tall < 2 * conf.spacing:

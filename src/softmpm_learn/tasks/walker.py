@@ -64,11 +64,11 @@ class WalkerConf(TaskConf):
             raise ValueError(
                 f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
             )
-        if not (math.isfinite(self.length) and self.length >= ROOM):
+        if not (math.isfinite(self.track_length) and self.track_length >= ROOM):
             raise ValueError(f"task.track must be at least {ROOM:g} m, got {self.track}.")
 
     @property
-    def length(self) -> float:
+    def track_length(self) -> float:
         """Length of the track [m]."""
         return max(4.0, ROOM + LASTING * self.seconds) if self.track is None else self.track
 
@@ -110,7 +110,7 @@ def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
     nodes otherwise. There is no wall at the far end, which a fast walker would run into without a word: it leaves the grid instead, by
     name.
     """
-    length, height, margin, nodes, spacing = conf.length, 0.5, 0.05, conf.cells, conf.spacing
+    length, height, margin, nodes, spacing = conf.track_length, 0.5, 0.05, conf.cells, conf.spacing
     floor = math.floor(0.0625 * nodes) * spacing
     soles = floor + 0.5 * spacing
     if conf.on_surface:

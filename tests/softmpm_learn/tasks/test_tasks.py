@@ -13,7 +13,7 @@ from softmpm_learn.settings import Settings
 from softmpm_learn.tasks import TASKS, ArmConf, BipedConf, ElephantConf, arm, biped, elephant, make_task
 from softmpm_learn.tasks.outline import Limb, foot, smooth, smooth_line
 from softmpm_learn.tasks.task import LAWS, Resolution, Task, TaskConf
-from softmpm_learn.tasks.walker import EDGE
+from softmpm_learn.tasks.walker import EDGE, WalkerConf, track
 
 ROBOTS = ("elephant", "arm", "biped")
 """The tasks that need no file."""
@@ -332,10 +332,21 @@ def test_a_foot_ends_at_the_floor_with_bevelled_edges():
 
 def test_a_track_has_room_for_three_episodes():
     """At 1 m/s; what comes to its end leaves the grid, and no wall is there to stop it without a word."""
-    assert ElephantConf().length == 7.0 and ElephantConf(seconds=0.5).length == 4.0
+    assert ElephantConf().track_length == 7.0 and ElephantConf(seconds=0.5).track_length == 4.0
     task = make_task(ElephantConf(seconds=4.0))
-    assert task.scene.grid.shape[0] == 13 * 80 and ElephantConf(track=2.5).length == 2.5
+    assert task.scene.grid.shape[0] == 13 * 80 and ElephantConf(track=2.5).track_length == 2.5
     assert [wall.normal for wall in task.scene.walls] == [(0.0, 1.0), (1.0, 0.0)]
+
+
+def test_a_robot_of_ones_own_may_have_a_length():
+    """A setting ``length`` of a walker is that of the robot, and leaves the track as it is."""
+
+    @dataclasses.dataclass(kw_only=True)
+    class WormConf(WalkerConf):
+        name: str = "worm"
+        length: float = 0.2
+
+    assert track(WormConf())[0].shape == track(WalkerConf(name="worm"))[0].shape
 
 
 def test_a_limb_knows_along_and_across():
