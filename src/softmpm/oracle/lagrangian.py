@@ -36,7 +36,8 @@ from softmpm.oracle.moving import (
     stencil,
     stress,
 )
-from softmpm.scene.scene import Scene
+from softmpm.oracle.walls import BESIDE_POINTS, ON_NODES
+from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.state import Params, State
 
 
@@ -132,7 +133,7 @@ def step(
         clamps or planes of symmetry at last the impulse of each.
     """
     impulse = scene.dt * node_force(scene, points, u, v, activation, mu, lam, inputs)
-    contacts = ("stick", "slip", "separate") if surface is None else ("stick", "slip")
+    contacts = ON_NODES if surface is None else BESIDE_POINTS
     momentum = mass[..., None] * v + impulse
     v = grid_velocity(scene, mass, momentum, inputs, time, duration, displacement=u, contacts=contacts)
     free, v = v, reflected(scene, mass, v)
@@ -147,7 +148,7 @@ def step(
 
 
 def _mirrored(scene: Scene) -> bool:
-    return any(wall.contact in ("clamp", "symmetry") for wall in scene.walls)
+    return any(wall.contact in MIRRORS for wall in scene.walls)
 
 
 def driven(v: Tensor, drive: tuple[Tensor, Tensor] | None) -> Tensor:

@@ -26,6 +26,7 @@ from softmpm.oracle.moving import (
     stencil,
     to_grid,
 )
+from softmpm.oracle.walls import BESIDE_POINTS
 from softmpm.scene.scene import Scene
 from softmpm.state import Params, State
 
@@ -157,7 +158,7 @@ def simulate(
         force = torch.zeros_like(anchor)
         for s in range(substeps):
             time = s * scene.dt
-            of_nodes, v = to_grid(scene, state, row, mu, lam, mass, now, time, duration, ("slip", "stick"))
+            of_nodes, v = to_grid(scene, state, row, mu, lam, mass, now, time, duration, BESIDE_POINTS)
             v, anchor, J = meet(scene, points, state, anchor, of_nodes, v, now, smoothing, time, duration)
             state = from_grid(scene, state, v, now)
             force = force + points.area[:, None] * J / duration

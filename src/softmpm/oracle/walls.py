@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 
 from softmpm.inputs import Inputs
-from softmpm.scene.scene import Scene, Wall
+from softmpm.scene.scene import CONTACTS, MIRRORS, Scene, Wall
+
+ON_NODES = tuple(kind for kind in CONTACTS if kind not in MIRRORS)
+"""Kinds of walls that act on nodes."""
+BESIDE_POINTS = tuple(kind for kind in ON_NODES if kind != "separate")
+"""Those that do so where separating walls act on surface points."""
 
 
 class Surface(NamedTuple):

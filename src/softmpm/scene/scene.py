@@ -118,7 +118,8 @@ class Body:
     """Particles made of one material."""
 
     particles: Particles
-    """From :func:`softmpm.box`, ``ball``, ``polygons``, ``image`` or ``mesh``. Good spacing: half a cell, 4 particles per cell in 2D, 8 in 3D."""
+    """From :func:`softmpm.box`, ``ball``, ``polygons``, ``image`` or ``mesh``. Good spacing: half a cell, 4 particles per cell in 2D, 8
+    in 3D."""
     material: Material
     """One of the laws, such as :class:`softmpm.NeoHookean`."""
 
