@@ -127,8 +127,8 @@ def draw_limit(rows: list[dict], folder: Path) -> None:
     figure, three = plt.subplots(1, 3, figsize=(WIDTH, 3.5), layout="constrained", facecolor="white")
     panels = {
         "lone": "20 lone particles: measured / reported",
-        "strip": "held strip: measured / reported",
-        "strip reported / rest": "held strip: reported / that at rest",
+        "strip": "clamped strip: measured / reported",
+        "strip reported / rest": "clamped strip: reported / that at rest",
     }
     for axes, (column, title) in zip(three, panels.items(), strict=True):
         for law, colour, marker in zip(LAWS, LINES, "osD^vP*X", strict=False):
@@ -152,8 +152,6 @@ def draw_limit(rows: list[dict], folder: Path) -> None:
         axes.grid(color="#e6e6e6", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8.5)
-    three[0].axhspan(0.9, 1.0, color="#bfe3d5", zorder=0)
-    three[1].axhspan(1.0, 1.6, color="#bfe3d5", zorder=0)
     three[0].legend(frameon=False, fontsize=8, ncols=2, loc="lower left")
     figure.savefig(folder / "limits_step.png", dpi=130)
     plt.close(figure)
