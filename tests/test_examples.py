@@ -95,6 +95,17 @@ def test_the_code_on_quantities_runs(tmp_path, monkeypatch):
     assert torch.equal(names["resumed"].x, names["state"].x)
 
 
+def test_the_code_on_inputs_runs():
+    """The block slides less far where the friction is greater, and says so by its gradient."""
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (README.parent / "docs" / "inputs.md").read_text(), re.DOTALL
+    )
+    names: dict = {}
+    exec(code, names)
+    few, many = names["end"].x[..., 0].mean(1).tolist()
+    assert few > many and (names["friction"].grad < 0).all()
+
+
 def test_the_code_on_shapes_runs(capsys):
     """The particles of a disc and of a leg, and the outline of the whole robot."""
     names: dict = {}
