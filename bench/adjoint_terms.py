@@ -60,6 +60,7 @@ STRUCTS = (
     *(
         "through_others",
         "after_all_walls_adj",
+        "meet",
         "meet_adj",
         "response_adj",
         "face",

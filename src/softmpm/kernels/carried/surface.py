@@ -22,8 +22,7 @@ from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.physics.wall_face import wall_face
+from softmpm.kernels.physics.wall_face import wall_face, wall_faces
 from softmpm.kernels.structs import Spec, input_types, types
 
 
@@ -32,33 +31,15 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
     """Kernels on particles that are ``packed`` as in the fast scheme, or not."""
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype)
     real, vec, node_vec, Constants, Window = t.real, t.vec, t.node, t.Constants, t.Window
-    exact_vec, GridInputs = types(dim, "float64").vec, input_types(spec).GridInputs
-    point, Outline, one = (
-        surface_point(dim, spec.dtype, packed),
-        outline_type(dim, spec.dtype),
-        wall_face(spec),
-    )
+    GridInputs, Outline = input_types(spec).GridInputs, outline_type(dim, spec.dtype)
+    point, walls, depth = surface_point(dim, spec.dtype, packed), wall_faces(spec), wall_face(spec).depth
     Particles, point_of, share = point.Particles, point.point_of, point.share
     load_state = point.load_state
     Point, offset, node_index, size = point.Point, s.offset, s.node_index, s.count
     vD, summed = wp.types.vector(dim + 1, real), lane_sum(dim + 1, real)
-    face, depth, friction_of = one.face, one.depth, one.friction_of
-    block = surface_contact(dim, spec.dtype)
-    touch, Touch = block.touch, block.Touch
-    reports, walls = status.report(dim, spec.dtype), spec.surface_walls
-    running, report = reports.running, reports.report
-    count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
-    vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
+    faces_of, meet, count, number, vecs = walls.faces_of, walls.meet, walls.count, walls.number, walls.vecs
+    running, report = status.report(dim, spec.dtype).running, status.report(dim, spec.dtype).report
     in_wall, apart = int(Kind.IN_WALL), packed and spec.slabs
-
-    @wp.struct
-    class Faces:
-        near: int  # 1 if a wall is not further away than a cell
-        n: vecs
-        y: reals
-        depth: reals
-        anchor: vecs
-        friction: reals
 
     @wp.func
     def add_share(window: Window, at: Point, n: int, area: real, world: int, load: wp.array2d(dtype=real)):
@@ -83,41 +64,6 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         else:
             for n in range(lane, size, outline.lanes):
                 add_share(window, at, n, area, world, load)
-
-    @wp.func
-    def faces_of(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, anchor: vecs) -> Faces:
-        """The walls as the point at ``x`` meets them. All are read before the nodes are awaited."""
-        out = Faces()
-        for q in range(count):
-            k = number[q]
-            wall = face(constants, inputs, world, k, x, anchor[q])
-            out.n[q] = wall.n
-            out.y[q] = wall.y
-            out.depth[q] = wall.depth
-            out.anchor[q] = wall.anchor
-            out.friction[q] = friction_of(inputs, world, k)
-            if not wall.y > constants.spacing:  # nor for a place that is not a number
-                out.near = 1
-        return out
-
-    @wp.func
-    def meet(
-        constants: Constants, wall: Faces, q: int, stiffness: real, smoothing: real, x: vec, v: vec, D: real
-    ) -> Touch:
-        """J and the new anchor of (K3), (K4) at wall ``q``."""
-        return touch(
-            wall.n[q],
-            wall.y[q],
-            x,
-            v,
-            wall.anchor[q],
-            D,
-            wall.friction[q],
-            stiffness,
-            constants.dt,
-            smoothing,
-            constants.spacing,
-        )
 
     @wp.func
     def push(
@@ -291,11 +237,7 @@ def surface(spec: Spec, packed: bool) -> SimpleNamespace:
         check_end=check_end,
         add_load=add_load,
         apart=apart,
-        faces_of=faces_of,
-        meet=meet,
         push=push,
-        number=number,
-        vecs=vecs,
     )
 
 
@@ -306,8 +248,7 @@ def start_depth(spec: Spec) -> wp.Kernel:
     dim, vec, mat, Outline = spec.dim, t.vec, t.mat, outline_type(spec.dim, spec.dtype)
     depth, GridInputs = wall_face(spec).depth, input_types(spec).GridInputs
     report, in_wall = status.report(spec.dim, spec.dtype).report, int(Kind.IN_WALL)
-    walls = spec.surface_walls
-    count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)
+    count, number = wall_faces(spec).count, wall_faces(spec).number
 
     @kernel()
     def check_start(

@@ -20,8 +20,7 @@ from softmpm.kernels.compile import kernel, kernel_factory
 from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.physics.lanes import lane_sum, meet_lanes
 from softmpm.kernels.physics.spline import spline
-from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.physics.wall_face import wall_face_adj
+from softmpm.kernels.physics.wall_face import wall_face_adj, wall_faces
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
@@ -71,12 +70,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool, single: bool) 
     Args:
         single: Whether a lane has at most one node, which it then reads once.
     """
-    dim, t, s, one = (
-        spec.dim,
-        types(spec.dim, spec.dtype),
-        spline(spec.dim, spec.dtype),
-        surface(spec, packed),
-    )
+    dim, t, s = spec.dim, types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype)
     real, vec, node_vec, Constants, Window, pack = t.real, t.vec, t.node, t.Constants, t.Window, s.pack
     point, Outline = surface_point(dim, spec.dtype, packed), outline_type(dim, spec.dtype)
     Point, Particles, ParticlesAdj, PlaceAdj = (
@@ -90,11 +84,11 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool, single: bool) 
     load_state, load_velocity, load_number = point.load_state, point.load_velocity, point.load_number
     vD, summed, pulled = wp.types.vector(dim + 1, real), lane_sum(dim + 1, real), lane_sum(dim, real)
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    touch_adj, meet, number = surface_contact(dim, spec.dtype).touch_adj, one.meet, one.number
-    faces_of, face_adj = one.faces_of, wall_face_adj(spec, wanted)
-    offset, node_index, size, vecs = s.offset, s.node_index, s.count, one.vecs
-    add_load_adj, count = loads_adj(dim, spec.dtype, packed), len(spec.surface_walls)
-    apart = one.apart
+    walls, face_adj = wall_faces(spec), wall_face_adj(spec, wanted)
+    faces_of, meet, meet_adj = walls.faces_of, walls.meet, walls.meet_adj
+    count, number, vecs = walls.count, walls.number, walls.vecs
+    offset, node_index, size, apart = s.offset, s.node_index, s.count, surface(spec, packed).apart
+    add_load_adj = loads_adj(dim, spec.dtype, packed)
 
     @wp.struct
     class Seen:
@@ -217,19 +211,15 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool, single: bool) 
         slot = world * window.count + p
         for back in range(count):
             q = count - 1 - back
-            here = reached[q]
-            more = touch_adj(
-                wall.n[q],
-                wall.y[q],
-                vec(at.x),
-                here,
-                wall.anchor[q],
-                D,
-                wall.friction[q],
+            more = meet_adj(
+                constants,
+                wall,
+                q,
                 stiffness,
-                constants.dt,
                 smoothing,
-                constants.spacing,
+                vec(at.x),
+                reached[q],
+                D,
                 pull + D * back_v + per_force * adj_pushed[q],
                 adj_after[q],
             )

@@ -24,67 +24,31 @@ from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics import status
 from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.physics.wall_face import wall_face
+from softmpm.kernels.physics.wall_face import wall_face, wall_faces
 from softmpm.kernels.structs import Spec, input_types, types
 
 
 @kernel_factory
 def surface(spec: Spec) -> SimpleNamespace:
-    t, r, block = (
-        types(spec.dim, spec.dtype),
-        rest(spec.dim, spec.dtype),
-        surface_contact(spec.dim, spec.dtype),
-    )
+    t, r, walls = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), wall_faces(spec)
     real, vec, Constants, dim = t.real, t.vec, t.Constants, spec.dim
     exact_vec, GridInputs, Surface = (
         types(dim, "float64").vec,
         input_types(spec).GridInputs,
         surface_type(dim, spec.dtype),
     )
-    walls = spec.surface_walls
-    number = wp.types.vector(len(walls), wp.int32)(*walls)  # of each separating wall among all walls
-    count, friction_of = len(walls), wall_face(spec).friction_of
-    touch, across, in_wall, f = block.touch, block.across, int(Kind.IN_WALL), frame(dim, spec.dtype)
+    faces_of, meet, count, number, vecs = walls.faces_of, walls.meet, walls.count, walls.number, walls.vecs
+    across, depth = surface_contact(dim, spec.dtype).across, wall_face(spec).depth
+    in_wall, f = int(Kind.IN_WALL), frame(dim, spec.dtype)
     Frame, recentring, memory = f.Frame, f.recentring, chunk(dim, spec.dtype)
     Chunk, state_of, u_of, moved = memory.Chunk, memory.state_of, memory.u_of, memory.moved
-    face, depth = wall_face(spec).face, wall_face(spec).depth
     running, was_running, report = (
         getattr(status.report(dim, spec.dtype), name) for name in ("running", "was_running", "report")
     )
-    vecs, reals = wp.types.matrix((count, dim), real), wp.types.vector(count, real)
     sums = surface_sums(dim, spec.dtype)
     Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
     Touched, touched_of, from_points = sums.Touched, sums.touched_of, sums.from_points
     row = rows(dim, spec.dtype)
-
-    @wp.struct
-    class Faces:
-        n: vecs
-        y: reals
-        depth: reals
-        anchor: vecs
-        friction: reals
-
-    @wp.func
-    def faces_of(
-        constants: Constants,
-        inputs: GridInputs,
-        anchor: wp.array3d(dtype=vec),
-        world: int,
-        p: int,
-        x: exact_vec,
-    ) -> Faces:
-        """The walls as a point meets them. All are read before the first acts, so that they wait for memory together."""
-        out = Faces()
-        for q in range(count):
-            k = number[q]
-            wall = face(constants, inputs, world, k, x, row(anchor, world, q)[p])
-            out.n[q] = wall.n
-            out.y[q] = wall.y
-            out.depth[q] = wall.depth
-            out.anchor[q] = wall.anchor
-            out.friction[q] = friction_of(inputs, world, k)
-        return out
 
     @kernel(LAGRANGIAN)
     def delassus(body: Surface, mass: wp.array2d(dtype=real), D: wp.array2d(dtype=real)):
@@ -120,13 +84,13 @@ def surface(spec: Spec) -> SimpleNamespace:
         v = at_point(point, row(at.free, world))
         dv = row(at.D, world)[p]
         per_force = at.rate[0] * point.newtons
-        wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[now, world])
         after = vecs()
         pushed = vecs()
         for q in range(count):
             after[q] = row(anchor, world, q)[p]
             if anew == 0:
                 pushed[q] = row(at.force, world, q)[p]
+        wall = faces_of(constants, inputs, world, x + at.shift[now, world], after)
         total = vec()
         last = wp.max(s - 1, 0)
         deep = int(-1)
@@ -135,19 +99,7 @@ def surface(spec: Spec) -> SimpleNamespace:
             for q in range(count):
                 if wall.depth[q] > point.deepest:
                     deep = q
-                found = touch(
-                    wall.n[q],
-                    wall.y[q],
-                    vec(x),
-                    v,
-                    wall.anchor[q],
-                    dv,
-                    wall.friction[q],
-                    point.stiffness,
-                    constants.dt,
-                    body.width,
-                    constants.spacing,
-                )
+                found = meet(constants, wall, q, point.stiffness, body.width, vec(x), v, dv)
                 after[q] = found.anchor - across(wall.n[q], d)
                 total += found.J
                 v += dv * found.J
@@ -248,8 +200,4 @@ def surface(spec: Spec) -> SimpleNamespace:
         press_at=press_at,
         settle_at=settle_at,
         check_depth=check_depth,
-        faces_of=faces_of,
-        vecs=vecs,
-        reals=reals,
-        number=number,
     )

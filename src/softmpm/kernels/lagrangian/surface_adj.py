@@ -20,31 +20,29 @@ from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.portions import end_of, first_of
 from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.lagrangian.rows import rows
-from softmpm.kernels.lagrangian.surface import surface
 from softmpm.kernels.lagrangian.surface_sums import surface_sums, surface_type
 from softmpm.kernels.physics.grid import grid
-from softmpm.kernels.physics.surface_contact import surface_contact
-from softmpm.kernels.physics.wall_face import wall_face_adj
+from softmpm.kernels.physics.wall_face import wall_face_adj, wall_faces
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
 @kernel_factory
 def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
-    t, r, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), surface(spec)
+    t, r, walls = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), wall_faces(spec)
     real, vec, Constants, Rest, dim = t.real, t.vec, t.Constants, r.Rest, spec.dim
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    Surface, block, count = (
+    Surface, face_adj, after_free = (
         surface_type(dim, spec.dtype),
-        surface_contact(dim, spec.dtype),
-        len(spec.surface_walls),
+        wall_face_adj(spec, wanted),
+        grid(spec).after_free,
     )
-    touch, touch_adj, number = block.touch, block.touch_adj, one.number
-    faces_of, face_adj, after_free = one.faces_of, wall_face_adj(spec, wanted), grid(spec).after_free
+    faces_of, meet, meet_adj = walls.faces_of, walls.meet, walls.meet_adj
+    count, number, vecs, reals = walls.count, walls.number, walls.vecs, walls.reals
     mirrored, constrained, rough = bool(spec.mirrors), spec.constrained, "friction" in wanted
     sums = surface_sums(dim, spec.dtype)
     Point, point_of, at_point, present = sums.Point, sums.point_of, sums.at_point, sums.present
     Touched, touched_of, both_from_points = sums.Touched, sums.touched_of, sums.both_from_points
-    Node, node_of, vecs, reals = nodes(spec).Node, nodes(spec).node_of, one.vecs, one.reals
+    Node, node_of = nodes(spec).Node, nodes(spec).node_of
     back, memory = nodes_adj(spec, wanted), chunk(dim, spec.dtype)
     before, adj_of, complete, moved_adj = back.before, back.adj_of, back.complete, back.moved_adj
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
@@ -102,7 +100,6 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         v = at_point(point, row(at.free, world))
         dv = row(at.D, world)[p]
         per_force = at.rate[0] * point.newtons
-        wall = faces_of(constants, inputs, anchor, world, p, x + at.shift[s, world])
         i = world * bar.held + p
         anchored = vecs()
         adj_anchor = vecs()
@@ -114,24 +111,13 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             pushed[q] = row(bar.force, world, q)[p]
             if wp.static(rough):
                 rubbed[q] = row(adj_inputs.friction, number[q])[i]
+        wall = faces_of(constants, inputs, world, x + at.shift[s, world], anchored)
         adj_D = row(bar.D, world)[p]
         adj_J = point.area * at_point(point, row(bar.shared, world))
         reached = vecs()
         for q in range(count):
             reached[q] = v
-            found = touch(
-                wall.n[q],
-                wall.y[q],
-                vec(x),
-                v,
-                wall.anchor[q],
-                dv,
-                wall.friction[q],
-                point.stiffness,
-                constants.dt,
-                body.width,
-                constants.spacing,
-            )
+            found = meet(constants, wall, q, point.stiffness, body.width, vec(x), v, dv)
             v += dv * found.J
         back_x = vec()
         back_v = vec()
@@ -140,18 +126,15 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
             q = count - 1 - back
             k = number[q]
             here = reached[q]
-            adj = touch_adj(
-                wall.n[q],
-                wall.y[q],
+            adj = meet_adj(
+                constants,
+                wall,
+                q,
+                point.stiffness,
+                body.width,
                 vec(x),
                 here,
-                wall.anchor[q],
                 dv,
-                wall.friction[q],
-                point.stiffness,
-                constants.dt,
-                body.width,
-                constants.spacing,
                 adj_J + dv * back_v + per_force * pushed[q],
                 adj_anchor[q],
             )

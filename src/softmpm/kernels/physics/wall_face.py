@@ -1,4 +1,4 @@
-"""The wall that a surface point meets in a substep: it moves first, and takes the anchor of the point along.
+"""The walls that a surface point meets in a substep: each moves first, and takes the anchor of the point along.
 
 With its unit normal and offset n°, o° at the beginning of the substep and n, o at the end, both of (C4), and the velocity w of the
 surface
@@ -19,6 +19,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.physics.carry import carry
+from softmpm.kernels.physics.surface_contact import surface_contact
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
@@ -27,7 +28,6 @@ def wall_face(spec: Spec) -> SimpleNamespace:
     t, exact_vec = types(spec.dim, spec.dtype), types(spec.dim, "float64").vec
     real, vec, Constants, GridInputs = t.real, t.vec, t.Constants, input_types(spec).GridInputs
     dim, moving, Pose, way = spec.dim, spec.moving, carry(spec.dim).Pose, carry(spec.dim).way
-    rough, each_world = spec.friction, "friction" in spec.given
 
     @wp.struct
     class Face:
@@ -87,16 +87,7 @@ def wall_face(spec: Spec) -> SimpleNamespace:
             out.anchor = anchor
         return out
 
-    @wp.func
-    def friction_of(inputs: GridInputs, world: int, k: int) -> real:
-        if wp.static(rough and each_world):
-            return inputs.friction[world, k]
-        elif wp.static(rough):
-            return inputs.friction[k]
-        else:
-            return real(0.0)
-
-    return SimpleNamespace(face=face, depth=depth, pose=pose, elapsed=elapsed, friction_of=friction_of)
+    return SimpleNamespace(face=face, depth=depth, pose=pose, elapsed=elapsed)
 
 
 @kernel_factory
@@ -147,3 +138,106 @@ def wall_face_adj(spec: Spec, wanted: RequestedGrads) -> wp.Function:
             return adj_anchor
 
     return face_adj
+
+
+@kernel_factory
+def wall_faces(spec: Spec) -> SimpleNamespace:
+    """All separating walls, and the contact of a surface point with one of them, wall ``q`` among them."""
+    t, exact_vec, GridInputs = (
+        types(spec.dim, spec.dtype),
+        types(spec.dim, "float64").vec,
+        input_types(spec).GridInputs,
+    )
+    real, vec, Constants, face = t.real, t.vec, t.Constants, wall_face(spec).face
+    one, walls = surface_contact(spec.dim, spec.dtype), spec.surface_walls
+    Touch, touch, TouchAdj, touch_adj = one.Touch, one.touch, one.TouchAdj, one.touch_adj
+    count, number = len(walls), wp.types.vector(len(walls), wp.int32)(*walls)  # among all walls
+    vecs, reals = wp.types.matrix((count, spec.dim), real), wp.types.vector(count, real)
+    rough, each_world = spec.friction, "friction" in spec.given
+
+    @wp.struct
+    class Faces:
+        near: int  # 1 if a wall is not further away than a cell
+        n: vecs
+        y: reals
+        depth: reals
+        anchor: vecs
+        friction: reals
+
+    @wp.func
+    def friction_of(inputs: GridInputs, world: int, k: int) -> real:
+        if wp.static(rough and each_world):
+            return inputs.friction[world, k]
+        elif wp.static(rough):
+            return inputs.friction[k]
+        else:
+            return real(0.0)
+
+    @wp.func
+    def faces_of(constants: Constants, inputs: GridInputs, world: int, x: exact_vec, anchor: vecs) -> Faces:
+        """The walls as the point at ``x`` meets them. All are read before the first acts, so that they wait for memory together."""
+        out = Faces()
+        for q in range(count):
+            k = number[q]
+            wall = face(constants, inputs, world, k, x, anchor[q])
+            out.n[q] = wall.n
+            out.y[q] = wall.y
+            out.depth[q] = wall.depth
+            out.anchor[q] = wall.anchor
+            out.friction[q] = friction_of(inputs, world, k)
+            if not wall.y > constants.spacing:  # nor for a place that is not a number
+                out.near = 1
+        return out
+
+    @wp.func
+    def meet(
+        constants: Constants, wall: Faces, q: int, stiffness: real, smoothing: real, x: vec, v: vec, D: real
+    ) -> Touch:
+        """J and the new anchor of (K3), (K4)."""
+        return touch(
+            wall.n[q],
+            wall.y[q],
+            x,
+            v,
+            wall.anchor[q],
+            D,
+            wall.friction[q],
+            stiffness,
+            constants.dt,
+            smoothing,
+            constants.spacing,
+        )
+
+    @wp.func
+    def meet_adj(
+        constants: Constants,
+        wall: Faces,
+        q: int,
+        stiffness: real,
+        smoothing: real,
+        x: vec,
+        v: vec,
+        D: real,
+        adj_J: vec,
+        adj_next: vec,
+    ) -> TouchAdj:
+        """Adjoint of ``meet``: (K3.adj), (K4.adj)."""
+        return touch_adj(
+            wall.n[q],
+            wall.y[q],
+            x,
+            v,
+            wall.anchor[q],
+            D,
+            wall.friction[q],
+            stiffness,
+            constants.dt,
+            smoothing,
+            constants.spacing,
+            adj_J,
+            adj_next,
+        )
+
+    return SimpleNamespace(
+        faces_of=faces_of, meet=meet, meet_adj=meet_adj, count=count, number=number, vecs=vecs, reals=reals
+    )
