@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import softmpm
-from softmpm.oracle import contact, lagrangian, moving
+from softmpm.oracle import contact, lagrangian, moving, stress
 from softmpm.surface_grid import SurfaceGrid
 
 from . import exact
@@ -41,7 +41,7 @@ def pressures(one: Simulation) -> tuple[np.ndarray, np.ndarray]:
     rest = lagrangian.quadrature(scene)
     params = softmpm.Params(*(value.cpu()[None] for value in model.params()))
     mass = lagrangian.node_mass(scene, rest, model.mass.cpu()[None])
-    force = lagrangian.node_force(scene, rest, u, v, None, *moving.lame(params.young, params.poisson))
+    force = lagrangian.node_force(scene, rest, u, v, None, *stress.lame(params.young, params.poisson))
     free = moving.grid_velocity(scene, mass, mass[..., None] * v + scene.dt * force, contacts=())
     _, _, impulses = contact.contact(scene, surface, u, free, nodes.anchor.cpu(), mass)
     places = surface.X + contact.gather(surface, u)[0]

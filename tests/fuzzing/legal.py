@@ -13,7 +13,7 @@ import torch
 import softmpm
 from fuzzing.scenes import LAWS, SPECIALS, Special
 from fuzzing.verdict import Verdict
-from softmpm.oracle import moving
+from softmpm.oracle import stress
 
 ROWS, SUBSTEPS = 8, 40
 GAIN = 1.05
@@ -192,7 +192,7 @@ def energy(scene: softmpm.Scene, state: softmpm.State) -> float:
 
 def stored(material: softmpm.NeoHookean | softmpm.FixedCorotated, F: torch.Tensor) -> torch.Tensor:
     """Elastic energy of a law per rest volume [J/m³]."""
-    mu, lam = moving.lame(
+    mu, lam = stress.lame(
         *(torch.tensor(value, dtype=F.dtype) for value in (material.young, material.poisson))
     )
     J = torch.linalg.det(F)
@@ -200,7 +200,7 @@ def stored(material: softmpm.NeoHookean | softmpm.FixedCorotated, F: torch.Tenso
         log = torch.log(J)
         return mu / 2 * ((F**2).sum((-1, -2)) - F.shape[-1]) - mu * log + lam / 2 * log**2
     if isinstance(material, softmpm.FixedCorotated):
-        return mu * ((F - moving.polar(F)) ** 2).sum((-1, -2)) + lam / 2 * (J - 1) ** 2
+        return mu * ((F - stress.polar(F)) ** 2).sum((-1, -2)) + lam / 2 * (J - 1) ** 2
     raise TypeError(f"no energy is written down for {type(material).__name__}.")
 
 

@@ -9,7 +9,7 @@ import torch
 from helpers import LAWS, bar
 
 import softmpm
-from softmpm.oracle import moving
+from softmpm.oracle import stress as oracle_stress
 from softmpm.stability import running_limit
 
 
@@ -205,24 +205,30 @@ def test_step_alarm_is_the_largest_eigenvalue(law, dim, poisson, device):
 def test_tangent_is_the_derivative_of_the_stress(law, dim):
     """A[G] = d/dε τ((I + εG) F) by central differences, also where principal stretches are equal."""
     rng = np.random.default_rng(1)
-    material, basis = LAWS[law](density=1.0, young=1.0), moving.strains(dim)
+    material, basis = LAWS[law](density=1.0, young=1.0), oracle_stress.strains(dim)
     mu, lam, h = torch.tensor(3.0, dtype=torch.float64), torch.tensor(5.0, dtype=torch.float64), 1e-5
     F = torch.from_numpy(np.eye(dim) + 0.3 * rng.normal(size=(3, dim, dim)))
     F = torch.cat(
         [F, torch.eye(dim, dtype=torch.float64)[None], 1.7 * torch.eye(dim, dtype=torch.float64)[None]]
     )
     F = F[torch.linalg.det(F) > 0]
-    stress, d = moving.LAWS[type(material)], torch.from_numpy(rng.normal(size=dim))
+    stress, d = oracle_stress.LAWS[type(material)], torch.from_numpy(rng.normal(size=dim))
     A, M = (
-        moving.tangent(material, F, mu.expand(len(F)), lam.expand(len(F))),
-        moving.muscle_tangent(F, d),
+        oracle_stress.tangent(material, F, mu.expand(len(F)), lam.expand(len(F))),
+        oracle_stress.muscle_tangent(F, d),
     )
     eye = torch.eye(dim, dtype=torch.float64)
     for col, G in enumerate(basis):
         ends = [(eye + s * h * G) @ F for s in (1, -1)]
         for got, values in (
             (A, [stress(end, mu.expand(len(F)), lam.expand(len(F))) for end in ends]),
-            (M, [moving.muscle_stress(end, d, torch.ones(len(F), dtype=torch.float64)) for end in ends]),
+            (
+                M,
+                [
+                    oracle_stress.muscle_stress(end, d, torch.ones(len(F), dtype=torch.float64))
+                    for end in ends
+                ],
+            ),
         ):
             slope = (values[0] - values[1]) / (2 * h)
             want = torch.einsum("kij,nij->nk", basis, slope)

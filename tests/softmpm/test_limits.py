@@ -10,7 +10,7 @@ from bench.extremes.laws import LAWS
 from bench.extremes.pages import PAGES
 
 import softmpm
-from softmpm.oracle import moving
+from softmpm.oracle import stress as oracle_stress
 
 ROWS = [row for rows in PAGES.values() for row in rows]
 
@@ -37,7 +37,7 @@ def test_the_judges_energies_belong_to_the_stresses(law, dim):
         moved = F + step * G @ F
         return DENSITIES[law.__name__](stretches(moved), np.linalg.det(moved), mu, lam)
 
-    stress = moving.LAWS[law](*(torch.from_numpy(array) for array in (F, mu, lam))).numpy()
+    stress = oracle_stress.LAWS[law](*(torch.from_numpy(array) for array in (F, mu, lam))).numpy()
     slope = (energy(eps) - energy(-eps)) / (2 * eps)
     assert slope == pytest.approx((stress * G).sum((1, 2)), rel=1e-7, abs=1e-7)
 
@@ -58,6 +58,6 @@ def test_the_judges_energies_belong_to_the_actuators(kind, dim):
     actuator = scene.muscles[0]
     direction = torch.tensor(getattr(actuator, "direction", ()), dtype=torch.float64).expand(len(F), -1)
     p = torch.full((len(F),), 0.7 * 20.0, dtype=torch.float64)
-    stress = moving.actuator_stress(actuator, torch.from_numpy(F), direction, p).numpy()
+    stress = oracle_stress.actuator_stress(actuator, torch.from_numpy(F), direction, p).numpy()
     slope = (energy(eps) - energy(-eps)) / (2 * eps)
     assert slope == pytest.approx(matter.volume @ (stress * G).sum((1, 2)), rel=1e-7)

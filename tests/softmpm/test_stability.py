@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import softmpm
-from softmpm.oracle import moving
+from softmpm.oracle import stress as oracle_stress
 from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Body, Grid, Particles, Scene
@@ -156,8 +156,8 @@ def test_viscous_limit_is_the_largest_step():
     made = scene(StableNeoHookean(density=RHO, young=100.0, viscosity=0.3), 3, count=rows)
     mu, lam = (torch.tensor(v, dtype=torch.float64) for v in (50.0 / 1.3, 30.0 / (1.3 * 0.4)))
     for p in range(rows):
-        A = moving.tangent(made.bodies[0].material, F[p], mu, lam)
-        V = 0.3 * moving.viscous_tangent(F[p])
+        A = oracle_stress.tangent(made.bodies[0].material, F[p], mu, lam)
+        V = 0.3 * oracle_stress.viscous_tangent(F[p])
         dt = running_limit(made, p, mu.item(), lam.item(), RHO, F[p], [], 0.3)
         scan = torch.tensor([*np.linspace(0.01, 0.999, 60), 1.0], dtype=torch.float64)[:, None, None] * dt
         reach = torch.linalg.eigvalsh(scan**2 * A + 2 * scan * V)[:, -1] / (RHO * DX**2)

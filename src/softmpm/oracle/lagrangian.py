@@ -30,12 +30,12 @@ from softmpm.oracle.moving import (
     SCENE,
     control_steps,
     grid_velocity,
-    lame,
     of_control_step,
     rest_volume,
-    stencil,
     stress,
 )
+from softmpm.oracle.stress import lame
+from softmpm.oracle.transfer import stencil
 from softmpm.oracle.walls import BESIDE_POINTS, ON_NODES
 from softmpm.scene.scene import MIRRORS, Scene
 from softmpm.state import Params, State

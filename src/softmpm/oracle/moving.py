@@ -11,59 +11,12 @@ import torch
 from torch import Tensor
 
 from softmpm.inputs import QUANTITIES, Inputs
-from softmpm.oracle.stress import (
-    LAWS,
-    actuator_stress,
-    actuator_tangent,
-    barrier_corotated,
-    fixed_corotated,
-    lame,
-    law_of,
-    muscle_stress,
-    muscle_tangent,
-    neo_hookean,
-    polar,
-    strains,
-    tangent,
-    viscous_stress,
-    viscous_tangent,
-)
-from softmpm.oracle.transfer import g2p, p2g, stencil
+from softmpm.oracle.stress import actuator_stress, lame, law_of, viscous_stress
+from softmpm.oracle.transfer import g2p, p2g
 from softmpm.oracle.walls import inside, respond, surface, wall_velocity
 from softmpm.scene.actuators import Actuator
 from softmpm.scene.scene import CONTACTS, Scene
 from softmpm.state import GridField, Params, State
-
-__all__ = [
-    "LAWS",
-    "actuator_stress",
-    "actuator_tangent",
-    "barrier_corotated",
-    "fixed_corotated",
-    "from_grid",
-    "g2p",
-    "grid_velocity",
-    "inside",
-    "lame",
-    "muscle_stress",
-    "muscle_tangent",
-    "neo_hookean",
-    "p2g",
-    "polar",
-    "rasterize",
-    "respond",
-    "simulate",
-    "stencil",
-    "step",
-    "strains",
-    "stress",
-    "surface",
-    "tangent",
-    "to_grid",
-    "viscous_stress",
-    "viscous_tangent",
-    "wall_velocity",
-]
 
 SCENE = Inputs()
 """Every input is the scene's."""

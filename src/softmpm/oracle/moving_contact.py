@@ -20,12 +20,12 @@ from softmpm.oracle.moving import (
     SCENE,
     control_steps,
     from_grid,
-    lame,
     of_control_step,
     rest_volume,
-    stencil,
     to_grid,
 )
+from softmpm.oracle.stress import lame
+from softmpm.oracle.transfer import stencil
 from softmpm.oracle.walls import BESIDE_POINTS
 from softmpm.scene.scene import Scene
 from softmpm.state import Params, State

@@ -11,7 +11,7 @@ from oracle_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, 
 
 from softmpm.inputs import Inputs
 from softmpm.oracle import contact as oracle_contact
-from softmpm.oracle import lagrangian, moving
+from softmpm.oracle import lagrangian, moving, stress, transfer
 from softmpm.oracle import walls as oracle_walls
 from softmpm.oracle.contact import Surface
 from softmpm.scene.materials import NeoHookean
@@ -21,7 +21,7 @@ from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 def surface_at(scene: Scene, positions, area, stiffness) -> Surface:
     """Points with the B-spline weights of the grid."""
     X = torch.as_tensor(positions)
-    nodes = moving.stencil(scene, X[None])
+    nodes = transfer.stencil(scene, X[None])
     node, w = (torch.stack([part[k][0] for part in nodes], 1) for k in range(2))
     area, stiffness = (torch.as_tensor(value).double().expand(len(X)) for value in (area, stiffness))
     return Surface(X, node, w, area, stiffness)
@@ -477,7 +477,7 @@ def test_a_block_rests_on_the_floor():
     scene, surface, mass = slope(0.0)
     u, v, anchor, _ = advance(scene, surface, 400)
     params, points = rest(scene)[1], lagrangian.quadrature(scene)
-    mu, lam = (value[None] for value in moving.lame(params.young, params.poisson))
+    mu, lam = (value[None] for value in stress.lame(params.young, params.poisson))
     impulse = scene.dt * lagrangian.node_force(scene, points, u, v, None, mu, lam)
     star = moving.grid_velocity(scene, mass, mass[..., None] * v + impulse, contacts=())
     _, _, J = oracle_contact.contact(scene, surface, u, star, anchor, mass)

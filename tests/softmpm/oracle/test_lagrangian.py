@@ -9,7 +9,7 @@ import torch
 from oracle_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, shaken, tiny
 
 from softmpm.inputs import Inputs
-from softmpm.oracle import lagrangian, moving, walls
+from softmpm.oracle import lagrangian, moving, stress, transfer, walls
 from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Body, Particles, Scene, Wall
@@ -22,7 +22,7 @@ def nodal(scene: Scene, params) -> tuple[torch.Tensor, torch.Tensor, torch.Tenso
     """Mass of the nodes, (1, node), and the material (μ, λ) of the particles, (1, particle)."""
     points = lagrangian.quadrature(scene)
     count = len(points.X)
-    mu, lam = (value.expand(1, count) for value in moving.lame(params.young, params.poisson))
+    mu, lam = (value.expand(1, count) for value in stress.lame(params.young, params.poisson))
     mass = masses(scene, params).expand(1, count)
     return lagrangian.node_mass(scene, points, mass), mu, lam
 
@@ -53,7 +53,7 @@ def test_weights_and_their_gradient(dim):
     """Σ N = 1, Σ N r = 0, Σ g = 0, Σ X_i ⊗ g = I, and N is that of the moving formulation: ≤ 1e-13."""
     scene = tiny(dim)
     points = lagrangian.quadrature(scene)
-    for k, (node, N, _) in enumerate(moving.stencil(scene, points.X[None])):
+    for k, (node, N, _) in enumerate(transfer.stencil(scene, points.X[None])):
         assert torch.equal(node[0], points.node[:, k]) and torch.equal(N[0], points.N[:, k])
     places = walls.nodes(scene)[points.node]
 
@@ -132,7 +132,7 @@ def energy(scene: Scene, F: torch.Tensor, mu: torch.Tensor, lam: torch.Tensor, a
     """Energy of the particles [J] in closed form: that of the law, and the work of the actuators."""
     law, volume = type(scene.bodies[0].material), masses(scene, rest(scene)[1]) / 1.2
     squared, J = (F**2).sum((-2, -1)), torch.linalg.det(F)
-    corotated = mu * ((F - moving.polar(F)) ** 2).sum((-2, -1))
+    corotated = mu * ((F - stress.polar(F)) ** 2).sum((-2, -1))
     if law is NeoHookean:
         density = mu / 2 * (squared - 2 * J.log()) + lam / 2 * J.log() ** 2
     elif law is StableNeoHookean:
@@ -387,7 +387,7 @@ def test_adjoint_of_a_substep(dim):
     F = torch.eye(dim) + lagrangian.gather(points, u)[1]
     inverse = torch.linalg.inv(F)
     L = lagrangian.gather(points, v)[1] @ inverse
-    tau = moving.neo_hookean(F, mu, lam) + moving.viscous_stress(F, L, eta)
+    tau = stress.neo_hookean(F, mu, lam) + stress.viscous_stress(F, L, eta)
     P = tau @ inverse.mT
     f = lagrangian.node_force(scene, points, u, v, None, mu, lam, Inputs(viscosity=eta, force=force))
     v_star = torch.where(present, decay * (v + dt * (f / one + g[:, None])), 0.0)
@@ -487,7 +487,7 @@ def test_fastest_oscillation(dim):
         )
         root = of_nodes[0, present].rsqrt().repeat_interleave(dim)
         tangent = torch.autograd.functional.jacobian(
-            lambda F: moving.neo_hookean(F, mu[0, 0], lam[0, 0]) @ torch.linalg.inv(F).mT,
+            lambda F: stress.neo_hookean(F, mu[0, 0], lam[0, 0]) @ torch.linalg.inv(F).mT,
             torch.eye(dim).double(),
         ).view(dim, dim, dim, dim)
         bound = torch.linalg.eigvalsh(tangent.reshape(dim * dim, dim * dim))[-1] * 4 / DX**2 / 1.2

@@ -9,7 +9,8 @@ import torch
 from oracle_scenes import DIMS, DX, f64, full, masses, randn, rest, shaken, slopes, tiny
 
 from softmpm.inputs import Inputs
-from softmpm.oracle import moving
+from softmpm.oracle import moving, stress, transfer
+from softmpm.oracle import walls as oracle_walls
 from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import NeoHookean
 from softmpm.scene.scene import Body, Grid, Particles, Wall
@@ -22,7 +23,7 @@ def test_weights_are_quadratic_b_splines(dim):
     scene = tiny(dim)
     edge = f64([[0.45, 0.5, 0.55][:dim], [0.4, 0.35, 0.6][:dim]])
     x = torch.cat([edge, shaken(scene)[0].x[0]])[None].requires_grad_()
-    nodes = moving.stencil(scene, x)
+    nodes = transfer.stencil(scene, x)
     w, r = torch.stack([n[1] for n in nodes], -1), torch.stack([n[2] for n in nodes], -2)
     eye = torch.eye(dim, dtype=torch.float64)
 
@@ -47,8 +48,10 @@ def test_transfer_keeps_mass_momentum_and_spin(dim):
     scene = tiny(dim)
     state, params = shaken(scene)
     mass = masses(scene, params)[..., None]
-    node_mass, momentum = moving.p2g(scene, state.x, mass[..., 0], mass * state.v, mass[..., None] * state.C)
-    v, C = moving.g2p(scene, state.x, moving.grid_velocity(scene, node_mass, momentum))
+    node_mass, momentum = transfer.p2g(
+        scene, state.x, mass[..., 0], mass * state.v, mass[..., None] * state.C
+    )
+    v, C = transfer.g2p(scene, state.x, moving.grid_velocity(scene, node_mass, momentum))
 
     def spin(v, C):
         A = (mass[..., None] * (state.x[..., :, None] * v[..., None, :] + DX**2 / 4 * C.mT)).sum(1)
@@ -74,7 +77,7 @@ def test_an_affine_flow_is_seen_and_kept_exactly(dim):
     assert (field.mass == 0).any()
     torch.testing.assert_close(field.velocity, want, rtol=0, atol=1e-12)
     torch.testing.assert_close(field.mass.sum(), masses(scene, params).sum(), rtol=1e-14, atol=0)
-    v, C = moving.g2p(scene, state.x, field.velocity.view(1, -1, dim))
+    v, C = transfer.g2p(scene, state.x, field.velocity.view(1, -1, dim))
     torch.testing.assert_close(v, state.v, rtol=0, atol=1e-12)
     torch.testing.assert_close(C, state.C, rtol=0, atol=1e-12)
 
@@ -166,10 +169,10 @@ def test_stress_of_each_particle():
     """Every body has its law, every muscle its activation, fibre and particles; overlapping muscles add."""
     scene, activation = full(2), f64([[0.5, -2.0]])
     start, params = shaken(scene)
-    mu, lam = (term[0] for term in moving.lame(params.young, params.poisson))
+    mu, lam = (term[0] for term in stress.lame(params.young, params.poisson))
     got = moving.stress(scene, start.F, mu[None], lam[None], activation)[0]
     for p, F in enumerate(start.F[0]):
-        law = moving.neo_hookean if p < 6 else moving.fixed_corotated
+        law = stress.neo_hookean if p < 6 else stress.fixed_corotated
         want = law(F, mu[p], lam[p])
         for muscle, a in zip(scene.muscles, activation[0], strict=True):
             if p in muscle.particles:
@@ -210,7 +213,7 @@ def test_contact_of_a_node(wall, v, want):
     v, want = f64(v), f64(want)
     for Q in (f64([[1.0, 0.0], [0.0, 1.0]]), f64([[0.8, 0.6], [-0.6, 0.8]])):
         normal = tuple(Q[:, 1].tolist())
-        got = moving.respond(Wall(normal=normal, offset=0.0, **wall), Q @ v)
+        got = oracle_walls.respond(Wall(normal=normal, offset=0.0, **wall), Q @ v)
         torch.testing.assert_close(got, Q @ want, rtol=0, atol=1e-15)
 
 
@@ -220,10 +223,10 @@ def test_friction_never_gives_nan(dim):
     n = torch.eye(dim, dtype=torch.float64)[1]
     for friction, want in ((0.5, torch.zeros(dim, dim)), (0.0, torch.eye(dim) - torch.outer(n, n).float())):
         wall = Wall(normal=tuple(n.tolist()), offset=0.0, friction=friction)
-        jacobian = torch.autograd.functional.jacobian(lambda v: moving.respond(wall, v), -n)  # noqa: B023
+        jacobian = torch.autograd.functional.jacobian(lambda v: oracle_walls.respond(wall, v), -n)  # noqa: B023
         torch.testing.assert_close(jacobian, want.double(), rtol=0, atol=0)
         still = torch.autograd.functional.jacobian(
-            lambda v: moving.respond(wall, v),  # noqa: B023
+            lambda v: oracle_walls.respond(wall, v),  # noqa: B023
             torch.zeros_like(n),
         )
         torch.testing.assert_close(still, torch.eye(dim).double(), rtol=0, atol=0)  # v·n < 0 does not hold
@@ -237,7 +240,7 @@ def test_contact_derivative(dim):
         wall = Wall(normal=normal, offset=0.0, contact=contact, friction=friction)
         for up in (-1.0, 1.0):
             v = f64((0.7, up, 0.4)[:dim]).requires_grad_()
-            assert torch.autograd.gradcheck(lambda v: moving.respond(wall, v), v)  # noqa: B023
+            assert torch.autograd.gradcheck(lambda v: oracle_walls.respond(wall, v), v)  # noqa: B023
 
 
 def test_walls_act_on_their_nodes_in_order():
@@ -354,7 +357,7 @@ def test_pressure_expands_a_free_body_alike_in_all_directions(dim, strength):
     F = end.F[0, 0]
     stretch = F[0, 0]
     torch.testing.assert_close(F, stretch * torch.eye(dim).double(), rtol=0, atol=1e-10)
-    mu, lam = moving.lame(params.young, params.poisson)
+    mu, lam = stress.lame(params.young, params.poisson)
     J = stretch**dim
     assert abs(mu[0] * (stretch**2 - 1) + lam[0] * J.log() - strength * J) < 1e-6
     assert (stretch > 1.02) if strength > 0 else (stretch < 0.98)

@@ -7,7 +7,7 @@ import torch
 from oracle_scenes import DX, f64, masses, randn, rest, shaken
 
 from softmpm.inputs import Inputs
-from softmpm.oracle import moving
+from softmpm.oracle import moving, stress, transfer
 from softmpm.oracle.contact import across_walls, meet_walls
 from softmpm.oracle.moving_contact import Points, meet, places, surface_points, weights
 from softmpm.oracle.walls import nodes
@@ -32,7 +32,7 @@ def floor(dim: int, friction=0.5, **changes) -> Scene:
 def on_grid(scene: Scene, state: State, mass: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Masses and velocities of the nodes after P2G without stress."""
     affine = mass[..., None, None] * state.C
-    of_nodes, momentum = moving.p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
+    of_nodes, momentum = transfer.p2g(scene, state.x, mass, mass[..., None] * state.v, affine)
     return of_nodes, momentum / torch.where(of_nodes > 0, of_nodes, 1.0)[..., None]
 
 
@@ -158,7 +158,7 @@ def test_points_move_with_the_velocity_of_the_contact(dim):
     v, given = randn(2, len(nodes(scene)), dim, seed=5), randn(2, len(scene.driven), dim, seed=6)
     after = moving.from_grid(scene, state, v, Inputs(velocity=given))
     want = places(points, state) + scene.dt * at_points(scene, points, state, v)
-    carried, _ = moving.g2p(scene, state.x, v)
+    carried, _ = transfer.g2p(scene, state.x, v)
     driven = torch.isin(points.particle, torch.tensor(scene.driven))
     assert driven.any() and not driven.all()
     torch.testing.assert_close(places(points, after)[:, ~driven], want[:, ~driven], rtol=0, atol=1e-14)
@@ -175,7 +175,7 @@ def test_points_stay_at_their_body():
     spin = f64([[0.5, -4.0], [7.0, -0.5]])
     state = state._replace(v=shape @ spin.T - f64([1.0, 1.0]), C=spin.expand_as(state.F))
     mass = masses(scene, params)[None]
-    mu, lam = (one[None] for one in moving.lame(params.young, params.poisson))
+    mu, lam = (one[None] for one in stress.lame(params.young, params.poisson))
     x = places(points, state)
     anchor, worst, touched = across_walls(scene, x), 0.0, 0
     for _ in range(500):

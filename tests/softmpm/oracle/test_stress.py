@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from softmpm.oracle import moving, stress
+from softmpm.oracle import stress
 from softmpm.scene.materials import StableNeoHookean
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 LAWS = {
-    "neo_hookean": moving.neo_hookean,
+    "neo_hookean": stress.neo_hookean,
     "stable_neo_hookean": stress.stable_neo_hookean,
-    "fixed_corotated": moving.fixed_corotated,
-    "barrier_corotated": moving.barrier_corotated,
+    "fixed_corotated": stress.fixed_corotated,
+    "barrier_corotated": stress.barrier_corotated,
 }
 SURVIVES_INVERSION = ("stable_neo_hookean", "fixed_corotated")
 
@@ -74,7 +74,7 @@ def assert_derivative(f, at: torch.Tensor, what: str) -> None:
 def test_polar_is_the_best_proper_rotation(dim):
     """RᵀR = I, det R = 1, RᵀF is symmetric, and no other rotation has a larger tr(RᵀF); also if det F < 0."""
     for name, F in special_points(dim).items():
-        R = moving.polar(F)
+        R = stress.polar(F)
         torch.testing.assert_close(R.T @ R, torch.eye(dim, dtype=torch.float64), rtol=0, atol=1e-14)
         assert torch.linalg.det(R) > 0, name
         torch.testing.assert_close(R.T @ F, F.T @ R, rtol=0, atol=1e-14)
@@ -87,7 +87,7 @@ def test_polar_of_a_product(dim):
     """polar(Q S) = Q for a rotation Q and a symmetric positive S, in batches of any leading shape."""
     Q = torch.stack([rotation(dim, seed) for seed in range(6)]).view(2, 3, dim, dim)
     S = torch.matrix_exp(0.5 * (lambda A: A + A.mT)(randn(2, 3, dim, dim, seed=5)))
-    torch.testing.assert_close(moving.polar(Q @ S), Q, rtol=0, atol=1e-13)
+    torch.testing.assert_close(stress.polar(Q @ S), Q, rtol=0, atol=1e-13)
 
 
 @DIMS
@@ -95,12 +95,12 @@ def test_derivatives_at_special_points(dim):
     """Rotation, stresses and the muscle's, at F = I, rotations, equal stretches and det F < 0."""
     fibre = torch.nn.functional.normalize(randn(dim, seed=6), dim=0)
     for name, F in special_points(dim).items():
-        assert_derivative(moving.polar, F, f"polar, {name}")
-        assert_derivative(lambda F: moving.fixed_corotated(F, MU, LAM), F, f"fixed corotated, {name}")
+        assert_derivative(stress.polar, F, f"polar, {name}")
+        assert_derivative(lambda F: stress.fixed_corotated(F, MU, LAM), F, f"fixed corotated, {name}")
         assert_derivative(lambda F: stress.stable_neo_hookean(F, MU, LAM), F, f"stable neo-Hookean, {name}")
-        assert_derivative(lambda F: moving.muscle_stress(F, fibre, MU), F, f"muscle, {name}")
+        assert_derivative(lambda F: stress.muscle_stress(F, fibre, MU), F, f"muscle, {name}")
         if torch.linalg.det(F) > 0:
-            assert_derivative(lambda F: moving.neo_hookean(F, MU, LAM), F, f"neo-Hookean, {name}")
+            assert_derivative(lambda F: stress.neo_hookean(F, MU, LAM), F, f"neo-Hookean, {name}")
 
 
 @DIMS
@@ -110,11 +110,11 @@ def test_second_derivative_of_polar(dim):
 
     def first(F):
         F = F.detach().requires_grad_()
-        return torch.autograd.grad((weights * moving.polar(F)).sum(), F)[0]
+        return torch.autograd.grad((weights * stress.polar(F)).sum(), F)[0]
 
     for name in ("identity", "equal stretches", "inverted"):
         F = special_points(dim)[name].requires_grad_()
-        (slope,) = torch.autograd.grad((weights * moving.polar(F)).sum(), F, create_graph=True)
+        (slope,) = torch.autograd.grad((weights * stress.polar(F)).sum(), F, create_graph=True)
         (got,) = torch.autograd.grad((slope * d).sum(), F)  # the Hessian is symmetric
         torch.testing.assert_close(got, difference(first, F.detach(), d, 1e-3), rtol=1e-7, atol=1e-8)
 
@@ -127,7 +127,7 @@ def test_polar_never_raises(dim):
     F = torch.stack(
         [mirror, torch.zeros_like(mirror), torch.full_like(mirror, math.nan), sound]
     ).requires_grad_()
-    R = moving.polar(F)
+    R = stress.polar(F)
     (slope,) = torch.autograd.grad((R * randn(*R.shape)).sum(), F)
     torch.testing.assert_close(
         R[:2].mT @ R[:2], torch.eye(dim).double().expand(2, dim, dim), rtol=0, atol=1e-14
@@ -135,7 +135,7 @@ def test_polar_never_raises(dim):
     assert R[2].isnan().all()
     assert slope[:3].isnan().all()
     # To rounding: in a batch of another size, LAPACK may take its sums in another order.
-    torch.testing.assert_close(R[3], moving.polar(sound), rtol=0, atol=1e-15)
+    torch.testing.assert_close(R[3], stress.polar(sound), rtol=0, atol=1e-15)
     assert slope[3].isfinite().all()
 
 
@@ -178,14 +178,14 @@ def test_stress_turns_with_the_body(dim):
         torch.testing.assert_close(law(Q, MU, LAM), torch.zeros_like(Q), rtol=0, atol=1e-14)
         torch.testing.assert_close(law(Q @ F, MU, LAM), Q @ law(F, MU, LAM) @ Q.T, rtol=0, atol=1e-13)
         torch.testing.assert_close(law(F, MU, LAM), law(F, MU, LAM).T, rtol=0, atol=1e-13)
-    pulled = moving.muscle_stress(Q, fibre, MU)
+    pulled = stress.muscle_stress(Q, fibre, MU)
     torch.testing.assert_close(pulled, MU * torch.outer(Q[:, 1], Q[:, 1]), rtol=0, atol=1e-14)
 
 
 def test_lame_gives_back_the_constants_of_engineers():
     """E = μ(3λ + 2μ)/(λ + μ) and ν = λ/(2(λ + μ))."""
     young, poisson = f64([100.0, 7.0, 1e6]), f64([0.3, 0.0, 0.49])
-    mu, lam = moving.lame(young, poisson)
+    mu, lam = stress.lame(young, poisson)
     torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), young, rtol=1e-13, atol=0)
     torch.testing.assert_close(lam / (2 * (lam + mu)), poisson, rtol=1e-13, atol=0)
 
@@ -225,9 +225,9 @@ def test_stable_neo_hookean_without_cancellation(dim):
 @pytest.mark.parametrize("poisson", [-0.9, -0.3, 0.0, 0.3, 0.49])
 def test_stable_neo_hookean_is_linear_elasticity_at_rest(dim, poisson):
     """A[G] = 2μ G + λ tr(G) I at F = I, for every Poisson's ratio: ≤ 1e-13."""
-    mu, lam = moving.lame(f64(100.0), f64(poisson))
-    basis, eye = moving.strains(dim), torch.eye(dim, dtype=torch.float64)
-    A = moving.tangent(StableNeoHookean(density=1.0, young=1.0), eye, mu, lam)
+    mu, lam = stress.lame(f64(100.0), f64(poisson))
+    basis, eye = stress.strains(dim), torch.eye(dim, dtype=torch.float64)
+    A = stress.tangent(StableNeoHookean(density=1.0, young=1.0), eye, mu, lam)
     trace = basis.diagonal(dim1=-2, dim2=-1).sum(-1)
     want = 2 * mu * torch.eye(len(basis), dtype=torch.float64) + lam * torch.outer(trace, trace)
     torch.testing.assert_close(A, want, rtol=0, atol=1e-12 * mu.item())
@@ -237,9 +237,9 @@ def test_stable_neo_hookean_is_linear_elasticity_at_rest(dim, poisson):
 @pytest.mark.parametrize("poisson", [-0.9, 0.0, 0.3, 0.49])
 def test_bound_of_the_stiffness_of_stable_neo_hookean(dim, poisson):
     """K ≤ 2μ [(1 + k) S + k' S tr B] + d max(p' J, 0) for the largest eigenvalue K of A, inverted F included; K itself at rest."""
-    mu, lam = moving.lame(f64(100.0), f64(poisson))
+    mu, lam = stress.lame(f64(100.0), f64(poisson))
     F = torch.cat([wild(dim, 1000), torch.eye(dim, dtype=torch.float64)[None]])
-    A = moving.tangent(StableNeoHookean(density=1.0, young=1.0), F, mu.expand(len(F)), lam.expand(len(F)))
+    A = stress.tangent(StableNeoHookean(density=1.0, young=1.0), F, mu.expand(len(F)), lam.expand(len(F)))
     K = torch.linalg.eigvalsh(A)[:, -1]
     B, _, k, slope, J = (t.squeeze() if t.shape[-2:] == (1, 1) else t for t in parts(F))
     largest, trace = torch.linalg.eigvalsh(B)[:, -1], B.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -275,14 +275,14 @@ def test_viscous_stress_is_that_of_the_strain_rate(dim):
     F, C, Q = wild(dim, 50), randn(51, dim, dim, seed=32), rotation(dim, 9)
     eta = torch.full((51,), 3.0, dtype=torch.float64)
     rate = ((C @ F).mT @ F + F.mT @ (C @ F)) / 2
-    tau = moving.viscous_stress(F, C, eta)
+    tau = stress.viscous_stress(F, C, eta)
     torch.testing.assert_close(tau, 6 * F @ rate @ F.mT, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(tau, tau.mT, rtol=1e-12, atol=1e-12)
-    turned = moving.viscous_stress(Q @ F, Q @ C @ Q.T, eta)
+    turned = stress.viscous_stress(Q @ F, Q @ C @ Q.T, eta)
     torch.testing.assert_close(turned, Q @ tau @ Q.T, rtol=1e-12, atol=1e-12)
     power = (tau * C).sum((-2, -1))
     torch.testing.assert_close(power, 6 * (rate**2).sum((-2, -1)), rtol=1e-11, atol=1e-11)
-    spinning = moving.viscous_stress(F, C - C.mT, eta)
+    spinning = stress.viscous_stress(F, C - C.mT, eta)
     assert spinning.abs().max() == 0
 
 
@@ -292,14 +292,14 @@ def test_adjoint_of_viscosity(dim):
     leaves = [wild(dim, 50), randn(51, dim, dim, seed=33), randn(51, seed=34).abs()]
     F, C, eta = (leaf.requires_grad_() for leaf in leaves)
     adj_tau = randn(51, dim, dim, seed=35)
-    want = torch.autograd.grad(moving.viscous_stress(F, C, eta), (F, C, eta), adj_tau)
+    want = torch.autograd.grad(stress.viscous_stress(F, C, eta), (F, C, eta), adj_tau)
     with torch.no_grad():
         B, D, T, e = F @ F.mT, (C + C.mT) / 2, (adj_tau + adj_tau.mT) / 2, eta[:, None, None]
         adj_F = 4 * e * (T @ B @ D + D @ B @ T) @ F
         got = adj_F, 2 * e * B @ T @ B, 2 * (T * (B @ D @ B)).sum((-2, -1))
         for mine, value in zip(got, want, strict=True):
             torch.testing.assert_close(mine, value, rtol=1e-11, atol=1e-11)
-        V, basis = moving.viscous_tangent(F), moving.strains(dim)
+        V, basis = stress.viscous_tangent(F), stress.strains(dim)
         for column, G in enumerate(basis):
             damping = 2 * B @ G @ B
             torch.testing.assert_close(V[..., column], torch.einsum("kij,pij->pk", basis, damping))
@@ -318,7 +318,7 @@ def test_pressure_is_the_derivative_of_its_work(dim):
     trace, J = adj_tau.diagonal(dim1=-2, dim2=-1).sum(-1), stress.det(F)
     torch.testing.assert_close(adj_p, -J * trace)
     torch.testing.assert_close(adj_F, -(p * trace)[:, None, None] * cofactor(F))
-    T, basis = stress.pressure_tangent(F), moving.strains(dim)
+    T, basis = stress.pressure_tangent(F), stress.strains(dim)
     for column, G in enumerate(basis):
         want = -J[:, None] * torch.einsum("kii->k", basis) * G.trace()
         torch.testing.assert_close(T[..., column], want)

@@ -87,7 +87,7 @@ def test_kinematics_of_a_turning_wall(dim):
     length = torch.linalg.vector_norm(normal, dim=-1)
 
     def at(time):
-        return moving.surface(scene, 0, inputs, like, time, 0.5)
+        return walls.surface(scene, 0, inputs, like, time, 0.5)
 
     torch.testing.assert_close(at(0.0).normal, normal[0, 0] / length[0])
     torch.testing.assert_close(at(0.5).normal, normal[1, 0] / length[1])
@@ -103,7 +103,7 @@ def test_kinematics_of_a_turning_wall(dim):
     want = -(distance(at(0.2 + h)) - distance(at(0.2 - h))) / (2 * h)
     got = (now.offset_rate[0] - x @ now.normal_rate[0]) / torch.linalg.vector_norm(a)
     torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-7)
-    u, at_nodes = moving.wall_velocity(scene, now)[0], walls.nodes(scene)
+    u, at_nodes = walls.wall_velocity(scene, now)[0], walls.nodes(scene)
     speed = (now.offset_rate[0] - at_nodes @ now.normal_rate[0]) / torch.linalg.vector_norm(a)
     torch.testing.assert_close(u, speed[:, None] * now.unit[0], rtol=1e-13, atol=1e-13)
 
@@ -178,9 +178,9 @@ def test_adjoint_of_a_moving_wall(dim, contact, friction):
     want = torch.autograd.grad(out, (v, w, N, O), adj)
 
     with torch.no_grad():
-        s = moving.surface(scene, 0, inputs, v, time, T)
-        here = moving.inside(scene, s)[0]
-        x, q = walls.nodes(scene)[here], (v - moving.wall_velocity(scene, s))[0, here]
+        s = walls.surface(scene, 0, inputs, v, time, T)
+        here = walls.inside(scene, s)[0]
+        x, q = walls.nodes(scene)[here], (v - walls.wall_velocity(scene, s))[0, here]
         n, size, g = s.unit[0], torch.linalg.vector_norm(s.normal[0]), adj[0, here]
         P = torch.eye(dim).double() - torch.outer(n, n)
         q_n, q_t = (q @ n)[:, None], q @ P

@@ -9,7 +9,7 @@ import softmpm
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.physics.slot_sum import COLLECTORS, collect_slots, collectors
 from softmpm.kernels.structs import RequestedGrads
-from softmpm.oracle import moving
+from softmpm.oracle import moving, stress, transfer
 from softmpm.planning.chunks import Horizon
 from softmpm.schemes.buffers import Motion, MotionAdj
 from softmpm.schemes.device import stream_of
@@ -46,13 +46,13 @@ class Bench:
 
     def reference_p2g(self):
         c, volume = self.cpu, self.model.specific_volume.cpu()
-        mu, lam = moving.lame(c["young"], c["poisson"])
+        mu, lam = stress.lame(c["young"], c["poisson"])
         mass = c["density"] * volume
         tau = moving.stress(self.scene, c["F"], mu, lam, c["activation"][0])
         affine = (
             mass[..., None, None] * c["C"] - (4 * self.scene.dt / self.dx**2 * volume)[:, None, None] * tau
         )
-        return moving.p2g(self.scene, c["x"], mass, mass[..., None] * c["v"], affine)
+        return transfer.p2g(self.scene, c["x"], mass, mass[..., None] * c["v"], affine)
 
 
 @pytest.fixture(params=[2, 3], ids=["2D", "3D"])
@@ -99,7 +99,9 @@ def test_grid_velocity(walled):
 def test_g2p(bench):
     """v, C, x and F after the substep (T2, T3)."""
     bench.step.advance(bench.now, bench.then, 0)
-    v, C = moving.g2p(bench.scene, bench.cpu["x"], moving.grid_velocity(bench.scene, *bench.reference_p2g()))
+    v, C = transfer.g2p(
+        bench.scene, bench.cpu["x"], moving.grid_velocity(bench.scene, *bench.reference_p2g())
+    )
     end = bench.step.leave(bench.then)
     dt, F = bench.scene.dt, bench.cpu["F"]
     for name, got, want in zip("xvCF", end[:4], (bench.cpu["x"] + dt * v, v, C, F + dt * C @ F), strict=True):
@@ -111,7 +113,7 @@ def test_g2p_adj(bench):
     model, c, dt = bench.model, bench.cpu, bench.scene.dt
     bench.step.advance(bench.now, bench.then, 0)
     velocity = bench.step.velocity.cpu().requires_grad_()
-    v, C = moving.g2p(bench.scene, c["x"], velocity)
+    v, C = transfer.g2p(bench.scene, c["x"], velocity)
     end = (c["x"] + dt * v, v, C, c["F"] + dt * C @ c["F"])
     weights = [bench.random(tensor, n) for n, tensor in enumerate(end)]
     loss = sum((w * t).sum() for w, t in zip(weights, end, strict=True))
@@ -169,7 +171,7 @@ def test_p2g_adj(bench):
     assert_relative(adj.H.cpu(), want["F"], LIMIT, "F")
     assert_relative(adj_mass * model.specific_volume.cpu(), want["density"], LIMIT, "density")
     young, poisson = (c[n].detach().requires_grad_() for n in ("young", "poisson"))
-    by_lame = torch.autograd.grad(moving.lame(young, poisson), (young, poisson), (adj_mu, adj_lam))
+    by_lame = torch.autograd.grad(stress.lame(young, poisson), (young, poisson), (adj_mu, adj_lam))
     assert_relative(by_lame[0], want["young"], LIMIT, "young")
     assert_relative(by_lame[1], want["poisson"], LIMIT, "poisson")
     adj_active = adj_inputs.tensors["active_stress"]
