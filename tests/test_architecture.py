@@ -18,7 +18,7 @@ LAYERS = """
     errors
     scene planning alarms kernels.structs
     checks
-    check_inputs
+    check_inputs check_state
     energy_density oracle.stress oracle.transfer oracle.walls
     oracle.moving oracle.step_limit kernels.physics check_nodes
     oracle.contact oracle.driven oracle.overlap oracle.mirror

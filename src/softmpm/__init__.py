@@ -9,7 +9,7 @@ differentiable in the start, the activation and the material:
 
 from softmpm.alarms import Alarms, Failures
 from softmpm.autograd import rasterize, simulate
-from softmpm.building import build
+from softmpm.building import StabilityWarning, build
 from softmpm.cuda_graph import Graph
 from softmpm.errors import UnstableError, noted
 from softmpm.forces import clamp_forces, contact_forces
@@ -42,7 +42,7 @@ from softmpm.scene.outline import Outline
 from softmpm.scene.polygons import inside
 from softmpm.scene.scene import Body, Grid, Particles, Scene, Wall
 from softmpm.scene.shapes import ball, box, image, mesh, polygons
-from softmpm.stability import StabilityWarning, StableDt, stable_dt
+from softmpm.stability import StableDt, stable_dt
 from softmpm.state import ContactForces, GridField, Low, Nodal, Params, State, SurfaceState
 from softmpm.trajectories import Trajectory, trajectory
 from softmpm.warp_api import step

@@ -11,7 +11,8 @@ from torch.autograd import forward_ad
 from softmpm.alarms import Failures
 from softmpm.batches import FirstOrder, FirstOrderAdjoint, refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
-from softmpm.checks import check_activation, check_finite, check_horizon, check_state
+from softmpm.check_state import check_finite, check_state
+from softmpm.checks import check_activation, check_horizon
 from softmpm.compiling import opaque
 from softmpm.errors import at, place
 from softmpm.inputs import Inputs, differentiable

@@ -1,5 +1,6 @@
 """``build``: a scene checked, a scheme chosen, and the model of both."""
 
+import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -22,7 +23,14 @@ from softmpm.model import Model
 from softmpm.scene.check_scene import check_precision, check_scene
 from softmpm.scene.scene import Scene
 from softmpm.schemes.registry import SCHEMES
-from softmpm.stability import need_stable, warn_sparse
+from softmpm.stability import need_stable
+
+APART = 1.4
+"""Cells between particles beyond which they share too few nodes: at 4/3 a body that was stretched springs back, at 3/2 it does not."""
+
+
+class StabilityWarning(UserWarning):
+    """The particles of a body are so far apart that numerical fracture occurs."""
 
 
 def build(
@@ -95,7 +103,7 @@ def build(
     check_precision(scene, dtype)
     if alarms.step is not None:
         need_stable(scene, alarms.step)
-    warn_sparse(scene)
+    _warn_sparse(scene)
     formulation, why = choose_formulation(scene, scheme, formulation)
     surface = on_surface(scene, formulation, contact, contact_width)
     if formulation == "reference":
@@ -137,6 +145,19 @@ def _check_settings(dtype: torch.dtype, scheme: str, deterministic: bool, contac
         raise TypeError(f"deterministic must be True or False, got {deterministic!r}.")
     if not 0.0 <= contact_width < 1.0:
         raise ValueError(f"contact_width must be in [0, 1) cells, got {contact_width!r}.")
+
+
+def _warn_sparse(scene: Scene) -> None:
+    """Warn of bodies whose particles are so far apart that numerical fracture occurs."""
+    for b, body in enumerate(scene.bodies):
+        apart = body.particles.spacing
+        if len(body.particles) > 1 and apart > APART * scene.grid.spacing:
+            warnings.warn(
+                f"body {b}: the mean particle spacing is {apart / scene.grid.spacing:.3g} cells (from particle volumes). Above {APART} "
+                f"cells numerical fracture occurs; use a spacing of about half a cell, {0.5 * scene.grid.spacing:.3g} m.",
+                StabilityWarning,
+                stacklevel=3,
+            )
 
 
 def _whole_bytes(budget: float | None) -> int | None:

@@ -8,12 +8,12 @@ import math
 import torch
 from torch import Tensor
 
-from softmpm.checks import Sizes, check_tensor, demand, fields
+from softmpm.checks import ModelLike, check_tensor, demand, fields
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.validate import need
 
 
-def check_inputs(model: Sizes, inputs: Inputs | None) -> dict[str, Tensor]:
+def check_inputs(model: ModelLike, inputs: Inputs | None) -> dict[str, Tensor]:
     """Inputs that are given, by name: such as the model was built for, with shapes that broadcast, its dtype and its device."""
     if inputs is None:
         return {}

@@ -6,7 +6,7 @@ Each message names the rule, the value received and a remedy.
 import torch
 from torch import Tensor
 
-from softmpm.checks import Sizes
+from softmpm.checks import ModelLike
 from softmpm.oracle.stress import det
 from softmpm.state import State
 from softmpm.validate import need
@@ -52,7 +52,7 @@ ASTRAY = 0.5
 """Largest distance along an axis between a particle and where its nodes show it [cells]."""
 
 
-def check_projected(model: Sizes, given: State, shown: State) -> None:
+def check_projected(model: ModelLike, given: State, shown: State) -> None:
     """The particles of a state without nodes are not inverted, and about where the nodes that were computed from them show them: these
     have one smooth displacement, by which a particle cannot be parted from its neighbours. Reads back once.
 

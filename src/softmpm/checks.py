@@ -1,9 +1,8 @@
-"""Rules of the tensors that meet a model; those of inputs are in ``check_inputs.py``, of nodes in ``check_nodes.py``.
+"""Rules of the tensors that meet a model; those of states are in ``check_state.py``, of inputs in ``check_inputs.py``.
 
 Each message names the rule, the value received and a remedy.
 """
 
-import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
@@ -15,11 +14,11 @@ from softmpm.alarms import Alarms
 from softmpm.inputs import QUANTITIES
 from softmpm.planning.chunks import Horizon
 from softmpm.scene.scene import Scene
-from softmpm.state import Low, Nodal, Params, State, SurfaceState
+from softmpm.state import Params
 from softmpm.validate import need
 
 
-class Sizes(Protocol):
+class ModelLike(Protocol):
     """Properties of a model that decide which tensors it accepts."""
 
     @property
@@ -57,78 +56,7 @@ MOST_SUBSTEPS = 100_000_000
 """Of one call: its chunks are listed beforehand."""
 
 
-def check_state(model: Sizes, state: State) -> None:
-    """Shape, dtype and device of x, v, C and F, and of the low-order parts if there are any."""
-    if not isinstance(state, State):
-        raise TypeError(f"state must be a softmpm.State, got {type(state).__name__}.")
-    lead, d = (model.worlds, model.particle_count), model.dim
-    shapes = {"x": (*lead, d), "v": (*lead, d), "C": (*lead, d, d), "F": (*lead, d, d)}
-    for name in shapes:
-        check_tensor(model, f"state.{name}", getattr(state, name), shapes[name])
-    for name, kind in (("low", Low), ("nodes", Nodal), ("surface", SurfaceState)):
-        part = getattr(state, name)
-        if not (part is None or isinstance(part, kind)):
-            raise TypeError(
-                f"state.{name} must be a softmpm.{kind.__name__} or None, got {type(part).__name__}; "
-                "state.of_worlds(...) takes some worlds of a state."
-            )
-    if state.nodes is not None:
-        _check_nodes(model, state.nodes)
-    if state.surface is not None:
-        _check_surface(model, state.surface)
-    if state.low is None:
-        return
-    if model.dtype != torch.float32:
-        raise ValueError(
-            f"state.low must be None in {model.dtype}, which has room for these remainders in x and F; take state.to({model.dtype}), "
-            "which adds them."
-        )
-    for name in ("x", "F"):
-        check_tensor(model, f"state.low.{name}", getattr(state.low, name), shapes[name])
-
-
-def _check_nodes(model: Sizes, nodes: Nodal) -> None:
-    """Shape, dtype and device of the nodal state, which only the reference formulation has."""
-    if model.formulation != "reference":
-        raise ValueError(
-            "state.nodes must be None with formulation='moving'; take state._replace(nodes=None), or build the model with "
-            "formulation='reference'."
-        )
-    shape = (model.worlds, model.rest_grid.count, model.dim)
-    wanted_shapes = {"u": shape, "v": shape, "anchor": model.anchor_shape, "force": model.anchor_shape}
-    for name, wanted in wanted_shapes.items():
-        check_tensor(model, f"state.nodes.{name}", getattr(nodes, name), wanted)
-    if nodes.reaction is not None:
-        check_tensor(model, "state.nodes.reaction", nodes.reaction, model.reaction_shape)
-    if nodes.shift is not None:
-        check_tensor(model, "state.nodes.shift", nodes.shift, (model.worlds, model.dim), torch.float64)
-    if nodes.low is not None:
-        check_tensor(model, "state.nodes.low", nodes.low, (shape[0], 2, *shape[1:]))
-
-
-def _check_surface(model: Sizes, surface: SurfaceState) -> None:
-    """Shape, dtype and device of the surface points, which only the moving formulation with contact at them has."""
-    if model.formulation != "moving" or model.anchor_shape[2] == 0:
-        raise ValueError(
-            "state.surface must be None unless formulation='moving' and contact='surface'; take state._replace(surface=None)."
-        )
-    shape = model.anchor_shape
-    for name in ("anchor", "force"):
-        check_tensor(model, f"state.surface.{name}", getattr(surface, name), shape)
-
-
-ALONE = 32_767
-"""Numbers of a tensor, at most, for which PyTorch uses the calling thread alone on a CPU."""
-
-
-def _total(tensor: Tensor) -> Tensor:
-    """Sum of a tensor, on a CPU in parts that PyTorch adds up in the calling thread (docs/decisions/0011-cpu-threads.md)."""
-    if tensor.device.type != "cpu" or tensor.numel() <= ALONE:
-        return tensor.sum()
-    return torch.stack([part.sum() for part in tensor.reshape(-1).split(ALONE)]).sum()
-
-
-def check_activation(model: Sizes, activation: Tensor | None) -> None:
+def check_activation(model: ModelLike, activation: Tensor | None) -> None:
     """Shape (control_step, world, muscle), dtype and device; None is no activation."""
     if activation is None:
         return
@@ -162,7 +90,7 @@ def _activation_hint(shape: tuple[int, ...], worlds: int, muscles: int) -> str:
     return f"the axes are control steps, {worlds} worlds and {muscles} muscles, in this order"
 
 
-def check_row(model: Sizes, activation: Tensor | None) -> None:
+def check_row(model: ModelLike, activation: Tensor | None) -> None:
     """Shape (world, muscle), dtype and device of one row of activation; None is no activation."""
     if activation is None:
         return
@@ -186,7 +114,7 @@ def check_horizon(steps: int, substeps: int) -> Horizon:
     return Horizon(steps, substeps)
 
 
-def check_params(model: Sizes, params: NamedTuple) -> None:
+def check_params(model: ModelLike, params: NamedTuple) -> None:
     """Shapes that broadcast to (world, particle), dtype and device of young, poisson and density."""
     for name, value in fields("params", params, Params._fields):
         check_tensor(model, f"params.{name}", value)
@@ -233,35 +161,6 @@ def check_bounds(params: NamedTuple, mass: Tensor, unit: Tensor) -> None:
         demand("mass = density * volume", mass, (mass >= least) & (mass <= most), rule)
 
 
-@torch.no_grad()
-def check_finite(state: State | None, activation: Tensor | None) -> None:
-    """All numbers that a call reads of a state, and the activation, are finite. Reads back once: a GPU has to wait."""
-    given = [] if state is None else list(_read(state))
-    given += [] if activation is None else [("activation", activation)]
-    if not given:
-        return
-    # A sum is finite only if all of it is, and takes one pass; few sums of finite numbers are not.
-    totals = [_total(value).double() for _, value in given]
-    for (name, value), total in zip(given, torch.stack(totals).tolist(), strict=True):
-        if not math.isfinite(total):
-            demand(name, value, torch.isfinite(value), "finite")
-
-
-def _read(state: State) -> Iterator[tuple[str, Tensor]]:
-    """The tensors of a state that a call reads, by name: all but mean forces of the last control step."""
-    parts = {
-        "state": (state, ("x", "v", "C", "F")),
-        "state.low": (state.low, ("x", "F")),
-        "state.nodes": (state.nodes, ("u", "v", "anchor", "shift", "low")),
-        "state.surface": (state.surface, ("anchor",)),
-    }
-    for place, (part, names) in parts.items():
-        for name in names if part is not None else ():
-            value = getattr(part, name)
-            if value is not None:
-                yield f"{place}.{name}", value
-
-
 def demand(name: str, value: Tensor, holds: Tensor, rule: str) -> None:
     """Raise ValueError for the first value that breaks the rule."""
     if not bool(holds.all()):
@@ -278,7 +177,7 @@ def fields(what: str, record: NamedTuple, names: tuple[str, ...]) -> Iterator[tu
 
 
 def check_tensor(
-    model: Sizes,
+    model: ModelLike,
     name: str,
     value: Tensor,
     shape: tuple[int, ...] | None = None,

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from softmpm.checks import check_state
+from softmpm.check_state import check_state
 from softmpm.compiling import opaque
 from softmpm.model import Model, check_model
 from softmpm.state import ContactForces, State

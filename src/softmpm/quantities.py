@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from softmpm.checks import check_broadcasts, check_params, check_state, check_tensor
+from softmpm.check_state import check_state
+from softmpm.checks import check_broadcasts, check_params, check_tensor
 from softmpm.energy_density import DENSITIES
 from softmpm.model import Model, check_model
 from softmpm.oracle.stress import lame

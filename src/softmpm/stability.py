@@ -16,7 +16,6 @@ shrinks with stretch; half of that at rest leaves room for a stretch of 1.7 (fix
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -33,13 +32,6 @@ from softmpm.scene.materials import Material
 from softmpm.scene.scene import Scene
 from softmpm.state import Params
 from softmpm.validate import need
-
-APART = 1.4
-"""Cells between particles beyond which they share too few nodes: at 4/3 a body that was stretched springs back, at 3/2 it does not."""
-
-
-class StabilityWarning(UserWarning):
-    """The particles of a body are so far apart that numerical fracture occurs."""
 
 
 class StableDt(float):
@@ -146,19 +138,6 @@ def need_stable(scene: Scene, most: float) -> None:
         f"that ratio must stay within {most:.7g}. Use a dt of about {0.5 * most * limit:.2g} s, which leaves room for stretch, "
         "or a coarser grid; build(..., alarms=softmpm.Alarms(step=None)) runs it all the same.",
     )
-
-
-def warn_sparse(scene: Scene, *, stacklevel: int = 3) -> None:
-    """Warn of bodies whose particles are so far apart that numerical fracture occurs."""
-    for b, body in enumerate(scene.bodies):
-        apart = body.particles.spacing
-        if len(body.particles) > 1 and apart > APART * scene.grid.spacing:
-            warnings.warn(
-                f"body {b}: the mean particle spacing is {apart / scene.grid.spacing:.3g} cells (from particle volumes). Above {APART} "
-                f"cells numerical fracture occurs; use a spacing of about half a cell, {0.5 * scene.grid.spacing:.3g} m.",
-                StabilityWarning,
-                stacklevel=stacklevel,
-            )
 
 
 class _Group(NamedTuple):

@@ -11,7 +11,8 @@ from softmpm.autograd import cast, simulate
 from softmpm.batches import refuse_batches
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, steps_of
 from softmpm.check_inputs import control_steps as steps_of_call
-from softmpm.checks import check_activation, check_finite, check_horizon, check_state, check_whole
+from softmpm.check_state import check_finite, check_state
+from softmpm.checks import check_activation, check_horizon, check_whole
 from softmpm.errors import noted
 from softmpm.inputs import QUANTITIES, Inputs
 from softmpm.kernel_inputs import expanded, velocity_to

@@ -8,7 +8,8 @@ import warp as wp
 from torch import Tensor
 
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
-from softmpm.checks import check_finite, check_params, check_row, check_state
+from softmpm.check_state import check_finite, check_state
+from softmpm.checks import check_params, check_row
 from softmpm.inputs import INPUTS, Input, Inputs, differentiable, stored
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import element_type

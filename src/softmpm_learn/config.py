@@ -15,7 +15,7 @@ from pathlib import Path
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from softmpm_learn.register import CHOICES
-from softmpm_learn.setting_checks import typed
+from softmpm_learn.setting_checks import one_of, typed
 from softmpm_learn.settings import (
     DesignConf,
     LearningConf,
@@ -50,9 +50,8 @@ class DeviceConf:
 
     def __post_init__(self):
         typed("device", self)
-        for name, value, known in (("name", self.name, DEVICES), ("dtype", self.dtype, DTYPES)):
-            if value not in known:
-                raise ValueError(f"device.{name} must be one of {', '.join(known)}; got {value!r}.")
+        one_of("device.name", self.name, DEVICES)
+        one_of("device.dtype", self.dtype, DTYPES)
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"device.threads must be at least 1 or null, got {self.threads}.")
         if self.memory is not None and not 0 < self.memory < math.inf:

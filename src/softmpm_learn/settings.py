@@ -7,7 +7,7 @@ elsewhere name their source. A wrong value fails where the settings are made, in
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
@@ -292,19 +292,21 @@ class Settings:
         Args:
             encoded: Whether the observer's features are those of an encoder, to which the task's ``feature_gain`` applies.
         """
-        optimizer, policy, train = self.optimizer, self.policy, self.train
-        if optimizer.policy_rate is None:
-            optimizer = dataclasses.replace(optimizer, policy_rate=task.rate)
-        if optimizer.fade is None:
-            optimizer = dataclasses.replace(optimizer, fade=task.fade)
-        if optimizer.restart_above is None:
-            optimizer = dataclasses.replace(optimizer, restart_above=task.worth)
-        if policy.gain is None:
-            policy = dataclasses.replace(policy, gain=task.gain)
-        if policy.clock is None:
-            policy = dataclasses.replace(policy, clock=task.clock)
-        if policy.feature_gain is None:
-            policy = dataclasses.replace(policy, feature_gain=task.feature_gain if encoded else 1.0)
-        if train.endurance is None:
-            train = dataclasses.replace(train, endurance=task.endurance)
-        return dataclasses.replace(self, optimizer=optimizer, policy=policy, train=train)
+        feature_gain = task.feature_gain if encoded else 1.0
+        return dataclasses.replace(
+            self,
+            optimizer=_filled(
+                self.optimizer, policy_rate=task.rate, fade=task.fade, restart_above=task.worth
+            ),
+            policy=_filled(self.policy, gain=task.gain, clock=task.clock, feature_gain=feature_gain),
+            train=_filled(self.train, endurance=task.endurance),
+        )
+
+
+Conf = TypeVar("Conf", OptimizerConf, PolicyConf, TrainConf)
+
+
+def _filled(conf: Conf, **values: Any) -> Conf:
+    """A part of the settings with these values where it has None."""
+    missing = {name: value for name, value in values.items() if getattr(conf, name) is None}
+    return dataclasses.replace(conf, **missing)

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from softmpm.checks import (
-    check_activation,
-    check_bounds,
-    check_finite,
-    check_params,
-    check_state,
-    check_whole,
-)
+from softmpm.check_state import check_finite, check_state
+from softmpm.checks import check_activation, check_bounds, check_params, check_whole
 from softmpm.state import Low, Nodal, Params, State, SurfaceState
 
 MODEL = SimpleNamespace(

@@ -11,11 +11,12 @@ import pytest
 import torch
 
 import softmpm
+from softmpm.building import StabilityWarning
 from softmpm.oracle import stress as oracle_stress
 from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Body, Grid, Particles, Scene
-from softmpm.stability import StabilityWarning, need_stable, running_limit, stable_dt
+from softmpm.stability import need_stable, running_limit, stable_dt
 
 DX, RHO = 0.1, 2.0
 

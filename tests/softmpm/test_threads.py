@@ -8,7 +8,7 @@ from surface_scenes import made, slab
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import softmpm
-from softmpm.checks import ALONE
+from softmpm.check_state import ALONE
 from softmpm.schemes import program
 from softmpm.schemes.lagrangian.bricks import NODE_PART
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from softmpm.checks import check_state
+from softmpm.check_state import check_state
 from softmpm.model import Model
 from softmpm.pictures.camera import Camera
 from softmpm.pictures.colouring import QUANTITIES, Colouring, coloured, values_of

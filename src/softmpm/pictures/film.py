@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from softmpm.checks import check_state
+from softmpm.check_state import check_state
 from softmpm.model import Model, check_model
 from softmpm.pictures.colouring import QUANTITIES, coloured, values_of
 from softmpm.pictures.figure import longest, panels_of

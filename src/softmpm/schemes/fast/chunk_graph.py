@@ -13,7 +13,7 @@ from softmpm.schemes.fast.chunk_buffers import ChunkBuffers
 from softmpm.schemes.fast.launches import launch_chunk
 from softmpm.schemes.fast.launches_adj import launch_chunk_adj
 from softmpm.schemes.fast.particle_order import ParticleLayout
-from softmpm.schemes.launch import KernelLauncher, LaunchReplay
+from softmpm.schemes.launch import LaunchReplay
 
 
 class ChunkGraph:
@@ -29,10 +29,7 @@ class ChunkGraph:
 
     def run(self, stream: wp.Stream | None) -> None:
         """Launch all substeps on what the buffers hold."""
-        self._replay.run(stream, self._launch)
-
-    def _launch(self, launch: KernelLauncher) -> None:
-        launch_chunk(self.buffers, launch)
+        self._replay.run(stream, lambda launch: launch_chunk(self.buffers, launch))
 
 
 class ChunkGraphAdj:
@@ -44,7 +41,4 @@ class ChunkGraphAdj:
 
     def run(self, stream: wp.Stream | None) -> None:
         """Turn the adjoint of the final state in the buffers into that of the initial state."""
-        self._replay.run(stream, self._launch)
-
-    def _launch(self, launch: KernelLauncher) -> None:
-        launch_chunk_adj(self.buffers, launch)
+        self._replay.run(stream, lambda launch: launch_chunk_adj(self.buffers, launch))
