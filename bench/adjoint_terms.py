@@ -51,6 +51,8 @@ STRUCTS = (
         "gather_adj",
         "slope_adj",
         "node_velocity_adj",
+        "after_free_adj",
+        "free_adj",
         "viscous_stress_adj",
         "respond_adj",
         "slide_adj",

@@ -23,7 +23,8 @@ from softmpm.kernels.dependent import await_previous
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.gather import stencil
 from softmpm.kernels.fast.native import NATIVE, native
-from softmpm.kernels.physics.grid import grid, grid_adj
+from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.physics.grid_adj import grid_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
@@ -109,10 +110,8 @@ def contact_stage_adj(spec: Spec, wanted: RequestedGrads) -> wp.Kernel:
     Point, Particles, ParticlesAdj = point.Point, point.Particles, point.ParticlesAdj
     point_of, add_load, push = point.point_of, surface(spec, True).add_load, surface(spec, True).push
     place_of, node_velocity = fused(spec).place_of, grid(spec).node_velocity
-    node_velocity_adj, add_load_adj = (
-        grid_adj(spec, wanted).node_velocity_adj,
-        loads_adj(dim, spec.dtype, True),
-    )
+    node_velocity_adj = grid_adj(spec, wanted).node_velocity_adj
+    add_load_adj = loads_adj(dim, spec.dtype, True)
     aligned, head, world_of = s.aligned, s.head, s.world_of
     load_node, store_node = native(dim, spec.dtype).load_node, native(dim, spec.dtype).store_node
 

@@ -24,7 +24,8 @@ from softmpm.kernels.fast.gather_adj import stencil_adj
 from softmpm.kernels.fast.native import BLOCK, NATIVE, native
 from softmpm.kernels.fast.slabs import slabs
 from softmpm.kernels.physics import status
-from softmpm.kernels.physics.grid import grid, grid_adj
+from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.physics.grid_adj import grid_adj
 from softmpm.kernels.physics.particle import particle, particle_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 

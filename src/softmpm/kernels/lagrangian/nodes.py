@@ -24,7 +24,8 @@ from softmpm.kernels.lagrangian.record import record
 from softmpm.kernels.lagrangian.rest import LAGRANGIAN, rest
 from softmpm.kernels.lagrangian.rows import rows
 from softmpm.kernels.physics import status
-from softmpm.kernels.physics.grid import grid, grid_adj
+from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.physics.grid_adj import grid_adj
 from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input_types, types
 
 
@@ -33,19 +34,15 @@ def nodes(spec: Spec) -> SimpleNamespace:
     t, r, g = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), grid(spec)
     real, vec, Constants, Rest = t.real, t.vec, t.Constants, r.Rest
     exact_vec, GridInputs = types(spec.dim, "float64").vec, input_types(spec).GridInputs
-    position, increment, after_free, sums = (
-        g.position,
-        g.increment,
-        g.after_free,
-        gathering(spec.dim, spec.dtype),
-    )
-    Entries, entries_of, gathered, surface = (
-        sums.Entries,
-        sums.entries_of,
-        sums.gathered,
-        bool(spec.surface_walls),
-    )
-    apart = surface and not spec.constrained  # nodes that no surface points act on are done here
+    position = g.position
+    increment = g.increment
+    after_free = g.after_free
+    sums = gathering(spec.dim, spec.dtype)
+    Entries = sums.Entries
+    entries_of = sums.entries_of
+    gathered = sums.gathered
+    surface = bool(spec.surface_walls)
+    done_here = not (surface and spec.constrained)  # nodes that no surface points act on
     f, running = frame(spec.dim, spec.dtype), status.report(spec.dim, spec.dtype).running
     Frame, recentring, exact, memory = f.Frame, f.recentring, f.exact, chunk(spec.dim, spec.dtype)
     Chunk, state_of, u_of, store = memory.Chunk, memory.state_of, memory.u_of, record(spec).store
@@ -117,15 +114,11 @@ def nodes(spec: Spec) -> SimpleNamespace:
             at.shift[then, world] = shift + exact(d)
         if wp.static(surface):
             row(at.free, world)[i] = new
-        if wp.static(apart):
+        if wp.static(done_here):
             if node.touched < 0:
                 new_u[i] = here
                 lost_u[i] = low_u
                 row(at.v, then, world)[i] = new
-        if wp.static(not surface):
-            new_u[i] = here
-            lost_u[i] = low_u
-            row(at.v, then, world)[i] = new
 
     @kernel(LAGRANGIAN)
     def advance(
@@ -153,11 +146,9 @@ def nodes_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     after_free_adj, sums = grid_adj(spec, wanted).after_free_adj, gathering(spec.dim, spec.dtype)
     entries_of, gathered, Node, node_of = sums.entries_of, sums.gathered, one.Node, one.node_of
     viscous, surface, moving = spec.viscosity, bool(spec.surface_walls), spec.moving
-    constrained, memory, exact = (
-        spec.constrained,
-        chunk(spec.dim, spec.dtype),
-        frame(spec.dim, spec.dtype).exact,
-    )
+    constrained = spec.constrained
+    memory = chunk(spec.dim, spec.dtype)
+    exact = frame(spec.dim, spec.dtype).exact
     Chunk, Adjoint, stored = memory.Chunk, memory.Adjoint, record(spec).stored
     row = rows(spec.dim, spec.dtype)
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from softmpm.errors import NEVER
 from softmpm.kernels.compile import launch
 from softmpm.kernels.convert import conversion
-from softmpm.kernels.physics.grid import grid, grid_adj
+from softmpm.kernels.physics.grid import grid
+from softmpm.kernels.physics.grid_adj import grid_adj
 from softmpm.kernels.plain.transfer import transfer, transfer_adj
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
