@@ -273,10 +273,8 @@ class Model:
         )
 
     def __repr__(self) -> str:
-        particles, muscles = (
-            counted(self.particle_count, "particle"),
-            counted(self.muscle_count, "muscle"),
-        )
+        particles = counted(self.particle_count, "particle")
+        muscles = counted(self.muscle_count, "muscle")
         sizes = f"{counted(self.worlds, 'world')} of {particles} and {muscles}"
         return f"Model({self.dim}D, {self.spec.dtype} on {self.device}, {sizes}, {self.scheme} scheme, dt {self.scene.dt:.4g} s)"
 

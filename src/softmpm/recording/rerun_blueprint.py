@@ -66,10 +66,8 @@ def _space(source: Recording, show: Show, name: str, contents: list[str]):
 def legend(source: Recording) -> str:
     """Meaning of red and blue, and of strokes."""
     fibres = source.static["muscle_direction"].any(axis=1)  # zero for a pressure
-    muscles, pressures = (
-        "muscles: red pulls, blue pushes, strokes are fibres",
-        "pressures: red expands, blue contracts",
-    )
+    muscles = "muscles: red pulls, blue pushes, strokes are fibres"
+    pressures = "pressures: red expands, blue contracts"
     if fibres.all():
         return muscles
     return f"{muscles}; {pressures}" if fibres.any() else pressures

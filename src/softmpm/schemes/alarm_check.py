@@ -32,10 +32,8 @@ class StartCheck:
     def __init__(self, model: Model):
         self.model, t = model, types(model.spec.dim, model.spec.dtype)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
-        inputs, places = (
-            particle_struct(model, model.fixed),
-            [placeholder(model, t.vec), placeholder(model, t.mat)],
-        )
+        inputs = particle_struct(model, model.fixed)
+        places = [placeholder(model, t.vec), placeholder(model, t.mat)]
         self._open = [
             one for one in stored(model.spec) if one.stage != "grid" and one.name not in model.fixed
         ]

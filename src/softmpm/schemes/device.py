@@ -1,6 +1,7 @@
 """PyTorch's current GPU and stream, for Warp."""
 
 import functools
+import weakref
 from collections.abc import Callable
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -35,3 +36,10 @@ def stream_of(device: torch.device) -> wp.Stream | None:
 def _known_stream(device: torch.device, handle: int) -> wp.Stream:
     """The Warp stream of a handle, created once: Warp registers a stream on creation and unregisters it on deletion."""
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+
+
+def of_this_stream(kind: Callable[[Model], T], model: Model) -> T:
+    """The object of this kind for the current thread and stream, cached in the model's workspace; it refers to the model weakly, to
+    avoid a cycle."""
+    stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
+    return model.workspace.get((kind, stream), lambda: kind(weakref.proxy(model)))

@@ -99,13 +99,11 @@ def surface_point(dim: int, dtype: str, packed: bool) -> SimpleNamespace:
         return out
 
     if packed:
-        n, unpack_base, row_fx, row_low, row_H = (
-            native(dim, dtype),
-            stencil(dim, dtype).unpack_base,
-            t.row_fx,
-            t.row_low,
-            t.row_h,
-        )
+        n = native(dim, dtype)
+        unpack_base = stencil(dim, dtype).unpack_base
+        row_fx = t.row_fx
+        row_low = t.row_low
+        row_H = t.row_h
         load_vec, load_mat, load_base, rows = n.early.vector, n.early.matrix, n.early.base, t.rows
 
         @wp.func

@@ -27,12 +27,10 @@ from softmpm.kernels.structs import RequestedGrads, Spec, input_adj_types, input
 @kernel_factory
 def loads_adj(dim: int, dtype: str, packed: bool) -> wp.Function:
     """Function of a point's part in L̄ (K9.adj)"""
-    t, s, point, Outline = (
-        types(dim, dtype),
-        spline(dim, dtype),
-        surface_point(dim, dtype, packed),
-        outline_type(dim, dtype),
-    )
+    t = types(dim, dtype)
+    s = spline(dim, dtype)
+    point = surface_point(dim, dtype, packed)
+    Outline = outline_type(dim, dtype)
     real, vec, Constants, Window = t.real, t.vec, t.Constants, t.Window
     Point, ParticlesAdj, PlaceAdj = point.Point, point.ParticlesAdj, point.PlaceAdj
     share, with_share_adj, add_place_adj = point.share, point.with_share_adj, point.add_place_adj
@@ -73,12 +71,10 @@ def surface_adj(spec: Spec, wanted: RequestedGrads, packed: bool, single: bool) 
     dim, t, s = spec.dim, types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype)
     real, vec, node_vec, Constants, Window, pack = t.real, t.vec, t.node, t.Constants, t.Window, s.pack
     point, Outline = surface_point(dim, spec.dtype, packed), outline_type(dim, spec.dtype)
-    Point, Particles, ParticlesAdj, PlaceAdj = (
-        point.Point,
-        point.Particles,
-        point.ParticlesAdj,
-        point.PlaceAdj,
-    )
+    Point = point.Point
+    Particles = point.Particles
+    ParticlesAdj = point.ParticlesAdj
+    PlaceAdj = point.PlaceAdj
     point_of, share, with_share_adj = point.point_of, point.share, point.with_share_adj
     add_place_adj = point.add_place_adj
     load_state, load_velocity, load_number = point.load_state, point.load_velocity, point.load_number

@@ -116,7 +116,7 @@ class Bricks(NamedTuple):
         """Of kernels that have bricks."""
         return dict(grid_stride=False, launch_bounds=(self.threads, self.blocks))
 
-    def layer_settings(self, warps: int = 0) -> dict:
+    def layer_settings(self, warps: int) -> dict:
         """Of kernels that have bricks of a lattice, with so many warps in a multiprocessor at least."""
         bounds = (self.layer_threads, max(self.blocks, warps // -(-self.layer_threads // 32)))
         return dict(grid_stride=False, launch_bounds=bounds)

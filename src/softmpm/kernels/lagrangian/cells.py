@@ -144,11 +144,9 @@ def cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
 
 @kernel_factory
 def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNamespace:
-    t, Rest, one = (
-        types(spec.dim, spec.dtype),
-        rest(spec.dim, spec.dtype).Rest,
-        particle_forces_adj(spec, wanted),
-    )
+    t = types(spec.dim, spec.dtype)
+    Rest = rest(spec.dim, spec.dtype).Rest
+    one = particle_forces_adj(spec, wanted)
     vec, mat, Constants, dim = t.vec, t.mat, t.Constants, spec.dim
     ParticleInputs = input_types(spec).ParticleInputs
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
@@ -156,11 +154,9 @@ def cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNames
     of_u, of_f, of_v = (field(dim, spec.dtype, bricks, number) for number in range(3))
     stage_u, stage_f, stage_v = of_u.stage_at, of_f.stage_at, of_v.stage_at
     gradient_u, gradient_f, gradient_v, value_f = of_u.gradient, of_f.gradient, of_v.gradient, of_f.value
-    one_sum, both, viscous = (
-        sums(dim, spec.dtype, bricks, False),
-        pair_sums(dim, spec.dtype, bricks),
-        spec.viscosity,
-    )
+    one_sum = sums(dim, spec.dtype, bricks, False)
+    both = pair_sums(dim, spec.dtype, bricks)
+    viscous = spec.viscosity
     clear, add, write, add_both, write_both = one_sum.clear, one_sum.add, one_sum.write, both.add, both.write
     lines, loaded = both.Lines if viscous else one_sum.line, "force" in wanted
     seat = seats(spec, bricks)

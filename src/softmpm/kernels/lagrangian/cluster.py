@@ -90,20 +90,16 @@ def numbering(cluster: Cluster) -> SimpleNamespace:
 @kernel_factory
 def holdings(spec: Spec, cluster: Cluster) -> SimpleNamespace:
     """Each thread holds the first of its bricks, nodes, points and touched nodes, which is mostly the only one, and rereads others."""
-    t, r, bricks, contact = (
-        types(spec.dim, spec.dtype),
-        rest(spec.dim, spec.dtype),
-        cluster.bricks,
-        bool(spec.surface_walls),
-    )
+    t = types(spec.dim, spec.dtype)
+    r = rest(spec.dim, spec.dtype)
+    bricks = cluster.bricks
+    contact = bool(spec.surface_walls)
     real, Constants, Rest, ParticleInputs = t.real, t.Constants, r.Rest, input_types(spec).ParticleInputs
     seat = lattice_seats(spec, bricks) if bricks.lattice else seats(spec, bricks)
     Seat, seat_of, Node, node_of = seat.Seat, seat.seat_of, nodes(spec).Node, nodes(spec).node_of
-    Surface, sums, lanes = (
-        surface_type(spec.dim, spec.dtype),
-        surface_sums(spec.dim, spec.dtype),
-        cluster.lanes,
-    )
+    Surface = surface_type(spec.dim, spec.dtype)
+    sums = surface_sums(spec.dim, spec.dtype)
+    lanes = cluster.lanes
     Point, point_of, Touched, touched_of = sums.Point, sums.point_of, sums.Touched, sums.touched_of
     number, size, blocks = numbering(cluster).number, cluster.group_threads, cluster.blocks
     roomy, alone = cluster.roomy, cluster.alone

@@ -172,17 +172,13 @@ def sums(dim: int, dtype: str, bricks: Bricks, loaded: bool) -> SimpleNamespace:
     """
     t, r = types(dim, dtype), rest(dim, dtype)
     real, vec, mat, Rest, weights, lean = t.real, t.vec, t.mat, r.Rest, r.weights, r.lean
-    nodes, cells, parts, slots, serial = (
-        bricks.nodes,
-        bricks.cell_count,
-        bricks.parts,
-        bricks.slots,
-        bricks.serial,
-    )
-    memory, add_of_one = (
-        exchange(dim, dtype, bricks, dim + (2 if loaded else 1), 1),
-        fours(dim, dtype, bricks).add,
-    )
+    nodes = bricks.nodes
+    cells = bricks.cell_count
+    parts = bricks.parts
+    slots = bricks.slots
+    serial = bricks.serial
+    memory = exchange(dim, dtype, bricks, dim + (2 if loaded else 1), 1)
+    add_of_one = fours(dim, dtype, bricks).add
     line, give, given, write_shared = memory.line, memory.give, memory.taken, memory.write
 
     if dim == 2:

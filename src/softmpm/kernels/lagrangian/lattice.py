@@ -120,11 +120,9 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
 @kernel_factory
 def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> SimpleNamespace:
     """As :func:`cells_adj`, for particles on a lattice without external forces of their own."""
-    t, Rest, one = (
-        types(spec.dim, spec.dtype),
-        rest(spec.dim, spec.dtype).Rest,
-        particle_forces_adj(spec, wanted),
-    )
+    t = types(spec.dim, spec.dtype)
+    Rest = rest(spec.dim, spec.dtype).Rest
+    one = particle_forces_adj(spec, wanted)
     Constants, dim = t.Constants, spec.dim
     ParticleInputs = input_types(spec).ParticleInputs
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
@@ -135,7 +133,6 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     stage_u, stage_f, stage_v = of_u.stage_at, of_f.stage_at, of_v.stage_at
     clear, viscous = sums(dim, spec.dtype, bricks, False).clear, spec.viscosity
     Lattice, block, places_of = one_layer.Lattice, one_layer.block, one_layer.places_of
-    Seat, seat_of = lattice_seats(spec, bricks).Seat, lattice_seats(spec, bricks).seat_of
     taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
     gradients_u, gradients_f, gradients_v = one_layer.gradients
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial

@@ -97,11 +97,9 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
 def lattice_seats(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     """As :func:`seats`."""
     Rest, ParticleInputs = rest(spec.dim, spec.dtype).Rest, input_types(spec).ParticleInputs
-    windows, one, count = (
-        window(bricks, bricks.layer_threads),
-        layers(spec.dim, spec.dtype, bricks),
-        bricks.cell_count,
-    )
+    windows = window(bricks, bricks.layer_threads)
+    one = layers(spec.dim, spec.dtype, bricks)
+    count = bricks.cell_count
     Window, window_of, Places, places_of = windows.Window, windows.window_of, one.Places, one.places_of
 
     @wp.struct

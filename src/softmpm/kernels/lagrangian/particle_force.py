@@ -172,4 +172,4 @@ def particle_forces_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
         if not wp.isfinite(wp.ddot(adj.F, adj.F) + wp.ddot(adj.rate, adj.rate)):
             report(words, world, substep, bad_gradient, p)
 
-    return SimpleNamespace(forced_adj=forced_adj, check_adj=check_adj, ForceAdj=ForceAdj)
+    return SimpleNamespace(forced_adj=forced_adj, check_adj=check_adj)

@@ -17,11 +17,9 @@ def seats(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     vec, Rest = types(spec.dim, spec.dtype).vec, rest(spec.dim, spec.dtype).Rest
     ParticleInputs, one, count = input_types(spec).ParticleInputs, particle_forces(spec), bricks.cell_count
     Given, given_to, windows = one.Given, one.given_to, window(bricks, bricks.threads)
-    Window, window_of, place_of = (
-        windows.Window,
-        windows.window_of,
-        sums(spec.dim, spec.dtype, bricks, False).place_of,
-    )
+    Window = windows.Window
+    window_of = windows.window_of
+    place_of = sums(spec.dim, spec.dtype, bricks, False).place_of
 
     @wp.struct
     class Occupant:
@@ -58,4 +56,4 @@ def seats(spec: Spec, bricks: Bricks) -> SimpleNamespace:
         out.occupant = occupant_of(inside, inputs, world, out.first, lane)
         return out
 
-    return SimpleNamespace(Occupant=Occupant, Seat=Seat, occupant_of=occupant_of, seat_of=seat_of)
+    return SimpleNamespace(Seat=Seat, occupant_of=occupant_of, seat_of=seat_of)

@@ -32,11 +32,9 @@ from softmpm.kernels.structs import Spec, input_types, types
 def surface(spec: Spec) -> SimpleNamespace:
     t, r, walls = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), wall_faces(spec)
     real, vec, Constants, dim = t.real, t.vec, t.Constants, spec.dim
-    exact_vec, GridInputs, Surface = (
-        types(dim, "float64").vec,
-        input_types(spec).GridInputs,
-        surface_type(dim, spec.dtype),
-    )
+    exact_vec = types(dim, "float64").vec
+    GridInputs = input_types(spec).GridInputs
+    Surface = surface_type(dim, spec.dtype)
     faces_of, meet, count, number, vecs = walls.faces_of, walls.meet, walls.count, walls.number, walls.vecs
     across, depth = surface_contact(dim, spec.dtype).across, wall_face(spec).depth
     in_wall, f = int(Kind.IN_WALL), frame(dim, spec.dtype)
@@ -174,7 +172,6 @@ def surface(spec: Spec) -> SimpleNamespace:
     @kernel(LAGRANGIAN)
     def check_depth(
         # Parameters:
-        constants: Constants,
         inputs: GridInputs,
         body: Surface,
         later: wp.float64,  # than the inputs [s]

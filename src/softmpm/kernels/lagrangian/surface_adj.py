@@ -31,11 +31,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, r, walls = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype), wall_faces(spec)
     real, vec, Constants, Rest, dim = t.real, t.vec, t.Constants, r.Rest, spec.dim
     GridInputs, GridInputsAdj = input_types(spec).GridInputs, input_adj_types(spec, wanted).GridInputsAdj
-    Surface, face_adj, after_free = (
-        surface_type(dim, spec.dtype),
-        wall_face_adj(spec, wanted),
-        grid(spec).after_free,
-    )
+    Surface = surface_type(dim, spec.dtype)
+    face_adj = wall_face_adj(spec, wanted)
+    after_free = grid(spec).after_free
     faces_of, meet, meet_adj = walls.faces_of, walls.meet, walls.meet_adj
     count, number, vecs, reals = walls.count, walls.number, walls.vecs, walls.reals
     mirrored, constrained, rough = bool(spec.mirrors), spec.constrained, "friction" in wanted

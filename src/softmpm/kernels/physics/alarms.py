@@ -28,10 +28,8 @@ def alarm(spec: Spec) -> SimpleNamespace:
     """Blocks of one particle: is its step stable, and is a neighbour too far away."""
     t, wanted = types(spec.dim, spec.dtype), RequestedGrads()
     real, vec, mat, ivec, Constants = t.real, t.vec, t.mat, t.ivec, t.Constants
-    ParticleInputs, ParticleInputsAdj = (
-        input_types(spec).ParticleInputs,
-        input_adj_types(spec, wanted).ParticleInputsAdj,
-    )
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     total, stress_adj = total_stress(spec), total_stress_adj(spec, wanted).stress_adj
     rotation, stiffness_bound, largest_square = total.rotation, total.stiffness_bound, total.largest_square
     identity, dim, steps = kinematics(spec.dim, spec.dtype).identity, spec.dim, STEPS[spec.dim]

@@ -124,18 +124,14 @@ def particle(spec: Spec) -> SimpleNamespace:
 def particle_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     t, one = types(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, Constants, divide = t.real, t.vec, t.mat, t.Constants, t.divide
-    ParticleInputs, ParticleInputsAdj = (
-        input_types(spec).ParticleInputs,
-        input_adj_types(spec, wanted).ParticleInputsAdj,
-    )
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     stress_adj, impulse, identity = total_stress_adj(spec, wanted).stress_adj, one.impulse, one.identity
     viscous_stress_adj = viscosity(spec.dim, spec.dtype).viscous_stress_adj
-    moduli, viscous, driven, material_of = (
-        "material" in wanted,
-        spec.viscosity,
-        spec.driven,
-        material(spec).material_of,
-    )
+    moduli = "material" in wanted
+    viscous = spec.viscosity
+    driven = spec.driven
+    material_of = material(spec).material_of
     forced, steered = "force" in wanted, "velocity" in wanted
 
     @wp.struct

@@ -16,11 +16,9 @@ from softmpm.kernels.structs import Spec, input_types, types
 
 @kernel_factory
 def rest_step(spec: Spec) -> SimpleNamespace:
-    t, k, material_of = (
-        types(spec.dim, spec.dtype),
-        kinematics(spec.dim, spec.dtype),
-        material(spec).material_of,
-    )
+    t = types(spec.dim, spec.dtype)
+    k = kinematics(spec.dim, spec.dtype)
+    material_of = material(spec).material_of
     real, mat, Constants, ParticleInputs = t.real, t.mat, t.Constants, input_types(spec).ParticleInputs
     slots, Moduli = spec.muscle_slots, moduli_type(spec.dtype)
     identity, volume_change = k.identity, k.volume_change

@@ -143,11 +143,9 @@ def wall_face_adj(spec: Spec, wanted: RequestedGrads) -> wp.Function:
 @kernel_factory
 def wall_faces(spec: Spec) -> SimpleNamespace:
     """All separating walls, and the contact of a surface point with one of them, wall ``q`` among them."""
-    t, exact_vec, GridInputs = (
-        types(spec.dim, spec.dtype),
-        types(spec.dim, "float64").vec,
-        input_types(spec).GridInputs,
-    )
+    t = types(spec.dim, spec.dtype)
+    exact_vec = types(spec.dim, "float64").vec
+    GridInputs = input_types(spec).GridInputs
     real, vec, Constants, face = t.real, t.vec, t.Constants, wall_face(spec).face
     one, walls = surface_contact(spec.dim, spec.dtype), spec.surface_walls
     Touch, touch, TouchAdj, touch_adj = one.Touch, one.touch, one.TouchAdj, one.touch_adj

@@ -43,12 +43,10 @@ def transfer_adj(spec: Spec, wanted: RequestedGrads, ordered: bool = False) -> S
 @kernel_factory
 def _p2g(spec: Spec, ordered: bool):
     t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle(spec)
-    node_vec, Constants, Motion, ParticleInputs = (
-        t.node,
-        t.Constants,
-        t.Motion,
-        input_types(spec).ParticleInputs,
-    )
+    node_vec = t.node
+    Constants = t.Constants
+    Motion = t.Motion
+    ParticleInputs = input_types(spec).ParticleInputs
     weights, offset, position, weight, node_index = s.weights, s.offset, s.position, s.weight, s.node_index
     rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
     pack, define = s.pack, kernel_in_order(s.count) if ordered else kernel()
@@ -147,10 +145,8 @@ def _p2g_adj(spec: Spec, wanted: RequestedGrads):
     t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle(spec)
     real, vec, mat, node_vec, dim = t.real, t.vec, t.mat, t.node, spec.dim
     Constants, Motion, MotionAdj = t.Constants, t.Motion, t.MotionAdj
-    ParticleInputs, ParticleInputsAdj = (
-        input_types(spec).ParticleInputs,
-        input_adj_types(spec, wanted).ParticleInputsAdj,
-    )
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index, momentum = s.weight, s.weight_slope, s.node_index, s.momentum
     rotation, linear_momentum, affine_momentum = one.rotation, one.linear_momentum, one.affine_momentum
@@ -218,10 +214,8 @@ def _p2g_adj(spec: Spec, wanted: RequestedGrads):
 def _g2p_adj(spec: Spec, wanted: RequestedGrads, ordered: bool):
     t, s, one = types(spec.dim, spec.dtype), spline(spec.dim, spec.dtype), particle_adj(spec, wanted)
     vec, Constants, Motion, MotionAdj = t.vec, t.Constants, t.Motion, t.MotionAdj
-    ParticleInputs, ParticleInputsAdj = (
-        input_types(spec).ParticleInputs,
-        input_adj_types(spec, wanted).ParticleInputsAdj,
-    )
+    ParticleInputs = input_types(spec).ParticleInputs
+    ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     weights, slopes, offset, position = s.weights, s.slopes, s.offset, s.position
     weight, weight_slope, node_index = s.weight, s.weight_slope, s.node_index
     ParticleAdj, moved_adj = one.ParticleAdj, one.moved_adj

@@ -45,10 +45,8 @@ def _grid(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) -> None:
     if model.spec.moving and not (last or first):  # the walls have another pose in each
         stages = [(s, now, nothing), (s - 1, nothing, then)]
     for k, now, then in stages:
-        inputs, adj_inputs = (
-            forward.inputs.grid_struct(k),
-            adjoint.found.grid_struct(forward.chunk.row(k)),
-        )
+        inputs = forward.inputs.grid_struct(k)
+        adj_inputs = adjoint.found.grid_struct(forward.chunk.row(k))
         grids = (now, then, here, shared.velocity_at(s - 1), before)
         arguments = (model.constants, inputs, forward.window, *grids, adj_inputs)
         launch(kernel, forward.held, *arguments, block_dim=BLOCK, part=NODE_PART)
@@ -80,10 +78,8 @@ def _grid_with_contact(adjoint: ChunkAdjoint, s: int, launch: KernelLauncher) ->
         states = (now, then, *about, forward.packed[s], forward.packed[earlier], adj_loads[s % 2])
         out = (here, shared.gained_array, free, before, cleared, loads[s % 2], adj_loads[(s + 1) % 2])
         added = (velocity, pushed, loads[(s + 1) % 2], shared.adj_array)
-        adj_inputs, kernel = (
-            adjoint.found.grid_struct(forward.chunk.row(k)),
-            contact_stage_adj(model.spec, adjoint.wanted),
-        )
+        adj_inputs = adjoint.found.grid_struct(forward.chunk.row(k))
+        kernel = contact_stage_adj(model.spec, adjoint.wanted)
         arguments = (*parameters, *states, *out, *added, adj_inputs)
         launch(kernel, threads, *arguments, block_dim=BLOCK, part=NODE_PART, beside=beside)
         beside = False

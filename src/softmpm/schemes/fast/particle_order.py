@@ -99,10 +99,8 @@ class ParticleLayout:
         if by_place.shape[2] == 0:
             return []
         places, order = view(torch.empty_like(self.order), wp.int32), view(self.order, wp.int32)
-        invert, permute = (
-            sorting(t.dim, model.spec.dtype).invert,
-            packed_alarms(model.spec).permute_neighbours,
-        )
+        invert = sorting(t.dim, model.spec.dtype).invert
+        permute = packed_alarms(model.spec).permute_neighbours
         given = (order, places, view(model.neighbours, wp.int32), self.neighbours)
         return [
             RebindableLaunch(model, invert, self.order.shape, (order, places), ()),

@@ -1,10 +1,8 @@
 """The fast scheme: chunks of substeps run as captured graphs, on particles sorted by cell and the grid nodes near them."""
 
-import weakref
 from collections.abc import Callable
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from softmpm.kernels.compile import compile_together
@@ -15,7 +13,7 @@ from softmpm.planning.memory import LONGEST, Footprint
 from softmpm.schemes.alarm_check import StartCheck
 from softmpm.schemes.capture import after_replay, is_capturing, keep_alive
 from softmpm.schemes.carried import check_start
-from softmpm.schemes.device import stream_of
+from softmpm.schemes.device import of_this_stream, stream_of
 from softmpm.schemes.failure_report import began_outside, outgrown
 from softmpm.schemes.fast.adjoint_buffers import SharedAdjoint
 from softmpm.schemes.fast.chunk_graph import ChunkGraph, ChunkGraphAdj
@@ -118,9 +116,7 @@ class Fast:
 
     @classmethod
     def of(cls, model: Model) -> "Fast":
-        """The scheme of this stream, cached in the model's workspace; it refers to the model weakly, to avoid a cycle."""
-        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
-        return model.workspace.get((cls, stream), lambda: cls(weakref.proxy(model)))
+        return of_this_stream(cls, model)
 
     def __init__(self, model: Model):
         self.model = model

@@ -54,11 +54,9 @@ class ChunkBuffers:
         self._keeps_u = keep and stores_u(model.spec)
         stored_u = stored if self._keeps_u else 2
         self.u, self.v = self.tensor(stored_u, *nodal), self.tensor(stored, *nodal)
-        self.w, self.mass, self.low = (
-            self.tensor(substeps, model.worlds, stored_nodes(model), model.dim),
-            self.tensor(*nodal[:2]),
-            self.tensor(nodal[0], 2, *nodal[1:]),
-        )
+        self.w = self.tensor(substeps, model.worlds, stored_nodes(model), model.dim)
+        self.mass = self.tensor(*nodal[:2])
+        self.low = self.tensor(nodal[0], 2, *nodal[1:])
         self.anchor, self.partial = self.tensor(stored, *model.anchor_shape), empty_partial(model)
         self.shift = torch.empty(stored, model.worlds, model.dim, dtype=torch.float64, device=model.device)
         self.force, self.frame = self.tensor(*model.anchor_shape), frame_struct(model)

@@ -27,10 +27,8 @@ def first_kernels(model: Model, adjoint: bool) -> list[tuple[wp.Kernel, int]]:
     states, mass = projection(spec.dim, spec.dtype, bricks), masses(spec.dim, spec.dtype, bricks)
     sums = node_sums(spec.dim, spec.dtype)
     if adjoint:
-        of_bricks, of_nodes = (
-            [states.project_adj, states.show_adj, mass.masses_adj],
-            [sums.fields, sums.means_adj],
-        )
+        of_bricks = [states.project_adj, states.show_adj, mass.masses_adj]
+        of_nodes = [sums.fields, sums.means_adj]
     else:
         of_bricks = [states.show, states.project, mass.bricks_of_masses, cells(spec, bricks).check_state]
         of_nodes = [sums.mass, sums.means]

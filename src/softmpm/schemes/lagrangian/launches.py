@@ -52,10 +52,8 @@ def _check_end(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
 def _forces(buffers: ChunkBuffers, s: int, launch: KernelLauncher) -> None:
     """Internal and external forces of substep ``s`` on the nodes of each brick."""
     model, bricks = buffers.model, buffers.model.rest_grid.bricks
-    parameters, out = (
-        (model.constants, buffers.inputs.particle_struct(s, s), buffers.rest),
-        (buffers.struct, s),
-    )
+    parameters = (model.constants, buffers.inputs.particle_struct(s, s), buffers.rest)
+    out = (buffers.struct, s)
     if bricks.lattice:
         kernel, lattice = lattice_cells(model.spec, bricks).forces, lattice_struct(model)
         brick_launch(model, launch, kernel, *parameters, lattice, *out, layered=True)

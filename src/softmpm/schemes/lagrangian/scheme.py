@@ -1,6 +1,5 @@
 """The scheme of the reference formulation: chunks of substeps on the nodes at rest, any precision, any device."""
 
-import weakref
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -16,7 +15,7 @@ from softmpm.planning.chunks import Chunk
 from softmpm.planning.memory import Footprint
 from softmpm.schemes.buffers import view
 from softmpm.schemes.capture import is_capturing, keep_alive
-from softmpm.schemes.device import stream_of
+from softmpm.schemes.device import of_this_stream, stream_of
 from softmpm.schemes.graph_cache import GraphCache, Lease
 from softmpm.schemes.inputs import InputsAdj, ReusedParticleStruct, Values, elapsed, grid_struct, stiffest
 from softmpm.schemes.lagrangian.bricks import brick_launch, rest_struct
@@ -161,9 +160,7 @@ class Lagrangian:
 
     @classmethod
     def of(cls, model: Model) -> "Lagrangian":
-        """The scheme of this stream, cached in the model's workspace; it refers to the model weakly, to avoid a cycle."""
-        stream = torch.cuda.current_stream(model.device).cuda_stream if model.device.type == "cuda" else 0
-        return model.workspace.get((cls, stream), lambda: cls(weakref.proxy(model)))
+        return of_this_stream(cls, model)
 
     def __init__(self, model: Model):
         self.model, self._pool = model, LagrangianGraphs(model)

@@ -106,9 +106,8 @@ class SurfaceContact:
         self, launch: Callable[..., None], inputs: Any, s: int, shift: wp.array, u: wp.array, words: wp.array
     ) -> None:
         """Check the depth of the points in the state after substep ``s``, whose inputs are given."""
-        kernel, about = surface(self.model.spec).check_depth, (self.model.scene.dt, s)
-        parameters = (self.model.constants, inputs, self.struct, *about)
-        launch(kernel, self.points, *parameters, shift, u, words, part=POINT_PART)
+        arguments = (inputs, self.struct, self.model.scene.dt, s, shift, u, words)
+        launch(surface(self.model.spec).check_depth, self.points, *arguments, part=POINT_PART)
 
 
 def check_start(
@@ -116,7 +115,7 @@ def check_start(
 ) -> None:
     """Check the depth of the points in the initial state of a call, with the inputs of its first substep."""
     points = (model.worlds, model.anchor_shape[2])
-    arguments = (model.constants, inputs, surface_struct(model), 0.0, 0, shift, u, words)
+    arguments = (inputs, surface_struct(model), 0.0, 0, shift, u, words)
     launch(surface(model.spec).check_depth, points, *arguments, part=POINT_PART)
 
 
