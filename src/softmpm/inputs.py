@@ -6,7 +6,7 @@ derived from them.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -137,8 +137,10 @@ def direction_of(actuator, scene) -> tuple[float, ...]:
 class Input:
     """Input of the kernels: its count and type, the scenes that have it, and the group of gradients that it belongs to."""
 
-    name: str
-    per: Literal["particle", "slot", "muscle", "driven", "driven_node", "world", "wall", "substep"]
+    name: str = field(kw_only=False)
+    per: Literal["particle", "slot", "muscle", "driven", "driven_node", "world", "wall", "substep"] = field(
+        kw_only=False
+    )
     kind: Literal["scalar", "vector", "index"] = "scalar"
     present: Callable[[Any], bool] = lambda spec: True
     """True if the kernels of a :class:`softmpm.kernels.structs.Spec` take it."""
@@ -175,53 +177,43 @@ def _moving(spec) -> bool:
 
 
 INPUTS = (
-    Input(name="mass", per="particle", group="material"),  # m_p / m₀, m₀ that of the heaviest particle
-    Input(name="mu", per="particle", group="material"),  # Lamé's μ [Pa]
-    Input(name="lam", per="particle", group="material"),  # Lamé's λ [Pa]
-    Input(name="volume", per="particle"),  # V⁰ / m₀ [m³/kg]
-    Input(
-        name="law", per="particle", kind="index", present=lambda spec: len(spec.laws) > 1
-    ),  # into spec.laws
-    Input(name="muscle", per="slot", kind="index", present=lambda spec: spec.muscle_slots > 0),  # or -1
-    Input(
-        name="fibre",  # unit direction d
-        per="muscle",
+    Input("mass", "particle", group="material"),  # m_p / m₀, m₀ that of the heaviest particle
+    Input("mu", "particle", group="material"),  # Lamé's μ [Pa]
+    Input("lam", "particle", group="material"),  # Lamé's λ [Pa]
+    Input("volume", "particle"),  # V⁰ / m₀ [m³/kg]
+    Input("law", "particle", kind="index", present=lambda spec: len(spec.laws) > 1),  # into spec.laws
+    Input("muscle", "slot", kind="index", present=lambda spec: spec.muscle_slots > 0),  # or -1
+    Input(  # unit direction d
+        "fibre",
+        "muscle",
         kind="vector",
         present=lambda spec: spec.fibres,
         group="direction",
         shared=lambda spec: "direction" not in spec.given,
     ),
     Input(  # activation times strength [Pa]
-        name="active_stress",
-        per="muscle",
-        present=lambda spec: spec.muscle_slots > 0,
-        group="activation",
-        rows=True,
+        "active_stress", "muscle", present=lambda spec: spec.muscle_slots > 0, group="activation", rows=True
     ),
     Input(  # index into spec.actuators
-        name="actuator",
-        per="muscle",
+        "actuator",
+        "muscle",
         kind="index",
         present=lambda spec: len(spec.actuators) > 1,
         shared=lambda spec: True,
     ),
-    Input(
-        name="viscosity", per="particle", present=lambda spec: spec.viscosity, group="viscosity"
-    ),  # η [Pa s]
+    Input("viscosity", "particle", present=lambda spec: spec.viscosity, group="viscosity"),  # η [Pa s]
     Input(  # f / m₀ [m/s²]
-        name="force",
-        per="particle",
+        "force",
+        "particle",
         kind="vector",
         present=lambda spec: "force" in spec.given,
         group="force",
         rows=True,
     ),
-    Input(
-        name="driven", per="particle", kind="index", present=lambda spec: spec.driven, stage="g2p"
-    ),  # or -1
+    Input("driven", "particle", kind="index", present=lambda spec: spec.driven, stage="g2p"),  # or -1
     Input(  # of the driven particles [m/s]
-        name="velocity",
-        per="driven",
+        "velocity",
+        "driven",
         kind="vector",
         present=lambda spec: spec.driven,
         group="velocity",
@@ -229,8 +221,8 @@ INPUTS = (
         stage="g2p",
     ),
     Input(  # of the nodes that driven particles hold in the reference formulation [m/s]
-        name="driven_velocity",
-        per="driven_node",
+        "driven_velocity",
+        "driven_node",
         kind="vector",
         present=lambda spec: spec.driven_nodes,
         group="velocity",
@@ -238,19 +230,19 @@ INPUTS = (
         stage="grid",
     ),
     Input(  # g [m/s²]
-        name="gravity",
-        per="world",
+        "gravity",
+        "world",
         kind="vector",
         present=lambda spec: "gravity" in spec.given,
         group="gravity",
         stage="grid",
     ),
     Input(  # exp(−damping Δt)
-        name="decay", per="world", present=lambda spec: "damping" in spec.given, group="damping", stage="grid"
+        "decay", "world", present=lambda spec: "damping" in spec.given, group="damping", stage="grid"
     ),
     Input(
-        name="normal",
-        per="wall",
+        "normal",
+        "wall",
         kind="vector",
         present=lambda spec: len(spec.contacts) > 0,
         group="wall",
@@ -260,8 +252,8 @@ INPUTS = (
         constant=lambda spec: not spec.moving,
     ),
     Input(
-        name="offset",
-        per="wall",
+        "offset",
+        "wall",
         present=lambda spec: len(spec.contacts) > 0,
         group="wall",
         branches=lambda spec: not spec.surface_walls,
@@ -271,20 +263,18 @@ INPUTS = (
         constant=lambda spec: not spec.moving,
     ),
     Input(
-        name="friction",
-        per="wall",
+        "friction",
+        "wall",
         present=lambda spec: spec.friction,
         group="friction",
         stage="grid",
         constant=lambda spec: "friction" not in spec.given,
     ),
     # How the pose of a moving wall changes in a control step, see contact.py:
+    Input("offset_rate", "wall", present=_moving, group="wall", rows=True, stage="grid", double=True),
     Input(
-        name="offset_rate", per="wall", present=_moving, group="wall", rows=True, stage="grid", double=True
-    ),
-    Input(
-        name="normal_rate",
-        per="wall",
+        "normal_rate",
+        "wall",
         kind="vector",
         present=_moving,
         group="wall",
@@ -292,18 +282,8 @@ INPUTS = (
         stage="grid",
         double=True,
     ),
-    Input(
-        name="surface_velocity",
-        per="wall",
-        kind="vector",
-        present=_moving,
-        group="wall",
-        rows=True,
-        stage="grid",
-    ),
-    Input(
-        name="elapsed", per="substep", present=_moving, stage="grid", double=True
-    ),  # of the control step [s]
+    Input("surface_velocity", "wall", kind="vector", present=_moving, group="wall", rows=True, stage="grid"),
+    Input("elapsed", "substep", present=_moving, stage="grid", double=True),  # of the control step [s]
 )
 """All inputs of the kernels, in the order of the fields of the kernels' structs."""
 

@@ -52,10 +52,7 @@ class OptimizerConf:
     def __post_init__(self):
         typed("optimizer", self)
         OPTIMIZERS.need(self.name, self.options)
-        positive("optimizer", self, "design_rate")
-        for name in ("policy_rate", "halving", "max_norm"):
-            if getattr(self, name) is not None:
-                positive("optimizer", self, name)
+        positive("optimizer", self, "design_rate", "policy_rate", "halving", "max_norm")
         if self.fade is not None and not self.fade > 0:
             raise ValueError(f"optimizer.fade must be > 0, inf or null, got {self.fade}.")
         for name in ("retries", "fallback_from"):

@@ -41,10 +41,10 @@ def one_of(name: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def positive(group: str, settings, *names: str) -> None:
-    """Raise ValueError for the first of some settings that is not finite and positive."""
+    """Raise ValueError for the first of some settings that is not finite and positive, or None."""
     for name in names:
         value = getattr(settings, name)
-        if not (math.isfinite(value) and value > 0):
+        if value is not None and not (math.isfinite(value) and value > 0):
             raise ValueError(f"{group}.{name} must be > 0, got {value}.")
 
 

@@ -192,10 +192,8 @@ class LearningConf:
     def __post_init__(self):
         typed("learning", self)
         positive("learning", self, "every", "batches", "batch", "rate", "patience")
-        positive("learning", self, "simulations", "megabytes", "frame_every")
+        positive("learning", self, "simulations", "megabytes", "frame_every", "target_halving")
         share("learning", self, "target_rate")
-        if self.target_halving is not None:
-            positive("learning", self, "target_halving")
         if self.epochs < 0:
             raise ValueError(f"learning.epochs must be ≥ 0, got {self.epochs}.")
         if not 0.0 <= self.improvement < 1.0:
@@ -255,20 +253,8 @@ class TrainConf:
                 raise ValueError(
                     f"train.log must have names of loggers, each once, out of {', '.join(LOGGERS)}; got {list(self.log)}."
                 )
-        positive(
-            "train",
-            self,
-            "iterations",
-            "seeds",
-            "side_by_side",
-            "worlds",
-            "save_every",
-            "frame_every",
-            "evaluate_every",
-            "evaluation_goals",
-        )
-        if self.endurance is not None:
-            positive("train", self, "endurance")
+        positive("train", self, "iterations", "seeds", "side_by_side", "worlds", "save_every", "frame_every")
+        positive("train", self, "evaluate_every", "evaluation_goals", "endurance")
         if self.record_every < 0:
             raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
         lengths("train.goal_spread", self.goal_spread)

@@ -39,7 +39,7 @@ def grown_margin(margin: int) -> int:
     return 2 * margin + 1
 
 
-def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int, least: int = 0) -> tuple[int, ...]:
+def window_shape(grid: Sequence[int], reach: Sequence[int], margin: int, least: int) -> tuple[int, ...]:
     """Nodes along each axis of the window, the part of the grid that is allocated.
 
     Args:

@@ -1,9 +1,8 @@
 """Recorder: a run to HDF5 as it happens.
 
-The file can be read at every instant, also after ``kill -9``: everything with a name exists before the first
-row is written; the file is then in HDF5's single-writer-multiple-reader mode, in which the library orders its
-writes so that the file is always consistent; and a frame counts only once its row of ``frame/index`` has
-followed its data. Layout: ``format.py``.
+The file can be read at every instant, also after ``kill -9``: everything with a name exists before the first row is written; the file
+is then in HDF5's single-writer-multiple-reader mode, in which the library orders its writes so that the file is always consistent; and
+a frame counts only once its row of ``frame/index`` has followed its data. Layout: ``format.py``.
 """
 
 import contextlib
@@ -39,14 +38,14 @@ class Recorder:
                 episode.frame(0.0, state, activation)
             recorder.scalars(0, {"loss": 0.3})
 
-    A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity
-    comes on top, and forces of w walls on s surface points with 8 (w + 1) s bytes in 2D and 12 (w + 1) s in 3D.
+    A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity comes on top, and forces of
+    w walls on s surface points with 8 (w + 1) s bytes in 2D and 12 (w + 1) s in 3D.
 
     Args:
         path: The file to write. It must not exist, unless ``resume_before`` is given.
         model: What is simulated.
-        resume_before: Keep the simulations and scalars of iterations before this one of an existing file and
-            go on after them; without a file, start one.
+        resume_before: Keep the simulations and scalars of iterations before this one of an existing file and go on after them;
+            without a file, start one.
         resume_digest: What :attr:`digest` was when these iterations had been recorded; None does not ask.
         every: Record each ``every``-th frame of a simulation only.
         max_particles: Record this many particles, chosen evenly at random, the same in every run; None: all.
@@ -80,9 +79,8 @@ class Recorder:
             )
         static = static_values(model, max_particles, max_points)
         check_values(self.path, static)  # as readers do
-        self._particles, self._points = (
-            torch.from_numpy(static[name]) for name in ("particle", "surface_point")
-        )
+        self._particles = torch.from_numpy(static["particle"])
+        self._points = torch.from_numpy(static["surface_point"])
         self._shape = (model.particle_count, model.scene.grid.dim)
         self._point_count = None if model.surface is None else model.surface.count
         self._content = Content()
@@ -160,11 +158,11 @@ class Recorder:
                 rows.setdefault(PARTS[name], []).append(one)
                 count[PARTS[name]] += 1
             index.append((frame.episode._row, frame.time, *at.values()))
-        begin = self._count | {f"frame/{name}": self._count["frame/index"] for name in frames[0].values}
+        first = self._count | {f"frame/{name}": self._count["frame/index"] for name in frames[0].values}
         size = sum(one.nbytes for many in rows.values() for one in many)
         with room(self._file, size + (len(frames) - 1) * FURTHER_FRAME):
             for table, many in rows.items():
-                put(self._tables[table], begin[table], np.stack(many))
+                put(self._tables[table], first[table], np.stack(many))
         self._write("frame/index", np.array(index, FRAME))
         self._count |= {table: count[table] for table in PARTS.values()}
         for frame in frames:
@@ -240,8 +238,7 @@ class Episode:
             time: Time since the start of this simulation [s].
             state: State of all worlds.
             activation: Muscle activation [-], shape (world, muscle) or (muscle,).
-            field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize``
-                returns.
+            field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize`` returns.
             latent: What an observer saw, shape (world, size) or (size,).
             forces: What :func:`softmpm.contact_forces` returns for this state.
             world: The world to record.

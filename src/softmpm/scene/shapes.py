@@ -1,9 +1,9 @@
 """Shapes to particles: a box, a ball, polygons, a picture's silhouette or a closed mesh, on a regular lattice.
 
-Every particle sits in the middle of its lattice cell and has the cell's volume; the last axis runs fastest.
-A box is filled exactly: its mass is its density times its own volume. The other shapes keep the cells whose
-middle lies in them: their mass is exact to the lattice, density · particle count · spacingᵈ. With ``cut_cells`` they keep
-every cell that they cross, with the volume and the centroid of its inner part.
+Every particle sits in the middle of its lattice cell and has the cell's volume; the last axis runs fastest. A box is filled exactly:
+its mass is its density times its own volume. The other shapes keep the cells whose middle lies in them: their mass is exact to the
+lattice, density · particle count · spacingᵈ. With ``cut_cells`` they keep every cell that they cross, with the volume and the centroid
+of its inner part.
 """
 
 import math
@@ -39,10 +39,10 @@ def box(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Parti
     need(len(low) == len(high), f"lower and upper need the same number of axes, got {lower} and {upper}.")
     need(bool((low < high).all()), f"upper must be above lower along each axis, got {lower} and {upper}.")
     count = _count(high - low, _spacing(spacing))
+    sides = " × ".join(f"{side:.4g}" for side in high - low)
     need(
         bool((count > 0).all()),
-        f"a box with sides of {_numbers(high - low)} m is thinner than half its spacing of {spacing} m: "
-        "make the spacing smaller.",
+        f"a box with sides of {sides} m is thinner than half its spacing of {spacing} m: make the spacing smaller.",
     )
     step = (high - low) / count
     positions = _lattice((low + high) / 2, count, step)
@@ -256,10 +256,6 @@ def _point(name: str, value: Sequence[float]) -> np.ndarray:
 def _spacing(spacing: float) -> float:
     need(math.isfinite(spacing) and spacing > 0, f"spacing must be > 0 m, got {spacing}.")
     return float(spacing)
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " × ".join(f"{value:.4g}" for value in values)
 
 
 def _not_empty(positions: np.ndarray, spacing: float) -> np.ndarray:

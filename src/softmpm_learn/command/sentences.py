@@ -82,8 +82,8 @@ def _line(text: str) -> str:
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
-def give_up(error: Exception, more: str = "") -> NoReturn:
-    end(1, f"{sentence(error)}{more}")
+def give_up(error: Exception) -> NoReturn:
+    end(1, sentence(error))
 
 
 def end(code: int, said: str) -> NoReturn:

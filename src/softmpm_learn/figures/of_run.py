@@ -25,11 +25,9 @@ SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
 
-def loss_figure(
-    path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, lowest: str = "loss"
-) -> None:
-    """Draw curves over the iterations, one panel each; ``lowest`` names one that also shows its lowest value so far. A few values that
-    would flatten the others are marked at the edge, and the farthest stands above it.
+def loss_figure(path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
+    """Draw curves over the iterations, one panel each; that of the loss also shows its lowest value so far. A few values that would
+    flatten the others are marked at the edge, and the farthest stands above it.
 
     Args:
         curves: For each name the iterations and the values; values that are not finite leave gaps.
@@ -42,13 +40,13 @@ def loss_figure(
         iteration, value = (np.asarray(array, dtype=float) for array in curves[name])
         axes = figure.add_subplot(len(names), 1, place + 1, sharex=first)
         first = first or axes
-        if name == lowest:  # wide and below, since it is the curve itself where that falls
+        if name == "loss":  # wide and below, since it is the curve itself where that falls
             axes.plot(
                 iteration, np.fmin.accumulate(value), color="#f2bd6b", linewidth=6, label="lowest so far"
             )
         marker = "o" if len(value) < 3 else None
         axes.plot(iteration, value, color="#1f5fa8", marker=marker, markersize=4, label=name)
-        if name == lowest:
+        if name == "loss":
             axes.legend(frameon=False)
         axes.set_title(name, fontsize=9, loc="left")
         scale = canvas.scale(value)

@@ -154,7 +154,7 @@ class Run:
 
     def begins_to_settle(self) -> bool:
         """Decide in the first of them whether it does; True if it begins."""
-        return self.settling.begins(self.left, self._settling_iterations, self.is_at_work)
+        return self.settling.begins(self.left, self._settling_iterations, self.motions.best_is_worth_it)
 
     @property
     def _settling_iterations(self) -> int:
@@ -164,11 +164,6 @@ class Run:
     def best(self) -> dict:
         """The best motion, see :class:`softmpm_learn.recovery.motions.Motions`."""
         return self.motions.best
-
-    @property
-    def is_at_work(self) -> bool:
-        """True if the best is worth going on with."""
-        return self.motions.best_is_worth_it
 
     def keep(self, loss: float, lasts: bool) -> None:
         """Keep policy and design as they are if they are the best so far, or among the next best; see
@@ -200,7 +195,7 @@ class Run:
     def fall_back(self) -> str:
         """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments; or begin anew
         if the best is not worth it. Says which."""
-        if not self.is_at_work:
+        if not self.motions.best_is_worth_it:
             return self.begin_anew()
         self.fallback.count += 1
         return self.return_to_best(self.settings.optimizer.fallback_rate)

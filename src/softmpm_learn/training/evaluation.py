@@ -71,9 +71,9 @@ def evaluate_best(runs: Runs, of: Collection[int]) -> dict[int, Evaluation]:
         again = simulate(runs, of, runs.evaluator.again)
         first, found = again | first, found | again
         tried = [k for k in of if left and runs.all[k].settles and not _repeats(runs.all[k], again[k])]
-        of = [k for k in tried if runs.all[k].is_at_work]
+        of = [k for k in tried if runs.all[k].motions.best_is_worth_it]
     for k, motions in before.items():
-        if motions and not runs.all[k].is_at_work:
+        if motions and not runs.all[k].motions.best_is_worth_it:
             runs.all[k].motions.rank(motions)
             runs.all[k].load_policy(runs.all[k].best)
             found[k] = first[k]
@@ -92,7 +92,7 @@ def _repeats(run: Run, again: Evaluation) -> bool:
             before["loss"],
             " and does not last" if before["lasts"] and not again.lasts else "",
             f"the best is that of iteration {run.best['iteration']} now"
-            if run.is_at_work
+            if run.motions.best_is_worth_it
             else "no other is better",
         )
     return repeats

@@ -63,11 +63,14 @@ def test_a_best_that_is_not_worth_it_need_not_repeat_itself(task, model, setting
     run.fallback.first = 0.0
     run.keep(0.1, True)
     assert (
-        not run.is_at_work and run.recount(0.3, True) and run.recount(INF, False) and run.best["loss"] == 0.1
+        not run.motions.best_is_worth_it
+        and run.recount(0.3, True)
+        and run.recount(INF, False)
+        and run.best["loss"] == 0.1
     )
     run.keep(-1.4, False)
     run.keep(-1.5, True)
-    assert not run.recount(-0.1, True) and run.is_at_work
+    assert not run.recount(-0.1, True) and run.motions.best_is_worth_it
     assert [(one["loss"], one["lasts"]) for one in run.motions.all] == [
         (-1.4, False),
         (-0.1, False),
