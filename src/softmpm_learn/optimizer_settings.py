@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from softmpm_learn.register import OPTIMIZERS
-from softmpm_learn.setting_checks import positive, share, typed
+from softmpm_learn.setting_checks import not_negative, positive, share, typed
 
 
 @dataclass(kw_only=True)
@@ -55,9 +55,7 @@ class OptimizerConf:
         positive("optimizer", self, "design_rate", "policy_rate", "halving", "max_norm")
         if self.fade is not None and not self.fade > 0:
             raise ValueError(f"optimizer.fade must be > 0, inf or null, got {self.fade}.")
-        for name in ("retries", "fallback_from"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"optimizer.{name} must be ≥ 0, got {getattr(self, name)}.")
+        not_negative("optimizer", self, "retries", "fallback_from")
         positive("optimizer", self, "fallback_after", "restart_after")
         if self.restart_above is not None and math.isnan(self.restart_above):
             raise ValueError("optimizer.restart_above must be a number, inf or null, got nan.")

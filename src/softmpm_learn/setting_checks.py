@@ -41,11 +41,19 @@ def one_of(name: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def positive(group: str, settings, *names: str) -> None:
-    """Raise ValueError for the first of some settings that is not finite and positive, or None."""
+    """Raise ValueError for the first of some settings that is not finite and positive; None passes."""
     for name in names:
         value = getattr(settings, name)
         if value is not None and not (math.isfinite(value) and value > 0):
             raise ValueError(f"{group}.{name} must be > 0, got {value}.")
+
+
+def not_negative(group: str, settings, *names: str) -> None:
+    """Raise ValueError for the first of some settings that is negative or not finite; None passes."""
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{group}.{name} must be ≥ 0, got {value}.")
 
 
 def share(group: str, settings, *names: str) -> None:

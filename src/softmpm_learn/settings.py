@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
-from softmpm_learn.setting_checks import lengths, one_of, positive, share, typed
+from softmpm_learn.setting_checks import lengths, not_negative, one_of, positive, share, typed
 
 if TYPE_CHECKING:
     from softmpm_learn.tasks.task import Task
@@ -89,9 +89,7 @@ class PolicyConf:
             raise ValueError(f"policy.hidden needs at least one positive width, got {list(self.hidden)}.")
         if self.knots < 2:
             raise ValueError(f"policy.knots must be at least 2, got {self.knots}.")
-        for name, value in {"gain": self.gain, "feature_gain": self.feature_gain}.items():
-            if value is not None and not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"policy.{name} must be ≥ 0, got {value}.")
+        not_negative("policy", self, "gain", "feature_gain")
 
 
 @dataclass(kw_only=True)
@@ -194,14 +192,11 @@ class LearningConf:
         positive("learning", self, "every", "batches", "batch", "rate", "patience")
         positive("learning", self, "simulations", "megabytes", "frame_every", "target_halving")
         share("learning", self, "target_rate")
-        if self.epochs < 0:
-            raise ValueError(f"learning.epochs must be ≥ 0, got {self.epochs}.")
+        not_negative("learning", self, "epochs", "kl")
         if not 0.0 <= self.improvement < 1.0:
             raise ValueError(f"learning.improvement must lie in [0, 1), got {self.improvement}.")
         if not 0.0 < self.validation <= 0.25:
             raise ValueError(f"learning.validation must lie in (0, 0.25], got {self.validation}.")
-        if not (math.isfinite(self.kl) and self.kl >= 0):
-            raise ValueError(f"learning.kl must be ≥ 0, got {self.kl}.")
 
 
 @dataclass(kw_only=True)
@@ -255,8 +250,7 @@ class TrainConf:
                 )
         positive("train", self, "iterations", "seeds", "side_by_side", "worlds", "save_every", "frame_every")
         positive("train", self, "evaluate_every", "evaluation_goals", "endurance")
-        if self.record_every < 0:
-            raise ValueError(f"train.record_every must be ≥ 0, got {self.record_every}.")
+        not_negative("train", self, "record_every")
         lengths("train.goal_spread", self.goal_spread)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from softmpm import Body, Grid, Muscle, Scene, Wall, neighbour_pairs
 from softmpm_learn.objective import Effort, Objective, Reach, Still, Stretch
+from softmpm_learn.setting_checks import not_negative
 from softmpm_learn.tasks.outline import Limb
 from softmpm_learn.tasks.task import LASTING, STRETCH, Task, TaskConf, clock, filled, material
 
@@ -49,7 +50,7 @@ class ArmConf(TaskConf):
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("hold", "still", "stretch")
+        not_negative("task", self, "hold", "still", "stretch")
         if len(self.goal) != 2 or not all(math.isfinite(c) for c in self.goal):
             raise ValueError(
                 f"task.goal must be two numbers, x and y, such as task.goal=[0.6,0.35], got {self.goal}."

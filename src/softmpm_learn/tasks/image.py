@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from softmpm_learn.setting_checks import not_negative
 from softmpm_learn.tasks.drawing import Part, drawn
 from softmpm_learn.tasks.own import OwnConf
 from softmpm_learn.tasks.task import Task
@@ -99,7 +100,7 @@ class ImageConf(OwnConf):
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("tolerance")
+        not_negative("task", self, "tolerance")
         self.legend = {name: _colour(name, entry, self.legend) for name, entry in self.legend.items()}
 
 

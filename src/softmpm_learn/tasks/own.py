@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 import softmpm
+from softmpm_learn.setting_checks import positive
 from softmpm_learn.tasks.task import Source, Task, material
 from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
@@ -47,10 +48,7 @@ class OwnConf(WalkerConf):
             self.file = str(Path(self.file).absolute())
         if self.cells is None:
             self.cells = self.resolution.value
-        for name in ("size", "cells"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"task.{name} must be > 0, got {value}.")
+        positive("task", self, "size", "cells")
         if self.cells < 20:
             raise ValueError(f"task.cells must be at least 20 per metre, got {self.cells}.")
 

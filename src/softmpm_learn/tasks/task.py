@@ -13,7 +13,7 @@ import torch
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Objective
-from softmpm_learn.setting_checks import typed
+from softmpm_learn.setting_checks import not_negative, one_of, positive, typed
 from softmpm_learn.term import Path
 
 FORMULATIONS = ("moving", "reference")
@@ -103,11 +103,9 @@ class TaskConf:
         if not isinstance(self.resolution, Resolution):
             known = ", ".join(map(str, Resolution))
             raise ValueError(f"task.resolution must be one of {known}; got {self.resolution!r}.")
-        for name, known in (("formulation", FORMULATIONS), ("contact", CONTACTS), ("law", tuple(LAWS))):
-            if getattr(self, name) not in known:
-                raise ValueError(
-                    f"task.{name} must be one of {', '.join(known)}; got {getattr(self, name)!r}."
-                )
+        one_of("task.formulation", self.formulation, FORMULATIONS)
+        one_of("task.contact", self.contact, CONTACTS)
+        one_of("task.law", self.law, tuple(LAWS))
         if self.viscosity > 0 and self.retardation > 0:
             raise ValueError(
                 f"task.viscosity = {self.viscosity} and task.retardation = {self.retardation} are two names for one thing; "
@@ -115,14 +113,10 @@ class TaskConf:
             )
         if not -1.0 < self.poisson < 0.5:
             raise ValueError(f"task.poisson must lie in (-1, 0.5), got {self.poisson}.")
-        positive = ("seconds", "control_period", "young", "density", "strength", "safety")
-        for name in positive:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"task.{name} must be > 0, got {value}.")
-        self.need_not_negative("viscosity", "retardation", "gravity", "damping", "effort")
-        if self.contact_width is not None:
-            self.need_not_negative("contact_width")
+        positive("task", self, "seconds", "control_period", "young", "density", "strength", "safety")
+        not_negative(
+            "task", self, "viscosity", "retardation", "gravity", "damping", "effort", "contact_width"
+        )
         if self.safety > 1.0:
             raise ValueError(
                 f"task.safety must be at most 1, with which the substep is the stable one, got {self.safety}."
@@ -131,13 +125,6 @@ class TaskConf:
             raise ValueError(
                 f"task.control_period must be at most task.seconds = {self.seconds}, got {self.control_period}."
             )
-
-    def need_not_negative(self, *names: str) -> None:
-        """Raise ValueError for the first of some settings that is negative or not finite."""
-        for name in names:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"task.{name} must be ≥ 0, got {value}.")
 
     def refined(self) -> Self | None:
         """Settings of the same task on the next finer grid, None if there is none."""

@@ -10,6 +10,7 @@ import numpy as np
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Effort, Objective, Progress, Stretch, Tilt
+from softmpm_learn.setting_checks import not_negative
 from softmpm_learn.tasks.task import LASTING, STRETCH, Task, TaskConf, clock
 
 STEP = 0.1
@@ -59,7 +60,7 @@ class WalkerConf(TaskConf):
 
     def __post_init__(self):
         super().__post_init__()
-        self.need_not_negative("friction", "upright", "stretch")
+        not_negative("task", self, "friction", "upright", "stretch")
         if self.lead is not None and not 0 <= self.lead < self.seconds:
             raise ValueError(
                 f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
