@@ -1,5 +1,6 @@
-"""Learners with pictures of one's choice, for tests of the learning phase."""
+"""Learners with pictures of one's choice, settings with other values, and the metrics of runs, for tests of several parts."""
 
+import csv
 import dataclasses
 import itertools
 from pathlib import Path
@@ -11,7 +12,7 @@ from softmpm_learn.learning.learner import Learner
 from softmpm_learn.learning.phase import learn_together
 from softmpm_learn.learning.replay import Replay
 from softmpm_learn.seeding import seeded
-from softmpm_learn.settings import LearningConf
+from softmpm_learn.settings import LearningConf, Settings
 
 TRAINING, HELD_OUT = (0, 4, 8), (2, 6)
 """Numbers of simulations that are for training and for validation, by the split of a quarter."""
@@ -68,3 +69,22 @@ def viscous(task):
 def learn(learner: Learner) -> dict[str, float]:
     """One learning phase of a learner alone; its figures."""
     return learn_together([learner])[0]
+
+
+def changed(settings: Settings, **changes) -> Settings:
+    """Settings with other values, given as group=dict(name=value)."""
+    parts = {
+        group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()
+    }
+    return dataclasses.replace(settings, **parts)
+
+
+def rows_of(folder: str | Path) -> list[dict[str, str]]:
+    """Rows of the metrics of a run."""
+    with open(Path(folder) / "metrics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def metrics(folder: str | Path) -> list[dict[str, float]]:
+    """The same as numbers, nan where a cell is empty."""
+    return [{name: float(cell or "nan") for name, cell in row.items()} for row in rows_of(folder)]

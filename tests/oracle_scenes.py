@@ -30,6 +30,12 @@ def difference(f, at: torch.Tensor, d: torch.Tensor, h: float) -> torch.Tensor:
     return sum(c * (f(at + k * h * d) - f(at - k * h * d)) for k, c in terms) / h
 
 
+def assert_same(got: State, want: State, limit: float) -> None:
+    """The particles of two states agree within this limit."""
+    for a, b in zip(got[:4], want[:4], strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=limit)
+
+
 def slopes(
     losses, inputs: dict, along: dict, h: float, worlds: dict | None = None
 ) -> dict[str, torch.Tensor]:

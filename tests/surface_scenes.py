@@ -32,6 +32,13 @@ def block(dim: int, **changes) -> softmpm.Scene:
     return softmpm.Scene(**(settings | changes))
 
 
+def pressed(dim: int) -> softmpm.Scene:
+    """A block with an edge at which two rough walls meet the same points; a third wall acts on nodes."""
+    first, _, third = block(dim).walls
+    second = softmpm.Wall(normal=(0.5, 1.0, 0.2)[:dim], offset=0.4, friction=0.2)
+    return block(dim, walls=[first, second, third])
+
+
 def build(made: softmpm.Scene, **settings) -> softmpm.Model:
     alarms = softmpm.Alarms(collapse=None, depth=None)
     return softmpm.build(

@@ -4,16 +4,12 @@ import numpy as np
 import pytest
 import torch
 from helpers import LAWS
+from oracle_scenes import DIMS, randn
 
 from softmpm.energy_density import DENSITIES, rotation_change, volume_change
 from softmpm.oracle import stress
 
-DIMS = pytest.mark.parametrize("dim", [2, 3])
 MU, LAM = torch.tensor(3.0, dtype=torch.float64), torch.tensor(5.0, dtype=torch.float64)
-
-
-def randn(*shape: int, seed=0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def rotations(count: int, dim: int, seed: int) -> torch.Tensor:

@@ -8,7 +8,7 @@ import pytest
 import torch
 import warp as wp
 from helpers import assert_relative, busy_inputs, cotangent, dot, given, little_memory
-from surface_scenes import G, block, slab, velocity
+from surface_scenes import G, pressed, slab, velocity
 
 import softmpm
 from softmpm import Inputs
@@ -28,13 +28,6 @@ WALLS = ("wall_offset", "wall_normal", "wall_velocity")
 NAMES = ("gravity", "friction", "viscosity", *WALLS)
 STEPS, SUBSTEPS = 3, 3
 QUIET = softmpm.Alarms(collapse=None, depth=None, step=None, gap=None)
-
-
-def pressed(dim: int) -> softmpm.Scene:
-    """A block with an edge at which two rough walls meet the same points; a third wall acts on nodes."""
-    first, _, third = block(dim).walls
-    second = softmpm.Wall(normal=(0.5, 1.0, 0.2)[:dim], offset=0.4, friction=0.2)
-    return block(dim, walls=[first, second, third])
 
 
 def build(made: softmpm.Scene, **settings) -> softmpm.Model:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from helpers import assert_relative, busy_inputs, cotangent, dot, given, surface_of
-from surface_scenes import G, block, build, made, settled, slab, velocity
+from surface_scenes import G, block, build, made, pressed, settled, slab, velocity
 
 import softmpm
 from softmpm import Inputs
@@ -14,13 +14,6 @@ from softmpm.oracle import lagrangian
 WALLS = ("wall_offset", "wall_normal", "wall_velocity")
 NAMES = ("gravity", "friction", "viscosity", *WALLS)
 STEPS, SUBSTEPS = 3, 2
-
-
-def pressed(dim: int) -> softmpm.Scene:
-    """A block with an edge at which two rough walls meet the same points; a third wall acts on nodes."""
-    first, _, third = block(dim).walls
-    second = softmpm.Wall(normal=(0.5, 1.0, 0.2)[:dim], offset=0.4, friction=0.2)
-    return block(dim, walls=[first, second, third])
 
 
 def leaves_of(model: softmpm.Model, seed=5) -> dict[str, torch.Tensor]:

@@ -1,9 +1,14 @@
 """A crawler small enough to train in a test: a soft block on a rough floor, with a muscle in each half."""
 
+import logging
+import sys
+
 import numpy as np
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
+from softmpm_learn.command import app
 from softmpm_learn.objective import Effort, Objective, Progress
 from softmpm_learn.settings import LearningConf, ObserverConf, PolicyConf, Settings, TrainConf
 from softmpm_learn.tasks.task import Task
@@ -70,3 +75,39 @@ def small_settings() -> Settings:
         learning=LearningConf(every=2, epochs=3, batches=2, batch=4, validation=0.25, frame_every=2),
         train=TrainConf(iterations=5, record_every=0, examine=False),
     )
+
+
+@pytest.fixture
+def fresh_hydra(monkeypatch):
+    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
+    GlobalHydra.instance().clear()
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def in_folder(fresh_hydra, monkeypatch, tmp_path):
+    """The same, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def main(monkeypatch):
+    """``python -m softmpm_learn`` in this process; gives the exit code and the objectives, which Hydra's sweeper gets."""
+    real = app.job
+
+    def go(*words: str) -> tuple[int, list[float]]:
+        objectives = []
+        monkeypatch.setattr(app, "job", lambda *args: objectives.append(real(*args)) or objectives[-1])
+        quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+        monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words, *quiet])
+        GlobalHydra.instance().clear()
+        try:
+            app.main()
+        except SystemExit as stop:
+            return stop.code, objectives
+        return 0, objectives
+
+    return go

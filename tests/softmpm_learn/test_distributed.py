@@ -1,6 +1,5 @@
 """Two processes do what one does. Run as a script by torchrun, this file is one of the processes."""
 
-import csv
 import dataclasses
 import datetime
 import importlib.util
@@ -15,6 +14,7 @@ from pathlib import Path
 import forked
 import pytest
 import torch
+from learners import metrics
 
 import softmpm
 from softmpm_learn import distributed, train
@@ -121,14 +121,9 @@ def four(task):
     return softmpm.build(task.scene, device="cpu", worlds=4)
 
 
-def figures(folder: Path) -> list[dict[str, float]]:
-    with open(folder / "metrics.csv", newline="") as file:
-        return [{name: float(cell or "nan") for name, cell in row.items()} for row in csv.DictReader(file)]
-
-
 def assert_same(folder: Path, other: Path) -> None:
     """Every metric is equal, and so are the weights, the policy's encoder and the random stream of the goals in the checkpoint."""
-    for row, want in zip(figures(folder), figures(other), strict=True):
+    for row, want in zip(metrics(folder), metrics(other), strict=True):
         assert row == pytest.approx(want, rel=SAME, abs=SMALL, nan_ok=True)
     now, want = checkpoint.load(folder), checkpoint.load(other)
     for part in ("policy", "design"):
@@ -153,7 +148,7 @@ def test_two_processes_give_the_run_of_one(task, four, settings, both, tmp_path)
     out, *said = both
     train.train(task, four, shared(settings), tmp_path)
     assert_same(out / "two", tmp_path)
-    assert all(row["clipped"] for row in figures(tmp_path))
+    assert all(row["clipped"] for row in metrics(tmp_path))
     assert_in_step(out, "two")
     assert [s["two"] for s in said] == [[True, 3]] * 2
 
@@ -173,7 +168,7 @@ def test_a_failure_in_one_process_is_a_retry_in_both(task, four, settings, both,
     out, *_ = both
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, {14}))
     train.train(task, four, shared(settings), tmp_path)
-    assert [row["retries"] for row in figures(out / "retried")] == [0, 1, 0]
+    assert [row["retries"] for row in metrics(out / "retried")] == [0, 1, 0]
     assert_same(out / "retried", tmp_path)
     assert_in_step(out, "retried")
 
@@ -233,7 +228,7 @@ def test_the_command_line_through_torchrun(tmp_path, device, dtype):
     conf = load(out)
     task, one = make_task(conf.task), tmp_path / "one"
     train.train(task, make_model(task, conf, Group()), conf.settings, one)
-    (*rows, last), (*wanted, end) = figures(out), figures(one)
+    (*rows, last), (*wanted, end) = metrics(out), metrics(one)
     for row, want in zip(rows, wanted, strict=True):
         assert row == pytest.approx(want, rel=SAME, abs=SMALL, nan_ok=True)
     assert last["end"] == pytest.approx(end["end"], rel=SAME) and math.isfinite(end["end"])

@@ -1,7 +1,6 @@
 """Training of each task in the reference formulation and of a walker on the moving grid, from the settings to the pictures, and again
 from a checkpoint."""
 
-import csv
 import math
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from learners import rows_of
 
 import softmpm
 from softmpm_learn.command import app, experiment
@@ -32,11 +32,6 @@ def conf_of(task: str, *changes: str) -> RunConf:
         return to_run(compose("config", [f"task={task}", *SETTINGS, *changes]))
 
 
-def metrics(folder) -> list[dict[str, str]]:
-    with open(folder / "metrics.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.mark.parametrize(
     ("task", "formulation"),
     [*((task, "reference") for task in ("elephant", "arm", "biped")), ("biped", "moving")],
@@ -46,7 +41,7 @@ def test_a_run_is_whole(task, formulation, tmp_path):
     gives the same model; a run of one iteration continued by a second, with two threads, equals one of two."""
     chosen = (task, f"task.formulation={formulation}")
     experiment.run_experiment(conf_of(*chosen), tmp_path / "whole")
-    found = metrics(tmp_path / "whole")
+    found = rows_of(tmp_path / "whole")
     assert len(found) == 2
     for row in found:
         for name in ("loss", "gradient_policy", "gradient_design"):
@@ -61,7 +56,7 @@ def test_a_run_is_whole(task, formulation, tmp_path):
     parts = (*chosen, "train.pictures=false", "device.threads=2")
     experiment.run_experiment(conf_of(*parts, "train.iterations=1"), tmp_path / "parts")
     experiment.run_experiment(conf_of(*parts), tmp_path / "parts")
-    assert metrics(tmp_path / "parts") == found
+    assert rows_of(tmp_path / "parts") == found
     one, two = (checkpoint.load(tmp_path / name) for name in ("whole", "parts"))
     assert all(torch.equal(one["policy"][name], two["policy"][name]) for name in one["policy"])
     assert all(torch.equal(one["design"][name], two["design"][name]) for name in one["design"])

@@ -1,10 +1,10 @@
 """Random streams: what one part of a run draws does not depend on the others."""
 
-import dataclasses
 import itertools
 
 import pytest
 import torch
+from learners import changed
 
 from softmpm_learn.runs.goals import Goals
 from softmpm_learn.runs.run import Run
@@ -37,11 +37,6 @@ CHANGES = {
     "variational": dict(learning=dict(variational=False)),
     "policy": dict(policy=dict(name="mlp", hidden=[3])),
 }
-
-
-def changed(settings, **groups):
-    parts = {name: dataclasses.replace(getattr(settings, name), **values) for name, values in groups.items()}
-    return dataclasses.replace(settings, **parts)
 
 
 @pytest.mark.parametrize("part", CHANGES)

@@ -15,6 +15,7 @@ import forked
 import numpy as np
 import pytest
 import torch
+from learners import changed, rows_of
 
 import softmpm
 from softmpm_learn import train
@@ -27,19 +28,6 @@ from softmpm_learn.storage import checkpoint
 from softmpm_learn.storage.csv_log import Table
 from softmpm_learn.training.optimisation import TrainingError
 from softmpm_learn.training.timing import clock
-
-
-def copy_of(settings: Settings, **changes) -> Settings:
-    """Settings with other values, given as group=dict(name=value)."""
-    parts = {
-        group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()
-    }
-    return dataclasses.replace(settings, **parts)
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    header, *lines = ((folder / "metrics.csv").read_text()).splitlines()
-    return [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
 
 
 class Killed(BaseException):
@@ -76,7 +64,7 @@ def assert_same(folder: Path, unbroken: Path) -> None:
 
 def test_every_iteration_is_a_row(unbroken, settings):
     """metrics.csv has a row for each iteration, learning phases where they are due, and a loss that is no nan."""
-    found = rows(unbroken)
+    found = rows_of(unbroken)
     assert [int(r["iteration"]) for r in found] == list(range(5))
     assert [bool(r["epochs"]) for r in found] == [
         True,
@@ -106,7 +94,7 @@ def test_times_are_summed(monkeypatch):
 def test_times_are_those_of_an_iteration(task, model, settings, tmp_path):
     """All rows together take no longer than the training: no time is in two of them. The result has their sums, with what followed."""
     begin = time.perf_counter()
-    result = train.train(task, model, copy_of(settings, train=dict(record_every=1)), tmp_path)
+    result = train.train(task, model, changed(settings, train=dict(record_every=1)), tmp_path)
     whole = time.perf_counter() - begin
     header, *lines = (tmp_path / "timing.csv").read_text().splitlines()
     columns = zip(*(map(float, line.split(",")) for line in lines), strict=True)
@@ -124,8 +112,8 @@ def test_equal_seeds_give_equal_runs(task, model, settings, unbroken, tmp_path):
     """The same seed repeats every bit, another seed does not."""
     train.train(task, model, settings, tmp_path / "again")
     assert_same(tmp_path / "again", unbroken)
-    train.train(task, model, copy_of(settings, train=dict(seed=1)), tmp_path / "other")
-    assert rows(tmp_path / "other")[0]["loss"] != rows(unbroken)[0]["loss"]
+    train.train(task, model, changed(settings, train=dict(seed=1)), tmp_path / "other")
+    assert rows_of(tmp_path / "other")[0]["loss"] != rows_of(unbroken)[0]["loss"]
 
 
 @pytest.mark.parametrize("where", ["optimise", "learn", "metrics", "checkpoint", "between renames", "prune"])
@@ -177,11 +165,11 @@ def test_killed_processes_resume(task, model, settings, unbroken, tmp_path):
 
 def test_falls_back_to_the_previous_checkpoint(task, model, settings, tmp_path):
     """With the newest checkpoint damaged, the run goes on from the one before and ends the same; the replay buffer too."""
-    small = copy_of(settings, learning=dict(simulations=2))
+    small = changed(settings, learning=dict(simulations=2))
     train.train(task, model, small, tmp_path / "small")
     out = tmp_path / "out"
-    train.train(task, model, copy_of(small, train=dict(iterations=3)), out)
-    train.train(task, model, copy_of(small, train=dict(iterations=3)), out)  # resumed, nothing to do
+    train.train(task, model, changed(small, train=dict(iterations=3)), out)
+    train.train(task, model, changed(small, train=dict(iterations=3)), out)  # resumed, nothing to do
     (out / checkpoint.NAME).write_bytes(b"spoilt")
     train.train(task, model, small, out)
     assert_same(out, tmp_path / "small")
@@ -199,7 +187,7 @@ def three_runs(task, model, make_settings, tmp_path_factory):
     folder = tmp_path_factory.mktemp("three")
     for name, seed, iterations in (("run", 0, 3), ("other", 1, 3), ("whole", 0, 5)):
         conf = dict(record_every=1, seed=seed, iterations=iterations)
-        train.train(task, model, copy_of(make_settings(), train=conf), folder / name)
+        train.train(task, model, changed(make_settings(), train=conf), folder / name)
     return folder
 
 
@@ -209,7 +197,7 @@ def test_files_that_are_not_those_of_the_checkpoint_are_refused(
     task, model, settings, three_runs, tmp_path, name, harm
 ):
     """A damaged file or that of another run is named; with the right one in its place the run goes on to the same end."""
-    conf = copy_of(settings, train=dict(record_every=1, iterations=3))
+    conf = changed(settings, train=dict(record_every=1, iterations=3))
     shutil.copytree(three_runs / "run", tmp_path / "run")
     path, right = tmp_path / "run" / name, (tmp_path / "run" / name).read_bytes()
     if harm == "flipped bit":
@@ -221,21 +209,21 @@ def test_files_that_are_not_those_of_the_checkpoint_are_refused(
         train.train(task, model, conf, tmp_path / "run", begin=lambda: began.append(1))
     assert not began
     path.write_bytes(right)
-    train.train(task, model, copy_of(conf, train=dict(iterations=5)), tmp_path / "run")
+    train.train(task, model, changed(conf, train=dict(iterations=5)), tmp_path / "run")
     assert_same(tmp_path / "run", three_runs / "whole")
 
 
 def test_what_was_moved_away_is_begun_anew(task, model, settings, unbroken, tmp_path, caplog):
     """Tables and recording are not needed to go on: without them the rest is the same, and the log says what is lost."""
-    conf = copy_of(settings, train=dict(record_every=1, iterations=3))
+    conf = changed(settings, train=dict(record_every=1, iterations=3))
     train.train(task, model, conf, tmp_path / "run")
     (tmp_path / "run" / "run.h5").write_bytes(b"spoilt")
     with pytest.raises(ValueError, match=r"Move .*run\.h5 away to go on"):
-        train.train(task, model, copy_of(conf, train=dict(iterations=5)), tmp_path / "run")
+        train.train(task, model, changed(conf, train=dict(iterations=5)), tmp_path / "run")
     for name in ("run.h5", "metrics.csv", "timing.csv"):
         (tmp_path / "run" / name).rename(tmp_path / name)
-    train.train(task, model, copy_of(conf, train=dict(iterations=5)), tmp_path / "run")
-    assert rows(tmp_path / "run") == rows(unbroken)[3:]
+    train.train(task, model, changed(conf, train=dict(iterations=5)), tmp_path / "run")
+    assert rows_of(tmp_path / "run") == rows_of(unbroken)[3:]
     for name in ("run.h5", "metrics.csv", "timing.csv"):
         assert f"{name} is missing" in caplog.text
     with softmpm.Recording(tmp_path / "run" / "run.h5") as recording:
@@ -245,7 +233,7 @@ def test_what_was_moved_away_is_begun_anew(task, model, settings, unbroken, tmp_
 def test_a_recording_outlives_a_part_that_records_nothing(task, model, settings, tmp_path):
     """Earlier recordings still belong to the run afterwards."""
     for iterations, every in ((2, 1), (3, 0), (4, 1)):
-        conf = copy_of(settings, train=dict(iterations=iterations, record_every=every))
+        conf = changed(settings, train=dict(iterations=iterations, record_every=every))
         train.train(task, model, conf, tmp_path)
     with softmpm.Recording(tmp_path / "run.h5") as recording:
         assert list(recording.episodes) == [0, 1, 3, 4]
@@ -266,7 +254,7 @@ def test_another_task_does_not_resume(task, model, settings, unbroken, change):
 
 def test_a_checkpoint_of_something_else_is_refused(task, model, settings, tmp_path):
     """With a hash that is right, but another shape, a part that is missing or of another kind: named, in a sentence."""
-    train.train(task, model, copy_of(settings, train=dict(iterations=2)), tmp_path)
+    train.train(task, model, changed(settings, train=dict(iterations=2)), tmp_path)
     good = checkpoint.load(tmp_path)
     moments = good["optimizer"]["state"]
     bad = [
@@ -315,16 +303,16 @@ def test_stops_when_asked_and_goes_on(task, model, settings, unbroken, tmp_path)
     )
     assert not result.finished and done == [0, 1]
     result = train.train(task, model, settings, tmp_path / "out")
-    assert result.finished and result.best_loss == float(rows(unbroken)[-1]["best"])
+    assert result.finished and result.best_loss == float(rows_of(unbroken)[-1]["best"])
     assert_same(tmp_path / "out", unbroken)
 
 
 def test_other_settings_do_not_resume(task, model, settings, unbroken):
     """A checkpoint of other settings is refused, naming each difference; more iterations are welcome."""
     with pytest.raises(ValueError, match=r"policy\.gain: .* then, 0\.5 now"):
-        train.train(task, model, copy_of(settings, policy=dict(gain=0.5)), unbroken)
-    assert train.train(task, model, copy_of(settings, train=dict(iterations=6)), unbroken).finished
-    assert len(rows(unbroken)) == 6
+        train.train(task, model, changed(settings, policy=dict(gain=0.5)), unbroken)
+    assert train.train(task, model, changed(settings, train=dict(iterations=6)), unbroken).finished
+    assert len(rows_of(unbroken)) == 6
 
 
 def test_a_checkpoint_that_is_older_than_a_setting_resumes(task, model, settings, unbroken):
@@ -334,18 +322,18 @@ def test_a_checkpoint_that_is_older_than_a_setting_resumes(task, model, settings
     del about["design.strength"], about["design.strength_factor"]
     checkpoint.save(unbroken, old | {"about": json.dumps(about)})
     with pytest.raises(ValueError, match=r"design\.strength: False then, True now"):
-        train.train(task, model, copy_of(settings, design=dict(strength=True)), unbroken)
-    assert train.train(task, model, copy_of(settings, train=dict(iterations=6)), unbroken).finished
+        train.train(task, model, changed(settings, design=dict(strength=True)), unbroken)
+    assert train.train(task, model, changed(settings, train=dict(iterations=6)), unbroken).finished
 
 
 def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
     """A run that designs the strength lowers the loss by it alone, reports its change, and resumes."""
     alone = dict(young=False, poisson=False, density=False, strength=True)
-    conf = copy_of(settings, design=alone, optimizer=dict(policy_rate=1e-12), policy=dict(gain=1.0))
-    conf = copy_of(conf, observer=dict(name="centroids"), train=dict(iterations=4))
+    conf = changed(settings, design=alone, optimizer=dict(policy_rate=1e-12), policy=dict(gain=1.0))
+    conf = changed(conf, observer=dict(name="centroids"), train=dict(iterations=4))
     train.train(task, model, conf, tmp_path)
-    result = train.train(task, model, copy_of(conf, train=dict(iterations=6)), tmp_path)
-    found = rows(tmp_path)
+    result = train.train(task, model, changed(conf, train=dict(iterations=6)), tmp_path)
+    found = rows_of(tmp_path)
     assert result.finished and list(found[0])[14:19] == [
         f"{n}_change" for n in ("young", "poisson", "density", "strength")
     ] + ["epochs"]
@@ -366,7 +354,7 @@ def test_a_design_of_stiff_parts_is_drawn_over_that_of_the_scene(task, make_bloc
         for part, material in zip(np.split(body.particles.positions, 2), (body.material, stiff), strict=True)
     ]
     scene = dataclasses.replace(scene, bodies=halves, dt=1e-3)
-    conf = copy_of(settings, observer=dict(name="centroids"))
+    conf = changed(settings, observer=dict(name="centroids"))
     model = softmpm.build(scene, device="cpu")
     drawn = design(Run(dataclasses.replace(task, scene=scene), model, conf, tmp_path))
     values, unit = drawn["Young's modulus, over that of the scene"]
@@ -380,9 +368,9 @@ def test_it_gets_better(task, model, settings, tmp_path, observer, alone):
     """Whatever it observes, gradient descent lowers the crawler's loss from each step to the next, by policy or design alone."""
     longer = dataclasses.replace(task, control_steps=12)
     off = dict(design=dict(enabled=False)) if alone == "policy" else dict(optimizer=dict(policy_rate=1e-12))
-    conf = copy_of(settings, observer=dict(name=observer, clusters=3), learning=dict(every=99), **off)
-    train.train(longer, model, copy_of(conf, train=dict(iterations=8)), tmp_path)
-    losses = [float(row["loss"]) for row in rows(tmp_path)][1:]  # the encoder learned after the first
+    conf = changed(settings, observer=dict(name=observer, clusters=3), learning=dict(every=99), **off)
+    train.train(longer, model, changed(conf, train=dict(iterations=8)), tmp_path)
+    losses = [float(row["loss"]) for row in rows_of(tmp_path)][1:]  # the encoder learned after the first
     assert all(after < before for before, after in itertools.pairwise(losses)), losses
 
 
@@ -391,17 +379,17 @@ def test_each_refinement_can_be_switched_off(task, model, settings, tmp_path):
     ends = {}
     switches = ("early_stopping", "replay", "target_network", "variational")
     for switch in ("none", *switches):
-        conf = copy_of(settings, learning={"patience": 1} | ({} if switch == "none" else {switch: False}))
+        conf = changed(settings, learning={"patience": 1} | ({} if switch == "none" else {switch: False}))
         out = tmp_path / switch
-        train.train(task, model, copy_of(conf, train=dict(iterations=7)), out)
-        ends[switch] = [float(r["loss"]) for r in rows(out)]
+        train.train(task, model, changed(conf, train=dict(iterations=7)), out)
+        ends[switch] = [float(r["loss"]) for r in rows_of(out)]
     assert all(ends[s] != ends["none"] for s in switches if s != "early_stopping"), ends
 
 
 def test_random_goals_are_drawn_anew(task, settings, tmp_path):
     """Each world and iteration has its own goal inside the box; a task without a goal refuses."""
     model = softmpm.build(task.scene, device="cpu", worlds=3)
-    conf = copy_of(settings, train=dict(worlds=3, iterations=2, goal_spread=[0.1, 0.0], record_every=1))
+    conf = changed(settings, train=dict(worlds=3, iterations=2, goal_spread=[0.1, 0.0], record_every=1))
     run = train.Run(task, model, conf, tmp_path)
     goals = torch.stack([run.goals.draw() for _ in range(200)])
     assert goals[..., 0].unique().numel() == 600 and ((goals[..., 0] - 0.6).abs() <= 0.1).all()
@@ -440,14 +428,14 @@ def test_a_failed_simulation_is_tried_again_from_halfway_back(
     task, model, settings, tmp_path, monkeypatch, caplog
 ):
     """After a failure policy and design go halfway back to where the last simulation went well; it is counted and logged."""
-    conf = copy_of(settings, observer=dict(name="centroids"), train=dict(iterations=2))
-    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    conf = changed(settings, observer=dict(name="centroids"), train=dict(iterations=2))
+    first = train.train(task, model, changed(conf, train=dict(iterations=1)), tmp_path / "one").run
     halfway = [(p + s) / 2 for p, s in zip(first.parameters, first.safe, strict=True)]
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8}))
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, halfway, strict=True):
         torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
-    assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"]
+    assert [r["retries"] for r in rows_of(tmp_path / "two")] == ["0", "1"]
     at = "particle 3 is inverted. In control step 2 of 6, which began at 0.032 s. Going halfway back."
     assert at in caplog.text
 
@@ -457,14 +445,14 @@ def test_a_run_without_a_retry_left_goes_back_to_its_best(
 ):
     """Of the whole step and of its half: the policy is that of the best iteration again, and the rates fall as in a fallback."""
     optimizer = dict(retries=1, halving=None)
-    conf = copy_of(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=2))
-    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    conf = changed(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=2))
+    first = train.train(task, model, changed(conf, train=dict(iterations=1)), tmp_path / "one").run
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8, 9}))
     second = train.train(task, model, conf, tmp_path / "two").run
     for now, want in zip(second.safe, first.safe, strict=True):
         assert torch.equal(now, want)
     assert "In control step 0 of 6, which began at 0 s. The run is going back to iteration 0." in caplog.text
-    assert rows(tmp_path / "two")[1]["retries"] == "2"
+    assert rows_of(tmp_path / "two")[1]["retries"] == "2"
     now, before = (run.optimizer.param_groups[0]["lr"] for run in (second, first))
     assert now == pytest.approx(before * conf.optimizer.fallback_rate)
 
@@ -473,10 +461,10 @@ def test_a_run_without_a_retry_left_goes_back_to_its_best(
 def test_what_follows_failed_steps_is_counted(task, model, settings, tmp_path, monkeypatch, above, want):
     """A run without a retry left that goes back to its best, or begins anew, does so in the row of that iteration."""
     optimizer = dict(retries=1, restart_above=above)
-    conf = copy_of(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=3))
+    conf = changed(settings, observer=dict(name="centroids"), optimizer=optimizer, train=dict(iterations=3))
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8, 9}))
     train.train(task, model, conf, tmp_path)
-    found = [(row["fallbacks"], row["restarts"]) for row in rows(tmp_path)]
+    found = [(row["fallbacks"], row["restarts"]) for row in rows_of(tmp_path)]
     assert found == [("0", "0"), want, ("0", "0")]
 
 
@@ -485,7 +473,7 @@ def test_a_run_that_cannot_go_on_names_the_iteration(
     task, model, settings, tmp_path, monkeypatch, at, iteration
 ):
     """A failure that cannot backtrack ends with the iteration, the particle and advice; the run resumes from before it."""
-    conf = copy_of(settings, optimizer=dict(retries=1))
+    conf = changed(settings, optimizer=dict(retries=1))
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at))
     with pytest.raises(
         TrainingError, match=f"iteration {iteration}: particle 3 is inverted. In control"
@@ -512,8 +500,8 @@ def test_a_gradient_that_is_not_finite_is_tried_again_from_halfway_back(
     task, model, settings, tmp_path, monkeypatch, caplog, value
 ):
     """As a simulation that fails: counted and logged, the step is halved, and the optimiser never sees such a gradient."""
-    conf = copy_of(settings, observer=dict(name="centroids"), train=dict(iterations=2))
-    first = train.train(task, model, copy_of(conf, train=dict(iterations=1)), tmp_path / "one").run
+    conf = changed(settings, observer=dict(name="centroids"), train=dict(iterations=2))
+    first = train.train(task, model, changed(conf, train=dict(iterations=1)), tmp_path / "one").run
     halfway = [(p + s) / 2 for p, s in zip(first.parameters, first.safe, strict=True)]
     real, calls = torch.autograd.grad, itertools.count()
 
@@ -527,7 +515,7 @@ def test_a_gradient_that_is_not_finite_is_tried_again_from_halfway_back(
     assert next(calls) == 9
     for now, want in zip(second.safe, halfway, strict=True):
         torch.testing.assert_close(now, want.detach(), rtol=1e-6, atol=1e-9)
-    assert [r["retries"] for r in rows(tmp_path / "two")] == ["0", "1"]
+    assert [r["retries"] for r in rows_of(tmp_path / "two")] == ["0", "1"]
     assert "not finite" in caplog.text and "Going halfway back" in caplog.text
     moments = [v for state in second.optimizer.state.values() for v in state.values()]
     assert all(p.isfinite().all() for p in [*second.parameters, *moments])
@@ -535,17 +523,17 @@ def test_a_gradient_that_is_not_finite_is_tried_again_from_halfway_back(
 
 def test_clipping_is_counted(task, model, settings, tmp_path):
     """A longer gradient is shortened to max_norm and counted; its full length is what the metrics show."""
-    conf = copy_of(settings, optimizer=dict(max_norm=1e-9), train=dict(iterations=2))
+    conf = changed(settings, optimizer=dict(max_norm=1e-9), train=dict(iterations=2))
     run = train.train(task, model, conf, tmp_path).run
     length = sum(p.grad.square().sum() for p in run.parameters).sqrt().item()
     assert length == pytest.approx(1e-9, rel=1e-3)
-    assert all(r["clipped"] == "1" and float(r["gradient_policy"]) > 1e-6 for r in rows(tmp_path))
+    assert all(r["clipped"] == "1" and float(r["gradient_policy"]) > 1e-6 for r in rows_of(tmp_path))
 
 
 def test_the_recording_holds_the_run(task, model, settings, tmp_path):
     """First, every second, last (of either part) and best episode are in run.h5, all their frames, and every loss."""
-    conf = copy_of(settings, train=dict(record_every=2))
-    train.train(task, model, copy_of(conf, train=dict(iterations=2)), tmp_path)
+    conf = changed(settings, train=dict(record_every=2))
+    train.train(task, model, changed(conf, train=dict(iterations=2)), tmp_path)
     train.train(task, model, conf, tmp_path)
     with softmpm.Recording(tmp_path / "run.h5") as recording:
         assert list(recording.episodes) == [0, 1, 2, 4, 5]
@@ -553,16 +541,16 @@ def test_the_recording_holds_the_run(task, model, settings, tmp_path):
         frames = recording.frames(4)
         assert len(frames["time"]) == task.control_steps + 1
         iterations, losses = recording.scalars["loss"]
-    assert list(iterations) == list(range(5)) and [float(r["loss"]) for r in rows(tmp_path)] == pytest.approx(
-        losses
-    )
+    assert list(iterations) == list(range(5)) and [
+        float(r["loss"]) for r in rows_of(tmp_path)
+    ] == pytest.approx(losses)
 
 
 def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path):
     """Centroids need no replay buffer: none is written, and learning columns stay empty."""
-    train.train(task, model, copy_of(settings, observer=dict(name="centroids")), tmp_path)
+    train.train(task, model, changed(settings, observer=dict(name="centroids")), tmp_path)
     assert not (tmp_path / "replay").exists() and all(
-        r["replay"] == r["epochs"] == "" for r in rows(tmp_path)
+        r["replay"] == r["epochs"] == "" for r in rows_of(tmp_path)
     )
 
 
@@ -571,14 +559,14 @@ def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path)
 def test_what_others_are_compared_with(task, model, settings, tmp_path, observer, clock):
     """A random encoder keeps its weights in learning phases; without a view activations are those of the clock, or constant. Stopped
     and resumed, such a run ends as an unbroken one, recorded and examined."""
-    conf = copy_of(settings, observer=dict(name=observer), policy=dict(name="mlp", hidden=[8], clock=clock))
-    conf = copy_of(conf, train=dict(record_every=4, examine=True))
+    conf = changed(settings, observer=dict(name=observer), policy=dict(name="mlp", hidden=[8], clock=clock))
+    conf = changed(conf, train=dict(record_every=4, examine=True))
     first = Run(task, model, conf, tmp_path / "first")
     done = []
     words = dict(progress=lambda k, row: done.append(k), stop=lambda: len(done) == 3)
     assert not train.train(task, model, conf, tmp_path / "run", **words).finished
     result, whole = (train.train(task, model, conf, tmp_path / name) for name in ("run", "whole"))
-    assert rows(tmp_path / "run") == rows(tmp_path / "whole") and result.examination["later"]
+    assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole") and result.examination["later"]
     if observer == "untrained":
         assert result.run.learner.phases == 3
         for one in (result.run, whole.run):
@@ -593,7 +581,7 @@ def test_what_others_are_compared_with(task, model, settings, tmp_path, observer
 
 def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):
     """The folder holds what the last two checkpoints name, and no more."""
-    folder, small = tmp_path / "replay", copy_of(settings, learning=dict(simulations=2))
+    folder, small = tmp_path / "replay", changed(settings, learning=dict(simulations=2))
     train.train(task, model, small, tmp_path)
     kept = ["00000002.h5", "00000003.h5", "00000004.h5"]
     assert sorted(p.name for p in folder.iterdir()) == kept
@@ -604,12 +592,12 @@ def test_old_simulations_leave_the_disk(task, model, settings, tmp_path):
 
 def test_control_only(task, model, settings, tmp_path):
     """With the design off the materials stay and only the policy has a gradient."""
-    conf = copy_of(
+    conf = changed(
         settings, observer=dataclasses.asdict(ObserverConf(name="centroids")), design={"enabled": False}
     )
     assert not DesignConf(enabled=False).enabled
     train.train(task, model, conf, tmp_path)
-    assert all(float(r["young_change"]) == 0 == float(r["gradient_design"]) for r in rows(tmp_path))
+    assert all(float(r["young_change"]) == 0 == float(r["gradient_design"]) for r in rows_of(tmp_path))
 
 
 def test_double_precision(task, settings, tmp_path):
@@ -620,10 +608,10 @@ def test_double_precision(task, settings, tmp_path):
     train.train(
         task,
         softmpm.build(task.scene, device="cpu"),
-        copy_of(settings, train=dict(iterations=1)),
+        changed(settings, train=dict(iterations=1)),
         tmp_path / "single",
     )
-    double, single = (float(rows(tmp_path / name)[0]["loss"]) for name in ("double", "single"))
+    double, single = (float(rows_of(tmp_path / name)[0]["loss"]) for name in ("double", "single"))
     assert double != single and double == pytest.approx(single, rel=1e-3)
 
 
@@ -659,7 +647,7 @@ def test_pictures_can_be_drawn_while_a_run_goes_on(task, model, settings, tmp_pa
 
 def test_an_episode_that_failed_is_no_picture(task, model, settings, tmp_path, monkeypatch):
     """It was drawn with the number of the iteration before."""
-    conf = copy_of(
+    conf = changed(
         settings, observer=dict(name="centroids"), optimizer=dict(retries=0), train=dict(record_every=1)
     )
     monkeypatch.setattr(softmpm, "simulate", fails(softmpm.simulate, at={8}))

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from oracle_scenes import DIMS, f64, full, masses, randn, rest, shaken, slopes, tiny
+from oracle_scenes import DIMS, assert_same, f64, full, masses, randn, rest, shaken, slopes, tiny
 
 from softmpm.inputs import Inputs
 from softmpm.oracle import moving
@@ -27,11 +27,6 @@ def sliding(dim: int, scene: Scene, worlds: int) -> tuple[State, Params]:
     """A random start that slides with 2 m/s, so that no node changes between held, sliding and leaving nearby."""
     start, params = shaken(scene, worlds=worlds, noise=0.3)
     return start._replace(v=start.v + f64((2.0, -0.5, 0.3)[:dim])), params
-
-
-def assert_same(got: State, want: State, limit: float) -> None:
-    for a, b in zip(got[:4], want[:4], strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=limit)
 
 
 @DIMS

@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from oracle_scenes import DIMS, difference, f64, randn
 
 from softmpm.oracle import stress
 from softmpm.scene.materials import StableNeoHookean
 
-DIMS = pytest.mark.parametrize("dim", [2, 3])
 LAWS = {
     "neo_hookean": stress.neo_hookean,
     "stable_neo_hookean": stress.stable_neo_hookean,
@@ -18,15 +18,7 @@ LAWS = {
 SURVIVES_INVERSION = ("stable_neo_hookean", "fixed_corotated")
 
 
-def f64(values) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
 MU, LAM = f64(3.0), f64(5.0)
-
-
-def randn(*shape, seed=0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def rotation(dim: int, seed: int) -> torch.Tensor:
@@ -53,12 +45,6 @@ def special_points(dim: int) -> dict[str, torch.Tensor]:
         "inverted, equal stretches": stretched(dim, 1.2, -0.4, 1.2),
         "random": randn(dim, dim, seed=4) + torch.eye(dim),
     }
-
-
-def difference(f, at: torch.Tensor, d: torch.Tensor, h: float) -> torch.Tensor:
-    """Directional derivative by a central difference of sixth order."""
-    terms = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
-    return sum(c * (f(at + k * h * d) - f(at - k * h * d)) for k, c in terms) / h
 
 
 def assert_derivative(f, at: torch.Tensor, what: str) -> None:

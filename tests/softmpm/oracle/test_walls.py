@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from oracle_scenes import DIMS, f64, full, randn, rest, shaken, tiny
+from oracle_scenes import DIMS, assert_same, f64, full, randn, rest, shaken, tiny
 
 from softmpm.inputs import Inputs
 from softmpm.oracle import moving, walls
@@ -10,11 +10,6 @@ from softmpm.scene.scene import Grid, Scene, Wall
 from softmpm.state import Params, State
 
 KINDS = [("stick", 0.0), ("slip", 0.0), ("separate", 0.0), ("separate", 0.4)]
-
-
-def assert_same(got: State, want: State, limit: float) -> None:
-    for a, b in zip(got[:4], want[:4], strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=limit)
 
 
 def poses(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:

@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn.__main__ import help_text
@@ -28,6 +27,8 @@ from softmpm_learn.runs.saved import load, save
 from softmpm_learn.storage import checkpoint
 from softmpm_learn.tasks import ArmConf, Resolution, make_task
 
+pytestmark = pytest.mark.usefixtures("fresh_hydra")
+
 ROOT = Path(__file__).parents[3]
 TINY = [  # the smallest run that has every phase
     *("task=arm", "experiment=smoke", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
@@ -37,16 +38,6 @@ LEFT = (
     *("config.yaml", "metrics.csv", "timing.csv", "run.h5", "run.rrd", "checkpoint.pt"),
     *("loss.png", "latent.png", "robot.png"),
 )
-
-
-@pytest.fixture(autouse=True)
-def fresh_hydra(monkeypatch):
-    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
-    GlobalHydra.instance().clear()
-    yield
-    GlobalHydra.instance().clear()
 
 
 def composed(*overrides):

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import gc
-import logging
 import math
 import sys
 import types
@@ -23,6 +22,8 @@ from softmpm_learn.config import RunConf
 from softmpm_learn.settings import ObserverConf, OptimizerConf, TrainConf
 from softmpm_learn.tasks import ArmConf, BipedConf
 
+pytestmark = pytest.mark.usefixtures("in_folder")
+
 TINY = [
     *("task=arm", "task.seconds=0.05", "task.control_period=0.025", "task.hold=0.05", "device=cpu"),
     *("device.dtype=float64", "policy=linear", "train.iterations=2", "train.examine=false"),
@@ -30,16 +31,6 @@ TINY = [
     "policy.clock=true",  # so that the arm moves from the first step on
 ]
 CHOICES = ("observer=centroids,nothing", "design=off,particle", "train.seeds=2")
-
-
-@pytest.fixture(autouse=True)
-def fresh_hydra(monkeypatch, tmp_path):
-    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
-    monkeypatch.chdir(tmp_path)
-    yield
-    GlobalHydra.instance().clear()
 
 
 @pytest.fixture

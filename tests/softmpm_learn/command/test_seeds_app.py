@@ -1,26 +1,25 @@
 """Seeds side by side from the command line: folders, table, failures, going on, sweeps and several processes."""
 
 import csv
-import logging
 import math
 import statistics
 import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import forked
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
-from softmpm_learn.command import app, experiment, jobs, seeds
+from softmpm_learn.command import experiment, jobs, seeds
 from softmpm_learn.config import RunConf
 from softmpm_learn.distributed import Group
 from softmpm_learn.figures import __main__ as figures
 from softmpm_learn.runs.saved import load
 from softmpm_learn.settings import TrainConf
 from softmpm_learn.storage import checkpoint
+
+pytestmark = pytest.mark.usefixtures("in_folder")
 
 TINY = [
     *("task=arm", "observer=centroids", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
@@ -31,37 +30,6 @@ PLAIN = (*TINY, "train.pictures=false", "train.record_every=0")
 """For tests of numbers and rows: pictures and recordings take most of the time of such runs."""
 MOVING = (*PLAIN, "policy.clock=true")
 """The arm moves from the first step on."""
-
-
-@pytest.fixture(autouse=True)
-def fresh_hydra(monkeypatch, tmp_path):
-    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
-    monkeypatch.chdir(tmp_path)
-    GlobalHydra.instance().clear()
-    yield
-    GlobalHydra.instance().clear()
-
-
-@pytest.fixture
-def main(monkeypatch):
-    """``python -m softmpm_learn`` in this process; gives the exit code and the objectives."""
-    real = app.job
-
-    def go(*words: str) -> tuple[int, list[float]]:
-        objectives = []
-        monkeypatch.setattr(app, "job", lambda *args: objectives.append(real(*args)) or objectives[-1])
-        quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
-        monkeypatch.setattr(sys, "argv", ["softmpm_learn", *words, *quiet])
-        GlobalHydra.instance().clear()
-        try:
-            app.main()
-        except SystemExit as stop:
-            return stop.code, objectives
-        return 0, objectives
-
-    return go
 
 
 def rows(path: Path) -> list[dict[str, str]]:

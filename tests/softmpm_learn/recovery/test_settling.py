@@ -1,11 +1,11 @@
 """The last iterations of a run: from its best, with ever smaller steps, through features that stay as they are."""
 
-import csv
 import dataclasses
 import math
 
 import pytest
 import torch
+from learners import changed, rows_of
 
 from softmpm_learn.command.pictures import curves
 from softmpm_learn.optimizer_settings import OptimizerConf
@@ -79,19 +79,8 @@ def conf(settings):
     return dataclasses.replace(settings, optimizer=optimizer, learning=learning, train=some)
 
 
-def changed(conf, **parts):
-    return dataclasses.replace(
-        conf, **{k: dataclasses.replace(getattr(conf, k), **v) for k, v in parts.items()}
-    )
-
-
 def equal(one: dict, other: dict, *names: str) -> bool:
     return all(torch.equal(one[part][k], other[part][k]) for part in names or one for k in one[part])
-
-
-def rows_of(path) -> list[dict[str, str]]:
-    with open(path / "metrics.csv", newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize("target_network", [True, False])

@@ -1,8 +1,6 @@
 """Seeds side by side: each is the run that it would be alone."""
 
 import contextlib
-import csv
-import dataclasses
 import gc
 import itertools
 import math
@@ -14,6 +12,7 @@ import forked
 import numpy as np
 import pytest
 import torch
+from learners import changed, metrics
 from torch import nn
 
 import softmpm
@@ -35,14 +34,6 @@ from softmpm_learn.training.optimisation import TrainingError
 HERE = Path(__file__).parent
 SEEDS = 3
 CLOSE = 1e-9
-
-
-def changed(settings: Settings, **changes) -> Settings:
-    """Settings with other values, given as group=dict(name=value)."""
-    parts = {
-        group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()
-    }
-    return dataclasses.replace(settings, **parts)
 
 
 def three_seeds(settings: Settings) -> Settings:
@@ -70,11 +61,6 @@ def together(task, conf: Settings, out: Path, device: str = "cpu", **options) ->
     """All seeds in one simulation, in ``out/K``."""
     plans = [Plan(settings=one, out=out / str(k)) for k, one in enumerate(split(conf))]
     return train_side_by_side(task, built(task, conf, len(plans), device), plans, **options)
-
-
-def metrics(folder: Path) -> list[dict[str, float]]:
-    with open(folder / "metrics.csv", newline="") as file:
-        return [{name: float(cell or "nan") for name, cell in row.items()} for row in csv.DictReader(file)]
 
 
 def assert_same(folder: Path, want: Path, tolerance: float = CLOSE) -> None:

@@ -3,20 +3,19 @@
 import contextlib
 import csv
 import json
-import logging
 import math
-import sys
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 import softmpm
 from softmpm_learn import train
-from softmpm_learn.command import app, jobs
+from softmpm_learn.command import jobs
 from softmpm_learn.runs.saved import load
 from softmpm_learn.storage import checkpoint, sweep
 from softmpm_learn.training import optimisation
+
+pytestmark = pytest.mark.usefixtures("in_folder")
 
 TINY = [
     *("task=arm", "observer=centroids", "task.seconds=0.05", "task.control_period=0.025", "device=cpu"),
@@ -33,35 +32,10 @@ FAILS, WORKS = "task.poisson=0.45", "task.poisson=0.3"
 INVERTED = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
 
 
-@pytest.fixture(autouse=True)
-def fresh_hydra(monkeypatch, tmp_path):
-    """Hydra keeps what it has composed, and handlers of the log; main() also sets an environment variable."""
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    monkeypatch.setattr(logging.getLogger(), "handlers", logging.getLogger().handlers[:])
-    monkeypatch.chdir(tmp_path)
-    GlobalHydra.instance().clear()
-    yield
-    GlobalHydra.instance().clear()
-
-
 @pytest.fixture
-def run(monkeypatch):
+def run(main):
     """Runs a sweep in this process; gives the exit code and the numbers that Hydra's sweeper got."""
-    real = app.job
-
-    def go(*words: str) -> tuple[int, list[float]]:
-        objectives = []
-        monkeypatch.setattr(app, "job", lambda *args: objectives.append(real(*args)) or objectives[-1])
-        quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
-        monkeypatch.setattr(sys, "argv", ["softmpm_learn", "-m", *TINY, *words, *quiet])
-        GlobalHydra.instance().clear()
-        try:
-            app.main()
-        except SystemExit as stop:
-            return stop.code, objectives
-        return 0, objectives
-
-    return go
+    return lambda *words: main("-m", *TINY, *words)
 
 
 def table() -> list[dict[str, str]]:

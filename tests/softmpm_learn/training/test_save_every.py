@@ -1,6 +1,5 @@
 """Checkpoints every so many iterations: whatever a run is ahead of the last one when it ends, it goes on as if nothing had been."""
 
-import dataclasses
 import itertools
 import os
 import signal
@@ -9,6 +8,7 @@ from pathlib import Path
 import forked
 import pytest
 import torch
+from learners import changed
 
 import softmpm
 from softmpm_learn import train
@@ -18,14 +18,6 @@ from softmpm_learn.settings import Settings, TrainConf
 from softmpm_learn.storage import checkpoint
 from softmpm_learn.storage.csv_log import Table
 from softmpm_learn.training.optimisation import TrainingError
-
-
-def changed(settings: Settings, **changes) -> Settings:
-    """Settings with other values, given as group=dict(name=value)."""
-    parts = {
-        group: dataclasses.replace(getattr(settings, group), **values) for group, values in changes.items()
-    }
-    return dataclasses.replace(settings, **parts)
 
 
 def every_third(settings: Settings) -> Settings:
