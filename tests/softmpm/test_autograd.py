@@ -1,10 +1,12 @@
 """The PyTorch boundary: what users of torch expect of a differentiable function."""
 
+import dataclasses
 import warnings
 
 import pytest
 import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
+from helpers import given as given_inputs
 from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
@@ -102,6 +104,40 @@ def test_rounding_of_a_start_changed_in_place_before_backward_raises(device):
     start.low.x.add_(1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         end.x.sum().backward()
+
+
+def conjugate(tensor: torch.Tensor) -> torch.Tensor:
+    """The same numbers, as the imaginary part of a conjugate: a view of memory that has them with the other sign."""
+    return torch.complex(torch.zeros_like(tensor), -tensor).conj().imag
+
+
+def negative(tensor: torch.Tensor) -> torch.Tensor:
+    """The same, in contiguous memory."""
+    return torch._neg_view((-tensor).contiguous())
+
+
+@pytest.mark.parametrize("lazily", [conjugate, negative])
+@pytest.mark.parametrize("settings", [{"scheme": "plain"}, {"scheme": "fast"}, {"formulation": "reference"}])
+def test_lazily_negated_tensors_have_their_sign(lazily, settings, device):
+    """Inputs and cotangents with PyTorch's negative bit, as a complex loss gives: end, rasterized field and gradients are those of
+    ordinary tensors."""
+    scene = dataclasses.replace(busy_scene(2), body_contact=False)
+    model = softmpm.build(scene, device=device, inputs=("gravity", "friction"), **settings)
+    leaves = [tensor.detach().requires_grad_() for tensor in model.rest()[:4]]
+    leaves += [tensor.requires_grad_() for tensor in busy_inputs(model).values()][4:]
+    leaves += [tensor.requires_grad_() for tensor in given_inputs(model, ("gravity", "friction"), 2).values()]
+
+    def found(view) -> list[torch.Tensor]:
+        x, v, C, F, activation, *others = map(view, leaves)
+        params, inputs = softmpm.Params(*others[:3]), softmpm.Inputs(gravity=others[3], friction=others[4])
+        start = softmpm.State(x, v, C, F)
+        end = softmpm.simulate(model, start, activation, params, substeps=3, inputs=inputs)
+        results = [*end[:4], *softmpm.rasterize(model, start)]
+        weights = [view(torch.linspace(-1, 1, out.numel()).to(out).view_as(out)) for out in results]
+        return [*results, *torch.autograd.grad(results, leaves, weights)]
+
+    for got, want in zip(found(lazily), found(torch.clone), strict=True):
+        assert torch.equal(got, want) if device == "cpu" else torch.allclose(got, want, rtol=1e-4, atol=1e-6)
 
 
 def test_only_what_is_asked_for_is_computed(model):

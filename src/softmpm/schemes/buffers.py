@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 import warp as wp
@@ -12,9 +13,9 @@ from softmpm.model import Model
 
 
 def view(tensor: Tensor, dtype) -> wp.array:
-    """Warp array on a tensor's memory; vectors and matrices take up its last axes."""
+    """Warp array on a tensor's memory, or on that of a copy if it is lazily negated; vectors and matrices take up its last axes."""
     _check_reach(tensor)
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+    return wp.from_torch(tensor.detach().resolve_neg(), dtype=dtype, requires_grad=False)
 
 
 def _check_reach(tensor: Tensor) -> None:
@@ -32,7 +33,10 @@ def _check_reach(tensor: Tensor) -> None:
 def passing(tensor: Tensor, dtype):
     """As :func:`view`, for one launch: cheaper to create, but not usable as a field of a struct."""
     _check_reach(tensor)
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    memory = tensor.detach().resolve_neg()
+    found: Any = wp.from_torch(memory, dtype=dtype, requires_grad=False, return_ctype=True)
+    found.memory = memory  # a copy lives as long
+    return found
 
 
 def placeholder(model: Model, dtype, *size: int):

@@ -129,6 +129,7 @@ class RebindableLaunch:
         A backward pass runs in a thread of its own and shares launches with the thread of the call, hence the lock.
         """
         assert all(tensor.is_contiguous() for tensor in tensors)
+        tensors = tuple(tensor.resolve_neg() for tensor in tensors)
         with self._filling:
             for placeholder, tensor in zip(self._placeholders, tensors, strict=True):
                 placeholder.data = tensor.data_ptr()
