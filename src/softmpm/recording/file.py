@@ -4,6 +4,7 @@ The old file remains until the new one is complete; disk space is reserved befor
 """
 
 import contextlib
+import errno
 import json
 import os
 import time
@@ -143,3 +144,10 @@ def put_in_place(draft: Path, path: Path) -> None:
     with open(draft, "rb+") as file:
         os.fsync(file.fileno())
     os.replace(draft, path)
+
+
+def need_name(file: h5py.File) -> None:
+    """Raise OSError if the file has no name any more: nobody could read what is written to it."""
+    if os.fstat(file.id.get_vfd_handle()).st_nlink == 0:
+        text = "cannot record: the file was deleted, or replaced by another recorder; give each recorder a path of its own"
+        raise FileNotFoundError(errno.ENOENT, text, file.filename)

@@ -19,7 +19,7 @@ from torch import Tensor
 from softmpm.checks import check_whole
 from softmpm.model import Model
 from softmpm.recording.digest import Content, Hash
-from softmpm.recording.file import begin, open_to_append, put_in_place, room
+from softmpm.recording.file import begin, need_name, open_to_append, put_in_place, room
 from softmpm.recording.format import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
 from softmpm.recording.format_checks import check_values
 from softmpm.state import ContactForces, GridField, State
@@ -54,7 +54,8 @@ class Recorder:
     Raises:
         FileExistsError: The file exists, and ``resume_before`` was not given.
         ValueError: The existing file records another scene, or has another digest.
-        OSError: There is no room on the disk; also from the methods. What was recorded before is safe.
+        OSError: There is no room on the disk; also from the methods. What was recorded before is safe. From the methods also if
+            the file was deleted, or replaced by that of another recorder.
     """
 
     def __init__(
@@ -195,6 +196,7 @@ class Recorder:
     def _need_open(self) -> None:
         if not self._file:
             raise ValueError(f"{self.path}: this recorder is closed.")
+        need_name(self._file)
 
     def close(self) -> None:
         self._file.close()

@@ -385,6 +385,29 @@ def test_nothing_is_overwritten_by_accident(tmp_path):
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not replace or delete files that are open")
+@pytest.mark.parametrize("replace", [True, False])
+def test_a_file_that_was_replaced_or_deleted(tmp_path, replace):
+    """What a recorder writes then is lost: it says so, in the first frame; what replaced the file is recorded. A moved file goes on."""
+    model, path, moved = small_model(), tmp_path / "run.h5", tmp_path / "moved.h5"
+    with softmpm.Recorder(path, model) as recorder, recorder.episode(0) as episode:
+        path.rename(moved)
+        episode.frame(0.0, model.rest())
+        if replace:
+            with softmpm.Recorder(moved, model, resume_before=1) as other, other.episode(1) as second:
+                second.frame(0.0, model.rest())
+        else:
+            moved.unlink()
+        with pytest.raises(
+            FileNotFoundError, match=r"cannot record: the file was deleted, or replaced by .*run\.h5"
+        ):
+            episode.frame(1.0, model.rest())
+        with pytest.raises(FileNotFoundError, match="a path of its own"):
+            recorder.scalars(0, {"loss": 1.0})
+    if replace:
+        assert [len(softmpm.Recording(moved).rows(k)) for k in (0, 1)] == [1, 1]
+
+
 def test_a_scene_that_readers_would_refuse(tmp_path):
     """A strength beyond float32 is refused before there is a file, which no reader would open."""
     scene = small_model().scene
