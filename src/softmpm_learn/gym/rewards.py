@@ -74,8 +74,8 @@ def check_sums(task: Task, rest: State, activation: Tensor, goal: Tensor | None)
         single = [Path(times[:2], states[:1] * 2, steps[:1], goal)]
         single += [Path(times[:2], states[k : k + 2], steps[k : k + 1], goal) for k in range(len(share))]
         pairs = zip([first, *share], single, strict=True)
-        parts = [part * alone.value_of_each_world(path) for part, path in pairs]
-        away = (term.value_of_each_world(motion) - sum(parts)).abs().max()
+        parts = [part * _finite(alone, path) for part, path in pairs]
+        away = (_finite(term, motion) - sum(parts)).abs().max()
         if away > ROUNDING * sum(part.abs().max() for part in parts):
             raise ValueError(
                 f"{type(term).__name__} says adds_up = {term.adds_up!r}, but its value in a window is not the "

@@ -88,6 +88,23 @@ def test_a_term_that_does_not_add_up_as_it_says(term):
     SoftRobotEnv(task, EnvConf(device="cpu"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Height(Term):
+    """Logarithm of the height above one kilometre, which is no number below."""
+
+    adds_up = "states"
+
+    def value(self, path: Path) -> torch.Tensor:
+        return (path.x[self.window(path)].mean(dim=2)[..., 0] - 1e3).log().mean(dim=0)
+
+
+def test_a_term_whose_sum_is_no_number():
+    """Nobody can tell if it adds up."""
+    task = dataclasses.replace(make_task(ArmConf(seconds=0.05)), objective=Objective(Height()))
+    with pytest.raises(ValueError, match="term height must be finite after each control step.*got nan"):
+        SoftRobotEnv(task, EnvConf(device="cpu"))
+
+
 def test_a_body_is_material_and_inputs():
     """The material alone is refused when the settings are made."""
     params = make("arm", **SHORT).worlds.params
