@@ -6,7 +6,7 @@ word is read, and nothing is written out of bounds. Other worlds go on, unchange
 """
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from contextvars import ContextVar
 from enum import IntEnum
 from typing import Any
@@ -56,7 +56,8 @@ def at(place: str) -> Iterator[None]:
         _PLACE.reset(token)
 
 
-def noted(note: str) -> AbstractContextManager[None]:
+@contextmanager
+def noted(note: str) -> Iterator[None]:
     """Add a note, such as the place of a call among others, to every :class:`UnstableError` of the calls that are made in the block:
     raised, collected, or met in a backward pass later.
 
@@ -64,7 +65,8 @@ def noted(note: str) -> AbstractContextManager[None]:
         >>> with softmpm.noted("In control step 3."):
         ...     state = softmpm.simulate(model, state, activation, params, substeps=10)
     """
-    return at(f"{note} {place()}".strip())
+    with at(f"{note} {place()}".strip()):
+        yield
 
 
 class UnstableError(RuntimeError):

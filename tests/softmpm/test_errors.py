@@ -136,6 +136,11 @@ def test_errors_have_the_notes_of_their_call():
     with pytest.raises(softmpm.UnstableError) as caught, softmpm.noted("Elsewhere."):
         softmpm.simulate(model, start, None, model.params(), substeps=4)
     assert caught.value.__notes__ == ["Elsewhere."]
+    with softmpm.noted("Outer."):
+        made = softmpm.noted("Made before.")
+    with pytest.raises(softmpm.UnstableError) as caught, softmpm.noted("Around."), made:
+        softmpm.simulate(model, start, None, model.params(), substeps=4)
+    assert caught.value.__notes__ == ["Made before. Around."]
     with pytest.raises(softmpm.UnstableError) as caught:
         softmpm.simulate(model, start, None, model.params(), substeps=4)
     assert not hasattr(caught.value, "__notes__")
