@@ -1,4 +1,4 @@
-"""torch.compile: what it calls instead of tracing it."""
+"""torch.compile: what it calls instead of tracing it. torch.jit.trace is refused."""
 
 import functools
 from collections.abc import Callable
@@ -24,6 +24,11 @@ def opaque(work: Callable[P, T]) -> Callable[P, T]:
             if work not in _outside:
                 _outside[work] = torch.compiler.disable(work)
             return _outside[work](*args, **kwargs)
+        if torch._C._is_tracing():
+            raise RuntimeError(
+                "softmpm cannot be traced by torch.jit.trace, which would record memory that nothing writes to; trace the policy "
+                "alone, or use torch.compile, which calls softmpm as it is."
+            )
         return work(*args, **kwargs)
 
     return called

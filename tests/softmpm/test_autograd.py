@@ -191,6 +191,23 @@ def test_it_works_under_func_grad_checkpoint_autocast_and_compile(model):
     assert_relative(again.double(), want, 0.05)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
+@pytest.mark.parametrize("call", ["simulate", "rasterize"])
+def test_tracing_is_refused(model, call):
+    """A trace has operations of PyTorch alone: its results would be memory that no kernel has written to."""
+    start, params = model.rest(), model.params()
+
+    def work(v):
+        state = start._replace(v=v)
+        if call == "rasterize":
+            return softmpm.rasterize(model, state).velocity
+        return softmpm.simulate(model, state, None, params, substeps=1).x
+
+    with pytest.raises(RuntimeError, match="cannot be traced by torch.jit.trace"):
+        torch.jit.trace(work, (start.v,), check_trace=False)
+    work(start.v)
+
+
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # by PyTorch itself, for forward mode
 @pytest.mark.parametrize("name", ["x", "activation", "young"])
 def test_no_other_derivative_is_lost(name, scheme):
