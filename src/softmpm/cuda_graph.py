@@ -32,9 +32,9 @@ class Graph(Generic[Result]):
         >>> loss, gradients = graph()  # overwritten by the next call
     """
 
-    def __init__(self, work: Callable[[], Result], device: torch.device):
-        self.work, self.device = work, device
-        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+    def __init__(self, work: Callable[[], Result], device: torch.device | str):
+        self.work, self.device = work, torch.device(device)
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._resources: GraphResources | None = None
         self._warm = False

@@ -52,7 +52,7 @@ def test_a_gradient_that_failed_is_not_forgotten_for_one_that_did_not(settings, 
 
 def test_a_recording_that_failed_is_not_tried_again_at_once(monkeypatch):
     """The missing objects may be built by a call outside of a capture, so such a call comes first."""
-    graph, did = softmpm.Graph(lambda: None, torch.device("cpu")), []
+    graph, did = softmpm.Graph(lambda: None, "cpu"), []
     graph._stream = object()
 
     def record(self, stream):
