@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bench.problems import contact, exact, statics, waves
+from bench.problems import contact, exact, solids, spheres, statics, waves
 
 RESULTS = Path(__file__).parents[1] / "bench" / "results"
 
@@ -71,6 +71,36 @@ def test_a_soft_block_rests_on_a_slope(monkeypatch):
     assert found["1.5 s, mm"] < 25.0
 
 
+@pytest.mark.parametrize(("formulation", "force"), [("reference", 3.0), ("moving", 6.0)])
+def test_a_sphere_is_pressed_as_hertz_says(formulation, force):
+    """Force of two plates on a sphere of 8 cells to so many percent, and radius of the contact, one cell, to 3 %."""
+    found = {
+        name: 100 * (measured / want - 1)
+        for name, (measured, want) in spheres.pressed(4, formulation).items()
+    }
+    assert abs(found["force [N]"]) <= force
+    assert abs(found["radius of the contact [m]"]) <= 3.0
+
+
+@pytest.mark.parametrize("formulation", ["reference", "moving"])
+def test_friction_is_alike_in_all_directions(formulation):
+    """A block slides along an axis and obliquely as a rigid one, to 0.01 %, rests below the angle of friction, and goes with a belt."""
+    found = solids.slid(3, formulation, (0.25, 0.5, 0.4), headings=(0.0, 30.0))
+    acceleration, rigid = found.pop("acceleration [m/s²]")
+    assert abs(acceleration / rigid - 1) <= 1e-4
+    for name, (measured, _) in found.items():
+        assert abs(measured) <= 1e-4, name
+
+
+@pytest.mark.parametrize("formulation", ["reference", "moving"])
+def test_friction_stops_a_spin(formulation):
+    """Torque of a uniform pressure under a square, and its change of angular momentum, to 1.5 %; then it stands still."""
+    torque, change, spin = solids.spins(4, formulation, "square").values()
+    assert abs(torque.measured / torque.exact - 1) <= 0.015
+    assert abs(change.measured / change.exact - 1) <= 0.015
+    assert abs(spin.measured) <= 0.05
+
+
 def test_the_exact_answers():
     """Against the literature: roots of the disc, torsion of a square, a small beam, a light column."""
     assert abs(exact.breathing(0.3) - 2.12575) < 1e-5
@@ -79,6 +109,7 @@ def test_the_exact_answers():
     of = exact.section(1e5, 0.3, 0.1, None)
     small = exact.tip_of_beam(1e-3, 0.8, of)
     assert abs(small / (1e-3 * 0.8**4 / (8 * of.bending) + 1e-3 * 0.8**2 / (2 * of.shear)) - 1) < 1e-6
+    assert abs(exact.sphere(1.0, 1.0, 0.3, 0.05).approach / 0.05**2 - 1) < 0.015  # a²/R of a half space
     light = exact.column([1.0], 1.0, 1e-6, 1.0, 1.0)[0]
     assert abs(light / (-1e-6 / 6) - 1) < 1e-5
 

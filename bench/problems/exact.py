@@ -169,3 +169,33 @@ def hertz(radius: float, young: float, poisson: float, weight: float) -> Hertz:
     strain = (along - poisson / (1 - poisson) * across) / stiffness
     sinking = -np.sum(weights / 2 * strain * radius * 4 * t**3)
     return Hertz(p0, width, float(sinking))
+
+
+class Sphere(NamedTuple):
+    """Weightless sphere between two smooth plates."""
+
+    force: float
+    """Of each plate, 4/3 E* a³/R by Hertz [N]."""
+    approach: float
+    """Of each plate to the centre of the sphere [m]; a²/R for a half space."""
+
+
+def sphere(radius: float, young: float, poisson: float, width: float, degrees: int = 2000) -> Sphere:
+    """Sphere with Hertz' pressure on two circles of the radius ``width`` [m] about opposite poles, in linear elasticity.
+
+    The pressure Σ pₙ Pₙ(cos θ) displaces the pole by the series of Lur'e (Three-dimensional problems of elasticity, 1964):
+    uᵣ = R Σ Aₙ [(n + 1)(n − 2 + 4ν) − n (n² + 2n − 1 + 2ν)/(n − 1)], Aₙ = pₙ / (4 G (n² + n + 1 + (2n + 1) ν)) for even n.
+    """
+    ratio, stiffness, shear = width / radius, young / (1 - poisson**2), young / (2 * (1 + poisson))
+    places, weights = np.polynomial.legendre.leggauss(degrees)
+    angle = math.pi / 4 * (1 + places)  # r = a sin(angle) resolves the edge of the contact
+    x = np.sqrt(1 - (ratio * np.sin(angle)) ** 2)
+    pressure = 2 * ratio * stiffness / math.pi * np.cos(angle)
+    share = weights * math.pi / 4 * ratio**2 * np.sin(angle) * np.cos(angle) / x * pressure
+    before, here, sinking = np.ones_like(x), x, 0.0
+    for n in range(0, degrees, 2):
+        a = (2 * n + 1) * np.sum(share * before) / (4 * shear * (n * n + n + 1 + (2 * n + 1) * poisson))
+        sinking -= a * ((n + 1) * (n - 2 + 4 * poisson) - n * (n * n + 2 * n - 1 + 2 * poisson) / (n - 1))
+        before = ((2 * n + 3) * x * here - (n + 1) * before) / (n + 2)
+        here = ((2 * n + 5) * x * before - (n + 2) * here) / (n + 3)
+    return Sphere(4 / 3 * stiffness * width**3 / radius, radius * sinking)
