@@ -38,6 +38,12 @@ def scale(values: Any) -> str:
     return "log" if known.size and known.min() > 0 and known.max() > DECADES * known.min() else "linear"
 
 
+def alone(values: np.ndarray) -> np.ndarray:
+    """Finite values between two that are not, which a line does not show; shape (value,), boolean."""
+    known = np.pad(np.isfinite(values), 1)
+    return known[1:-1] & ~known[:-2] & ~known[2:]
+
+
 def limits(values: Any, scale: str) -> tuple[float, float] | None:
     """Ends of an axis that a few values would flatten: around those in the central range and not far from it; else None."""
     known = np.asarray(values, dtype=float).ravel()

@@ -44,8 +44,9 @@ def loss_figure(path: Path, curves: Mapping[str, tuple[Sequence[float], Sequence
             axes.plot(
                 iteration, np.fmin.accumulate(value), color="#f2bd6b", linewidth=6, label="lowest so far"
             )
-        marker = "o" if len(value) < 3 else None
-        axes.plot(iteration, value, color="#1f5fa8", marker=marker, markersize=4, label=name)
+        axes.plot(iteration, value, color="#1f5fa8", label=name)
+        alone = canvas.alone(value)
+        axes.plot(iteration[alone], value[alone], "o", color="#1f5fa8", markersize=4)
         if name == "loss":
             axes.legend(frameon=False)
         axes.set_title(name, fontsize=9, loc="left")

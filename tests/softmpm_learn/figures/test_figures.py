@@ -31,6 +31,16 @@ def scene():
     )
 
 
+@pytest.fixture
+def drawn(monkeypatch) -> list[Figure]:
+    """Figures that are saved."""
+    found, save = [], canvas.save
+    monkeypatch.setattr(
+        canvas, "save", lambda figure, path, dpi: found.append(figure) or save(figure, path, dpi)
+    )
+    return found
+
+
 def pixels(path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
@@ -99,12 +109,16 @@ def test_loss_figure_draws_what_has_numbers(tmp_path):
     assert colour_count(one, -60) > 100
 
 
-def test_the_loss_and_its_lowest_value_are_both_seen(tmp_path, monkeypatch):
+def test_values_between_gaps_are_dots(tmp_path, drawn):
+    """A line does not show one between two that are not finite."""
+    nan = np.nan
+    loss_figure(tmp_path / "loss.png", {"loss": (range(8), [nan, 5.0, nan, 4.0, 3.0, nan, nan, 2.0])})
+    (dots,) = (line for line in drawn[0].axes[0].lines if line.get_marker() == "o")
+    assert list(dots.get_xdata()) == [1, 7] and list(dots.get_ydata()) == [5.0, 2.0]
+
+
+def test_the_loss_and_its_lowest_value_are_both_seen(tmp_path, drawn):
     """Of a loss that falls all the time, where they are the same curve, and each has its name."""
-    drawn, save = [], canvas.save
-    monkeypatch.setattr(
-        canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi)
-    )
     loss_figure(tmp_path / "loss.png", {"loss": ([0, 1, 2, 3], [4.0, 3.0, 2.0, 1.0])})
     legend = drawn[0].axes[0].get_legend()
     assert {text.get_text() for text in legend.get_texts()} == {"loss", "lowest so far"}
@@ -153,12 +167,8 @@ def test_an_axis_leaves_out_what_would_flatten_it(values, scale, expected):
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_values_outside_of_an_axis_are_marked(tmp_path, monkeypatch):
+def test_values_outside_of_an_axis_are_marked(tmp_path, drawn):
     """A triangle at each place, and the farthest value above the axes; without such values there is neither."""
-    drawn, save = [], canvas.save
-    monkeypatch.setattr(
-        canvas, "save", lambda figure, path, dpi: drawn.append(figure) or save(figure, path, dpi)
-    )
     spikes = FALL + np.where(np.isin(np.arange(100), (40, 70)), 5e4, 0.0)
     spikes[80] = -700.0
     loss_figure(tmp_path / "loss.png", {"loss": (range(100), spikes), "evaluation": (range(100), FALL)})
