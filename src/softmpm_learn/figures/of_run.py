@@ -83,7 +83,7 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
     figure = canvas.figure(width + 0.4, width * mosaic.shape[0] / mosaic.shape[1] + 0.5)
     panel = figure.add_subplot()
     panel.imshow(mosaic, origin="lower", cmap=SIGNED, vmin=-1.0, vmax=1.0, interpolation="nearest")
-    titles = [f"{axis}, {_value(step, steps):+.1f}" for axis in "xy" for step in range(steps)]
+    titles = [f"{axis}, {_value(step, steps):g}".replace("-", "−") for axis in "xy" for step in range(steps)]
     panel.set_xticks((nx - 1) / 2 + (nx + gap) * np.arange(2 * steps), titles, fontsize=7)
     rows = [f"feature {features - k}" for k in range(features)]
     panel.set_yticks(
@@ -91,7 +91,10 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
     )
     panel.tick_params(length=0, labeltop=True, labelbottom=False)
     panel.spines[:].set_visible(False)
-    what = "velocity along x and y; red: to the left, down; blue: to the right, up; a scale for each feature"
+    what = (
+        "velocity along x or y where the feature has this value and the others are 0; red: to the left, down; blue: to the right, up; "
+        "a scale for each feature"
+    )
     figure.supxlabel(what, fontsize=7)
     canvas.save(figure, path, dpi=120)
 
