@@ -1,5 +1,6 @@
 """The pictures of a run: the loss, the latent space and the robot. Plain arrays in, PNG files out."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,6 +22,8 @@ STROKES, WIDTH = 24, 0.05
 distances between two."""
 PALE = 0.6
 """Activation from which on strokes are light, since the colours of muscles are dark."""
+PASSIVE = "#8d99a6"
+"""Colour of particles of no muscle."""
 SIGNED = "RdBu"
 """Red is negative, blue is positive, as in the workshop paper's Fig. 5."""
 
@@ -127,7 +130,7 @@ def robot_figure(
     Args:
         frames: Of each picture the title, positions (particle, dim) and activation (muscle,) or None.
         design: Of each material its value on each particle (particle,) and its unit; drawn at rest.
-        goal: Where the robot should go, drawn as a cross.
+        goal: Where the robot should go, drawn as a black cross.
     """
     way = np.concatenate(
         [positions[:, 0] for _, positions, _ in frames] + ([goal[:1]] if goal is not None else [])
@@ -136,35 +139,72 @@ def robot_figure(
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     columns = 1 if ratio < 0.45 else 2  # a high world is drawn half as wide
     rows = -(-len(frames) // columns)
-    above, below = rows * (7.4 / columns * ratio + 0.25), 2.3 if design else 0.0
+    above, below = rows * (7.4 / columns * ratio + 0.25), _height(scene, len(design)) if design else 0.0
     figure = canvas.figure(8.0, above + below + 0.3)
     parts = figure.subfigures(2, 1, height_ratios=[above, below]) if design else np.array([figure])
     panels = parts[0].subplots(rows, columns, squeeze=False).ravel()
     for panel, (title, positions, activation) in zip(panels, frames, strict=False):
         _draw_robot(panel, scene, positions, activation, (low, high), inches=7.4 / columns)
         if goal is not None:
-            panel.plot(goal[0], goal[1], marker="x", color="#c0392b", markersize=8, markeredgewidth=2)
+            panel.plot(goal[0], goal[1], marker="X", color="black", markersize=9, markeredgecolor="white")
         panel.set_title(title, fontsize=8, loc="left")
     for panel in panels[len(frames) :]:
         panel.set_axis_off()
-    parts[0].supxlabel(
-        "m; muscles are red where they pull, blue where they push; strokes: fibres", fontsize=7
-    )
+    what = "x and y [m]; muscles are red where they pull, blue where they push; strokes: fibres"
+    parts[0].supxlabel(what + "; cross: goal" * (goal is not None), fontsize=7)
     if design:
         _draw_design(parts[1], scene, design)
     canvas.save(figure, path, dpi=130)
 
 
+def _height(scene: Scene, panels: int) -> float:
+    """Height of so many pictures of the materials beside each other, with titles and scales [inch]."""
+    extent = np.ptp(_rest(scene), axis=0)
+    return min(2.3, 0.9 + 8.0 / panels * extent[1] / extent[0])
+
+
 def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]]) -> None:
-    """Each material on the shape at rest, with a scale of its own."""
-    rest = np.concatenate([body.particles.positions for body in scene.bodies])
+    """Each material on the shape at rest, with a scale of its own; grey where there is none, as of strengths outside of muscles."""
+    from matplotlib import colormaps
+
+    rest = _rest(scene)
+    order, extent = _from_behind(rest), np.ptp(rest, axis=0)
+    size = _dot(scene, rest, min(2.2 if extent[0] > extent[1] else 1.6, 7.4 / len(design)))
+    look: dict = dict(s=size, cmap=colormaps["viridis"].with_extremes(bad=PASSIVE), linewidths=0)
     panels = part.subplots(1, len(design), squeeze=False)[0]
     for panel, (name, (value, unit)) in zip(panels, design.items(), strict=True):
-        size = _dot(scene, rest, 2.2 if np.ptp(rest[:, 0]) > np.ptp(rest[:, 1]) else 1.6)
-        dots = panel.scatter(rest[:, 0], rest[:, 1], c=value, s=size, cmap="viridis", linewidths=0)
+        dots = panel.scatter(*rest[order, :2].T, c=value[order], plotnonfinite=True, **look)
         panel.set(xticks=[], yticks=[], aspect="equal")
-        panel.set_title(f"{name} [{unit}]" if unit else name, fontsize=8)
-        part.colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax.tick_params(labelsize=6)
+        title = f"{name} [{unit}]" if unit else name
+        panel.set_title(textwrap.fill(title, 120 // len(design)), fontsize=8)
+        bar = part.colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax
+        bar.tick_params(labelsize=6)
+        bar.xaxis.get_offset_text().set_fontsize(6)
+
+
+def _rest(scene: Scene) -> np.ndarray:
+    """Rest positions of all particles [m], shape (particle, dim)."""
+    return np.concatenate([body.particles.positions for body in scene.bodies])
+
+
+def _depth(positions: np.ndarray) -> np.ndarray:
+    """Place along z, which points out of the picture [m], shape (particle,); 0 in 2D."""
+    return positions[:, 2:].sum(axis=1)
+
+
+def _from_behind(positions: np.ndarray) -> np.ndarray:
+    """Order in which particles are drawn, so that near ones cover those behind."""
+    return np.argsort(_depth(positions), kind="stable")
+
+
+def _seen(positions: np.ndarray, spacing: float) -> np.ndarray:
+    """Particles that no other one covers, shape (particle,), boolean: the nearest in each column of cells, and those less than a cell
+    behind it."""
+    depth = _depth(positions)
+    columns, column = np.unique(np.floor(positions[:, :2] / spacing), axis=0, return_inverse=True)
+    nearest = np.full(len(columns), -np.inf)
+    np.fmax.at(nearest, column.ravel(), depth)
+    return depth > nearest[column.ravel()] - spacing
 
 
 def _window(scene: Scene, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,32 +232,24 @@ def _draw_robot(
     inches: float,
 ) -> None:
     """Particles in grey, muscles red where they pull and blue where they push, with strokes along their fibres, and walls."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_rgba
+
     low, high = window
-    value = np.zeros(len(positions))
-    if activation is not None:
-        for muscle, a in zip(scene.muscles, activation, strict=True):
-            value[muscle.particles] += a
-    size = _dot(scene, np.stack([low, high]), inches)
-    muscular = np.zeros(len(positions), dtype=bool)
-    for muscle in scene.muscles:
+    value, muscular = np.zeros(len(positions)), np.zeros(len(positions), dtype=bool)
+    for k, muscle in enumerate(scene.muscles):
+        value[muscle.particles] += 0.0 if activation is None else activation[k]
         muscular[muscle.particles] = True
-    x, y = positions[:, 0], positions[:, 1]
-    panel.scatter(x[~muscular], y[~muscular], s=size, color="#8d99a6", linewidths=0)
-    panel.scatter(
-        x[muscular],
-        y[muscular],
-        s=size,
-        c=value[muscular],
-        cmap="coolwarm",
-        vmin=-1.0,
-        vmax=1.0,
-        linewidths=0,
-    )
+    colours = colormaps["coolwarm"]((1.0 + value) / 2)
+    colours[~muscular] = to_rgba(PASSIVE)
+    order, size = _from_behind(positions), _dot(scene, np.stack([low, high]), inches)
+    panel.scatter(*positions[order, :2].T, s=size, color=colours[order], linewidths=0)
     gap = max(scene.grid.spacing, float((high - low).max()) / STROKES)
     strokes, particle = fibre_strokes(scene, positions, gap)
+    seen = _seen(positions, scene.grid.spacing)[particle]
     strong, width = np.abs(value[particle]) > PALE, 72.0 * inches * WIDTH / STROKES
     for some, colour in ((strong, "#fafafa"), (~strong, "#2c2c34")):
-        panel.plot(*strokes[some, :, :2].transpose(2, 1, 0), color=colour, linewidth=width)
+        panel.plot(*strokes[some & seen, :, :2].transpose(2, 1, 0), color=colour, linewidth=width)
     for wall in scene.walls:
         if any(wall.normal[:2]):  # not beside the picture
             _draw_wall(panel, wall, low, high)

@@ -42,7 +42,8 @@ def picture(scene: Scene, x: np.ndarray, activation: np.ndarray, goal: np.ndarra
         value[muscle.particles] += a
     distance = 0.62 * 72.0 / 100 * WIDTH * scene.grid.spacing / (high[0] - low[0])  # of particles, in points
     look: dict = dict(cmap="coolwarm", vmin=-1.0, vmax=1.0, linewidths=0, zorder=2)
-    axes.scatter(x[:, 0], x[:, 1], c=value, s=distance**2, **look)
+    order = np.argsort(x[:, 2:].sum(axis=1), kind="stable")  # near ones cover those behind
+    axes.scatter(*x[order, :2].T, c=value[order], s=distance**2, **look)
     if goal is not None:
         axes.plot(goal[0], goal[1], marker="x", color="black", markersize=8, markeredgewidth=2, zorder=3)
     canvas.draw()

@@ -1,6 +1,7 @@
 """The pictures of a run: they are made, they have the right size and colours, and they tell their arrays."""
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 
@@ -211,13 +212,66 @@ def test_robot_figure_shows_fibres(tmp_path, scene):
     assert dark[0] == dark[2] == 0 and dark[1] > 50 and light[2] > light[0] + 50
 
 
-def test_a_goal_is_drawn_as_a_red_cross(tmp_path, scene):
-    """Without a muscle at work the only red is the goal."""
+def test_a_goal_is_drawn_as_a_black_cross(tmp_path, scene, drawn):
+    """With white edges and over the robot, so that it is seen on muscles at work, and with its name below."""
+    rest, goal = scene.bodies[0].particles.positions, np.array([0.8, 0.3])
+    for place in (goal, None):
+        robot_figure(tmp_path / "robot.png", scene, [("", rest, None)], {}, goal=place)
+    panels = [figure.axes[0] for figure in drawn]
+    (cross,), none = ([line for line in axes.lines if line.get_marker() == "X"] for axes in panels)
+    assert (cross.get_xdata(), cross.get_ydata()) == (0.8, 0.3) and not none
+    assert (cross.get_color(), cross.get_markeredgecolor()) == ("black", "white")
+    assert cross.zorder > panels[0].collections[0].zorder
+    words = [figure.get_supxlabel() for figure in drawn]
+    assert words[0].endswith("cross: goal") and "goal" not in words[1]
+
+
+def test_pictures_of_a_robot_in_3d_show_its_near_side(tmp_path, drawn):
+    """Of two muscles, one behind the other, the near one has the colour and the strokes, and its material is drawn last."""
+    block = softmpm.box((0.3, 0.2, 0.2), (0.5, 0.4, 0.4), spacing=0.025)
+    order = np.argsort(-block.positions[:, 2], kind="stable")  # the far ones last
+    block = softmpm.Particles(block.positions[order], block.volume[order])
+    near = block.positions[:, 2] > 0.3
+    sides = ((near, (1.0, 0.0, 0.0)), (~near, (0.0, 1.0, 0.0)))
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(20, 12, 12), spacing=0.05),
+        bodies=[softmpm.Body(block, softmpm.NeoHookean(density=1e3, young=1e5, poisson=0.3))],
+        muscles=[
+            softmpm.Muscle(particles=np.flatnonzero(side), direction=along, strength=1.0)
+            for side, along in sides
+        ],
+        dt=1e-5,
+    )
+    frame = ("", block.positions, np.array([0.5, -0.5]))
+    robot_figure(tmp_path / "robot.png", scene, [frame], {"young": (near.astype(float), "Pa")})
+    panels = {axes.get_title(): axes for axes in drawn[0].axes}
+    robot, design = drawn[0].axes[0], panels["young [Pa]"]
+    faces = robot.collections[0].get_facecolors()
+    assert (faces[-1, 0] > faces[-1, 2]) and (faces[0, 0] < faces[0, 2])
+    ends = np.array([line.get_xydata() for line in robot.lines])
+    assert len(ends) > 3 and np.ptp(ends[..., 1], axis=1).max() < 1e-9 < np.ptp(ends[..., 0], axis=1).min()
+    assert list(design.collections[0].get_array()) == sorted(near)
+
+
+def test_all_materials_are_drawn_on_the_whole_robot(tmp_path, scene, drawn):
+    """With the same extent, also a strength that only muscles have, and with titles within the picture."""
+    count = len(scene.bodies[0].particles)
+    strength = np.where(np.arange(count) < 20, 1.0, np.nan)
+    design = {
+        name: (np.full(count, 2.0), "")
+        for name in (
+            "Young's modulus, over that of the scene",
+            "Poisson's ratio, over that of the scene",
+            "a",
+            "b",
+        )
+    }
     rest = scene.bodies[0].particles.positions
-    robot_figure(tmp_path / "with.png", scene, [("", rest, None)], {}, goal=np.array([0.8, 0.3]))
-    robot_figure(tmp_path / "without.png", scene, [("", rest, None)], {})
-    assert colour_count(pixels(tmp_path / "with.png"), 100) > 20
-    assert colour_count(pixels(tmp_path / "without.png"), 100) == 0
+    robot_figure(tmp_path / "robot.png", scene, [("", rest, None)], design | {"strength": (strength, "Pa")})
+    panels = [axes for axes in drawn[0].axes[1:] if axes.get_title()]
+    assert len(panels) == 5 and len({(*axes.get_xlim(), *axes.get_ylim()) for axes in panels}) == 1
+    boxes = [axes.title.get_window_extent() for axes in panels]
+    assert boxes[0].x0 > 0 and all(one.x1 < other.x0 for one, other in itertools.pairwise(boxes))
 
 
 def test_figures_do_not_import_matplotlib_until_they_draw():

@@ -251,6 +251,25 @@ def test_the_picture_follows_the_robot(dim):
     assert np.any(sky[0] != sky[1])
 
 
+def test_the_picture_of_a_robot_in_3d_shows_its_near_side():
+    """Of two muscles, one behind the other, the near one, also where its particles come first."""
+    block = softmpm.box((0.3, 0.1, 0.1), (0.6, 0.25, 0.3), 0.02)
+    block = softmpm.Particles(block.positions[::-1], block.volume[::-1])
+    near = block.positions[:, 2] > 0.2
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(30, 21, 11), spacing=0.04),
+        bodies=[softmpm.Body(block, softmpm.NeoHookean(density=1.0, young=10.0))],
+        muscles=[
+            softmpm.Muscle(particles=np.flatnonzero(side), direction=(1.0, 0.0, 0.0), strength=1.0)
+            for side in (near, ~near)
+        ],
+        dt=1e-3,
+    )
+    image = picture(scene, block.positions, np.array([1.0, -1.0]), None).astype(int)
+    red_over_blue = image[..., 0] - image[..., 2]
+    assert (red_over_blue > 100).sum() > 5000 and (red_over_blue < -100).sum() == 0
+
+
 def test_any_observer_takes_the_place_of_the_centroids():
     """An environment observes what the given observer computes."""
     env = make("arm", observer=lambda task, model: Centroids(model, [np.arange(5)], 1.0), **SHORT)
