@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from softmpm_learn.figures import sweeps, tables
-from softmpm_learn.figures.intervals import interval, pairs
+from softmpm_learn.figures.intervals import pairs
 from softmpm_learn.figures.of_sweep import curves_figure, grouped, pairs_figure, values, values_figure
-from softmpm_learn.figures.summary import summary
+from softmpm_learn.figures.summary import summary, with_interval
 from softmpm_learn.figures.sweeps import EXAMINED, SweptRun
 from softmpm_learn.storage import files
 
@@ -94,7 +94,7 @@ def draw(out: Path, settings: Sequence[str]) -> str:
         )
     ]
     curves_figure(out / CURVES, runs, groups, settings)
-    values_figure(out / VALUES, jobs, groups)
+    values_figure(out / VALUES, jobs, groups, settings)
     names = [tables.RUNS, tables.JOBS, CURVES, VALUES]
     for name in (tables.PAIRS, PAIRS):
         (out / name).unlink(missing_ok=True)  # of other sweeps
@@ -108,8 +108,7 @@ def draw(out: Path, settings: Sequence[str]) -> str:
     lines = [f"Median of {jobs[0]['quantity']} at iteration {jobs[0]['at']:.0f}, with its interval of 95 %:"]
     for setting, members in groups.items():
         found = list(values(members, "final").values())
-        low, high = interval(found, np.median)
-        middle = f"{np.median(found):.4g} [{low:.4g}, {high:.4g}]" if found else "none"
+        middle = with_interval(found, 4) if found else "none"
         lines.append(f"  {setting}: {middle}, {len(found)} of {len(members)} seeds")
     return "\n".join([*lines, f"{', '.join(names)} are in {out}."])
 

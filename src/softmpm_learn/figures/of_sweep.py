@@ -96,9 +96,7 @@ def curves_figure(
     for row in runs:
         if row["iteration"] <= last and math.isfinite(row[quantity]):
             series.setdefault(int(row["run"]), {})[int(row["iteration"])] = row[quantity]
-    panels = curve_panels(groups, settings)
-    names = dict.fromkeys(name for lines in panels.values() for name in lines)
-    styles = dict(zip(names, _styles(), strict=False))
+    panels, styles = curve_panels(groups, settings), _styles(groups, settings)
     widest = max(len(_count(name, members)) for lines in panels.values() for name, members in lines.items())
     columns = 2 if widest <= 42 else 1
     figure, grid = _curve_axes(len(panels), -(-len(groups) // columns))
@@ -138,14 +136,28 @@ def curve_panels(
 ) -> dict[str, dict[str, Sequence[Row]]]:
     """Settings of each panel of curves.png: all in one, or where colours do not suffice a panel for each combination of all but the one
     with the most values."""
-    if len(groups) <= len(COLOURS) or len(settings) < 2:
+    coloured = _coloured(groups, settings)
+    if coloured == list(settings):
         return {"": dict(groups)}
-    firsts = [members[0] for members in groups.values()]
-    widest = max(reversed(settings), key=lambda key: len({row[key] for row in firsts}))
-    others, found = [key for key in settings if key != widest], {}
-    for row, members in zip(firsts, groups.values(), strict=True):
-        found.setdefault(name_of(row, others), {})[name_of(row, [widest])] = members
+    others, found = [key for key in settings if key not in coloured], {}
+    for members in groups.values():
+        found.setdefault(name_of(members[0], others), {})[name_of(members[0], coloured)] = members
     return found
+
+
+def _coloured(groups: Mapping[str, Sequence[Row]], settings: Sequence[str]) -> list[str]:
+    """Settings that have colours: all, or where colours do not suffice the one with the most values."""
+    if len(groups) <= len(COLOURS) or len(settings) < 2:
+        return list(settings)
+    firsts = [members[0] for members in groups.values()]
+    return [max(reversed(settings), key=lambda key: len({row[key] for row in firsts}))]
+
+
+def _styles(groups: Mapping[str, Sequence[Row]], settings: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Colour and dashes of each value of the settings that have colours, the same in all pictures."""
+    names = (name_of(members[0], _coloured(groups, settings)) for members in groups.values())
+    looks = ((colour, dashes) for dashes in itertools.cycle(LINES) for colour in COLOURS)
+    return dict(zip(dict.fromkeys(names), looks, strict=False))
 
 
 def _curve_axes(panels: int, rows: int) -> tuple[Any, np.ndarray]:
@@ -183,18 +195,20 @@ def _count(name: str, members: Sequence[Row]) -> str:
     return f"{name} ({words if failed else f'{len(members)} seed' + 's' * (len(members) > 1)})"
 
 
-def _styles():
-    return ((colour, style) for style in itertools.cycle(LINES) for colour in COLOURS)
-
-
-def values_figure(path: Path, jobs: Sequence[Row], groups: Mapping[str, Sequence[Row]]) -> None:
+def values_figure(
+    path: Path, jobs: Sequence[Row], groups: Mapping[str, Sequence[Row]], settings: Sequence[str]
+) -> None:
     """Each seed as a point, for each setting and quantity, and the median with its bootstrap interval of 95 %."""
     names = [_count(name, members) for name, members in groups.items()]
     panels = {name: label(name, jobs) for name in shown(jobs)}
+    styles, coloured = _styles(groups, settings), _coloured(groups, settings)
 
-    def draw(axes, name: str) -> None:
-        for place, (members, (colour, _)) in enumerate(zip(groups.values(), _styles(), strict=False)):
+    def draw(axes, name: str) -> list[float]:
+        drawn = []
+        for place, members in enumerate(groups.values()):
+            colour, _ = styles[name_of(members[0], coloured)]
             found = list(values(members, name).values())
+            drawn += found
             if not found:
                 continue
             beside = place - 0.28 + 0.16 * np.arange(len(found)) / max(1, len(found) - 1)
@@ -202,6 +216,7 @@ def values_figure(path: Path, jobs: Sequence[Row], groups: Mapping[str, Sequence
             low, high = interval(found, np.median)
             axes.plot([low, high], [place + 0.1] * 2, color=colour, linewidth=2)
             axes.plot(np.median(found), place + 0.1, "D", color=colour, markersize=5)
+        return drawn
 
     _panels(
         path, names, panels, draw, "points: seeds; diamonds: their median with a bootstrap interval of 95 %"
@@ -215,15 +230,17 @@ def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[
         pairs = [row for row in pairs if row["first"] == pairs[0]["first"]]
     names = list(dict.fromkeys(f"{row['first']}  −  {row['second']}" for row in pairs))
     panels = {name: f"difference of {label(name, jobs)}" for name in shown(jobs)}
-    if not names or len(names) > MOST_ROWS:
+    if not any(row["pairs"] for row in pairs) or len(names) > MOST_ROWS:
         return False
 
-    def draw(axes, name: str) -> None:
+    def draw(axes, name: str) -> list[float]:
         axes.axvline(0.0, color="0.6", linewidth=0.8)
-        for place, row in enumerate(row for row in pairs if row["quantity"] == name):
+        drawn = [row for row in pairs if row["quantity"] == name]
+        for place, row in enumerate(drawn):
             colour = COLOURS[0] if row["low"] > 0 or row["high"] < 0 else "0.45"
             axes.plot([row["low"], row["high"]], [place] * 2, color=colour, linewidth=2)
             axes.plot(row["difference"], place, "o", color=colour, markersize=5)
+        return [row["difference"] for row in drawn]
 
     _panels(
         path,
@@ -235,15 +252,17 @@ def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[
     return True
 
 
-def _limit(axes, low: float, high: float) -> None:
-    """Show no more of the horizontal axis than this, unless everything lies outside."""
+def _limit(axes, drawn: Sequence[float], low: float, high: float) -> None:
+    """Show no more of the horizontal axis than this, unless everything lies outside, and count above the axes what does."""
     left, right = axes.get_xlim()
     if left < high and right > low:
         axes.set_xlim(max(left, low), min(right, high))
+        outside = sum(value < low or value > high for value in drawn)
+        axes.set_title(f"{outside} outside" if outside else "", fontsize=7, loc="right")
 
 
 def _panels(path: Path, names: Sequence[str], panels: Mapping[str, str], draw, note: str) -> None:
-    """Panels with one row for each name, from top to bottom."""
+    """Panels with one row for each name, from top to bottom; ``draw`` returns the values of its points."""
     columns = min(COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     figure = canvas.figure(
@@ -251,13 +270,14 @@ def _panels(path: Path, names: Sequence[str], panels: Mapping[str, str], draw, n
     )
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
     for axes, (name, text) in zip(grid.ravel(), panels.items(), strict=False):
-        draw(axes, name)
+        drawn = draw(axes, name)
         axes.set_xlabel(text, fontsize=8)
         axes.set_title(TITLES[name], fontsize=9, loc="left")
         if ANSWERS["progress"] in text:
-            _limit(axes, *QUOTIENTS)
+            _limit(axes, drawn, *QUOTIENTS)
         axes.xaxis.get_major_locator().set_params(nbins=5)
         axes.tick_params(labelsize=8)
+        axes.xaxis.get_offset_text().set_fontsize(8)
         axes.spines[["top", "right"]].set_visible(False)
     for axes in grid.ravel()[len(panels) :]:
         axes.set_axis_off()

@@ -90,14 +90,18 @@ def _named(members: Sequence[Row], settings: Sequence[str]) -> list[str]:
     return [members[0][key] or "default" for key in settings]
 
 
+def with_interval(found: Sequence[float], digits: int) -> str:
+    """Median, and in brackets its bootstrap interval of 95 %, which a single value does not have."""
+    low, high = interval(found, np.median)
+    text = f"{np.median(found):.{digits}g}"
+    return text if math.isnan(low) else f"{text} [{low:.{digits}g}, {high:.{digits}g}]"
+
+
 def _median(members: Sequence[Row], name: str, bracketed: bool) -> str:
     found = list(values(members, name).values())
     if not found:
         return "none"
-    low, high = interval(found, np.median)
-    text = f"{np.median(found):.3g}"
-    if bracketed and not math.isnan(low):
-        text += f" [{low:.3g}, {high:.3g}]"
+    text = with_interval(found, 3) if bracketed else f"{np.median(found):.3g}"
     finished = sum(row["status"] == "finished" for row in members)
     return text if len(found) == finished else f"{text} ({len(found)})"
 

@@ -148,7 +148,7 @@ def test_the_interval_is_that_of_scipy_and_of_enumeration():
 
 
 def test_answers_are_compared_by_medians(tmp_path, drawn):
-    """One quotient out of bounds neither carries the difference away nor squeezes the others in the picture."""
+    """One quotient out of bounds neither carries the difference away nor squeezes the others in the picture, which counts it."""
     folder = make_sweep(tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS})
     rows = read(folder / "sweep.csv")
     for row, later in zip(rows, (0.9, 0.8, 900.0, 0.6, 0.6, 0.6), strict=True):
@@ -160,6 +160,15 @@ def test_answers_are_compared_by_medians(tmp_path, drawn):
     assert float(found["final"]["difference"]) == pytest.approx(-7 / 3 + 4 / 3)
     assert drawn[1].axes[1].get_xlim()[1] == drawn[2].axes[1].get_xlim()[1] == 3.0
     assert drawn[1].axes[2].get_xlim()[1] > 10.0  # degrees are no quotients
+    assert [axes.get_title(loc="right") for axes in drawn[1].axes[:3]] == ["", "1 outside", ""]
+
+
+def test_settings_without_a_common_seed_have_no_picture_of_differences(tmp_path, drawn):
+    """All seeds of one have failed; of the other one is left, whose median has no interval."""
+    folder = make_sweep(tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS}, failing=range(5))
+    text = program.make([folder], tmp_path / "out")
+    assert len(drawn) == 2 and not (tmp_path / "out" / "pairs.png").exists()
+    assert "latent: none, 0 of 3 seeds" in text and "kmeans: -1, 1 of 3 seeds" in text and "nan" not in text
 
 
 def test_pairs_take_only_seeds_that_both_have():
@@ -340,18 +349,21 @@ def test_earlier_iterations_are_compared_too(tmp_path):
 
 
 def test_many_settings_have_panels(tmp_path, drawn):
-    """A panel for each combination but of what has most values, with the same colours; differences from the first setting alone."""
+    """A panel for each combination but of what has most values, with the same colours, also in the picture of all values; differences
+    from the first setting alone."""
     clocks, observers = ("true", "false"), ("latent", "centroids", "kmeans", "none")
     groups = {
         f"policy.clock={c} design={d} observer={o}": LATENT for c in clocks for d in clocks for o in observers
     }
     program.make([make_sweep(tmp_path, groups, failing=[3])], tmp_path / "out")
-    curves, _, differences = drawn.values()
+    curves, seeds, differences = drawn.values()
     assert [axes.get_title(loc="left") for axes in curves.axes] == [
         f"clock={c}, design={d}" for c in clocks for d in clocks
     ]
     colours = [[one.get_color() for one in axes.lines] for axes in curves.axes]
     assert all(found == COLOURS[:4] for found in colours)
+    diamonds = [one.get_color() for one in seeds.axes[0].lines if one.get_marker() == "D"]
+    assert diamonds == 4 * COLOURS[:4]
     assert line(curves.axes[0], "observer=centroids").get_label().endswith("(2 of 3 seeds, 1 failed)")
     names = [text.get_text() for text in differences.axes[0].get_yticklabels()]
     assert len(names) == 15 and all(
