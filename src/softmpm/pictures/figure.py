@@ -30,6 +30,8 @@ COLOUR_BAR = 0.35
 axis."""
 NAMES = 0.65
 """Room across for the names of the colours within that for labels [inch]; a figure with wider ones is wider."""
+SQUARE = 1.15
+"""Most height of all panels over their width: four worlds that are nearly square are two by two."""
 TYPE = (8, 6)
 """Size of the names of colours [point], of up to two columns and of more."""
 STROKE = "strokes: fibres"
@@ -185,17 +187,23 @@ def panels_of(
         for spare in axes[count:]:
             spare.set_axis_off()
         axes = axes[:count]
+        lowest = axes[-columns:]
     else:
         axes = np.ravel(np.asarray(axes, dtype=object))
         if len(axes) != count:
             raise ValueError(f"axes must be one for each world, {count}, got {len(axes)}.")
         figure = axes[0].get_figure()
         size, room = None, axes[-1].get_window_extent().height / figure.dpi
+        lowest = axes[:0]
     panels = [Panel(one, place, low, high, traction, colouring.with_fibres) for one in axes]
     if traction > 0.0:
         panels[0].draw_scale("traction" if count == 1 else "")  # beside the name of a world
-    for one in axes if place.dim == 2 and count > 1 else ():
-        one.label_outer()
+    if place.dim == 2 and count > 1:
+        for one in axes:
+            one.label_outer()
+        for one in lowest:  # also above an empty place
+            one.tick_params(labelbottom=True)
+            one.set_xlabel("x [m]")
     key = _key(figure, list(axes), colouring, room)
     if size is not None and key is not None:
         _widen(figure, key, size[0] - NAMES)
@@ -203,8 +211,8 @@ def panels_of(
 
 
 def _grid(count: int, ratio: float) -> tuple[int, int]:
-    """Rows and columns of panels with this ratio of height to width, so that the figure is at most as high as it is wide."""
-    columns = next(n for n in range(1, count + 1) if math.ceil(count / n) * ratio / n <= 1.0 or n == count)
+    """Rows and columns of panels with this ratio of height to width, so that the figure is about as high as it is wide, or less."""
+    columns = next(n for n in range(1, count + 1) if math.ceil(count / n) * ratio / n <= SQUARE or n == count)
     return math.ceil(count / columns), columns
 
 

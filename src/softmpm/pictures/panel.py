@@ -154,6 +154,7 @@ class Panel:
 
     def _arrows(self, feet: np.ndarray, vectors: np.ndarray, **look) -> Any:
         look |= dict(angles="xy", scale_units="xy", scale=1.0, units="xy", width=0.2 * self._place.spacing)
+        look |= dict(edgecolors="white", linewidths=0.5)  # apart from particles as dark as they are
         return self._axes.quiver(*feet.T, *vectors.T, color=[tuple(np.array(style.TRACTION) / 255)], **look)
 
     def _draw_walls(self, low: np.ndarray, high: np.ndarray) -> None:

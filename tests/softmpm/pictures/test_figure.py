@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
 from PIL import Image
 
 import softmpm
@@ -244,7 +245,7 @@ def test_a_world_is_any_whole_number(model, world):
 
 
 def test_tractions_are_green_arrows(model):
-    """A force on one surface point draws an arrow there, upward; without forces there is no green."""
+    """A force on one surface point draws an arrow there, upward, with white edges; without forces there is no green."""
     state = softmpm.simulate(model, model.rest(), None, model.params(), substeps=1)
     assert state.surface is not None
     green = pixels(softmpm.show(model, state))
@@ -257,6 +258,8 @@ def test_tractions_are_green_arrows(model):
     image = pixels(figure := softmpm.show(model, pushed))
     rows, columns = where(image[upper_edge(figure, image) :], style.TRACTION)
     assert len(rows) > 30 and np.ptp(rows) > 2 * np.ptp(columns)
+    edges = [one.get_edgecolor() for one in figure.axes[0].collections if isinstance(one, Quiver)]
+    assert np.concatenate(edges).tolist() == 2 * [4 * [1.0]]
 
 
 @pytest.mark.parametrize("worlds, words", [(0, "traction 200 Pa"), ((0, 1), "200 Pa")])
@@ -274,6 +277,19 @@ def test_an_arrow_is_the_scale_of_the_tractions(model, worlds, words):
     length = np.ptp(where(image[:top], style.TRACTION)[1])
     assert length / np.ptp(where(image[top:], style.TRACTION)[0]) == pytest.approx(200 / 320, rel=0.05)
     assert not any(axes.texts for axes in softmpm.show(model, state).axes)
+
+
+@pytest.mark.parametrize("count, rows, columns", [(1, 1, 1), (2, 1, 2), (3, 2, 2), (4, 2, 2), (5, 2, 3)])
+def test_worlds_are_side_by_side(count, rows, columns):
+    """Of nearly square pictures; the lowest one in each column has the numbers of its x axis, also above an empty place."""
+    block = softmpm.box((0.3, 0.1), (0.7, 0.5), 1 / 40)
+    floor = softmpm.Wall(normal=(0.0, 1.0), offset=0.1)
+    scene = scene_of(bodies=[softmpm.Body(block, RUBBER)], muscles=[], walls=[floor])
+    figure = softmpm.show(scene, world=range(count))
+    panels = [axes for axes in figure.axes if axes.axison]
+    assert panels[0].get_subplotspec().get_gridspec().get_geometry() == (rows, columns)
+    lowest = [axes.get_xlabel() == "x [m]" and axes.xaxis.get_tick_params()["labelbottom"] for axes in panels]
+    assert lowest == [False] * (count - columns) + [True] * columns
 
 
 @pytest.mark.parametrize("stress, text", [(0.5, "0.5 Pa"), (999.0, "999 Pa"), (2e3, "2 kPa"), (5e6, "5 MPa")])
