@@ -51,6 +51,7 @@ def bars(axes, heights: dict[str, list[float]], colours: list[str]) -> None:
         axes.bar_label(axes.bar(places, values, width, label=label, color=colour), fmt="%.0f", fontsize=8)
     axes.set_yscale("log")
     axes.set_xticks(range(len(SIZES)), list(SIZES))
+    axes.set_xlabel("particles")
     axes.spines[["top", "right"]].set_visible(False)
 
 

@@ -203,7 +203,7 @@ def draw(results: dict[str, list[float]], path: Path) -> None:
         axes.plot(x[width - 1 :], mean, color=COLOURS[name], label=LABELS[name])
     axes.set(xscale="log", xlabel="simulations of 0.5 s", ylabel="return of an episode [m²]")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=8)
     figure.savefig(path, dpi=120)
 
 

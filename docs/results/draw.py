@@ -8,9 +8,9 @@ from comparison import WALKS, read
 
 IMAGES = Path(__file__).parent.parent / "images"
 LABELS = {
-    "elephant": "best evaluation [m]",
-    "biped": "best evaluation [m]",
-    "arm": "best evaluation [10⁻⁵]",
+    "elephant": "best evaluation [m], lower is better",
+    "biped": "best evaluation [m], lower is better",
+    "arm": "best evaluation [10⁻⁵], lower is better",
 }
 
 
