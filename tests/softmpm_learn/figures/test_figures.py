@@ -323,6 +323,15 @@ def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
     assert "10/10" in shown and "loss 1.5" in shown
 
 
+def test_a_bar_of_several_runs_fits_into_a_terminal(monkeypatch, capsys):
+    """Of 80 columns, with the last digit of each number; the bar proper of ten columns may shrink to one."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with ProgressBar(100) as progress:
+        progress(0, -0.0123456, -0.0987654, -0.0345678)
+    line = capsys.readouterr().err.split("\r")[-1].rstrip()
+    assert line.endswith("loss -0.0346 (-0.0988 to -0.0123), lowest -0.0988]") and len(line) - 9 < 80
+
+
 def test_a_picture_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     """A run that ends while it draws leaves the picture before, and no half of one."""
     path = tmp_path / "loss.png"
