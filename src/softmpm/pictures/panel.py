@@ -153,8 +153,12 @@ class Panel:
         )
 
     def _arrows(self, feet: np.ndarray, vectors: np.ndarray, **look) -> Any:
+        from matplotlib.patheffects import withStroke
+
         look |= dict(angles="xy", scale_units="xy", scale=1.0, units="xy", width=0.2 * self._place.spacing)
-        look |= dict(edgecolors="white", linewidths=0.5)  # apart from particles as dark as they are
+        look |= dict(
+            path_effects=[withStroke(linewidth=1.0, foreground="white")]
+        )  # apart from particles as dark
         return self._axes.quiver(*feet.T, *vectors.T, color=[tuple(np.array(style.TRACTION) / 255)], **look)
 
     def _draw_walls(self, low: np.ndarray, high: np.ndarray) -> None:

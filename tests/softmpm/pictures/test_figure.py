@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.quiver import Quiver
 from PIL import Image
 
@@ -258,8 +259,8 @@ def test_tractions_are_green_arrows(model):
     image = pixels(figure := softmpm.show(model, pushed))
     rows, columns = where(image[upper_edge(figure, image) :], style.TRACTION)
     assert len(rows) > 30 and np.ptp(rows) > 2 * np.ptp(columns)
-    edges = [one.get_edgecolor() for one in figure.axes[0].collections if isinstance(one, Quiver)]
-    assert np.concatenate(edges).tolist() == 2 * [4 * [1.0]]
+    arrows = [one for one in figure.axes[0].collections if isinstance(one, Quiver)]
+    assert len(arrows) == 2 and all(isinstance(one.get_path_effects()[0], withStroke) for one in arrows)
 
 
 @pytest.mark.parametrize("worlds, words", [(0, "traction 200 Pa"), ((0, 1), "200 Pa")])
