@@ -1,7 +1,7 @@
 """Resource usage of the kernels of a CUDA binary: registers and local memory, read from its ELF sections without the CUDA toolkit.
 
 The section ``.nv.info`` is a list of attributes, each a format, a number, a size and the value; those below hold the index of a
-symbol and what is said about it.
+symbol and what is said about it. A binary with line numbers (Warp's option ``lineinfo``) also contains the PTX it was assembled from.
 """
 
 import re
@@ -56,9 +56,14 @@ def kernels(path: Path) -> dict[str, Kernel]:
     return found
 
 
-def entries(path: Path) -> dict[str, str]:
-    """Code of each kernel in a PTX file by its name."""
-    _, *parts = re.split(r"\.visible \.entry ", path.read_text().rstrip("\0"))
+def ptx(path: Path) -> str:
+    """PTX of a cubin with line numbers; lines are not indented."""
+    return _sections(path.read_bytes())[".nv_debug_ptx_txt"].replace(b"\0", b"\n").decode()
+
+
+def entries(ptx: str) -> dict[str, str]:
+    """Code of each kernel in a PTX module by its name."""
+    _, *parts = re.split(r"\.visible \.entry ", ptx.rstrip("\0"))
     return {part[: part.index("(")]: part for part in parts}
 
 

@@ -117,7 +117,7 @@ def ptx_of(kernel: wp.Kernel, threads: int) -> str:
     wp.set_module_options({"block_dim": threads}, module=kernel.module)
     (file,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
     entry = re.compile(rf"{kernel.key}_\w*_cuda_kernel_forward")
-    (code,) = (code for found, code in cubin.entries(file).items() if entry.fullmatch(found))
+    (code,) = (code for found, code in cubin.entries(file.read_text()).items() if entry.fullmatch(found))
     return code
 
 

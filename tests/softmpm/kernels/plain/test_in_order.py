@@ -40,7 +40,9 @@ def test_terms_are_recorded(dim, dtype):
         for kernel in kernels(dim, dtype, ordered):
             (ptx,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
             name = re.compile(rf"{kernel.key}_[0-9a-f]+_cuda_kernel_forward")
-            (code,) = (code for entry, code in cubin.entries(ptx).items() if name.fullmatch(entry))
+            (code,) = (
+                code for entry, code in cubin.entries(ptx.read_text()).items() if name.fullmatch(entry)
+            )
             assert bool(re.findall(RECORD, code)) == ordered
             assert kernel.module.options["deterministic_max_records"] == (3**dim if ordered else 0)
 
