@@ -107,18 +107,28 @@ def torchrun(*words: str, cwd: Path) -> subprocess.CompletedProcess:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory):
-    """Folder of the runs of :func:`one_of_two`, and how they ended in the first and in the other process."""
+def four(task):
+    """All four worlds in one process."""
+    return softmpm.build(task.scene, device="cpu", worlds=4)
+
+
+@pytest.fixture(scope="module")
+def one(task, four, make_settings, tmp_path_factory):
+    """Folder of the run of one process."""
+    out = tmp_path_factory.mktemp("one")
+    train.train(task, four, shared(make_settings()), out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def both(one, tmp_path_factory):
+    """Folder of the runs of :func:`one_of_two`, and how they ended in the first and in the other process. Both find their kernels
+    compiled, by the run of one process.
+    """
     out = tmp_path_factory.mktemp("both")
     done = torchrun(str(Path(__file__)), str(out), cwd=out)
     assert done.returncode == 0, done.stderr
     return out, *(json.loads((out / f"said.{rank}.json").read_text()) for rank in range(2))
-
-
-@pytest.fixture(scope="module")
-def four(task):
-    """All four worlds in one process."""
-    return softmpm.build(task.scene, device="cpu", worlds=4)
 
 
 def assert_same(folder: Path, other: Path) -> None:
@@ -143,12 +153,11 @@ def assert_in_step(out: Path, name: str) -> None:
 # What two processes do
 
 
-def test_two_processes_give_the_run_of_one(task, four, settings, both, tmp_path):
+def test_two_processes_give_the_run_of_one(one, both):
     """Metrics, weights, autoencoder and replay buffer of three iterations do not depend on the number of processes."""
     out, *said = both
-    train.train(task, four, shared(settings), tmp_path)
-    assert_same(out / "two", tmp_path)
-    assert all(row["clipped"] for row in metrics(tmp_path))
+    assert_same(out / "two", one)
+    assert all(row["clipped"] for row in metrics(one))
     assert_in_step(out, "two")
     assert [s["two"] for s in said] == [[True, 3]] * 2
 
