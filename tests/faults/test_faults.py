@@ -1,10 +1,9 @@
 """A short round of the fault scripts, in a process of its own: it forks, and limits and kills what it forked."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -14,9 +13,5 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_short_round_of_all_fault_scripts():
     """Nothing hangs, is silently different, unclear, or written elsewhere; the whole round: ``python -m bench.faults``."""
-    environment = os.environ | {"PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "bench.faults", "--share", "0.03"]
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
+    done = forked.python("-m", "bench.faults", "--share", "0.03", folder=ROOT, timeout=600.0)
     assert done.returncode == 0 and done.stdout.count(" 0 bad") == 4, done.stdout + done.stderr

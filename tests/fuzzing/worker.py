@@ -1,7 +1,6 @@
 """A process that judges plans, and may die or hang without ending the one that asks."""
 
-import multiprocessing
-
+import forked
 import torch
 import warp as wp
 
@@ -36,9 +35,9 @@ class Worker:
         self._process = None
 
     def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs,), daemon=True)
+        forked.ensure_server()
+        self._pipe, theirs = forked.SERVER.Pipe()
+        self._process = forked.SERVER.Process(target=serve, args=(theirs,), daemon=True)
         self._process.start()
         theirs.close()
         self._left = PER_PROCESS
