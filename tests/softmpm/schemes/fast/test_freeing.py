@@ -363,7 +363,7 @@ def test_a_graph_runs_on_memory_of_its_own():
 @pytest.mark.gpu
 def test_garbage_does_not_end_a_recording(monkeypatch):
     """A graph that nothing but itself refers to waits for the collector, which is made to come at once."""
-    built, launches, threshold = model(device="cuda"), chunk_graph.ChunkGraph._launch, gc.get_threshold()
+    built, launches, threshold = model(device="cuda"), chunk_graph.launch_chunk, gc.get_threshold()
     inputs, weights = busy_inputs(built, control_steps=3), cotangent(built.rest())
 
     def work():
@@ -375,12 +375,12 @@ def test_garbage_does_not_end_a_recording(monkeypatch):
     knot.append(knot)
     want = [found.clone() for found in [knot[0]() for _ in range(3)][-1]]
 
-    def launching(self, launch):
+    def launching(buffers, launch):
         nonlocal knot
         knot = None
-        launches(self, launch)
+        launches(buffers, launch)
 
-    monkeypatch.setattr(chunk_graph.ChunkGraph, "_launch", launching)
+    monkeypatch.setattr(chunk_graph, "launch_chunk", launching)
     gc.set_threshold(1)
     try:
         other = model(device="cuda")  # which records its own
