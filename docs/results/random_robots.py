@@ -1,7 +1,7 @@
 """Robots drawn at random, of docs/results.md:
 
     python docs/results/random_robots.py draw FOLDER             writes FOLDER/r00.npy to r11.npy
-    python docs/results/random_robots.py collect NAME FOLDER...  adds the runs in FOLDER/r00 to r11 to NAME
+    python docs/results/random_robots.py collect NAME FOLDER...  writes NAME, a row for each run in FOLDER/r00 to r11
     python docs/results/random_robots.py [NAME]                  prints the figures of NAME, random_robots.h200.csv
     python docs/results/random_robots.py picture [NAME]          draws docs/images/random_robots.png
 
@@ -28,10 +28,10 @@ KINDS = {
     "horizontal actuator": "#ff8000",
     "vertical actuator": "#0080ff",
 }
-COLUMNS = {"best": "loss"} | {
-    name: name for name in ("iteration", "end", "later", "kicked", "friction", "finer")
-}
-COLUMNS["tilt"] = "largest_tilt"
+"""Kinds of voxels, from 1 on, and their colours."""
+SAME = ("iteration", "end", "later", "kicked", "friction", "finer")
+COLUMNS = {"best": "loss", **{name: name for name in SAME}, "tilt": "largest_tilt"}
+"""Columns of the table but the first three, and those of sweep.csv that they are."""
 
 
 def drawn() -> Iterator[tuple[str, np.ndarray]]:
@@ -54,7 +54,7 @@ def draw(folder: str) -> None:
 
 
 def collect(name: str, *folders: str) -> None:
-    """Write a row for each run."""
+    """Write a table with a row for each seed of the runs in some folders."""
     rows = []
     for folder in map(Path, folders):
         for run in sorted(folder.glob("r*/sweep.csv")):
