@@ -17,6 +17,7 @@ from .running import Simulation
 
 DENSITY, GRAVITY, POISSON = 1000.0, 9.81, 0.3
 Place = tuple[float, float, float]
+"""Displacement against the grid [cells]."""
 
 
 class Found(NamedTuple):
@@ -34,7 +35,7 @@ def simulation(
     *,
     young: float,
     relaxation: float,
-    room: Place = (0.0, 0.0, 0.0),
+    room: tuple[float, float, float] = (0.0, 0.0, 0.0),
     dtype: torch.dtype = torch.float64,
     **settings,
 ) -> Simulation:
@@ -218,9 +219,8 @@ def spins(cells: int, formulation: str, what: str = "disc", **settings) -> dict[
         points, force = (values[0] for values in loads(one))
         torques.append(-torch.linalg.cross(points - motion(one)[0], force).sum(0)[1].item())
     _, _, after, inertia = motion(one)
-    of_nodes = (
-        inertia[0, 1, 1].item() + weight / GRAVITY * h**2 / 2
-    )  # each particle's mass is spread over nodes
+    # The mass of a particle is spread over nodes:
+    of_nodes = inertia[0, 1, 1].item() + weight / GRAVITY * h**2 / 2
     slowing = (before - after[0, 1].item()) / (20 * substeps * one.model.scene.dt) * of_nodes
     one.run(steps(one, 0.8 * stops))
     want = friction * weight * arm

@@ -44,9 +44,8 @@ def pressed(
         moving = softmpm.Inputs(wall_offset=poses[begin : begin + 2, None], **still)
         one.run(steps(one, 10 / damping / 40), moving)
     held, found = softmpm.Inputs(wall_offset=poses[-1:, None], **still), []
-    decay = math.exp(
-        -damping * one.model.scene.dt
-    )  # acts on the forces, but not on the contact that balances them
+    # Damping acts on the forces, but not on the contact that balances them:
+    decay = math.exp(-damping * one.model.scene.dt)
     largest = 1.5 * want.force / (math.pi * (ratio * radius) ** 2)
     assert one.model.surface is not None
     areas = one.model.surface.areas.numpy()
@@ -55,15 +54,13 @@ def pressed(
         points, force = (values[0].numpy() for values in loads(one))
         square = (np.delete(points - center, axis, 1) ** 2).sum(1)
         normal_force = force[:, axis] / decay
-        width = math.sqrt(
-            2.5 * (normal_force * square).sum() / normal_force.sum()
-        )  # Σ f r² = 2/5 a² F by Hertz
-        shape = np.sqrt(np.maximum(1 - square / (ratio * radius) ** 2, 0.0)) * (normal_force > 0)
-        shape = shape * (
-            1 - (1 + POISSON) * (1 - 2 * POISSON) * largest / young * shape
-        )  # of the area under Hertz' strain
+        # Σ f r² = 2/5 a² F by Hertz
+        width = math.sqrt(2.5 * (normal_force * square).sum() / normal_force.sum())
+        profile = np.sqrt(np.maximum(1 - square / (ratio * radius) ** 2, 0.0)) * (normal_force > 0)
+        contraction = (1 + POISSON) * (1 - 2 * POISSON) * largest / young * profile  # of the area
+        profile = profile * (1 - contraction)
         inner = square < 0.5 * (ratio * radius) ** 2
-        peak = (shape * normal_force)[inner].sum() / (shape**2 * areas)[inner].sum()
+        peak = (profile * normal_force)[inner].sum() / (profile**2 * areas)[inner].sum()
         found.append((normal_force.sum(), width, peak))
     force, width, peak = np.mean(found[-4:], axis=0)
     return {
@@ -125,9 +122,8 @@ def rolls(
     gained = ((final - velocity) * along).sum(1) / time
     turned = ((fast - spin) * axis).sum(1) / time * radius
     beside = (final * across).sum(1) / final.norm(dim=1)
-    sunk = (0.75 * mass.item() * GRAVITY * (1 - POISSON**2) / (young * radius**2)) ** (
-        2 / 3
-    )  # a²/R² by Hertz
+    # a²/R² by Hertz
+    sunk = (0.75 * mass.item() * GRAVITY * (1 - POISSON**2) / (young * radius**2)) ** (2 / 3)
     found = {}
     for k, (degrees, mu, way) in enumerate(rows):
         name, normal_part = f"{degrees:g}°, μ {mu:g}, {way:g}°: ", GRAVITY * math.cos(slope[k])
