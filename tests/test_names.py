@@ -56,4 +56,5 @@ def missing(path: Path) -> Iterator[str]:
 
 
 def test_names_exist():
+    """In every file of the tests."""
     assert [sentence for path in sorted(TESTS.rglob("*.py")) for sentence in missing(path)] == []

@@ -1,4 +1,6 @@
-"""A crawler small enough to train in a test: a soft block on a rough floor, with a muscle in each half."""
+"""A crawler small enough to train in a test, a soft block on a rough floor with a muscle in each half; and the command line in this
+process.
+"""
 
 import logging
 import sys

@@ -156,9 +156,8 @@ class Panel:
         from matplotlib.patheffects import withStroke
 
         look |= dict(angles="xy", scale_units="xy", scale=1.0, units="xy", width=0.2 * self._place.spacing)
-        look |= dict(
-            path_effects=[withStroke(linewidth=1.0, foreground="white")]
-        )  # apart from particles as dark
+        edge = withStroke(linewidth=1.0, foreground="white")  # particles may be as dark as the arrows
+        look |= dict(path_effects=[edge])
         return self._axes.quiver(*feet.T, *vectors.T, color=[tuple(np.array(style.TRACTION) / 255)], **look)
 
     def _draw_walls(self, low: np.ndarray, high: np.ndarray) -> None:

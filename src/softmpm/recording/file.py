@@ -147,7 +147,7 @@ def put_in_place(draft: Path, path: Path) -> None:
 
 
 def need_name(file: h5py.File) -> None:
-    """Raise OSError if the file has no name any more: nobody could read what is written to it."""
+    """Raise FileNotFoundError if the file has no name any more: nobody could read what is written to it."""
     if os.fstat(file.id.get_vfd_handle()).st_nlink == 0:
         text = "cannot record: the file was deleted, or replaced by another recorder; give each recorder a path of its own"
         raise FileNotFoundError(errno.ENOENT, text, file.filename)

@@ -246,9 +246,8 @@ def torchrun(*words: str, cwd: Path) -> subprocess.CompletedProcess:
 
 def test_processes_share_the_seeds(main, tmp_path):
     """Each has its own, without an exchange of gradients: three seeds in two processes are those of one. The last lines are of all."""
-    assert (
-        main(*PLAIN, "train.seeds=3", "hydra.run.dir=one")[0] == 0
-    )  # first: both processes find the kernels compiled
+    # This run comes first, so that both processes find their kernels compiled.
+    assert main(*PLAIN, "train.seeds=3", "hydra.run.dir=one")[0] == 0
     done = torchrun(*PLAIN, "train.seeds=3", "hydra.run.dir=two", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     best = [float(row["loss"]) for row in rows(Path("two/sweep.csv"))]

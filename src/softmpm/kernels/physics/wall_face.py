@@ -142,7 +142,7 @@ def wall_face_adj(spec: Spec, wanted: RequestedGrads) -> wp.Function:
 
 @kernel_factory
 def wall_faces(spec: Spec) -> SimpleNamespace:
-    """All separating walls, and the contact of a surface point with one of them, wall ``q`` among them."""
+    """All separating walls as a surface point meets them, and its contact with the ``q``-th of them."""
     t = types(spec.dim, spec.dtype)
     exact_vec = types(spec.dim, "float64").vec
     GridInputs = input_types(spec).GridInputs
