@@ -422,7 +422,9 @@ def recordings(monkeypatch, device) -> list[softmpm.Graph]:
                 yield
 
         pretended = SimpleNamespace(
-            cat=torch.cat, cuda=MagicMock(graph=blindly, is_current_stream_capturing=bool)
+            cat=torch.cat,
+            device=torch.device,
+            cuda=MagicMock(graph=blindly, is_current_stream_capturing=bool),
         )
         monkeypatch.setattr("softmpm.cuda_graph.torch", pretended)
     return recorded
