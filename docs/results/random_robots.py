@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from collect import COLUMNS, EXAMINED, WALKER, number
 from comparison import Row, lasts
 from settling import table
 
@@ -29,9 +30,8 @@ KINDS = {
     "vertical actuator": "#0080ff",
 }
 """Kinds of voxels, from 1 on, and their colours."""
-SAME = ("iteration", "end", "later", "kicked", "friction", "finer")
-COLUMNS = {"best": "loss", **{name: name for name in SAME}, "tilt": "largest_tilt"}
-"""Columns of the table but the first three, and those of sweep.csv that they are."""
+TRIALS = "random_robots_trials.h200.csv"
+"""Lowest loss of an episode in shorter runs with other settings, a column for each seed."""
 
 
 def drawn() -> Iterator[tuple[str, np.ndarray]]:
@@ -66,7 +66,10 @@ def collect(name: str, *folders: str) -> None:
                         "strength": f"{task['strength']:g}",
                         "seed": row["seed"],
                     }
-                    rows.append(robot | {new: _short(row[old]) for new, old in COLUMNS.items()})
+                    columns = COLUMNS | EXAMINED | WALKER
+                    rows.append(
+                        robot | {new: number(row[old]) for new, old in columns.items()} | counts(run, row)
+                    )
     with open(Path(__file__).parent / name, "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -74,9 +77,17 @@ def collect(name: str, *folders: str) -> None:
     print(f"{len(rows)} runs")
 
 
-def _short(text: str) -> str:
-    """Four digits of a number; nothing of one that is missing or not finite."""
-    return f"{float(text):.4g}" if text and np.isfinite(float(text)) else ""
+def counts(run: Path, row: Row) -> Row:
+    """Of a seed the evaluations while it learned, how many of them failed, and how often it began anew.
+
+    The first iteration and every fifth are evaluated; a failed evaluation has no value.
+    """
+    with open(run.parent / f"seed_{row['seed']}" / "metrics.csv", newline="") as file:
+        steps = [step for step in csv.DictReader(file) if step["loss"]]
+    due = [step for step in steps if int(step["iteration"]) % 5 == 4 or step["iteration"] == "0"]
+    failed = sum(step["evaluation"] in ("", "nan") for step in due)
+    restarts = sum(int(step["restarts"]) for step in steps)
+    return {"evaluations": str(len(due)), "failed": str(failed), "restarts": str(restarts)}
 
 
 def by_robot(name: str) -> dict[str, dict[str, list[Row]]]:
@@ -100,6 +111,10 @@ def show(name: str = NAME) -> None:
         print(
             f"strength {strength} Pa: of {len(runs)} runs {len(walk)} walk, {sum(map(lasts, walk))} of which last;"
         )
+        total = {name: sum(int(row[name]) for row in runs) for name in ("evaluations", "failed")}
+        print(f"  of {total['evaluations']} evaluations {total['failed']} failed;")
+        still = [int(row["restarts"]) for row in runs if row not in walk]
+        print(f"  those that do not walk began anew {min(still)} to {max(still)} times")
         each = [len(walking(rows)) == len(rows) for rows in robots.values()]
         some = [bool(walking(rows)) for rows in robots.values()]
         print(f"  of {len(robots)} robots {sum(some)} walk with some seed, {sum(each)} with each")
@@ -110,8 +125,12 @@ def show(name: str = NAME) -> None:
             print(f"  {column}: median {median:.2f}, tenths {low:.2f} and {high:.2f}, {torn} torn")
         for robot, rows in robots.items():
             best = [float(row["best"]) for row in rows]
-            number = f"{len(walking(rows))} of {len(rows)} walk, {sum(map(lasts, walking(rows)))} last"
-            print(f"  {robot}: {number}, best {np.median(best):.2f} ({min(best):.2f} to {max(best):.2f})")
+            found = f"{len(walking(rows))} of {len(rows)} walk, {sum(map(lasts, walking(rows)))} last"
+            print(f"  {robot}: {found}, best {np.median(best):.2f} ({min(best):.2f} to {max(best):.2f})")
+
+    for trial in table(TRIALS) if name == NAME else ():
+        moved = sum(float(trial[f"seed {seed}"]) < WALKS for seed in range(1390, 1398))
+        print(f"trial of {trial['robot']}, {trial['settings']}: {moved} of 8 move")
 
 
 def picture(name: str = NAME) -> None:
