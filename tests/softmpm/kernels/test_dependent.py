@@ -1,4 +1,4 @@
-"""Kernels that begin before the previous one has ended, compiled here for sm_90: they wait for what it writes."""
+"""Kernels that begin before the previous one has ended, compiled for sm_90: they wait for what it writes."""
 
 import ast
 import dataclasses
@@ -9,6 +9,7 @@ from typing import Any
 import cubin
 import ptx
 import pytest
+import sm90
 import torch
 import warp as wp
 
@@ -31,7 +32,6 @@ from softmpm.kernels.lagrangian.nodes import nodes, nodes_adj
 from softmpm.kernels.lagrangian.persistent import march, march_adj
 from softmpm.kernels.structs import RequestedGrads, Spec
 
-ARCH = 90
 SPEC = Spec(
     dim=2,
     dtype="float32",
@@ -111,11 +111,7 @@ def code_of(name: str) -> tuple[wp.Kernel, str]:
 
 
 def ptx_of(kernel: wp.Kernel, threads: int) -> str:
-    wp.init()
-    if ARCH not in wp.get_cuda_supported_archs():
-        pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
-    wp.set_module_options({"block_dim": threads}, module=kernel.module)
-    (file,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
+    file = sm90.compiled(kernel, ptx=True, block_dim=threads)
     entry = re.compile(rf"{kernel.key}_\w*_cuda_kernel_forward")
     (code,) = (code for found, code in cubin.entries(file.read_text()).items() if entry.fullmatch(found))
     return code

@@ -1,11 +1,11 @@
-"""The machine code of the fast scheme's kernels, compiled here for a GPU that need not be here: sm_90, as for an H100."""
+"""The machine code of the fast scheme's kernels for sm_90."""
 
 import dataclasses
 import re
 
 import cubin
 import pytest
-import warp as wp
+import sm90
 
 from softmpm.kernels.fast.g2p2g import fused
 from softmpm.kernels.fast.g2p2g_adj import fused_adj
@@ -13,15 +13,7 @@ from softmpm.kernels.fast.native import BLOCK, FEW, MANY, WARP, SizeClass
 from softmpm.kernels.structs import RequestedGrads, Spec
 from softmpm.schemes.fast.launch_size import size_class_of
 
-ARCH = 90
 CASES = [(2, "neo_hookean"), (2, "fixed_corotated"), (3, "neo_hookean"), (3, "fixed_corotated")]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiler():
-    wp.init()
-    if ARCH not in wp.get_cuda_supported_archs():
-        pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
 
 
 def scene_spec(dim: int, law: str, bare: bool) -> Spec:
@@ -50,11 +42,11 @@ def kernel(dim: int, law: str, which: str, bare: bool, size_class: SizeClass):
 
 
 def compiled(kernel, threads: int = BLOCK) -> tuple[str, cubin.Kernel]:
-    """PTX of this kernel for blocks of so many threads, and what its binary says about it; from Warp's cache if nothing has changed.
+    """PTX of this kernel for blocks of so many threads, and what its binary says about it.
+
     Line numbers bring the PTX into the binary and change no instruction.
     """
-    wp.set_module_options({"block_dim": threads, "lineinfo": True}, module=kernel.module)
-    (binary,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=False)
+    binary = sm90.compiled(kernel, ptx=False, block_dim=threads, lineinfo=True)
     name = re.compile(rf"{kernel.key}_\w*_cuda_kernel_forward")
     (code,) = (code for entry, code in cubin.entries(cubin.ptx(binary)).items() if name.fullmatch(entry))
     (facts,) = (facts for entry, facts in cubin.kernels(binary).items() if name.fullmatch(entry))

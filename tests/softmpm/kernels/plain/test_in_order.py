@@ -6,6 +6,7 @@ from typing import Any
 
 import cubin
 import pytest
+import sm90
 import torch
 import warp as wp
 from helpers import busy_inputs, busy_scene, run
@@ -17,7 +18,6 @@ from softmpm.kernels.rasterize import raster
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.schemes.plain.substep import Substep
 
-ARCH = 90
 RECORD = r"\batom\.global\.add\.u32"  # the place of the next record
 
 
@@ -33,12 +33,9 @@ def kernels(dim: int, dtype: torch.dtype, ordered: bool) -> tuple:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_terms_are_recorded(dim, dtype):
     """Each records its terms, 3^dim of a particle; without ``ordered`` it records none."""
-    wp.init()
-    if ARCH not in wp.get_cuda_supported_archs():
-        pytest.skip(f"this Warp has no compiler for sm_{ARCH} (NVRTC)")
     for ordered in (True, False):
         for kernel in kernels(dim, dtype, ordered):
-            (ptx,) = wp.compile_aot_module(kernel.module, arch=ARCH, use_ptx=True)
+            ptx = sm90.compiled(kernel, ptx=True)
             name = re.compile(rf"{kernel.key}_[0-9a-f]+_cuda_kernel_forward")
             (code,) = (
                 code for entry, code in cubin.entries(ptx.read_text()).items() if name.fullmatch(entry)
