@@ -60,7 +60,9 @@ def alarm(spec: Spec) -> SimpleNamespace:
         before = mat()
         beta = real(0.0)
         pivot = real(1.0)
-        for _step in range(steps):
+        step = int(0)
+        while step < steps:  # which Warp does not unroll: the adjoint of the stress is compiled once
+            step += 1
             A = stress_adj(own, H, Q, G, 0, 0, ParticleInputsAdj()) * wp.transpose(F)
             A = real(0.5) * (A + wp.transpose(A))
             if wp.static(viscous):

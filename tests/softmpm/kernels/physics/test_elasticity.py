@@ -1,5 +1,7 @@
 """Stress of each law against NumPy; its adjoint against finite differences, for a random cotangent."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -47,12 +49,54 @@ def points(dim: int, law: str) -> dict[str, torch.Tensor]:
     }
 
 
-def arguments(law: str, dim: int, dtype: str, H: torch.Tensor):
-    """H, and what else the blocks of the law take: its rotation, μ and λ."""
-    t, real = types(dim, dtype), getattr(torch, dtype)
-    Q = apply(law_of(law, dim, dtype).rotation, t.mat, (dim, dim), (H.to(real), t.mat))
-    mu, lam = (torch.full((len(H),), value, dtype=real, device=H.device) for value in (MU, LAM))
-    return (H.to(real), t.mat), (Q, t.mat), (mu, t.real), (lam, t.real)
+@functools.cache
+def blocks_of(law: str, dim: int, dtype: str) -> wp.Function:
+    """Function of H, μ, λ and W: τ, P = τ F⁻ᵀ, and the adjoints of F, μ and λ for the cotangent W of τ, and of P."""
+    t, blocks = types(dim, dtype), law_of(law, dim, dtype)
+    rotation, stress, stress_adj, piola_adj = (
+        blocks.rotation,
+        blocks.stress,
+        blocks.stress_adj,
+        blocks.piola_adj,
+    )
+    inverse_transpose = kinematics(dim, dtype).inverse_transpose
+    size = dim * dim
+    flat = wp.types.vector(4 * size + 4, t.real)
+
+    @wp.func
+    def all_of(H: t.mat, mu: t.real, lam: t.real, W: t.mat) -> flat:
+        Q = rotation(H)
+        tau = stress(H, Q, mu, lam)
+        P = tau * inverse_transpose(H)
+        of_tau = stress_adj(H, Q, mu, lam, W)
+        of_P = piola_adj(H, Q, mu, lam, W)
+        out = flat()
+        for i in range(dim):
+            for j in range(dim):
+                k = i * dim + j
+                out[k] = tau[i, j]
+                out[size + k] = P[i, j]
+                out[2 * size + k] = of_tau.F[i, j]
+                out[3 * size + 2 + k] = of_P.F[i, j]
+        out[3 * size] = of_tau.mu
+        out[3 * size + 1] = of_tau.lam
+        out[4 * size + 2] = of_P.mu
+        out[4 * size + 3] = of_P.lam
+        return out
+
+    return all_of
+
+
+def law_at(law: str, dtype: str, H: torch.Tensor, W: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """``stress`` and ``piola`` in float64, flattened, and ``stress_adj`` and ``piola_adj``, those of F, then of μ and of λ."""
+    dim, real = H.shape[-1], getattr(torch, dtype)
+    t, size = types(dim, dtype), dim * dim
+    moduli = [(torch.full((len(H),), value, dtype=real, device=H.device), t.real) for value in (MU, LAM)]
+    given = (H.to(real), t.mat), *moduli, ((H if W is None else W).to(real), t.mat)
+    flat = wp.types.vector(4 * size + 4, t.real)
+    found = apply(blocks_of(law, dim, dtype), flat, (4 * size + 4,), *given).cpu().double()
+    names = ("stress", "piola", "stress_adj", "piola_adj")
+    return dict(zip(names, found.split((size, size, size + 2, size + 2), 1), strict=True))
 
 
 LAWS = list(LAW_CLASSES)
@@ -63,14 +107,12 @@ LAWS = list(LAW_CLASSES)
 @pytest.mark.parametrize("dtype, limit", [("float64", 1e-13), ("float32", 2e-6)])
 def test_stress_is_the_law(law, dim, dtype, limit, device):
     """τ of (E1) to (E3), at every special point."""
-    given, mat = points(dim, law), types(dim, dtype).mat
+    given = points(dim, law)
     H = torch.stack(list(given.values())).to(device) - torch.eye(dim, dtype=torch.float64, device=device)
-    got = (
-        apply(law_of(law, dim, dtype).stress, mat, (dim, dim), *arguments(law, dim, dtype, H)).cpu().double()
-    )
+    got = law_at(law, dtype, H)["stress"]
     for (name, F), tau in zip(given.items(), got, strict=True):
         want = numpy_stress(law, F.numpy())
-        assert np.abs(tau.numpy() - want).max() <= limit * max(1.0, float((F**2).sum())) * 10, name
+        assert np.abs(tau.numpy() - want.ravel()).max() <= limit * max(1.0, float((F**2).sum())) * 10, name
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -78,35 +120,10 @@ def test_stress_is_the_law(law, dim, dtype, limit, device):
 def test_small_strain_keeps_its_digits_in_float32(law, dim):
     """At strain 1e-6 the stress is Hooke's to 1e-5 relative: F − I and J − 1 are never formed by subtraction."""
     H = 1e-6 * torch.randn(10, dim, dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    mat = types(dim, "float32").mat
-    got = apply(
-        law_of(law, dim, "float32").stress, mat, (dim, dim), *arguments(law, dim, "float32", H)
-    ).double()
+    got = law_at(law, "float32", H)["stress"].view(H.shape)
     trace = H.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     hooke = MU * (H + H.mT) + LAM * trace * torch.eye(dim, dtype=torch.float64)
     assert ((got - hooke).abs().max() / hooke.abs().max()).item() < 1e-5
-
-
-def law_adjoint(
-    law: str, dim: int, dtype: str, measure: str, H: torch.Tensor, W: torch.Tensor
-) -> torch.Tensor:
-    """The adjoints of F, row by row, of μ and of λ, for the cotangent W of τ (``stress``) or P (``piola``)."""
-    t, real = types(dim, dtype), getattr(torch, dtype)
-    adjoint, flat = getattr(law_of(law, dim, dtype), f"{measure}_adj"), wp.types.vector(dim * dim + 2, t.real)
-
-    @wp.func
-    def flattened(H: t.mat, Q: t.mat, mu: t.real, lam: t.real, adj: t.mat) -> flat:
-        found = adjoint(H, Q, mu, lam, adj)
-        out = flat()
-        for i in range(dim):
-            for j in range(dim):
-                out[i * dim + j] = found.F[i, j]
-        out[dim * dim] = found.mu
-        out[dim * dim + 1] = found.lam
-        return out
-
-    given = arguments(law, dim, dtype, H), (W.to(real), t.mat)
-    return apply(flattened, flat, (dim * dim + 2,), *given[0], given[1]).cpu().double()
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -117,7 +134,7 @@ def test_the_adjoint_of_a_law_is_the_finite_difference(law, dim, measure, device
     given, h = points(dim, law), 1e-6
     H = torch.stack(list(given.values())) - torch.eye(dim, dtype=torch.float64)
     W = torch.randn(H.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    got = law_adjoint(law, dim, "float64", measure, H.to(device), W.to(device))
+    got = law_at(law, "float64", H.to(device), W.to(device))[f"{measure}_adj"]
     for n, (name, F) in enumerate(given.items()):
         F, w = F.numpy(), W[n].numpy()
 
@@ -156,24 +173,15 @@ def test_rounding_near_collapse(law, J, device):
     H = (F - torch.eye(3, dtype=torch.float64)).float().double().to(device)
     W = torch.randn(H.shape, generator=generator, dtype=torch.float64).float().double().to(device)
 
-    def piola(dtype):
-        t, stress = types(3, dtype), law_of(law, 3, dtype).stress
-        inverse_transpose = kinematics(3, dtype).inverse_transpose
+    single, double = (law_at(law, dtype, H, W) for dtype in ("float32", "float64"))
 
-        @wp.func
-        def product(H: t.mat, Q: t.mat, mu: t.real, lam: t.real) -> t.mat:
-            return stress(H, Q, mu, lam) * inverse_transpose(H)
-
-        return apply(product, t.mat, (3, 3), *arguments(law, 3, dtype, H)).double().flatten(1)
-
-    def error(of):
-        got, want = of("float32"), of("float64")
+    def error(name: str):
+        got, want = single[name][:, :9], double[name][:, :9]
         return ((got - want).norm(dim=1) / want.norm(dim=1)).median()
 
-    assert error(piola) <= ROUNDING[law] / J
+    assert error("piola") <= ROUNDING[law] / J
     finite = law in ("fixed_corotated", "stable_neo_hookean")
-    adjoint = error(lambda dtype: law_adjoint(law, 3, dtype, "piola", H, W)[:, :9])
-    assert adjoint <= (2e-7 if finite else 1.5 * ROUNDING[law] / J)
+    assert error("piola_adj") <= (2e-7 if finite else 1.5 * ROUNDING[law] / J)
 
 
 def pull_along(fibre, F, p):
@@ -192,42 +200,48 @@ ACTUATORS = {"muscle": pull_along, "pressure": push_from_inside}
 
 @pytest.mark.parametrize("kind", ACTUATORS)
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("measure", ["stress", "piola"])
-def test_active_stress_and_its_adjoint(kind, dim, measure, device):
+def test_active_stress_and_its_adjoint(kind, dim, device):
     """The stress of each actuator, and the derivatives of ⟨W, τ⟩ and ⟨W, P⟩ for random W, as PyTorch finds them."""
     t, blocks = types(dim, "float64"), actuator(kind, dim, "float64")
     generator, eye = torch.Generator().manual_seed(2), torch.eye(dim, dtype=torch.float64)
     H, W = torch.randn(2, 6, dim, dim, generator=generator, dtype=torch.float64)
     d = torch.nn.functional.normalize(torch.randn(6, dim, generator=generator, dtype=torch.float64), dim=1)
     p = torch.tensor([1.5, -0.7, 0.0, 2.0, 1.0, -3.0], dtype=torch.float64)
-    given = ((H.to(device), t.mat), (d.to(device), t.vec), (p.to(device), t.real))
-    stress = ACTUATORS[kind]
-
-    got = apply(blocks.stress, t.mat, (dim, dim), *given).cpu()
-    torch.testing.assert_close(got, stress(d, eye + H, p), rtol=1e-12, atol=1e-12)
-
-    size = dim * dim + 1 + dim
-    adjoint, flat = getattr(blocks, f"{measure}_adj"), wp.types.vector(size, wp.float64)
+    stress, stress_adj, piola_adj = blocks.stress, blocks.stress_adj, blocks.piola_adj
+    size, row = dim * dim, dim * dim + 1 + dim
+    flat = wp.types.vector(size + 2 * row, wp.float64)
 
     @wp.func
-    def flattened(H: t.mat, fibre: t.vec, p: t.real, adj: t.mat) -> flat:
-        found = adjoint(H, fibre, p, adj)
+    def all_of(H: t.mat, fibre: t.vec, p: t.real, W: t.mat) -> flat:
+        tau = stress(H, fibre, p)
+        of_tau = stress_adj(H, fibre, p, W)
+        of_P = piola_adj(H, fibre, p, W)
         out = flat()
         for i in range(dim):
             for j in range(dim):
-                out[i * dim + j] = found.F[i, j]
-            out[dim * dim + 1 + i] = found.fibre[i]
-        out[dim * dim] = found.active_stress
+                k = i * dim + j
+                out[k] = tau[i, j]
+                out[size + k] = of_tau.F[i, j]
+                out[size + row + k] = of_P.F[i, j]
+            out[2 * size + 1 + i] = of_tau.fibre[i]
+            out[2 * size + row + 1 + i] = of_P.fibre[i]
+        out[2 * size] = of_tau.active_stress
+        out[2 * size + row] = of_P.active_stress
         return out
 
-    adj = apply(flattened, flat, (size,), *given, (W.to(device), t.mat)).cpu()
-    leaves = [value.clone().requires_grad_() for value in (eye + H, p, d)]
-    F, p, d = leaves
-    tau = stress(d, F, p)
-    value = tau if measure == "stress" else tau @ torch.linalg.inv(F).mT
-    want = torch.autograd.grad((W * value).sum(), leaves, allow_unused=True, materialize_grads=True)
-    wanted = torch.cat([want[0].flatten(1), want[1][:, None], want[2]], 1)
-    torch.testing.assert_close(adj, wanted, rtol=1e-10, atol=1e-10)
+    given = ((H, t.mat), (d, t.vec), (p, t.real), (W, t.mat))
+    found = apply(all_of, flat, (size + 2 * row,), *((one.to(device), kind) for one, kind in given)).cpu()
+    tau, of_tau, of_P = found.split((size, row, row), 1)
+    want = ACTUATORS[kind](d, eye + H, p)
+    torch.testing.assert_close(tau, want.flatten(1), rtol=1e-12, atol=1e-12)
+    for measure, adj in (("stress", of_tau), ("piola", of_P)):
+        leaves = [value.clone().requires_grad_() for value in (eye + H, p, d)]
+        value = ACTUATORS[kind](leaves[2], leaves[0], leaves[1])
+        if measure == "piola":
+            value = value @ torch.linalg.inv(leaves[0]).mT
+        want = torch.autograd.grad((W * value).sum(), leaves, allow_unused=True, materialize_grads=True)
+        wanted = torch.cat([want[0].flatten(1), want[1][:, None], want[2]], 1)
+        torch.testing.assert_close(adj, wanted, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -237,28 +251,31 @@ def test_the_first_piola_kirchhoff_stress_of_viscosity(dim, device):
     generator = torch.Generator().manual_seed(4)
     F, rate, W = torch.randn(3, 6, dim, dim, generator=generator, dtype=torch.float64)
     eta = torch.rand(6, generator=generator, dtype=torch.float64)
-    given = ((F.to(device), t.mat), (rate.to(device), t.mat), (eta.to(device), t.real))
+    piola, piola_adj, size = blocks.viscous_piola, blocks.viscous_piola_adj, dim * dim
+    flat = wp.types.vector(3 * size + 1, wp.float64)
+
+    @wp.func
+    def all_of(F: t.mat, rate: t.mat, eta: t.real, W: t.mat) -> flat:
+        P = piola(F, rate, eta)
+        adj = piola_adj(F, rate, eta, W)
+        out = flat()
+        for i in range(dim):
+            for j in range(dim):
+                k = i * dim + j
+                out[k] = P[i, j]
+                out[size + k] = adj.F[i, j]
+                out[2 * size + k] = adj.rate[i, j]
+        out[3 * size] = adj.eta
+        return out
 
     def P_of(F, rate, eta):
         inverse = torch.linalg.inv(F)
         return oracle_stress.viscous_stress(F, rate @ inverse, eta) @ inverse.mT
 
-    got = apply(blocks.viscous_piola, t.mat, (dim, dim), *given).cpu()
-    torch.testing.assert_close(got, P_of(F, rate, eta), rtol=1e-10, atol=1e-10)
-    piola_adj, flat = blocks.viscous_piola_adj, wp.types.vector(2 * dim * dim + 1, wp.float64)
-
-    @wp.func
-    def flattened(F: t.mat, rate: t.mat, eta: t.real, adj_P: t.mat) -> flat:
-        adj = piola_adj(F, rate, eta, adj_P)
-        out = flat()
-        for i in range(dim):
-            for j in range(dim):
-                out[i * dim + j] = adj.F[i, j]
-                out[dim * dim + i * dim + j] = adj.rate[i, j]
-        out[2 * dim * dim] = adj.eta
-        return out
-
-    adj = apply(flattened, flat, (2 * dim * dim + 1,), *given, (W.to(device), t.mat)).cpu()
+    given = ((F, t.mat), (rate, t.mat), (eta, t.real), (W, t.mat))
+    found = apply(all_of, flat, (3 * size + 1,), *((one.to(device), kind) for one, kind in given)).cpu()
+    got, adj = found.split((size, 2 * size + 1), 1)
+    torch.testing.assert_close(got, P_of(F, rate, eta).flatten(1), rtol=1e-10, atol=1e-10)
     leaves = [tensor.clone().requires_grad_() for tensor in (F, rate, eta)]
     slopes = torch.autograd.grad((W * P_of(*leaves)).sum(), leaves)
     want = torch.cat([slopes[0].flatten(1), slopes[1].flatten(1), slopes[2][:, None]], 1)
