@@ -1,6 +1,7 @@
 """Checks that settings share: a wrong value fails where the settings are made, in a sentence."""
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
@@ -22,6 +23,18 @@ TYPES: dict[Any, tuple[str, Callable[[Any], bool]]] = {
     ),
 }
 """Rule of the values of a field by its type."""
+
+
+def replaces_nothing(kind: type) -> None:
+    """Raise ValueError for the first setting of a class, an annotated name in its body, that replaces an attribute of a base class that
+    is no setting itself."""
+    for name in inspect.get_annotations(kind):
+        owner = next((base for base in kind.__mro__[1:] if name in vars(base)), None)
+        if owner and name not in getattr(owner, "__dataclass_fields__", ()):
+            raise ValueError(
+                f"a setting must not replace an attribute of a base class: {name!r} of {kind.__name__} would take the place of "
+                f"{owner.__name__}.{name}; give the setting another name."
+            )
 
 
 def typed(group: str, settings) -> None:

@@ -83,7 +83,7 @@ def arm(conf: ArmConf) -> Task:
         for segment, (start, end) in SEGMENTS.items()
         for side, half in ((1, "left"), (-1, "right"))
     ]
-    nodes = conf.cells
+    nodes = conf.cells_per_metre
     scene = Scene(
         grid=Grid(shape=(round(0.9 * nodes), round(0.7 * nodes)), spacing=conf.spacing),
         bodies=[Body(shape, material(conf))],

@@ -38,7 +38,7 @@ class OwnConf(WalkerConf):
     """File of the robot. A relative path begins where the program runs; it becomes absolute, so that a run is resumed from anywhere."""
     size: float = 0.3
     """Longer side of the robot, its length or its height [m]."""
-    cells: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride, reportAssignmentType]
+    cells: int | None = None
     """Cells of the grid per metre, at least 20; null for those of task.resolution. Good value: four cells or more across the thinnest
     limb."""
 
@@ -46,11 +46,14 @@ class OwnConf(WalkerConf):
         super().__post_init__()
         if self.file:
             self.file = str(Path(self.file).absolute())
-        if self.cells is None:
-            self.cells = self.resolution.value
+        self.cells = self.cells_per_metre
         positive("task", self, "size", "cells")
         if self.cells < 20:
             raise ValueError(f"task.cells must be at least 20 per metre, got {self.cells}.")
+
+    @property
+    def cells_per_metre(self) -> int:
+        return self.resolution.value if self.cells is None else self.cells
 
     def refined(self) -> Self:
         """The same robot on a grid with half as many cells more."""

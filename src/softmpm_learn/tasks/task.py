@@ -13,7 +13,7 @@ import torch
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Objective
-from softmpm_learn.setting_checks import not_negative, one_of, positive, typed
+from softmpm_learn.setting_checks import not_negative, one_of, positive, replaces_nothing, typed
 from softmpm_learn.term import Path
 
 FORMULATIONS = ("moving", "reference")
@@ -98,6 +98,10 @@ class TaskConf:
     """Distance over which surface contact sets in [cells]; 0 to evaluate. null is 0.01 where the surface meets the floor, with which
     gradients were usable (docs/gait.md)."""
 
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        replaces_nothing(cls)
+
     def __post_init__(self):
         typed("task", self)
         if not isinstance(self.resolution, Resolution):
@@ -134,14 +138,14 @@ class TaskConf:
         return dataclasses.replace(self, resolution=known[known.index(self.resolution) + 1])
 
     @property
-    def cells(self) -> int:
-        """Cells per metre."""
+    def cells_per_metre(self) -> int:
+        """Cells of the grid per metre."""
         return self.resolution.value
 
     @property
     def spacing(self) -> float:
         """Distance of neighbouring grid nodes [m]."""
-        return 1.0 / self.cells
+        return 1.0 / self.cells_per_metre
 
     @property
     def on_surface(self) -> bool:

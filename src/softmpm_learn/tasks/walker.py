@@ -111,7 +111,7 @@ def track(conf: WalkerConf) -> tuple[softmpm.Grid, list[softmpm.Wall], float]:
     nodes otherwise. There is no wall at the far end, which a fast walker would run into without a word: it leaves the grid instead, by
     name.
     """
-    length, height, margin, nodes, spacing = conf.track_length, 0.5, 0.05, conf.cells, conf.spacing
+    length, height, margin, nodes, spacing = conf.track_length, 0.5, 0.05, conf.cells_per_metre, conf.spacing
     floor = math.floor(0.0625 * nodes) * spacing
     soles = floor + 0.5 * spacing
     if conf.on_surface:

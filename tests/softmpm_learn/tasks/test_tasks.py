@@ -349,6 +349,20 @@ def test_a_robot_of_ones_own_may_have_a_length():
     assert track(WormConf())[0].shape == track(WalkerConf(name="worm"))[0].shape
 
 
+@pytest.mark.parametrize("name", ["spacing", "build", "alarms", "on_surface", "track_length", "refined"])
+def test_a_setting_must_not_replace_an_attribute(name):
+    """The walker would be built from it; the name is refused in a class that derives from one of ours, at any distance."""
+    own = dataclasses.make_dataclass("WormConf", [("length", float, 0.2)], bases=(WalkerConf,), kw_only=True)
+    owner = WalkerConf if name in vars(WalkerConf) else TaskConf
+    says = (
+        f"{name!r} of LongConf would take the place of {owner.__name__}.{name}; give the setting another name"
+    )
+    for how in ((name, float, 0.2), (name, float)):
+        with pytest.raises(ValueError, match=says):
+            dataclasses.make_dataclass("LongConf", [how], bases=(own,), kw_only=True)
+    dataclasses.make_dataclass("LongConf", [("length", float, 0.3)], bases=(own,), kw_only=True)
+
+
 def test_a_limb_knows_along_and_across():
     """On a bent limb, places are measured along its line and to its left, and its parts are the halves of its outline."""
     limb = Limb(np.array([(0.0, 0.0), (0.0, -1.0), (1.0, -1.0)]), np.array([0.2, 0.2, 0.2]))
