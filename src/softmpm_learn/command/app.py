@@ -35,6 +35,7 @@ from softmpm_learn.config import RunConf, conf_dir, register, to_run
 from softmpm_learn.distributed import Group, OtherProcessError, joined
 from softmpm_learn.runs.saved import load as saved_configuration
 from softmpm_learn.storage import sweep
+from softmpm_learn.training.optimisation import TrainingError
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -119,8 +120,13 @@ def job(
         return _swept(config, out, group, signals, waiting, failed)
     try:
         conf = _configured(config, out, group)
-        (results,) = experiments([(conf, out)], group, signals)
         about = {"job": conf.job, "settings": " ".join(conf.command_line), "folder": str(out)}
+        try:
+            (results,) = experiments([(conf, out)], group, signals)
+        except JobError as failure:
+            if group.first and isinstance(failure.__cause__, TrainingError):
+                sweep.update(out, failure.outcome(about))
+            raise
         found = outcome(conf, out, results, group, about)
         if found:
             group.once(sweep.update, out, found)

@@ -36,6 +36,10 @@ class JobError(Exception):
         super().__init__(text)
         self.iterations = iterations
 
+    def outcome(self, about: dict) -> sweep.Outcome:
+        """Outcome of a job that failed so; ``about`` as of :attr:`Job.about`."""
+        return sweep.Outcome(status="failed", error=str(self), iterations=self.iterations, **about)
+
 
 class RefusedError(JobError):
     """A run that is another's: its folder is left as it is."""
@@ -134,10 +138,7 @@ def fail(jobs: Sequence[Job], failure: JobError, group: Group, failed: dict[int,
         print(f"softmpm_learn: job {_numbers(jobs)}: {failure}", file=sys.stderr)
     for mine in jobs:
         failed[mine.number] = mine.table
-        found = sweep.Outcome(
-            status="failed", error=str(failure), iterations=failure.iterations, **mine.about
-        )
-        _tabulate(mine, found, group)
+        _tabulate(mine, failure.outcome(mine.about), group)
     if group.size > 1:
         raise SystemExit(1)  # the processes may no longer be in step; the same command goes on
     return [math.inf] * len(jobs)

@@ -6,6 +6,7 @@ import statistics
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import forked
 import pytest
@@ -281,6 +282,23 @@ def test_what_goes_on_alone_has_its_row_in_the_table_of_the_sweep(main, alone, s
     assert [row for row, new in zip(after, changed, strict=True) if not new] == before[: changed.count(False)]
     assert main("-m", *PLAIN, *words, "hydra.sweep.dir=sweep")[0] == 0
     assert rows(Path("sweep/sweep.csv")) == after
+
+
+def test_what_fails_alone_has_failed_in_the_table_of_the_sweep(main, monkeypatch):
+    """A job that went on alone and failed is no longer finished; one that could not begin is what it was."""
+    words = (*MOVING, "optimizer.retries=0", "train.iterations=1", "train.seed=0,1")
+    assert main("-m", *words, "hydra.sweep.dir=sweep")[0] == 0
+    before = rows(Path("sweep/sweep.csv"))
+    with monkeypatch.context() as patch:
+        patch.setattr(softmpm, "build", Mock(side_effect=ValueError("there is no such device.")))
+        assert main("resume=sweep/1", "train.iterations=3")[0] == 1
+    assert rows(Path("sweep/sweep.csv")) == before
+    fails_in(monkeypatch, world=0)
+    assert main("resume=sweep/1", "train.iterations=3")[0] == 1
+    first, second = rows(Path("sweep/sweep.csv"))
+    assert first == before[0] and second["settings"] == before[1]["settings"]
+    assert (second["status"], second["iterations"], second["loss"]) == ("failed", "1", "inf")
+    assert "particle 3 is inverted" in second["error"]
 
 
 def test_a_run_without_a_sweep_has_no_table(main):
