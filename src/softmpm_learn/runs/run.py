@@ -201,10 +201,12 @@ class Run:
         return self.return_to_best(self.settings.optimizer.fallback_rate)
 
     def return_to_best(self, factor: float = 1.0) -> str:
-        """Go back to the best policy and design and what they saw through, without moments and with so many times the learning rates.
-        Says so."""
+        """Go back to the best policy and design and what they saw through, without moments, those of the autoencoder among them, and
+        with so many times the learning rates. Says so."""
         self.load_policy(self.best)
         self.optimizer.state.clear()
+        if self.learner is not None:
+            self.learner.optimizer.state.clear()
         self._scale_rates(factor)
         self.snapshot()
         return f"going back to iteration {self.best['iteration']}"

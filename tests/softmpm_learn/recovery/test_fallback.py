@@ -66,7 +66,8 @@ def scripted(monkeypatch):
     def attempt(runs, *args):
         (episode, rows), (run,) = real(runs, *args), runs.all
         rates = [group["lr"] for group in run.optimizer.param_groups]
-        seen[run.iteration] = (run.policy_snapshot(), rates, len(run.optimizer.state))
+        moments = [*run.optimizer.state, *run.learner.optimizer.state]
+        seen[run.iteration] = (run.policy_snapshot(), rates, len(moments))
         return episode, {0: rows[0] | {"loss": LOSSES[run.iteration]}}
 
     monkeypatch.setattr(optimisation, "attempt", attempt)
@@ -89,7 +90,7 @@ def equal(one: dict, other: dict) -> bool:
 
 @pytest.mark.parametrize("target_network", [True, False])
 def test_the_run_goes_back_to_its_best(task, model, falling, tmp_path, scripted, caplog, target_network):
-    """Policy, design and encoder of the best iteration, half the rates, no moments; counted and logged."""
+    """Policy, design and autoencoder of the best iteration, half the rates, no moments of any; counted and logged."""
     learning = dataclasses.replace(falling.learning, target_network=target_network, every=99)
     result = train(task, model, dataclasses.replace(falling, learning=learning), tmp_path)
     (best, rates, _), (low, _, _), (again, smaller, moments) = (scripted[k] for k in (2, 5, 6))
