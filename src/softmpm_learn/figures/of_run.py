@@ -15,6 +15,8 @@ STILL = 0.1
 """Nodes that never move at this share of the highest speed are cut off around a latent picture."""
 AROUND = 0.3
 """Margin around the places where a robot comes, over the height of the picture."""
+EQUAL = 0.1
+"""Change of a decoded velocity with its feature, over the largest speed, below which the columns of the feature look equal."""
 GAP = 0.08
 """Gap between two latent pictures, over their longer side."""
 STROKES, WIDTH = 24, 0.05
@@ -22,6 +24,10 @@ STROKES, WIDTH = 24, 0.05
 distances between two."""
 PALE = 0.6
 """Activation from which on strokes are light, since the colours of muscles are dark."""
+LINE = 0.15
+"""Height of a further line of words below the pictures of a robot [inch]."""
+UNIFORM = 1e-5
+"""Relative difference of a material below which it is uniform: rounding in single precision."""
 PASSIVE = "#8d99a6"
 """Colour of particles of no muscle."""
 SIGNED = "RdBu"
@@ -98,6 +104,11 @@ def latent_figure(path: Path, fields: np.ndarray) -> None:
         "velocity along x or y where the feature has this value and the others are 0; red: to the left, down; blue: to the right, up; "
         "a scale for each feature"
     )
+    changes = np.ptp(plane, axis=1).max(axis=(1, 2, 3))  # with the value of the feature
+    equal = np.flatnonzero(changes <= EQUAL * limit.ravel())
+    if len(equal):
+        which = ("features " if len(equal) > 1 else "feature ") + ", ".join(str(1 + k) for k in equal)
+        what += f"\nnearly equal columns: the velocity hardly depends on {which}"
     figure.supxlabel(what, fontsize=7)
     canvas.save(figure, path, dpi=120)
 
@@ -129,9 +140,11 @@ def robot_figure(
 
     Args:
         frames: Of each picture the title, positions (particle, dim) and activation (muscle,) or None.
-        design: Of each material its value on each particle (particle,) and its unit; drawn at rest.
+        design: Of each material its value on each particle (particle,) and its unit; drawn at rest, a uniform one is written below.
         goal: Where the robot should go, drawn as a black cross.
     """
+    drawn = {name: both for name, both in design.items() if not _is_uniform(both[0])}
+    words = _words(design, goal is not None)
     way = np.concatenate(
         [positions[:, 0] for _, positions, _ in frames] + ([goal[:1]] if goal is not None else [])
     )
@@ -139,9 +152,10 @@ def robot_figure(
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     columns = 1 if ratio < 0.45 else 2  # a high world is drawn half as wide
     rows = -(-len(frames) // columns)
-    above, below = rows * (7.4 / columns * ratio + 0.25), _height(scene, len(design)) if design else 0.0
+    above = rows * (7.4 / columns * ratio + 0.25) + LINE * words.count("\n")
+    below = _height(scene, len(drawn)) if drawn else 0.0
     figure = canvas.figure(8.0, above + below + 0.3)
-    parts = figure.subfigures(2, 1, height_ratios=[above, below]) if design else np.array([figure])
+    parts = figure.subfigures(2, 1, height_ratios=[above, below]) if drawn else np.array([figure])
     panels = parts[0].subplots(rows, columns, squeeze=False).ravel()
     for panel, (title, positions, activation) in zip(panels, frames, strict=False):
         _draw_robot(panel, scene, positions, activation, (low, high), inches=7.4 / columns)
@@ -150,11 +164,26 @@ def robot_figure(
         panel.set_title(title, fontsize=8, loc="left")
     for panel in panels[len(frames) :]:
         panel.set_axis_off()
-    what = "x and y [m]; muscles are red where they pull, blue where they push; strokes: fibres"
-    parts[0].supxlabel(what + "; cross: goal" * (goal is not None), fontsize=7)
-    if design:
-        _draw_design(parts[1], scene, design)
+    parts[0].supxlabel(words, fontsize=7)
+    if drawn:
+        _draw_design(parts[1], scene, drawn)
     canvas.save(figure, path, dpi=130)
+
+
+def _words(design: Mapping[str, tuple[np.ndarray, str]], goal: bool) -> str:
+    """Words below the pictures of the robot: what they show, and in further lines the uniform materials."""
+    what = (
+        "x and y [m]; muscles are red where they pull, blue where they push; strokes: fibres"
+        + "; cross: goal" * goal
+    )
+    known = [(name, np.nanmax(value), unit) for name, (value, unit) in design.items() if _is_uniform(value)]
+    uniform = ", ".join(f"{name} {value:.5g} {unit}".rstrip() for name, value, unit in known)
+    return "\n".join([what, *textwrap.wrap(f"uniform: {uniform}" * bool(known), 130)])
+
+
+def _is_uniform(value: np.ndarray) -> bool:
+    """True of a material that is the same on all particles that have it."""
+    return bool(np.nanmax(value) - np.nanmin(value) <= UNIFORM * np.nanmax(np.abs(value)))
 
 
 def _height(scene: Scene, panels: int) -> float:

@@ -100,6 +100,18 @@ def test_latent_figure_leaves_out_where_nothing_moves(tmp_path):
     assert colour_count(image, -60) > 0.15 * image.shape[0] * image.shape[1]
 
 
+def test_features_that_change_nothing_are_named(tmp_path, drawn):
+    """Their columns are equal, as those of an encoder that has hardly learned; of features that change something no word is said."""
+    fields = np.ones((3, len(VALUES), 12, 8, 2)) * (1.0, -0.5)
+    fields[1] *= np.reshape(VALUES, (-1, 1, 1, 1))
+    fields[2] += 0.04 * np.reshape(VALUES, (-1, 1, 1, 1))
+    for some in (fields, fields[:2], fields[1:2]):
+        latent_figure(tmp_path / "latent.png", some)
+    ends = [figure.get_supxlabel().split("\n")[1:] for figure in drawn]
+    said = "nearly equal columns: the velocity hardly depends on feature"
+    assert ends == [[f"{said}s 1, 3"], [f"{said} 1"], []]
+
+
 def test_loss_figure_draws_what_has_numbers(tmp_path):
     """A curve without a finite number is left out; gaps and a single point do no harm."""
     loss_figure(tmp_path / "two.png", {"loss": ([0, 1, 2], [3.0, np.nan, 1.0]), "validation": ([2], [0.5])})
@@ -199,6 +211,26 @@ def test_robot_figure_shows_activation_and_design(tmp_path, scene):
     assert pixels(tmp_path / "design.png").shape[0] > sizes["pull"][0] + 150
 
 
+def test_uniform_materials_are_words(tmp_path, scene, drawn):
+    """A panel of one colour tells nothing but a number; without co-design there is no panel of a material."""
+    rest, muscle = scene.bodies[0].particles.positions, np.arange(len(scene.bodies[0].particles)) < 20
+    young, poisson = np.full(len(rest), 5e4), np.float32(0.3) * np.ones(len(rest), dtype=np.float32)
+    off = {
+        "young": (young, "Pa"),
+        "poisson": (poisson, ""),
+        "strength": (np.where(muscle, 6e3, np.nan), "Pa"),
+    }
+    designed = off | {"young": (young * (1 + 1e-3 * muscle), "Pa")}
+    for design in (off, designed):
+        robot_figure(tmp_path / "robot.png", scene, [("start", rest, None)], design)
+    titles = [[axes.get_title() for axes in figure.axes if axes.get_title()] for figure in drawn]
+    assert titles == [[], ["young [Pa]"]]
+    plain, panels = drawn
+    assert plain.axes[0].title.get_window_extent().y1 < plain.bbox.y1
+    assert plain.get_supxlabel().endswith("\nuniform: young 50000 Pa, poisson 0.3, strength 6000 Pa")
+    assert panels.subfigs[0].get_supxlabel().endswith("\nuniform: poisson 0.3, strength 6000 Pa")
+
+
 def test_robot_figure_shows_fibres(tmp_path, scene):
     """Strokes over the muscle: dark at rest, and light over the dark colours of one that works. A pressure has none."""
     rest, counts = scene.bodies[0].particles.positions, {}
@@ -256,9 +288,9 @@ def test_pictures_of_a_robot_in_3d_show_its_near_side(tmp_path, drawn):
 def test_all_materials_are_drawn_on_the_whole_robot(tmp_path, scene, drawn):
     """With the same extent, also a strength that only muscles have, and with titles within the picture."""
     count = len(scene.bodies[0].particles)
-    strength = np.where(np.arange(count) < 20, 1.0, np.nan)
+    strength = np.where(np.arange(count) < 20, np.linspace(1.0, 2.0, count), np.nan)
     design = {
-        name: (np.full(count, 2.0), "")
+        name: (np.linspace(1.0, 2.0, count), "")
         for name in (
             "Young's modulus, over that of the scene",
             "Poisson's ratio, over that of the scene",
