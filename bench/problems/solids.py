@@ -37,9 +37,10 @@ def simulation(
     relaxation: float,
     room: tuple[float, float, float] = (0.0, 0.0, 0.0),
     dtype: torch.dtype = torch.float64,
+    step: float = 0.5,
     **settings,
 ) -> Simulation:
-    """A viscous body with contact at surface points at half of the stable step on a grid with ``room`` beyond it [m]."""
+    """A viscous body with contact at surface points, at this part of the stable step, on a grid with ``room`` beyond it [m]."""
     material = softmpm.NeoHookean(
         density=DENSITY, young=young, poisson=POISSON, viscosity=relaxation * young / (2 * (1 + POISSON))
     )
@@ -51,7 +52,7 @@ def simulation(
         gravity=(0.0, -GRAVITY, 0.0),
         dt=1.0,
     )
-    scene = dataclasses.replace(scene, dt=0.5 * softmpm.stable_dt(scene))
+    scene = dataclasses.replace(scene, dt=step * softmpm.stable_dt(scene))
     return Simulation(scene, formulation, contact="surface", dtype=dtype, **settings)
 
 

@@ -17,6 +17,7 @@ def pressed(
     place: Place = (0.0, 0.0, 0.0),
     axis: int = 1,
     ratio: float = 0.25,
+    relaxation: float = 0.0,
     **settings,
 ) -> dict[str, Found]:
     """A weightless sphere of so many cells in its radius, pressed by two smooth plates to a contact of ``ratio`` radii by Hertz.
@@ -33,7 +34,9 @@ def pressed(
         softmpm.Wall(normal=tuple(sign * normal), offset=sign * center[axis] - radius) for sign in (1.0, -1.0)
     ]
     names = ("wall_offset", "gravity", "damping")
-    one = simulation(shape, formulation, h, plates, young=young, relaxation=0.0, inputs=names, **settings)
+    one = simulation(
+        shape, formulation, h, plates, young=young, relaxation=relaxation, inputs=names, **settings
+    )
     rest = torch.tensor([wall.offset for wall in plates], dtype=torch.float64)
     still = dict(
         gravity=torch.zeros(3, dtype=one.model.dtype), damping=torch.tensor(damping, dtype=one.model.dtype)
