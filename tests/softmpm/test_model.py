@@ -168,6 +168,17 @@ def test_describe_says_what_was_compiled_and_left_out():
         assert phrase in busy, phrase
 
 
+def test_describe_warns_of_rigid_surface_points():
+    """Where a pressure wave passes less than a fifth of a cell in a substep; not at half of the stable step of an elastic body."""
+    scene, said = slab(), []
+    for part in (0.5, 0.05):
+        short = dataclasses.replace(scene, dt=part * softmpm.stable_dt(scene))
+        for contact in ("surface", "nodes"):
+            text = softmpm.build(short, device="cpu", formulation="reference", contact=contact).describe()
+            said.append(re.findall(r"a pressure wave passes 0\.0\d+ cells in a substep", text))
+    assert said[:2] == [[], []] and len(said[2]) == 1 and said[3] == []
+
+
 def test_describe_lists_the_names_of_muscles():
     """In their order, not broken, on lines of their own; a scene without names has no such line. The muscle that sets dt is named."""
     scene = busy_scene(2)

@@ -193,7 +193,7 @@ class Scene:
     """Rate at which grid velocity decays [1/s]; the same for every dt. 0 for free motion; an arm that should come to rest takes 6."""
     dt: float
     """Length of one substep, Δt [s]. Good values: half of :func:`softmpm.stable_dt`, which leaves room for stretch; above it ``build``
-    refuses."""
+    refuses. Far below it contact of curved bodies is less accurate (docs/accuracy.md)."""
 
     def __post_init__(self):
         need_kind("scene grid", self.grid, Grid)
