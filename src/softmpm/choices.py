@@ -152,7 +152,7 @@ def choose_scheme(
                 "CPU the plain one, or formulation='reference', whose sums have a fixed order."
             )
         return "plain", "deterministic contact at surface points"
-    particles = worlds * sum(len(body.particles) for body in scene.bodies)
+    particles = worlds * scene.particle_count
     if wanted != "auto":
         obstacle = SCHEMES[wanted].footprint.obstacle(scene.grid.shape, particles)
         if obstacle:

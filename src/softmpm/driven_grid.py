@@ -62,7 +62,7 @@ class DrivenGrid:
 
     def __init__(self, scene: Scene, rest: RestGrid, mirror: MirrorGrid | None, device: torch.device):
         grid = scene.grid
-        positions = np.concatenate([body.particles.positions for body in scene.bodies])
+        positions = scene.positions
         places = positions[np.asarray(scene.driven)] / grid.spacing
         offsets = np.array(list(itertools.product(range(3), repeat=grid.dim)))
         base, _, share = stencils(places, offsets)

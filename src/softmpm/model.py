@@ -90,14 +90,13 @@ class Model:
         self.memory_budget, self.calls, self.alarms = memory_budget, calls, alarms
         self.threads = threads
         self.dim = scene.grid.dim
-        sizes = [len(body.particles) for body in scene.bodies]
-        self.particle_count = sum(sizes)
+        self.particle_count = scene.particle_count
         self.muscle_count, self.wall_count = len(scene.muscles), len(scene.walls)
         self.driven_count = len(scene.driven)
         self.driven = torch.tensor(np.array(scene.driven, dtype=np.int64), device=device)
         self.node_count = math.prod(scene.grid.shape)
-        self.body = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes)).to(device)
-        self.exact_positions = np.concatenate([body.particles.positions for body in scene.bodies])
+        self.body = torch.from_numpy(scene.body_index).to(device)
+        self.exact_positions = scene.positions
         self.positions = self._tensor(self.exact_positions)
         self.volume = self._tensor(np.concatenate([body.particles.volume for body in scene.bodies]))
         slots = muscle_slots(scene, self.particle_count)

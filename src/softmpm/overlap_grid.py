@@ -57,7 +57,7 @@ def overlap_grid(
     scene: Scene, rest: RestGrid, alarm: float | None, device: torch.device
 ) -> OverlapGrid | None:
     """None if no particles are far enough from each other to overlap, or without the alarm."""
-    positions = np.concatenate([body.particles.positions for body in scene.bodies])
+    positions = scene.positions
     if alarm is None or (np.ptp(positions, axis=0) <= FAR * scene.grid.spacing).all():
         return None
     return OverlapGrid(scene, rest, alarm, device)

@@ -42,7 +42,7 @@ class RestGrid:
     def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype, worlds: int, loaded: bool):
         """``loaded`` says whether forces act on the particles, which lattices do not have."""
         grid, dim = scene.grid, scene.grid.dim
-        positions = np.concatenate([body.particles.positions for body in scene.bodies])
+        positions = scene.positions
         base, fraction = bases(positions / grid.spacing)
         lattice, number_of = (None, None) if loaded else lattice_of(base, fraction)
         places = 0 if lattice is None else lattice.shape[1]

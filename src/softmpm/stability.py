@@ -73,8 +73,7 @@ def stable_dt(
     check_scene(scene)
     need(math.isfinite(activation), f"activation must be finite, got {activation}.")
     with torch.inference_mode(False), torch.device("cpu"):
-        particles = sum(len(body.particles) for body in scene.bodies)
-        given = None if params is None else _rows(params, particles)
+        given = None if params is None else _rows(params, scene.particle_count)
         limits = [
             (*_limit(scene, group, given, F, activation), group)
             for group in _groups(scene)
@@ -106,12 +105,8 @@ def running_limit(
     with torch.inference_mode(False), torch.device("cpu"):
         F = F.detach().cpu().double()
         fibres = [None] * len(scene.muscles) if directions is None else directions.detach().cpu().double()
-        bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
-        A = tangent(
-            scene.bodies[bodies[particle]].material,
-            F,
-            *(torch.tensor(v, dtype=torch.float64) for v in (mu, lam)),
-        )
+        material = scene.bodies[scene.body_index[particle]].material
+        A = tangent(material, F, *(torch.tensor(v, dtype=torch.float64) for v in (mu, lam)))
         for muscle, stress, fibre in zip(scene.muscles, active_stress, fibres, strict=True):
             if particle in muscle.particles:
                 A = A + stress * actuator_tangent(muscle, F, fibre)
@@ -150,7 +145,7 @@ class _Group(NamedTuple):
 
 def _groups(scene: Scene) -> list[_Group]:
     keys: list[tuple[int, tuple[int, ...]]] = [(b, ()) for b in range(len(scene.bodies))]
-    label = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
+    label = scene.body_index
     for m, muscle in enumerate(scene.muscles):
         old, place = np.unique(label[muscle.particles], return_inverse=True)
         label[muscle.particles] = len(keys) + place
@@ -187,7 +182,7 @@ def _deformations(scene: Scene, group: _Group, stretch: float | Tensor | np.ndar
     if given.ndim == 2:
         given = given.expand(len(group.particles), dim, dim)
         return [given[:1]]
-    total = sum(len(body.particles) for body in scene.bodies)
+    total = scene.particle_count
     need(
         given.shape == (total, dim, dim),
         f"stretch must be one number or have shape ({dim}, {dim}) or ({total}, {dim}, {dim}), got {tuple(given.shape)}.",

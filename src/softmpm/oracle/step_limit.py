@@ -140,8 +140,7 @@ def running_limit(
     with torch.inference_mode(False), torch.device("cpu"):
         F = F.detach().cpu().double()
         of_mu, of_lam = torch.tensor([mu, lam], dtype=torch.float64).unbind()
-        bodies = [k for k, body in enumerate(scene.bodies) for _ in range(len(body.particles))]
-        material = scene.bodies[bodies[particle]].material
+        material = scene.bodies[scene.body_index[particle]].material
         acting = [
             STIFFENING[type(muscle)](stress)
             for muscle, stress in zip(scene.muscles, active_stress, strict=True)

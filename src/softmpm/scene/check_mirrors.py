@@ -123,7 +123,7 @@ def _check_gaps(scene: Scene, mirror: Mirror) -> None:
     dx, axis = scene.grid.spacing, mirror.axis
     # Distance from which on a particle reaches no node on the plane or with an image behind it [cells]:
     reach = 1.5 if mirror.twice % 2 == 0 else 1.0
-    x = np.concatenate([body.particles.positions for body in scene.bodies]) / dx
+    x = scene.positions / dx
     spacing = np.concatenate([np.full(len(b.particles), b.particles.spacing) for b in scene.bodies])
     heights = mirror.side * (x[:, axis] - 0.5 * mirror.twice)
     near = np.flatnonzero(heights < reach - EXACT)

@@ -180,7 +180,7 @@ def _check_closed(name: str, outline: Outline, particles: Particles) -> None:
 
 
 def _check_distinct(scene: Scene) -> None:
-    positions = np.concatenate([body.particles.positions for body in scene.bodies])
+    positions = scene.positions
     # An offset that no lattice has keeps two copies, equal up to rounding, on the same side of a bin's edge.
     bins = np.floor(positions / (SAME_PLACE * scene.grid.spacing) + 0.381966).astype(np.int64)
     order = _suspects(bins)
@@ -189,7 +189,7 @@ def _check_distinct(scene: Scene) -> None:
     if twice.any():
         first = int(np.argmax(twice))
         i, j = sorted(order[first : first + 2].tolist())
-        bodies = np.repeat(np.arange(len(scene.bodies)), [len(body.particles) for body in scene.bodies])
+        bodies = scene.body_index
         raise ValueError(
             f"particles {i} (body {bodies[i]}) and {j} (body {bodies[j]}) are at the same place, "
             f"{_tuple(positions[i])} m, and {twice.sum() - 1} more such pairs: bodies must not overlap. "
@@ -200,12 +200,11 @@ def _check_distinct(scene: Scene) -> None:
 def _check_apart(scene: Scene) -> None:
     """Raise ValueError for bodies that fill the same space: a box of two cells along each axis, by nine tenths each."""
     count, edge = len(scene.bodies), 2 * scene.grid.spacing
-    positions = np.concatenate([body.particles.positions for body in scene.bodies])
+    positions = scene.positions
     volumes = np.concatenate([np.broadcast_to(b.particles.volume, len(b.particles)) for b in scene.bodies])
-    bodies = np.repeat(np.arange(count), [len(body.particles) for body in scene.bodies])
     bins = np.floor(positions / edge + 0.381966).astype(np.int64)  # see _check_distinct
     numbers = np.ravel_multi_index(tuple(bins.T), tuple(bins.max(axis=0) + 1))
-    parts, of_part = np.unique(numbers * count + bodies, return_inverse=True)
+    parts, of_part = np.unique(numbers * count + scene.body_index, return_inverse=True)
     full = parts[np.bincount(of_part, volumes) >= 0.9 * edge**scene.grid.dim]
     shared = np.flatnonzero(np.diff(full // count) == 0)
     if len(shared):
@@ -233,7 +232,7 @@ def _check_muscles(scene: Scene) -> None:
 
 
 def _check_indices(name: str, particles: np.ndarray, scene: Scene) -> None:
-    count = sum(len(body.particles) for body in scene.bodies)
+    count = scene.particle_count
     low, high = particles.min(initial=0), particles.max(initial=0)
     need(
         low >= 0 and high < count,

@@ -226,6 +226,21 @@ class Scene:
     __setstate__ = restore
 
     @property
+    def particle_count(self) -> int:
+        """Particles of all bodies."""
+        return sum(len(body.particles) for body in self.bodies)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Positions of all particles at rest [m], shape (particle, dim)."""
+        return np.concatenate([body.particles.positions for body in self.bodies])
+
+    @property
+    def body_index(self) -> np.ndarray:
+        """Index of the body of each particle, shape (particle,)."""
+        return np.repeat(np.arange(len(self.bodies)), [len(body.particles) for body in self.bodies])
+
+    @property
     def muscle_names(self) -> tuple[str, ...]:
         """Labels of the muscles and pressures in pictures, all different: names, and "muscle 3" or "pressure 3" for those without one.
         Of equal names each is followed by its place, "leg (3)"."""
@@ -238,12 +253,11 @@ class Scene:
         return table("softmpm.Scene", self._rows())
 
     def _rows(self) -> dict[str, str]:
-        particles = sum(len(body.particles) for body in self.bodies)
         laws = {type(body.material).__name__: None for body in self.bodies}
         driven = {"driven": counted(len(self.driven), "particle")} if len(self.driven) else {}
         return {
             "grid": f"{' x '.join(map(str, self.grid.shape))} nodes, {self.grid.spacing:.4g} m apart",
-            "bodies": f"{counted(len(self.bodies), 'body', 'bodies')} of {counted(particles, 'particle')}, {', '.join(laws)}",
+            "bodies": f"{counted(len(self.bodies), 'body', 'bodies')} of {counted(self.particle_count, 'particle')}, {', '.join(laws)}",
             "muscles": str(len(self.muscles)),
             "walls": ", ".join(wall.contact for wall in self.walls) or "0",
             **driven,

@@ -188,7 +188,7 @@ def _is_uniform(value: np.ndarray) -> bool:
 
 def _height(scene: Scene, panels: int) -> float:
     """Height of so many pictures of the materials beside each other, with titles and scales [inch]."""
-    extent = np.ptp(_rest(scene), axis=0)
+    extent = np.ptp(scene.positions, axis=0)
     return min(2.3, 0.9 + 8.0 / panels * extent[1] / extent[0])
 
 
@@ -196,7 +196,7 @@ def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]
     """Each material on the shape at rest, with a scale of its own; grey where there is none, as of strengths outside of muscles."""
     from matplotlib import colormaps
 
-    rest = _rest(scene)
+    rest = scene.positions
     order, extent = _from_behind(rest), np.ptp(rest, axis=0)
     size = _dot(scene, rest, min(2.2 if extent[0] > extent[1] else 1.6, 7.4 / len(design)))
     look: dict = dict(s=size, cmap=colormaps["viridis"].with_extremes(bad=PASSIVE), linewidths=0)
@@ -209,11 +209,6 @@ def _draw_design(part, scene: Scene, design: Mapping[str, tuple[np.ndarray, str]
         bar = part.colorbar(dots, ax=panel, location="bottom", shrink=0.8).ax
         bar.tick_params(labelsize=6)
         bar.xaxis.get_offset_text().set_fontsize(6)
-
-
-def _rest(scene: Scene) -> np.ndarray:
-    """Rest positions of all particles [m], shape (particle, dim)."""
-    return np.concatenate([body.particles.positions for body in scene.bodies])
 
 
 def _depth(positions: np.ndarray) -> np.ndarray:

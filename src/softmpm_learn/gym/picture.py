@@ -52,7 +52,7 @@ def picture(scene: Scene, x: np.ndarray, activation: np.ndarray, goal: np.ndarra
 
 def window(scene: Scene, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the part of the world that is shown [m], shape (2,): around the mean position, with the floor near its lower edge."""
-    rest = np.concatenate([body.particles.positions for body in scene.bodies])
+    rest = scene.positions
     width = WINDOW * float(np.ptp(rest[:, :2], axis=0).max())
     size = np.array([width, width * HEIGHT / WIDTH])
     centre = x.mean(axis=0)

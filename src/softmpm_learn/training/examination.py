@@ -170,10 +170,7 @@ def transferred(run: Run | Runs, task: Task) -> tuple[softmpm.Params, softmpm.In
     """The design of a run, or of several, on the particles of a task of the same robot: values of the particle at the nearest place."""
     from scipy.spatial import KDTree
 
-    places = [
-        np.concatenate([body.particles.positions for body in scene.bodies])
-        for scene in (run.task.scene, task.scene)
-    ]
+    places = run.task.scene.positions, task.scene.positions
     old, new = ((place - place.min(axis=0)) / np.ptp(place, axis=0) for place in places)
     nearest = torch.as_tensor(KDTree(old).query(new)[1], device=run.model.device)
     params, inputs = run.design()
