@@ -33,23 +33,14 @@ from softmpm_learn.command.sentences import end, give_up, sentence
 from softmpm_learn.command.stop import Signals
 from softmpm_learn.config import RunConf, conf_dir, register, to_run
 from softmpm_learn.distributed import Group, OtherProcessError, joined
+from softmpm_learn.runs.identity import MAY_CHANGE
 from softmpm_learn.runs.saved import load as saved_configuration
 from softmpm_learn.storage import sweep
 from softmpm_learn.training.optimisation import TrainingError
 
 logger = logging.getLogger("softmpm_learn")
 
-CHANGEABLE = (
-    "train.iterations",
-    "train.save_every",
-    "train.record_every",
-    "train.frame_every",
-    "train.examine",
-    "train.pictures",
-    "train.log",
-    "train.side_by_side",
-    "device",
-)
+CHANGEABLE = (*(f"train.{name}" for name in MAY_CHANGE), "device")
 """Settings that may differ when a run is resumed: its length, checkpoints, recorded episodes, pictures, loggers, the jobs beside it and
 the device."""
 
