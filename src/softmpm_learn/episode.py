@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -12,11 +11,8 @@ import softmpm
 from softmpm import Inputs, Model, Params, State
 from softmpm_learn.fading import Fading
 from softmpm_learn.observe import Observer
+from softmpm_learn.tasks.task import Task
 from softmpm_learn.term import Path
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
-
 
 Policy = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 """Features, time and goal to activation, see :class:`softmpm_learn.policy.Space`."""
@@ -79,7 +75,7 @@ class Decisions:
 
 
 def run_episode(
-    task: "Task",
+    task: Task,
     model: Model,
     observer: Observer,
     policy: Policy,
@@ -174,6 +170,6 @@ def kicked(state: State, kicks: Tensor) -> State:
     return state._replace(v=v)
 
 
-def times_of(task: "Task", model: Model) -> Tensor:
+def times_of(task: Task, model: Model) -> Tensor:
     """Time at which each control step begins [s], shape (step,)."""
     return task.control_period * torch.arange(task.control_steps, dtype=model.dtype, device=model.device)

@@ -7,7 +7,6 @@ observer also trains on the observations. Both are differentiable.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,9 +19,7 @@ from softmpm_learn import register
 from softmpm_learn.autoencoder import Autoencoder
 from softmpm_learn.register import OBSERVERS
 from softmpm_learn.settings import ObserverConf
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
+from softmpm_learn.tasks.task import Task
 
 THIN = 0.01
 """A node with this share of a full node's mass shows half its velocity. Otherwise what is seen would jump, and the gradient
@@ -198,7 +195,7 @@ class Nothing(Observer):
 
 
 @register.observer("latent")
-def latent(conf: ObserverConf, model: Model, task: "Task") -> Latent:
+def latent(conf: ObserverConf, model: Model, task: Task) -> Latent:
     """Learned; its encoder is an autoencoder yet to be trained, whose own encoder the learner puts in its place."""
     picture = VelocityImage(model, conf.nodes, conf.follow, conf.posture)
     autoencoder = Autoencoder(
@@ -213,20 +210,20 @@ def latent(conf: ObserverConf, model: Model, task: "Task") -> Latent:
 
 
 @register.observer("centroids")
-def centroids(conf: ObserverConf, model: Model, task: "Task") -> Centroids:
+def centroids(conf: ObserverConf, model: Model, task: Task) -> Centroids:
     """Centroids of the task's regions."""
     return Centroids(model, list(task.regions.values()), task.body_length)
 
 
 @register.observer("kmeans")
-def kmeans(conf: ObserverConf, model: Model, task: "Task") -> Centroids:
+def kmeans(conf: ObserverConf, model: Model, task: Task) -> Centroids:
     """Centroids of clusters at rest."""
     found = clusters(model.positions.cpu().double().numpy(), conf.clusters)
     return Centroids(model, found, task.body_length)
 
 
 @register.observer("untrained")
-def untrained(conf: ObserverConf, model: Model, task: "Task") -> Latent:
+def untrained(conf: ObserverConf, model: Model, task: Task) -> Latent:
     """Random features: as :func:`latent`, with the first weights of the encoder."""
     observer = latent(conf, model, task)
     observer.trained = False
@@ -234,12 +231,12 @@ def untrained(conf: ObserverConf, model: Model, task: "Task") -> Latent:
 
 
 @register.observer("nothing")
-def nothing(conf: ObserverConf, model: Model, task: "Task") -> Nothing:
+def nothing(conf: ObserverConf, model: Model, task: Task) -> Nothing:
     """The control of all others."""
     return Nothing()
 
 
-def make_observer(conf: ObserverConf, model: Model, task: "Task") -> Observer:
+def make_observer(conf: ObserverConf, model: Model, task: Task) -> Observer:
     """The observer that the settings name."""
     made = OBSERVERS.build(conf.name, conf.options, conf, model, task)
     if not (isinstance(made, Observer) and isinstance(getattr(made, "size", None), int)):

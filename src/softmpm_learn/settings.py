@@ -7,15 +7,13 @@ elsewhere name their source. A wrong value fails where the settings are made, in
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from softmpm import QUANTITIES
 from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.register import LOGGERS, OBSERVERS, POLICIES
 from softmpm_learn.setting_checks import lengths, not_negative, one_of, positive, share, typed
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
+from softmpm_learn.tasks.task import Task
 
 DESIGNS = ("particle", "region", "uniform")
 
@@ -265,7 +263,7 @@ class Settings:
     learning: LearningConf = field(default_factory=LearningConf)
     train: TrainConf = field(default_factory=TrainConf)
 
-    def suited(self, task: "Task", encoded: bool) -> "Settings":
+    def suited(self, task: Task, encoded: bool) -> "Settings":
         """With a task's ``optimizer.policy_rate``, ``optimizer.fade`` [s], ``optimizer.restart_above``, ``policy.gain``,
         ``policy.feature_gain``, ``policy.clock`` and ``train.endurance`` where these leave them to it.
 

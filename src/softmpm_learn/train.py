@@ -28,6 +28,7 @@ from softmpm_learn.runs.resuming import entered, resume
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.settings import Settings
+from softmpm_learn.tasks.task import Task
 from softmpm_learn.training.finishing import evaluate_ends, finish
 from softmpm_learn.training.optimisation import optimise
 from softmpm_learn.training.run_logger import RunLogger
@@ -84,7 +85,7 @@ class _Work:
 
 
 def train(
-    task,
+    task: Task,
     model: Model,
     settings: Settings,
     out: str | Path,
@@ -93,7 +94,7 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     begin: Callable[[], None] = lambda: None,
     group: Group | None = None,
-    finer=None,
+    finer: Task | None = None,
     sketch: Callable[[Run, int, dict], None] = lambda run, iteration, frames: None,
 ) -> Result:
     """Optimise a robot; goes on where the checkpoint in ``out`` ends, if there is one.
@@ -101,7 +102,6 @@ def train(
     On a CPU the metrics of a run that was killed and resumed equal those of an unbroken one, to the last bit.
 
     Args:
-        task: A :class:`softmpm_learn.tasks.task.Task`.
         model: Built from ``task.scene`` with ``task.build`` and ``settings.train.worlds`` worlds, or this process's share of them.
             Evaluations of a walker and examinations build further models likewise.
         out, begin, sketch: See :class:`Plan`.
@@ -127,14 +127,14 @@ def train(
 
 
 def train_side_by_side(
-    task,
+    task: Task,
     model: Model,
     plans: Sequence[Plan],
     *,
     progress: Callable[[dict[int, tuple[int, dict[str, float]]]], object] | None = None,
     stop: Callable[[], bool] = lambda: False,
     group: Group | None = None,
-    finer=None,
+    finer: Task | None = None,
 ) -> list[Result]:
     """Optimise a robot several times in one simulation, with the results that :func:`train` gives one after another, up to rounding.
 
@@ -174,7 +174,7 @@ def train_side_by_side(
         return _loop(work, progress, stop, finer)
 
 
-def _loop(work: _Work, progress, stop: Callable[[], bool], finer) -> list[Result]:
+def _loop(work: _Work, progress, stop: Callable[[], bool], finer: Task | None) -> list[Result]:
     runs, group, seconds = work.runs, work.runs.group, work.seconds
     while runs.active and not group.any(stop()):
         rows, observations = optimise(runs, work.loggers, seconds)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,9 +11,7 @@ from softmpm import Model
 from softmpm_learn.policy import Goal
 from softmpm_learn.seeding import stream
 from softmpm_learn.settings import TrainConf
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
+from softmpm_learn.tasks.task import Task
 
 
 class Goals:
@@ -27,7 +24,7 @@ class Goals:
         stream: The random numbers.
     """
 
-    def __init__(self, task: "Task", model: Model, conf: TrainConf, worlds: range):
+    def __init__(self, task: Task, model: Model, conf: TrainConf, worlds: range):
         """``worlds`` are those of this process, of all of the run."""
         self._conf, self._worlds, self._model = conf, worlds, model
         self.stream = stream(conf.seed, "goals")
@@ -65,7 +62,7 @@ class Goals:
         return box.centre + spread * (2 * mine - 1)
 
 
-def _box(task: "Task", model: Model, spread: Sequence[float]) -> Goal | None:
+def _box(task: Task, model: Model, spread: Sequence[float]) -> Goal | None:
     if not any(spread):
         return None
     if task.goal is None or len(spread) != model.dim:

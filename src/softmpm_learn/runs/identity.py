@@ -4,15 +4,12 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator
 from enum import Enum
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softmpm import Model
 from softmpm_learn.settings import Settings
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
+from softmpm_learn.tasks.task import Task
 
 MAY_CHANGE = (
     *("iterations", "save_every", "record_every", "frame_every"),
@@ -31,7 +28,7 @@ class SettingsError(ValueError):
     """A run cannot go on with other settings than its own."""
 
 
-def identity(task: "Task", model: Model, settings: Settings) -> dict[str, object]:
+def identity(task: Task, model: Model, settings: Settings) -> dict[str, object]:
     """Settings, task and scene by name; arrays by a short digest."""
     flat = identity_of_settings(settings)
     for field in dataclasses.fields(task):

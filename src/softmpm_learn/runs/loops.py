@@ -3,7 +3,7 @@
 import math
 import weakref
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,10 +13,7 @@ from softmpm import Inputs, Model, Params
 from softmpm_learn.episode import Decisions, Episode, Frame, Policy, kicked, run_episode, times_of
 from softmpm_learn.lasting import AGAIN, FURTHER, STARTS
 from softmpm_learn.observe import Observer
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
-
+from softmpm_learn.tasks.task import Task
 
 _Outcome = tuple[Episode, tuple[Tensor, ...], list[Frame]]
 """Episode, gradients, and the frames of a captured graph, which were not passed to ``on_frames`` yet."""
@@ -29,7 +26,7 @@ def _captures(model: Model) -> bool:
     return not (model.deterministic and (model.scheme == "plain" or model.dtype == torch.float64))
 
 
-def starts_at_once(task: "Task") -> int:
+def starts_at_once(task: Task) -> int:
     """Number of starts from which an :class:`Evaluator` simulates a task at once."""
     return 1 if task.lasting is None else len(STARTS)
 
@@ -56,7 +53,7 @@ class Evaluator:
 
     def __init__(
         self,
-        task: "Task",
+        task: Task,
         model: Model,
         observer: Observer,
         policy: Policy,
@@ -119,7 +116,7 @@ class ClosedLoop:
 
     def __init__(
         self,
-        task: "Task",
+        task: Task,
         model: Model,
         observer: Observer,
         policy: Policy,

@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,9 +29,7 @@ from softmpm_learn.runs.identity import check_same, identity
 from softmpm_learn.runs.policy_check import check_policy
 from softmpm_learn.seeding import seeded, stream_seed
 from softmpm_learn.settings import Settings
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
+from softmpm_learn.tasks.task import Task
 
 
 class Run:
@@ -57,7 +55,7 @@ class Run:
 
     def __init__(
         self,
-        task: "Task",
+        task: Task,
         model: Model,
         settings: Settings,
         out: Path,
@@ -88,7 +86,7 @@ class Run:
         self.safe: list[Tensor] = []
         self.saturated = False
 
-    def model_of(self, task: "Task", worlds: int, inputs: Iterable[str] = ()) -> Model:
+    def model_of(self, task: Task, worlds: int, inputs: Iterable[str] = ()) -> Model:
         """Model of another task, or with other worlds, built as the task says; for simulations without a gradient.
 
         Args:

@@ -4,7 +4,6 @@ import contextlib
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -13,12 +12,10 @@ from softmpm_learn.distributed import in_full
 from softmpm_learn.episode import run_episode
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
+from softmpm_learn.tasks.task import Task
 from softmpm_learn.training.evaluation import evaluate_best
 from softmpm_learn.training.examination import examine
 from softmpm_learn.training.run_logger import RunLogger, recorded
-
-if TYPE_CHECKING:
-    from softmpm_learn.tasks.task import Task
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -96,7 +93,7 @@ def _end(run: Run) -> float | None:
 
 @torch.no_grad()
 def finish(
-    runs: Runs, loggers: Sequence[RunLogger], finer: "Task | None", ends: dict[int, float]
+    runs: Runs, loggers: Sequence[RunLogger], finer: Task | None, ends: dict[int, float]
 ) -> dict[int, dict[str, float]]:
     """Record the best policy and design of each finished run once more, as the episode after the last, and examine them.
 
