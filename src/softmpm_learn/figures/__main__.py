@@ -11,8 +11,9 @@ from softmpm_learn.figures import sweeps, tables
 from softmpm_learn.figures.intervals import pairs
 from softmpm_learn.figures.of_sweep import curves_figure, grouped, pairs_figure, values, values_figure
 from softmpm_learn.figures.summary import summary, with_interval
-from softmpm_learn.figures.sweeps import EXAMINED, SweptRun
+from softmpm_learn.figures.sweeps import SweptRun
 from softmpm_learn.storage import files
+from softmpm_learn.storage.sweep import EXAMINED
 
 CURVES, VALUES, PAIRS, SUMMARY = "curves.png", "values.png", "pairs.png", "summary.md"
 HELP = """Tables and figures of sweeps.

@@ -8,9 +8,9 @@ import numpy as np
 
 from softmpm_learn.figures.intervals import interval
 from softmpm_learn.figures.of_sweep import values
-from softmpm_learn.figures.sweeps import EXAMINED
 from softmpm_learn.figures.tables import Row, compared, iteration_of
 from softmpm_learn.lasting import LEVEL, SHARE
+from softmpm_learn.storage.sweep import EXAMINED
 
 NEAR = 0.005
 """Distance from the goal in which what reaches for it stays to pass [m], from 0.3 s before the end of the episode to 0.5 s after it."""

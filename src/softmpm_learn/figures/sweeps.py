@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from softmpm_learn.storage import sweep
+from softmpm_learn.storage.sweep import EXAMINED
 
 SEEDS = "train.seed", "train.seeds"
 INDIFFERENT = *SEEDS, "train.log", "train.record_every", "train.frame_every", "train.examine", "resume"
 """Settings by which runs do not become others, the seed apart."""
-EXAMINED = ["end", "later", "kicked", "friction", "finer", "largest_tilt", "largest_miss", "largest_speed"]
-"""Answers of the examination, as the columns of sweep.csv and of the last row of metrics.csv are called."""
 PIECE = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|\\[\\()[\]{}:=, \t]|.""", re.DOTALL)
 """A quoted text, an escaped character or another one."""
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from softmpm_learn.figures.sweeps import EXAMINED, SweptRun
+from softmpm_learn.figures.sweeps import SweptRun
 from softmpm_learn.storage.files import replace
+from softmpm_learn.storage.sweep import EXAMINED
 
 RUNS, JOBS, PAIRS = "runs.csv", "jobs.csv", "pairs.csv"
 Row = dict[str, Any]

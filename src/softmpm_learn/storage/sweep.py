@@ -53,6 +53,10 @@ class Outcome:
     """Reason why it failed."""
 
 
+EXAMINED = [field.name for field in dataclasses.fields(Outcome) if field.default is math.nan]
+"""Answers of the examination, as the columns of sweep.csv and of metrics.csv are called."""
+
+
 def folder_name(overrides: Sequence[str]) -> str:
     """Name of the folder of a sweep, from its command line: the same for the same words."""
     text = ",".join(overrides)

@@ -30,6 +30,7 @@ from softmpm_learn.episode import Frame, kicked, run_episode
 from softmpm_learn.objective import Reach, Still, Tilt
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
+from softmpm_learn.storage.sweep import EXAMINED
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.term import Path, Term
 
@@ -40,8 +41,6 @@ KICK = 0.1
 FRICTION = 0.75, 1.25
 BEFORE, AFTER = 0.3, 0.5
 """Durations before and after the end of an episode during which a held goal must be kept at rest [s]."""
-NAMES = ["end", "later", "kicked", "friction", "finer", "largest_tilt", "largest_miss", "largest_speed"]
-"""Columns of metrics.csv."""
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -63,20 +62,17 @@ def examine(runs: Runs, finer: Task | None = None) -> list[dict[str, float]]:
         "friction": [motion(runs, rubbed(task, f), "friction") for f in FRICTION],
         "finer": [replayed(runs, finer, own)] if finer is not None else [],
     }
-    return [
-        _answers(
-            runs.task, finer, own[k], {name: [paths[k] for paths in found] for name, found in motions.items()}
-        )
-        for k in range(len(runs.all))
-    ]
+    each = [{name: [paths[k] for paths in found] for name, found in motions.items()} for k in range(len(own))]
+    return [_answers(task, finer, *of_run) for of_run in zip(own, each, strict=True)]
 
 
 def _answers(
     task: Task, finer: Task | None, own: Path | None, motions: dict[str, list[Path | None]]
 ) -> dict[str, float]:
     """Answers of one run, from its motion in the episode and from the others by their names."""
+    found = dict.fromkeys(EXAMINED, math.nan)
     if own is None:
-        return dict.fromkeys(NAMES, math.nan)
+        return found
     term, T, (long,) = task.objective.terms[0], task.seconds, motions["long"]
 
     def against(paths: list[Path | None], like: Term = term) -> float:
@@ -84,7 +80,6 @@ def _answers(
         rates = [math.nan if path is None else like.rate(path) for path in paths]
         return math.nan if any(map(math.isnan, rates)) else term.verdict(term.rate(own), max(rates))
 
-    found = dict.fromkeys(NAMES, math.nan)
     if long is not None:
         late, then = (dataclasses.replace(term, begin=a, end=b) for a, b in ((T / 2, T), (T, LONGER * T)))
         found["later"] = term.verdict(late.rate(own), then.rate(long))

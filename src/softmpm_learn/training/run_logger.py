@@ -20,7 +20,7 @@ from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.storage import checkpoint
 from softmpm_learn.storage.csv_log import Table
-from softmpm_learn.training.examination import NAMES
+from softmpm_learn.storage.sweep import EXAMINED
 from softmpm_learn.training.timing import TIMING, clock
 
 logger = logging.getLogger("softmpm_learn")
@@ -35,7 +35,7 @@ def metrics(run: Run) -> list[str]:
     terms, others = run.task.objective.names, ["evaluation", "lasts", "best", "activation"]
     others += ["gradient_policy", "gradient_design", "clipped", "retries", "fallbacks", "restarts"]
     others += [f"{name}_change" for name in run.design.change()]
-    others += ["epochs", "training_loss", "validation_loss", "replay", *NAMES]
+    others += ["epochs", "training_loss", "validation_loss", "replay", *EXAMINED]
     taken = [name for name in terms if name in ("iteration", "loss", *others)]
     if taken:
         raise ValueError(
