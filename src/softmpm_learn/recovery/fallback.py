@@ -10,6 +10,11 @@ from softmpm_learn.optimizer_settings import OptimizerConf
 from softmpm_learn.recovery.settling import SETTLED_SHARE
 
 
+def limits(conf: OptimizerConf, settles: bool) -> tuple[float, int]:
+    """Share of the best progress below which a run is too far, and the iterations in a row after which it goes back."""
+    return (SETTLED_SHARE, 1) if settles else (conf.fallback_share, conf.fallback_after)
+
+
 @dataclass
 class Fallback:
     """Counts iterations in a row whose progress, the first loss minus the present one, is below a share of the best progress."""
@@ -49,7 +54,7 @@ class Fallback:
                 return False
             self.first = loss
         early = self.iterations <= conf.fallback_from and not settles
-        share, after = (SETTLED_SHARE, 1) if settles else (conf.fallback_share, conf.fallback_after)
+        share, after = limits(conf, settles)
         low = not early and self.is_below(loss, best, share)
         self.below = self.below + 1 if low else 0
         if conf.fallback_share == 0 or self.below < after:

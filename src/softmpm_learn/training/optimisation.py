@@ -10,7 +10,7 @@ from torch import Tensor
 import softmpm
 from softmpm_learn.distributed import OtherProcessError, in_full
 from softmpm_learn.episode import Episode
-from softmpm_learn.recovery.settling import SETTLED_SHARE
+from softmpm_learn.recovery.fallback import limits
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.training.evaluation import Evaluation, due, evaluate, evaluate_best
@@ -179,7 +179,7 @@ def step(run: Run, loss: float, value: float, begins: bool = False) -> None:
     if not run.settles and run.restart.is_due(loss, conf):
         low = f"in {run.restart.iterations} iterations no loss was below {conf.restart_above:g}; {run.begin_anew()}"
     elif is_far:
-        after, share = (1, SETTLED_SHARE) if run.settles else (conf.fallback_after, conf.fallback_share)
+        share, after = limits(conf, run.settles)
         low = f"for {after} iterations " if after > 1 else ""
         low += f"the progress was below {share:g} of the best; {run.fall_back()}"
     if low:
@@ -207,9 +207,9 @@ def attempt(
 
     Gives the figures of each run that goes on, or an error in their place.
     """
-    due = [loggers[k] for k in runs.active if loggers and loggers[k].due(runs.all[k].iteration)]
+    recording = [loggers[k] for k in runs.active if loggers and loggers[k].due(runs.all[k].iteration)]
     with clock(seconds, "episode"):
-        with runs.failing_together(), recorded(runs, due, seconds=seconds) as on_frames:
+        with runs.failing_together(), recorded(runs, recording, seconds=seconds) as on_frames:
             episode, gradients = runs.loop(goals, on_frames)
         return episode, take_gradients(runs, episode, gradients)
 
