@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from softmpm_learn.learning.replay import ReplayError
+from softmpm_learn.optimizers import moments
 from softmpm_learn.runs.identity import SettingsError
 from softmpm_learn.runs.run import Run
 from softmpm_learn.storage import checkpoint, files
@@ -48,6 +49,7 @@ def restore(run: Run, content: dict, out: Path) -> dict:
         if content["learner"] and not run.group.first:
             content["learner"]["replay"] = {}
         run.load_state_dict(content)
+        _check_loaded(run)
         return dict(content["seals"])
     except SettingsError as error:
         raise SettingsError(f"the checkpoint in {out} was {error}") from error
@@ -58,3 +60,16 @@ def restore(run: Run, content: dict, out: Path) -> dict:
         raise checkpoint.CheckpointError(
             f"the checkpoint in {out} does not hold this run: {text}."
         ) from error
+
+
+def _check_loaded(run: Run) -> None:
+    """Raise ValueError for what PyTorch does not compare when it loads: shapes of what belongs to a parameter, and iterations."""
+    parameters = run.parameters
+    of = [(p.shape, moment.shape) for p in parameters for moment in moments(run.optimizer, p)]
+    of += [(p.shape, safe.shape) for p, safe in zip(parameters, run.safe, strict=bool(run.safe))]
+    for want, got in of:
+        if want != got:
+            raise ValueError(f"something of shape {tuple(got)} belongs to a parameter of shape {tuple(want)}")
+    done, best = run.iteration, run.best["iteration"]
+    if not (isinstance(done, int) and done >= 0 and best < done):
+        raise ValueError(f"the iteration is {done!r}, that of the best loss {best!r}")

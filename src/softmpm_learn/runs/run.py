@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from softmpm_learn.distributed import Group
 from softmpm_learn.episode import times_of
 from softmpm_learn.learning.learner import Learner, make_learner
 from softmpm_learn.observe import Latent, Observer, make_observer
-from softmpm_learn.optimizers import make_optimizer, moments
+from softmpm_learn.optimizers import make_optimizer
 from softmpm_learn.policy import make_policy
 from softmpm_learn.recovery import settling
 from softmpm_learn.recovery.fallback import Fallback
@@ -73,16 +73,16 @@ class Run:
             )
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.learner: Learner | None = None
-        self.observer = self._make_observer(out)
+        self.observer = self._make_observer()
         self.settings = settings = settings.suited(task, isinstance(self.observer, Latent))
         self.name, self.iteration, self.motions = "", 0, Motions(settings.optimizer)
         self.end: tuple[int, float] | None = None
         self.fallback, self.restart, self.settling = Fallback(), Restart(), Settling()
         self.goals = Goals(task, model, settings.train, self.worlds)
         self.policy, self.design = self._make_policy("policy"), self._make_design()
-        rates = list(self.policy.parameters()), list(self.design.parameters())
-        self.optimizer = make_optimizer(settings.optimizer, *rates)
-        self._first_rates = [group["lr"] for group in self.optimizer.param_groups]
+        groups = (list(part.parameters()) for part in (self.policy, self.design))
+        self.optimizer = make_optimizer(settings.optimizer, *groups)
+        self._first_rates = self._rates
         self.safe: list[Tensor] = []
         self.saturated = False
 
@@ -111,13 +111,13 @@ class Run:
     def _make_design(self) -> Design:
         return Design(self.settings.design, self.model, self.task.regions)
 
-    def _make_observer(self, out: Path) -> Observer:
-        task = self.task
+    def _make_observer(self) -> Observer:
+        task, folder = self.task, self.out / "replay"
         with seeded(stream_seed(self.settings.train.seed, "autoencoder")):
             observer = make_observer(self.settings.observer, self.model, task)
         if not isinstance(observer, Latent):
             return observer.to(self.model.device, self.model.dtype)
-        self.learner = make_learner(self.settings, observer, task.control_steps, self.model, out / "replay")
+        self.learner = make_learner(self.settings, observer, task.control_steps, self.model, folder)
         observer.encoder = self.learner.encoder
         return observer
 
@@ -176,19 +176,21 @@ class Run:
     def step(self) -> None:
         """Take a step along the gradient, the next one with lower rates."""
         self.snapshot()
-        rates = [group["lr"] for group in self.optimizer.param_groups]
+        rates, halving = self._rates, self.settings.optimizer.halving
         if self.settles:
-            self._scale_rates(settling.pace(self.left, self._settling_iterations))
+            self._set_rates(rates, settling.pace(self.left, self._settling_iterations))
         self.optimizer.step()
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate
-        halving = self.settings.optimizer.halving
-        if halving is not None:
-            self._scale_rates(0.5 ** (1 / halving))
+        self._set_rates(rates, 1.0 if halving is None else 0.5 ** (1 / halving))
 
-    def _scale_rates(self, factor: float) -> None:
-        for group in self.optimizer.param_groups:
-            group["lr"] *= factor
+    @property
+    def _rates(self) -> list[float]:
+        """Learning rates of policy and design."""
+        return [group["lr"] for group in self.optimizer.param_groups]
+
+    def _set_rates(self, rates: Sequence[float], factor: float = 1.0) -> None:
+        """Set the learning rates to these times a factor."""
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = factor * rate
 
     def fall_back(self) -> str:
         """Go back to the best policy and design and what they saw through, with smaller learning rates and no moments; or begin anew
@@ -205,7 +207,7 @@ class Run:
         self.optimizer.state.clear()
         if self.learner is not None:
             self.learner.optimizer.state.clear()
-        self._scale_rates(factor)
+        self._set_rates(self._rates, factor)
         self.snapshot()
         return f"going back to iteration {self.best['iteration']}"
 
@@ -216,8 +218,7 @@ class Run:
         self.policy.load_state_dict(self._make_policy(f"policy {self.restart.count}").state_dict())
         self.design.load_state_dict(self._make_design().state_dict())
         self.optimizer.state.clear()
-        for group, rate in zip(self.optimizer.param_groups, self._first_rates, strict=True):
-            group["lr"] = rate
+        self._set_rates(self._first_rates)
         self.snapshot()
         return "beginning anew with other first weights"
 
@@ -243,11 +244,7 @@ class Run:
 
     @property
     def _moving(self) -> dict[str, nn.Module]:
-        parts: dict[str, nn.Module] = {
-            "observer": self.observer,
-            "policy": self.policy,
-            "design": self.design,
-        }
+        parts: dict[str, nn.Module] = dict(observer=self.observer, policy=self.policy, design=self.design)
         return parts if self.learner is None else parts | {"autoencoder": self.learner.autoencoder}
 
     def state_dict(self) -> dict:
@@ -269,7 +266,7 @@ class Run:
         }
 
     def load_state_dict(self, content: dict) -> None:
-        """Go on from a checkpoint of the same task and settings.
+        """Go on from a checkpoint. What PyTorch does not compare when it loads is for :func:`softmpm_learn.runs.resuming.restore`.
 
         Raises:
             SettingsError: Task or settings are others; names each difference.
@@ -289,25 +286,6 @@ class Run:
         self.fallback = Fallback(**content["fallback"])
         self.restart = Restart(**content.get("restart", {}))
         self.settling = Settling(**content.get("settling", {}))
-        self._check_shapes()
-
-    def _check_shapes(self) -> None:
-        """Raise ValueError for what PyTorch does not compare when it loads: what belongs to a parameter has its shape."""
-        of = [(p.shape, moment.shape) for p in self.parameters for moment in moments(self.optimizer, p)]
-        of += [(p.shape, safe.shape) for p, safe in zip(self.parameters, self.safe, strict=bool(self.safe))]
-        for want, got in of:
-            if want != got:
-                raise ValueError(
-                    f"something of shape {tuple(got)} belongs to a parameter of shape {tuple(want)}"
-                )
-        if not (
-            isinstance(self.iteration, int)
-            and self.iteration >= 0
-            and self.best["iteration"] < self.iteration
-        ):
-            raise ValueError(
-                f"the iteration is {self.iteration!r}, that of the best loss {self.best['iteration']!r}"
-            )
         now = self.policy_snapshot()
         for one in self.motions.all:
             self.load_policy(one)  # compares the shapes
