@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle
-from softmpm_learn.tasks.outline import HALVES, Limb, foot, smooth
+from softmpm_learn.tasks.outline import HALVES, foot, legs, smooth
 from softmpm_learn.tasks.task import Task, filled, material
 from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
@@ -29,11 +29,7 @@ class BipedConf(WalkerConf):
 
 def biped(conf: BipedConf) -> Task:
     """Build the walker: about 1,200 particles as a draft, 3,000 at the standard resolution."""
-    way, width = LEG_WIDTH.T
-    limbs = {
-        name: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
-        for name, (hip, sole) in LEGS.items()
-    }
+    limbs = legs(LEGS, LEG_WIDTH)
     shape = filled(conf, [smooth(TORSO), *(foot(limb.outline(), EDGE) for limb in limbs.values())])
     rest = shape.positions
     regions = {name: limb.part(rest, *LEG_MUSCLE) for name, limb in limbs.items()}

@@ -86,14 +86,14 @@ def _shapes(
     Raises:
         ValueError: No particle belongs to a body.
     """
-    masks, cut_cells = [owner >= 0 for owner in owners], conf.on_surface or conf.formulation == "reference"
+    masks = [owner >= 0 for owner in owners]
 
     def filled(mask: np.ndarray, cut_cells: bool) -> softmpm.Particles:
         height = len(mask) * pixel
         return softmpm.image(mask, (0.0, 0.0), height=height, spacing=conf.spacing / 2, cut_cells=cut_cells)
 
     shapes = [filled(mask, cut_cells=True) for mask in masks]
-    if cut_cells:
+    if conf.cut_cells:
         return shapes
     whole = filled(np.any(masks, axis=0), cut_cells=False)
     places, width = whole.positions / pixel, 0.5 * conf.spacing / pixel

@@ -9,40 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from softmpm import Body, Muscle
-from softmpm_learn.tasks.outline import HALVES, Limb, foot, smooth, smooth_line
+from softmpm_learn.tasks.outline import HALVES, Limb, foot, legs, smooth, smooth_line
 from softmpm_learn.tasks.task import Task, filled, material
 from softmpm_learn.tasks.walker import EDGE, WalkerConf, track, walker_task
 
 LENGTH = 0.44  # tail to trunk [m]; all that follows is in body lengths, feet at y = 0
 TORSO = (
-    *(
-        (0.050, 0.320),
-        (0.030, 0.420),
-        (0.048, 0.515),
-        (0.110, 0.590),
-        (0.210, 0.630),
-        (0.330, 0.637),
-        (0.440, 0.615),
-    ),
-    *(
-        (0.510, 0.590),
-        (0.560, 0.600),
-        (0.620, 0.640),
-        (0.690, 0.652),
-        (0.755, 0.622),
-        (0.800, 0.555),
-        (0.815, 0.480),
-    ),
-    *(
-        (0.790, 0.410),
-        (0.740, 0.385),
-        (0.690, 0.360),
-        (0.655, 0.310),
-        (0.590, 0.270),
-        (0.480, 0.255),
-        (0.330, 0.245),
-    ),
-    *((0.200, 0.255), (0.100, 0.270)),
+    *((0.050, 0.320), (0.030, 0.420), (0.048, 0.515), (0.110, 0.590), (0.210, 0.630), (0.330, 0.637)),
+    *((0.440, 0.615), (0.510, 0.590), (0.560, 0.600), (0.620, 0.640), (0.690, 0.652), (0.755, 0.622)),
+    *((0.800, 0.555), (0.815, 0.480), (0.790, 0.410), (0.740, 0.385), (0.690, 0.360), (0.655, 0.310)),
+    *((0.590, 0.270), (0.480, 0.255), (0.330, 0.245), (0.200, 0.255), (0.100, 0.270)),
 )  # rump, back, neck, forehead, chin, chest, belly: x, y
 TRUNK = (
     *((0.700, 0.560, 0.100), (0.770, 0.495, 0.130), (0.815, 0.410, 0.118), (0.842, 0.320, 0.096)),
@@ -113,11 +89,7 @@ def actuate(
 def limbs_and_outlines() -> tuple[dict[str, Limb], list[np.ndarray]]:
     """Legs and trunk [m] for the muscles; outlines of everything, in body lengths, for the particles."""
     trunk, tail = smooth_line(TRUNK), smooth_line(TAIL)
-    way, width = LEG_WIDTH.T
-    limbs = {
-        name: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
-        for name, (hip, sole) in LEGS.items()
-    }
+    limbs = legs(LEGS, LEG_WIDTH)
     limbs["trunk"] = Limb(trunk[:, :2], trunk[:, 2], round_tip=True)
     outlines = [smooth(TORSO), Limb(tail[:, :2], tail[:, 2], round_tip=True).outline()]
     for name, limb in limbs.items():

@@ -65,9 +65,8 @@ def mesh(conf: MeshConf) -> Task:
     if not extent.max() > 0:
         raise ValueError(f"the mesh of {conf.file} is empty.")
     surface.vertices = (surface.vertices - surface.vertices.min(axis=0)) * (conf.size / extent[:2].max())
-    cut = conf.on_surface or conf.formulation == "reference"
     try:
-        shape = softmpm.mesh(surface, conf.spacing / 2, cut_cells=cut)
+        shape = softmpm.mesh(surface, conf.spacing / 2, cut_cells=conf.cut_cells)
     except ValueError as error:
         raise ValueError(f"{conf.file}: {error}") from error
     warn_of_thin_limbs(conf, _voxels(shape.positions, conf.spacing / 2), conf.spacing / 2)

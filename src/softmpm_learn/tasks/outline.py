@@ -3,7 +3,7 @@
 All lengths are in metres unless a robot says otherwise; points are (x, y), y up.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,3 +123,17 @@ class Limb:
         along, left = self.locate(points[of_limb])
         chosen = (along >= start) & (along < end)
         return of_limb[chosen if side == 0 else chosen & (np.sign(left) == side)]
+
+
+def legs(ends: Mapping[str, tuple], shape: np.ndarray) -> dict[str, Limb]:
+    """Straight legs by name.
+
+    Args:
+        ends: Hip and sole of each, x and y.
+        shape: Way down from the hip, 1 at the sole, and width there, shape (place, 2).
+    """
+    way, width = shape.T
+    return {
+        name: Limb(np.array(hip) + way[:, None] * np.subtract(sole, hip), width)
+        for name, (hip, sole) in ends.items()
+    }

@@ -29,7 +29,6 @@ WIDTH = 0.01
 """Distance over which surface contact sets in while a robot learns [cells]."""
 LASTING = 3
 """Number of episodes in a row over which a motion is evaluated, to choose the best."""
-
 STRETCH = 1.6
 """Stretch of neighbouring particles of a robot that costs nothing. Those on the lattice part for good at 2.8, with 1.4 cells between
 them (:class:`softmpm.Alarms`)."""
@@ -153,6 +152,11 @@ class TaskConf:
         return self.contact == "surface"
 
     @property
+    def cut_cells(self) -> bool:
+        """True if the outline or the mass at rest counts, so that shapes are filled with cut cells."""
+        return self.on_surface or self.formulation == "reference"
+
+    @property
     def build(self) -> dict[str, Any]:
         """Arguments of :func:`softmpm.build`."""
         width = self.contact_width
@@ -240,6 +244,5 @@ def material(conf: TaskConf) -> Solid:
 
 
 def filled(conf: TaskConf, polygons: Sequence[np.ndarray]) -> softmpm.Particles:
-    """Particles half a cell apart in the union of polygons; with cut cells where the outline or the mass at rest counts."""
-    cut = conf.on_surface or conf.formulation == "reference"
-    return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=cut)
+    """Particles half a cell apart in the union of polygons."""
+    return softmpm.polygons(polygons, conf.spacing / 2, cut_cells=conf.cut_cells)

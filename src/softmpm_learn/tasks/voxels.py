@@ -1,13 +1,13 @@
 """A flat robot from an array of voxels, as Evolution Gym has them (Bhatia et al. 2021)."""
 
 import json
-import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from softmpm_learn.setting_checks import positive
 from softmpm_learn.tasks.drawing import Part, drawn
 from softmpm_learn.tasks.own import OwnConf
 from softmpm_learn.tasks.task import Task
@@ -32,8 +32,7 @@ class VoxelsConf(OwnConf):
 
     def __post_init__(self):
         super().__post_init__()
-        if not (math.isfinite(self.stiffness) and self.stiffness > 0):
-            raise ValueError(f"task.stiffness must be > 0, got {self.stiffness}.")
+        positive("task", self, "stiffness")
 
 
 def voxels(conf: VoxelsConf) -> Task:
