@@ -176,6 +176,10 @@ def _moving(spec) -> bool:
     return spec.moving
 
 
+def _given(name: str) -> Callable[[Any], bool]:
+    return lambda spec: name in spec.given
+
+
 INPUTS = (
     Input("mass", "particle", group="material"),  # m_p / m₀, m₀ that of the heaviest particle
     Input("mu", "particle", group="material"),  # Lamé's μ [Pa]
@@ -202,14 +206,8 @@ INPUTS = (
         shared=lambda spec: True,
     ),
     Input("viscosity", "particle", present=lambda spec: spec.viscosity, group="viscosity"),  # η [Pa s]
-    Input(  # f / m₀ [m/s²]
-        "force",
-        "particle",
-        kind="vector",
-        present=lambda spec: "force" in spec.given,
-        group="force",
-        rows=True,
-    ),
+    # f / m₀ [m/s²]
+    Input("force", "particle", kind="vector", present=_given("force"), group="force", rows=True),
     Input("driven", "particle", kind="index", present=lambda spec: spec.driven, stage="g2p"),  # or -1
     Input(  # of the driven particles [m/s]
         "velocity",
@@ -229,17 +227,10 @@ INPUTS = (
         rows=True,
         stage="grid",
     ),
-    Input(  # g [m/s²]
-        "gravity",
-        "world",
-        kind="vector",
-        present=lambda spec: "gravity" in spec.given,
-        group="gravity",
-        stage="grid",
-    ),
-    Input(  # exp(−damping Δt)
-        "decay", "world", present=lambda spec: "damping" in spec.given, group="damping", stage="grid"
-    ),
+    # g [m/s²]
+    Input("gravity", "world", kind="vector", present=_given("gravity"), group="gravity", stage="grid"),
+    # exp(−damping Δt)
+    Input("decay", "world", present=_given("damping"), group="damping", stage="grid"),
     Input(
         "normal",
         "wall",
