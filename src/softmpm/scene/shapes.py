@@ -280,22 +280,21 @@ def _cover(extent: np.ndarray, spacing: float) -> np.ndarray:
 
 def _whole(count: np.ndarray) -> np.ndarray:
     """As integers, which overflow far above the limit of cells."""
+    _need_few(count.max(), " along an axis")
+    return count.astype(np.int64)
+
+
+def _need_few(cells: float, where: str = "") -> None:
     need(
-        bool((count <= CELL_LIMIT).all()),
-        f"the shape spans {count.max():.2g} lattice cells along an axis, at most {CELL_LIMIT:.2g} are allowed in all: "
+        cells <= CELL_LIMIT,
+        f"the shape spans {cells:.2g} lattice cells{where}, at most {CELL_LIMIT:.2g} are allowed in all: "
         "make the spacing larger, and check that all lengths are in metres.",
     )
-    return count.astype(np.int64)
 
 
 def _lattice(center: np.ndarray, count: np.ndarray, step: np.ndarray | float) -> np.ndarray:
     """Middles of count cells of size step about a point, shape (prod(count), dim), the last axis fastest."""
-    cells = math.prod(int(n) for n in count)
-    need(
-        cells <= CELL_LIMIT,
-        f"the shape spans {cells:.2g} lattice cells, at most {CELL_LIMIT:.2g} are allowed: "
-        "make the spacing larger, and check that all lengths are in metres.",
-    )
+    _need_few(math.prod(int(n) for n in count))
     steps = np.broadcast_to(step, center.shape)
     axes = [c + (np.arange(n) + 0.5 - n / 2) * h for c, n, h in zip(center, count, steps, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(center))
