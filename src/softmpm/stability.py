@@ -112,9 +112,7 @@ def running_limit(
                 A = A + stress * actuator_tangent(muscle, F, fibre)
         inertia = torch.tensor(density * scene.grid.spacing**2, dtype=torch.float64)
         K = _stiffness(A, viscosity * viscous_tangent(F), inertia).item()
-    if math.isnan(K):
-        return math.nan
-    return scene.grid.spacing * math.sqrt(density / K) if K > 0 else math.inf
+    return math.inf if K <= 0 else scene.grid.spacing * math.sqrt(density / K)  # NaN stays NaN
 
 
 def stiffening_signs(scene: Scene) -> list[float]:
@@ -196,11 +194,11 @@ def _limit(
     """Stable step [s] of a group of particles, the stiffness [Pa] that sets it, and the particle."""
     material = scene.bodies[group.body].material
     A_mu, A_lam = _unit_tangents(material, F)
-    A_active = torch.zeros_like(A_mu)
+    A_active, active = torch.zeros_like(A_mu), [0.0]
     for m in group.muscles:
         A_unit = actuator_tangent(scene.muscles[m], F)
-        sign = _stiffening_sign(A_unit)[..., None, None]
-        A_active = A_active + abs(activation * scene.muscles[m].strength) * sign * A_unit
+        active.append(abs(activation * scene.muscles[m].strength))
+        A_active = A_active + active[-1] * _stiffening_sign(A_unit)[..., None, None] * A_unit
     if given is None:
         rows = Params(
             *(torch.tensor([[getattr(material, name)]], dtype=torch.float64) for name in Params._fields)
@@ -212,13 +210,12 @@ def _limit(
     K = _stiffness(A, V, rows.density * scene.grid.spacing**2)  # (world, particle)
     K, density = torch.broadcast_tensors(K, rows.density)
     squared = torch.where(K <= 0, math.inf, density / K)
-    active = max((abs(activation * scene.muscles[m].strength) for m in group.muscles), default=0.0)
     need(
         bool((squared > 0).all()),
         f"the stiffness of body {group.body}, or that by its density, is beyond what a number holds; use a smaller young's modulus, "
         f"strength of its muscles, activation or viscosity, or other units, got young {rows.young.max():.4g} Pa, viscosity "
-        f"{material.viscosity:.4g} Pa s, an active stress of up to {active:.4g} Pa, density {rows.density.min():.4g} kg/m³ and cells "
-        f"of {scene.grid.spacing:.4g} m.",
+        f"{material.viscosity:.4g} Pa s, an active stress of up to {max(active):.4g} Pa, density {rows.density.min():.4g} kg/m³ "
+        f"and cells of {scene.grid.spacing:.4g} m.",
     )
     world, particle = divmod(int(squared.argmin()), squared.shape[1])
     dt = scene.grid.spacing * math.sqrt(squared[world, particle].item())
@@ -229,13 +226,11 @@ def _unit_tangents(material: Material, F: Tensor) -> tuple[Tensor, Tensor]:
     """Stiffness of the law with μ = 1 Pa, λ = 0 and with μ = 0, λ = 1 Pa; that at rest is computed once for each law."""
     law, dim = law_of(material), F.shape[-1]
     at_rest = F.ndim == 2 and torch.equal(F, torch.eye(dim, dtype=torch.float64))
-    if at_rest and (law, dim) in _at_rest:
-        return _at_rest[law, dim]
-    one = torch.ones(F.shape[:-2], dtype=torch.float64)
-    found = tangent(material, F, one, 0 * one), tangent(material, F, 0 * one, one)
-    if at_rest:
-        _at_rest[law, dim] = found
-    return found
+    known = _at_rest if at_rest else {}
+    if (law, dim) not in known:
+        one = torch.ones(F.shape[:-2], dtype=torch.float64)
+        known[law, dim] = tangent(material, F, one, 0 * one), tangent(material, F, 0 * one, one)
+    return known[law, dim]
 
 
 _at_rest: dict[tuple[Callable, int], tuple[Tensor, Tensor]] = {}
