@@ -293,11 +293,8 @@ class Objective:
     def names(self) -> list[str]:
         """Name of each term; a second one of a name has a number."""
         names = [term.name for term in self.terms]
-        count = dict.fromkeys(names, 0)
-        for k, name in enumerate(names):
-            count[name] += 1
-            names[k] = f"{name}_{count[name]}" if count[name] > 1 else name
-        return names
+        count = [names[: k + 1].count(name) for k, name in enumerate(names)]
+        return [f"{name}_{n}" if n > 1 else name for name, n in zip(names, count, strict=True)]
 
     def __call__(self, path: Path) -> dict[str, Tensor]:
         """Each term with its weight, shape (world,), by its name; the loss is their sum."""
