@@ -139,33 +139,25 @@ class Recorder:
         finally:
             self._waiting = None
 
-    def _frame(self, frame: "_Waiting") -> None:
-        """Write a frame, or let it wait for others."""
-        if self._waiting is None:
-            self._write_together([frame])
-        else:
-            self._waiting.append(frame)
-
     def _write_together(self, frames: "list[_Waiting]") -> None:
         """One row in each table for each frame; they count once the last rows, those of ``frame/index``, are written."""
         self._need_open()
-        count, index = dict(self._count), []
-        rows: dict[str, list[np.ndarray]] = {}
+        rows, index = dict[str, list[np.ndarray]](), []
         for frame in frames:
             for name, one in frame.values.items():
                 rows.setdefault(f"frame/{name}", []).append(one)
-            at = {name: count[table] if name in frame.parts else -1 for name, table in PARTS.items()}
+            at = dict.fromkeys(PARTS, -1)
             for name, one in frame.parts.items():
-                rows.setdefault(PARTS[name], []).append(one)
-                count[PARTS[name]] += 1
+                many = rows.setdefault(PARTS[name], [])
+                at[name] = self._count[PARTS[name]] + len(many)
+                many.append(one)
             index.append((frame.episode._row, frame.time, *at.values()))
-        first = self._count | {f"frame/{name}": self._count["frame/index"] for name in frames[0].values}
         size = sum(one.nbytes for many in rows.values() for one in many)
         with room(self._file, size + (len(frames) - 1) * FURTHER_FRAME):
             for table, many in rows.items():
-                put(self._tables[table], first[table], np.stack(many))
+                put(self._tables[table], self._count[table], np.stack(many))
         self._write("frame/index", np.array(index, FRAME))
-        self._count |= {table: count[table] for table in PARTS.values()}
+        self._count |= {table: self._count[table] + len(many) for table, many in rows.items()}
         for frame in frames:
             Content.frame(frame.episode._content, frame.time, frame.values | frame.parts)
 
@@ -271,7 +263,11 @@ class Episode:
             parts["latent"] = _one_world("latent", latent, state, world, size)
         if forces is not None:
             parts |= recorder._contact(forces, world)
-        recorder._frame(_Waiting(self, float(time), values, parts))
+        frame = _Waiting(self, float(time), values, parts)
+        if recorder._waiting is None:
+            recorder._write_together([frame])
+        else:
+            recorder._waiting.append(frame)
 
     def __enter__(self) -> "Episode":
         return self
