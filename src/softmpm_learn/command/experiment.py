@@ -113,7 +113,7 @@ def run_side_by_side(
                 task,
                 model,
                 plans,
-                progress=progress and (lambda rows: progress(shown(rows)[0], *shown(rows)[1])),
+                progress=progress and (lambda rows: report(progress, rows)),
                 stop=stop,
                 group=group if alone else Group(),
                 finer=finer(conf.task) if conf.train.examine else None,
@@ -129,12 +129,12 @@ def run_side_by_side(
                     own.pictures(result.run.iteration, [place / f"{name}.png" for name in DRAWN])
     rest = iter(results)
     found = [[next(rest) for _ in share] for share in shares]
-    ends = [group.collect([Ending.of(result) for result in own]) for own in found] if not alone else []
+    if alone:
+        last = [farewell(results[0], task, out)] if group.first else []
+    else:
+        ends = [group.collect([Ending.of(result) for result in own]) for own in found]
+        last = [farewell_of_seeds(own, place) for own, (_, place) in zip(ends, jobs, strict=True)]
     if group.first:
-        if alone:
-            last = [farewell(results[0], task, out)]
-        else:
-            last = [farewell_of_seeds(own, place) for own, (_, place) in zip(ends, jobs, strict=True)]
         for text in (account(seconds, time.perf_counter() - began), *last):
             logger.info("%s", text)
         signals.advice = f"The run had ended; everything is in {out if len(jobs) == 1 else out.parent}."
@@ -148,9 +148,9 @@ def advice(jobs: Sequence[tuple[RunConf, Path]]) -> str:
     return f"Finished iterations are saved; to go on, or to draw the pictures: resume={jobs[0][1]}"
 
 
-def shown(rows: dict[int, tuple[int, dict[str, float]]]) -> tuple[int, list[float]]:
-    """Iteration and losses for the progress bar."""
-    return max(k for k, _ in rows.values()), [row["loss"] for _, row in rows.values()]
+def report(progress: ProgressBar, rows: dict[int, tuple[int, dict[str, float]]]) -> None:
+    """Show the iteration and the losses of the runs."""
+    progress(max(k for k, _ in rows.values()), *(row["loss"] for _, row in rows.values()))
 
 
 def finer(conf: TaskConf) -> Task | None:
@@ -160,7 +160,7 @@ def finer(conf: TaskConf) -> Task | None:
 
 
 def need_determinism(needed: bool) -> None:
-    """True if PyTorch must give the same bits in every run; an operation that cannot then raises a RuntimeError that names it."""
+    """Have PyTorch give the same bits in every run if needed; an operation that cannot then raises a RuntimeError that names it."""
     if needed:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it is first used
     torch.use_deterministic_algorithms(needed)
