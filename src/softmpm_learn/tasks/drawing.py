@@ -9,7 +9,7 @@ import numpy as np
 import softmpm
 from softmpm_learn.tasks.own import Muscular, OwnConf, longer_axis, walker
 from softmpm_learn.tasks.task import Task
-from softmpm_learn.tasks.thinness import warn_of_thin_limbs
+from softmpm_learn.tasks.thinness import pieces, warn_of_thin_limbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,26 +125,20 @@ def _coverage(mask: np.ndarray, places: np.ndarray, width: float) -> np.ndarray:
 
 def _fibres(mask: np.ndarray) -> tuple[float, ...]:
     """The longer axis of the part, or of its pieces."""
-    from scipy.ndimage import label
-
-    pieces = np.empty(mask.shape, dtype=np.int32)
-    label(mask, np.ones((3, 3)), output=pieces)
     row, column = np.nonzero(mask)
-    return longer_axis(np.stack([column, -row], axis=1).astype(float), pieces[row, column])
+    piece = pieces(mask, corners=True)[row, column]
+    return longer_axis(np.stack([column, -row], axis=1).astype(float), piece)
 
 
 def _check_pieces(conf: OwnConf, whole: np.ndarray) -> None:
-    from scipy.ndimage import label
-
-    pieces = np.empty(whole.shape, dtype=np.int32)
-    label(whole, output=pieces)
-    count = int(pieces.max())
+    piece = pieces(whole)
+    count = int(piece.max())
     if count == 0:
         raise ValueError(f"the robot of {conf.file} is empty.")
     if count > 1:
-        sizes = np.bincount(pieces.ravel())[1:]
+        sizes = np.bincount(piece.ravel())[1:]
         smallest = int(sizes.argmin()) + 1
-        row, column = (int(at) for at in np.argwhere(pieces == smallest)[0])
+        row, column = (int(at) for at in np.argwhere(piece == smallest)[0])
         raise ValueError(
             f"the robot of {conf.file} is in {count} pieces, which would fall apart; the smallest has {sizes.min()} pixels or voxels "
             f"and begins in row {row}, column {column}, counted from 0 at the top left. Connect or erase it."

@@ -36,7 +36,7 @@ def thinnest(mask: np.ndarray, pixel: float, least: float) -> float | None:
     Args:
         mask, pixel: As for :func:`warn_of_thin_limbs`.
     """
-    from scipy.ndimage import distance_transform_edt, label
+    from scipy.ndimage import distance_transform_edt
 
     parts = 1 if 8 * pixel <= least else 2 * math.ceil(4 * pixel / least)  # an even width is exact
     fine, unit = np.pad(np.kron(mask, np.ones((parts,) * mask.ndim, dtype=bool)), 1), pixel / parts
@@ -56,10 +56,9 @@ def thinnest(mask: np.ndarray, pixel: float, least: float) -> float | None:
                 middle = (low + high) / 2
                 low, high = (low, middle) if _has_neck(depth, away(middle), middle) else (middle, high)
             widths.append(high)
-    pieces = np.empty(fine.shape, dtype=np.int32)
-    label(fine, np.ones((3,) * mask.ndim), output=pieces)
-    widest = np.zeros(pieces.max() + 1)
-    np.maximum.at(widest, pieces[fine], depth[fine])
+    piece = pieces(fine, corners=True)
+    widest = np.zeros(piece.max() + 1)
+    np.maximum.at(widest, piece[fine], depth[fine])
     widths += (2 * widest[1:]).tolist()
     return min(widths, default=None)
 
@@ -75,18 +74,23 @@ def _has_neck(depth: np.ndarray, away: np.ndarray, width: float) -> bool:
         depth: Distance from the outside [m].
         away: Distance from the centres of the discs [m].
     """
-    from scipy.ndimage import label
-
-    pieces = np.empty(depth.shape, dtype=np.int32)
-    label(depth > 0, output=pieces)
-    with_disc = np.zeros(pieces.max() + 1, dtype=bool)
-    with_disc[pieces[away == 0]] = True
-    whole, opened = with_disc[pieces], away < width / 2
-    label(away < width / 4, output=pieces)
-    if pieces.max() > np.count_nonzero(with_disc):
+    piece = pieces(depth > 0)
+    with_disc = np.zeros(piece.max() + 1, dtype=bool)
+    with_disc[piece[away == 0]] = True
+    whole, opened = with_disc[piece], away < width / 2
+    if pieces(away < width / 4).max() > np.count_nonzero(with_disc):
         return True
     axes = depth.ndim
     return _euler(whole, axes) != _euler(opened, axes) and _euler(~whole, axes) != _euler(~opened, axes)
+
+
+def pieces(mask: np.ndarray, corners: bool = False) -> np.ndarray:
+    """Number of the piece of each pixel, counted from 1, and 0 outside; with ``corners`` pixels touch that share a corner alone."""
+    from scipy.ndimage import label
+
+    found = np.empty(mask.shape, dtype=np.int32)
+    label(mask, np.ones((3,) * mask.ndim) if corners else None, output=found)
+    return found
 
 
 def _euler(mask: np.ndarray, axes: int) -> int:
