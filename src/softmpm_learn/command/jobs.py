@@ -96,7 +96,7 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
     except (ValueError, OSError) as error:
         give_up(error)
     else:
-        losses = [_judged(one, own, group, failed) for one, own in zip(jobs, results, strict=True)]
+        losses = [_record(one, own, group, failed) for one, own in zip(jobs, results, strict=True)]
         if None in losses:
             logger.info("The same command goes on with the sweep.")
             raise SystemExit(0)
@@ -115,7 +115,7 @@ def outcome(
     return seeds.outcome(results[0], about) if results[0].finished or results[0].error else None
 
 
-def _judged(mine: Job, results: Sequence[Result], group: Group, failed: dict[int, Path]) -> float | None:
+def _record(mine: Job, results: Sequence[Result], group: Group, failed: dict[int, Path]) -> float | None:
     """Write the outcome of a job, unless it was stopped; gives its loss."""
     found = outcome(mine.conf, mine.out, results, group, mine.about)
     if found is None:

@@ -144,10 +144,10 @@ def _each(runs: Runs, name: str, failures: Failures, path: Path) -> list[Path | 
     for k, error in failed.items():
         of = f" of {runs.all[k].name}" if runs.all[k].name else ""
         logger.warning("Examination%s, %s: %s", of, name, error)
-    return [None if k in failed else _of(path, runs.worlds(k)) for k in range(len(runs.all))]
+    return [None if k in failed else _in_worlds(path, runs.worlds(k)) for k in range(len(runs.all))]
 
 
-def _of(path: Path, worlds: slice) -> Path:
+def _in_worlds(path: Path, worlds: slice) -> Path:
     """The motion in some of the worlds."""
     states = [State.of([tensor[worlds] for tensor in state[:4]]) for state in path.states]
     return Path(

@@ -237,11 +237,11 @@ def take_gradients(
         torch.stack([t.double() for figures in measured.values() for t in figures.values()]).tolist()
     )
     read = {k: {name: next(numbers) for name in figures} for k, figures in measured.items()}
-    return {k: _judged(runs.all[k], figures) for k, figures in read.items()}
+    return {k: _row(runs.all[k], figures) for k, figures in read.items()}
 
 
-def _judged(run: Run, figures: dict[str, float]) -> dict[str, float] | NotFiniteError:
-    """Row of a run; shortens a gradient that is longer than ``max_norm``."""
+def _row(run: Run, figures: dict[str, float]) -> dict[str, float] | NotFiniteError:
+    """Row of a run, whose gradient is shortened if it is longer than ``max_norm``."""
     squares = [figures.pop(f"square_{n}") for n in range(len(run.parameters))]
     count = len(list(run.policy.parameters()))
     lengths = {
