@@ -237,3 +237,13 @@ def test_a_preset_is_no_material_yet():
         TypeError, match=r"must be a Material, got a Preset; its method material\(\) makes one"
     ):
         Body(Particles(np.full((1, 2), 0.5), 0.01), ECOFLEX_00_30)
+
+
+def test_particles_of_a_scene_are_those_of_its_bodies_in_their_order():
+    """The other quantities of particles are numbered alike."""
+    parts = [Particles(np.full((count, 2), 0.1 * count), 0.01) for count in (2, 1, 3)]
+    whole = scene(bodies=[Body(part, NeoHookean(**SOFT)) for part in parts])
+    assert whole.particle_count == 6 and whole.body_index.tolist() == [0, 0, 1, 2, 2, 2]
+    assert whole.positions[:, 1].tolist() == [
+        part.positions[0, 0] for part in parts for _ in range(len(part))
+    ]
