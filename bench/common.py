@@ -9,11 +9,15 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 import softmpm
+from softmpm_learn.tasks import TaskConf
+
+Conf = TypeVar("Conf", bound=TaskConf)
 
 
 def cube(
@@ -63,6 +67,11 @@ def cube(
     )
     scene |= scene_settings
     return softmpm.Scene(**scene, dt=0.3 * softmpm.stable_dt(softmpm.Scene(**scene, dt=1.0)))
+
+
+def on_grid(kind: type[Conf], cells: int) -> type[Conf]:
+    """Settings of a task on a grid of so many cells per metre, which none of its resolutions need have."""
+    return type(kind.__name__, (kind,), {"cells_per_metre": cells})
 
 
 def turning(model: softmpm.Model, rate: float = 2.0) -> softmpm.State:

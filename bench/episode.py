@@ -8,12 +8,11 @@ such iteration as in training; ``physics`` that of its calls of `simulate`, forw
 and at surface points, and both formulations.
 """
 
-import enum
 import tempfile
 from pathlib import Path
 
 import torch
-from common import Table, arguments, median_seconds
+from common import Table, arguments, median_seconds, on_grid
 
 import softmpm
 from softmpm_learn.runs.run import Run
@@ -43,9 +42,8 @@ ON_A_CPU = [("biped", 80, 0.0125, 100, settings) for *_, settings in CASES[3:6]]
 
 
 def task_of(robot: str, cells: int, period: float, substeps: int, settings: dict) -> Task:
-    make_conf, make = ROBOTS[robot]
-    resolution = enum.Enum("Cells", {"bench": cells}).bench
-    settings = settings | dict(resolution=resolution, control_period=period)
+    kind, make = ROBOTS[robot]
+    make_conf, settings = on_grid(kind, cells), settings | dict(control_period=period)
     steps = round(substeps / make(make_conf(seconds=period, **settings)).substeps)
     return make(make_conf(seconds=steps * period, **settings))
 

@@ -30,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import Table
+from common import Table, on_grid
 
 import softmpm
 from softmpm_learn.tasks import BipedConf, Task, biped
@@ -64,15 +64,8 @@ GROWTH = [
 """η/μ [s], share of the stable step, width and friction."""
 
 
-class Walker(BipedConf):
-    """The biped at any resolution."""
-
-    cells = 80  # type: ignore
-
-
 def walker(cells: int, **settings) -> Task:
-    conf = type("Walker", (Walker,), {"cells": cells})(**dict(safety=0.4, contact_width=0.0) | settings)
-    return biped(conf)
+    return biped(on_grid(BipedConf, cells)(**dict(safety=0.4, contact_width=0.0) | settings))
 
 
 def replayed(
