@@ -21,7 +21,6 @@ import argparse
 import dataclasses
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -194,24 +193,38 @@ class Walkers:
         return found | {"own": own, "speed": speed, "later": speed / own, "failed": failed}
 
 
-def weighted(
-    task: Task, tilt: objective.Tilt, each: dict[str, Tensor]
-) -> Callable[[objective.Path], dict[str, Tensor]]:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MeanActivation(objective.Term):
+    """Mean over the muscles of the square of their mean activation [-]."""
+
+    def value(self, path: objective.Path) -> Tensor:
+        return path.activation.mean(dim=0).square().mean(dim=-1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Weighted(objective.Term):
+    """A term with a weight for each world."""
+
+    term: objective.Term
+    of_world: Tensor
+
+    def value(self, path: objective.Path) -> Tensor:
+        return self.of_world * self.term.value(path)
+
+
+def weighted(task: Task, tilt: objective.Tilt, each: dict[str, Tensor]) -> objective.Objective:
     """Objective with the weights of each world."""
-    rest = np.concatenate([body.particles.positions for body in task.scene.bodies])
-    soles = np.flatnonzero(rest[:, 1] <= rest[:, 1].min() + SOLES)
+    heights, on_soles = task.scene.positions[:, 1], each["soles"]
+    soles = np.flatnonzero(heights <= heights.min() + SOLES)
     begin = task.objective.terms[0].begin
-    whole, part = objective.Progress(begin=begin), objective.Progress(begin=begin, particles=soles)
-
-    def terms(path: objective.Path) -> dict[str, Tensor]:
-        return {
-            "progress": torch.where(each["soles"] > 0, part.value(path), whole.value(path)),
-            "effort": each["effort"] * objective.Effort().value(path),
-            "mean": each["mean"] * path.activation.mean(dim=0).square().mean(dim=-1),
-            "tilt": each["upright"] * tilt.value(path),
-        }
-
-    return terms
+    terms = (
+        (objective.Progress(begin=begin), 1.0 - on_soles),
+        (objective.Progress(begin=begin, particles=soles), on_soles),
+        (objective.Effort(), each["effort"]),
+        (MeanActivation(), each["mean"]),
+        (tilt, each["upright"]),
+    )
+    return objective.Objective(*(Weighted(term=term, of_world=weights) for term, weights in terms))
 
 
 def row(variant: Variant, found: dict[str, np.ndarray], iterations: int, examined: float) -> dict:

@@ -1,6 +1,7 @@
 """The programs in ``examples/`` with a small budget, each of which leaves its picture; and the list of benchmarks."""
 
 import ast
+import dataclasses
 import re
 import runpy
 from pathlib import Path
@@ -148,3 +149,17 @@ def test_every_benchmark_is_listed():
     assert names == set(re.findall(r"`([a-z_]+(?:\.py|/))`", text)) - {"results/"}
     for page in re.findall(r"\]\((\S+?)(?:#\S+)?\)", text):
         assert (folder / page).is_file(), page
+
+
+def test_benchmarks_of_walkers_begin(monkeypatch):
+    """Their tasks, on grids that no resolution has and with weights of each world, are not refused."""
+    monkeypatch.syspath_prepend(EXAMPLES.parent / "bench")
+    from bench import episode, variants
+
+    for _, cells, *rest in episode.CASES[:2]:
+        task = episode.task_of("biped", cells, *rest)
+        assert task.scene.grid.spacing == 1 / cells
+    each = {name: torch.ones(1) for name in ("soles", "effort", "mean", "upright")}
+    tilt = task.objective.terms[2]
+    weighted = dataclasses.replace(task, objective=variants.weighted(task, tilt, each)).objective
+    assert weighted.terms[-1].term is tilt
