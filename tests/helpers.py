@@ -68,9 +68,9 @@ def busy_scene(
     return softmpm.Scene(**(settings | changes))
 
 
-def full_scene(dim: int, laws=tuple(LAWS), *, driven=(1, 5), viscosity=0.02, **changes) -> softmpm.Scene:
-    """:func:`busy_scene` with these laws, a chamber under pressure, viscosity, driven particles and a wall of each kind."""
-    full = busy_scene(dim, laws, per_law=32 // len(laws), **changes)
+def full_scene(dim: int, *, driven=(1, 5), viscosity=0.02, **changes) -> softmpm.Scene:
+    """:func:`busy_scene` with every law, a chamber under pressure, viscosity, driven particles and a wall of each kind."""
+    full = busy_scene(dim, tuple(LAWS), per_law=8, **changes)
     bodies = [
         dataclasses.replace(body, material=dataclasses.replace(body.material, viscosity=viscosity))
         for body in full.bodies

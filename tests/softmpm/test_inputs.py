@@ -30,9 +30,8 @@ def build(made: softmpm.Scene, **settings) -> softmpm.Model:
 
 
 def scene_for(name: str) -> softmpm.Scene:
-    """:func:`full_scene` of one law for calls that give this input alone, with driven particles where it moves them."""
-    changes = {} if name in ("velocity", "position") else dict(driven=())
-    return full_scene(2, ("neo_hookean",), **changes)
+    """:func:`full_scene` for calls that give this input alone, with driven particles where it moves them."""
+    return full_scene(2) if name in ("velocity", "position") else full_scene(2, driven=())
 
 
 def both(model: softmpm.Model, names, substeps=2, steps=STEPS):
