@@ -10,8 +10,8 @@ from softmpm.scene.scene import CONTACTS
 from softmpm.stability import stable_dt
 
 RIGID = 0.2
-"""Way of a pressure wave in a substep below which the load is divided unevenly among surface points [cells]; 0.42 at half of the stable
-step of an elastic body in 2D (docs/accuracy.md)."""
+"""Way of a pressure wave in a substep below which surface points of a curved body in 3D share its load unevenly [cells]; 0.42 at half
+of the stable step of an elastic body (docs/accuracy.md)."""
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
@@ -70,7 +70,7 @@ def _contact(model) -> str:
     if model.surface is not None:
         text = f"{model.surface.count} surface points with separating walls, nodes with others"
         way = (model.surface.waves.min() * model.scene.dt / model.scene.grid.spacing).item()
-        if way < RIGID:
+        if model.dim == 3 and way < RIGID:
             text += f"; a pressure wave passes {way:.2g} cells in a substep: points of curved bodies share loads unevenly"
     held = "" if model.mirror is None else f"; {model.mirror.count} groups of nodes held or reflected"
     return text + held
