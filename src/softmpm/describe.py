@@ -10,8 +10,8 @@ from softmpm.scene.scene import CONTACTS
 from softmpm.stability import stable_dt
 
 RIGID = 0.2
-"""Way of a pressure wave in a substep below which surface points of a curved body in 3D share its load unevenly [cells]; 0.42 at half
-of the stable step of an elastic body (docs/accuracy.md)."""
+"""Way of a pressure wave in a substep below which surface points of a curved body in 3D share its load unevenly [cells]: at half of the
+stable step of an elastic one with ν = 0.3 the way is 0.37 (docs/accuracy.md)."""
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
