@@ -51,7 +51,7 @@ def to_video(
 
     Args:
         source: A recording, states one after the other, or the frames of a :func:`softmpm.trajectory`, which are a state each.
-        path: File to write, ``.gif`` (Pillow) or ``.mp4`` (``pip install softmpm[video]``). An older one is replaced.
+        path: File to write, ``.gif`` or ``.mp4`` (``pip install softmpm[video]``). An older one is replaced.
         model: What the states belong to.
         activation: Activation [-] of each state, shape (state, world, muscle).
         period: Simulated time between two states [s]; None shows each state in one picture.
@@ -66,7 +66,7 @@ def to_video(
         The path of the film.
 
     Raises:
-        ImportError: A package is not installed; the message names it.
+        ImportError: matplotlib, or the package that writes an MP4, is not installed; the message names it.
         TypeError, ValueError: An argument has another type or value, or there is nothing to show.
         FileNotFoundError, OSError: The recording cannot be read; see :class:`softmpm.Recording`.
     """
@@ -197,10 +197,8 @@ def _pictures(
 
 def _quantised(picture: np.ndarray) -> Any:
     """The picture in 256 colours. The most frequent ones are exact, so that plain areas do not change from picture to picture."""
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("a GIF needs the package Pillow: pip install pillow") from error
+    from PIL import Image
+
     packed, places, counts = np.unique(
         picture @ np.array([1 << 16, 1 << 8, 1]), return_inverse=True, return_counts=True
     )
