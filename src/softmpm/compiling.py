@@ -1,4 +1,4 @@
-"""torch.compile: what it calls instead of tracing it. torch.jit.trace is refused."""
+"""torch.compile: what it calls instead of tracing it. What only records PyTorch's operations is refused."""
 
 import functools
 from collections.abc import Callable
@@ -22,13 +22,28 @@ def opaque(work: Callable[P, T]) -> Callable[P, T]:
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
         if torch.compiler.is_compiling():
             if work not in _outside:
-                _outside[work] = torch.compiler.disable(work)
+                _outside[work] = torch.compiler.disable(recorded_nowhere)
             return _outside[work](*args, **kwargs)
-        if torch._C._is_tracing():
-            raise RuntimeError(
-                "softmpm cannot be traced by torch.jit.trace, which would record memory that nothing writes to; trace the policy "
-                "alone, or use torch.compile, which calls softmpm as it is."
-            )
+        return recorded_nowhere(*args, **kwargs)
+
+    def recorded_nowhere(*args: P.args, **kwargs: P.kwargs) -> T:
+        _refuse_recording()
         return work(*args, **kwargs)
 
     return called
+
+
+def _refuse_recording() -> None:
+    """Raise RuntimeError where PyTorch's operations are recorded, in which the kernels have no part."""
+    core = torch._C
+    if core._is_tracing() or any(core._get_dispatch_mode(kind) is not None for kind in _recording()):
+        raise RuntimeError(
+            "softmpm cannot be traced by torch.jit.trace, torch.export or make_fx, which would record memory that nothing writes to; "
+            "trace the policy alone, or use torch.compile, which calls softmpm as it is."
+        )
+
+
+@functools.cache
+def _recording() -> tuple:
+    kinds = torch._C._TorchDispatchModeKey
+    return kinds.PROXY, kinds.FAKE, kinds.FUNCTIONAL

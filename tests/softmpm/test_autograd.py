@@ -7,7 +7,9 @@ import pytest
 import torch
 from helpers import INPUTS, assert_relative, busy_inputs, busy_scene, cotangent, dot, gradients, run
 from helpers import given as given_inputs
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils.checkpoint import checkpoint
 
 import softmpm
@@ -191,9 +193,24 @@ def test_it_works_under_func_grad_checkpoint_autocast_and_compile(model):
     assert_relative(again.double(), want, 0.05)
 
 
+def _by_jit(work, v):
+    return torch.jit.trace(work, (v,), check_trace=False)
+
+
+def _by_fx(work, v):
+    return make_fx(work)(v)
+
+
+def _with_fake_tensors(work, v):
+    """As torch.export does."""
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        return work(v)
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
 @pytest.mark.parametrize("call", ["simulate", "rasterize"])
-def test_tracing_is_refused(model, call):
+@pytest.mark.parametrize("trace", [_by_jit, _by_fx, _with_fake_tensors])
+def test_tracing_is_refused(model, call, trace):
     """A trace has operations of PyTorch alone: its results would be memory that no kernel has written to."""
     start, params = model.rest(), model.params()
 
@@ -203,8 +220,8 @@ def test_tracing_is_refused(model, call):
             return softmpm.rasterize(model, state).velocity
         return softmpm.simulate(model, state, None, params, substeps=1).x
 
-    with pytest.raises(RuntimeError, match="cannot be traced by torch.jit.trace"):
-        torch.jit.trace(work, (start.v,), check_trace=False)
+    with pytest.raises(RuntimeError, match="cannot be traced by torch.jit.trace, torch.export or make_fx"):
+        trace(work, start.v)
     work(start.v)
 
 
