@@ -31,7 +31,7 @@ from softmpm_learn.settings import Settings
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.training.finishing import evaluate_ends, finish
 from softmpm_learn.training.optimisation import optimise
-from softmpm_learn.training.run_logger import RunLogger
+from softmpm_learn.training.run_files import RunFiles
 from softmpm_learn.training.threads import at_once
 from softmpm_learn.training.timing import TIMING, clock
 
@@ -76,7 +76,7 @@ class _Work:
 
     runs: Runs
     plans: Sequence[Plan]
-    loggers: list[RunLogger]
+    files: list[RunFiles]
     """One for each run in the first process, none in the others."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMING, 0.0))
     """Those of the parts of this iteration."""
@@ -164,20 +164,20 @@ def train_side_by_side(
         own = [
             plan.loggers or held.enter_context(Loggers(plan.settings.train.log, plan.out)) for plan in plans
         ]
-        loggers = [
+        files = [
             group.once(
-                lambda r=run, p=plan, s=seal, o=one: held.enter_context(RunLogger(r, p.out, s, p.begin, o))
+                lambda r=run, p=plan, s=seal, o=one: held.enter_context(RunFiles(r, p.out, s, p.begin, o))
             )
             for run, plan, seal, one in zip(runs.all, plans, seals, own, strict=True)
         ]
-        work = _Work(runs, plans, [one for one in loggers if one is not None])
+        work = _Work(runs, plans, [one for one in files if one is not None])
         return _loop(work, progress, stop, finer)
 
 
 def _loop(work: _Work, progress, stop: Callable[[], bool], finer: Task | None) -> list[Result]:
     runs, group, seconds = work.runs, work.runs.group, work.seconds
     while runs.active and not group.any(stop()):
-        rows, observations = optimise(runs, work.loggers, seconds)
+        rows, observations = optimise(runs, work.files, seconds)
         with clock(seconds, "learn"):
             learn(runs, rows, observations)
         ended = {k: (runs.all[k].iteration, row) for k, row in rows.items()}
@@ -185,16 +185,16 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer: Task | None) -
         if progress and group.first and rows:
             progress(ended)
         with clock(seconds, "draw"):
-            for k in ended if work.loggers else ():  # a run that failed may have frames, but of no iteration
-                if work.loggers[k].frames:
-                    work.loggers[k].flush()
-                    work.plans[k].sketch(runs.all[k], ended[k][0], work.loggers[k].take_frames())
+            for k in ended if work.files else ():  # a run that failed may have frames, but of no iteration
+                if work.files[k].frames:
+                    work.files[k].flush()
+                    work.plans[k].sketch(runs.all[k], ended[k][0], work.files[k].take_frames())
     _save_all(work)
     with clock(seconds, "end"):
         ends = evaluate_ends(runs)
     _save_all(work)  # with what became of the best
     with clock(seconds, "end"):
-        found = finish(runs, work.loggers, finer, ends) if work.loggers else {}
+        found = finish(runs, work.files, finer, ends) if work.files else {}
     work.passed.update(seconds)
     return [
         Result(
@@ -213,26 +213,26 @@ def _loop(work: _Work, progress, stop: Callable[[], bool], finer: Task | None) -
 def _end_iteration(work: _Work, ended: dict[int, tuple[int, dict[str, float]]]) -> None:
     """End an iteration of some runs: rows of the tables, new sums of the times, then the checkpoints that are due."""
     runs, group = work.runs, work.runs.group
-    loggers = {k: work.loggers[k] for k in ended} if work.loggers else {}
+    files = {k: work.files[k] for k in ended} if work.files else {}
     with group.fail_together():
-        at_once(lambda k: loggers[k].add(*ended[k], work.seconds), loggers)
+        at_once(lambda k: files[k].add(*ended[k], work.seconds), files)
     work.passed.update(work.seconds)
     work.seconds.clear()
     work.seconds |= dict.fromkeys(TIMING, 0.0)
     for k in ended:
         runs.all[k].iteration += 1
-    _save(work, [k for k, one in loggers.items() if one.is_due])
+    _save(work, [k for k, one in files.items() if one.is_due])
 
 
 def _save_all(work: _Work) -> None:
     """Write the checkpoints of the runs that are not saved as they are."""
-    _save(work, [k for k, one in enumerate(work.loggers) if not one.is_saved])
+    _save(work, [k for k, one in enumerate(work.files) if not one.is_saved])
 
 
 def _save(work: _Work, numbers: Collection[int]) -> None:
     """Write the checkpoints of some runs."""
     with clock(work.seconds, "save"), work.runs.group.fail_together():
-        at_once(lambda k: work.loggers[k].save(), numbers)
+        at_once(lambda k: work.files[k].save(), numbers)
 
 
 def learn(runs: Runs, rows: dict[int, dict[str, float]], observations: Tensor | None) -> None:

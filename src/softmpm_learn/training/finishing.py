@@ -15,12 +15,12 @@ from softmpm_learn.runs.runs import Runs
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.training.evaluation import evaluate_best
 from softmpm_learn.training.examination import examine
-from softmpm_learn.training.run_logger import RunLogger, recorded
+from softmpm_learn.training.run_files import RunFiles, recorded
 
 logger = logging.getLogger("softmpm_learn")
 
 
-def _record_best(runs: Runs, loggers: Sequence[RunLogger], done: Sequence[int]) -> None:
+def _record_best(runs: Runs, files: Sequence[RunFiles], done: Sequence[int]) -> None:
     """Record an episode of these runs, whose policies and designs are their best.
 
     It may fail where that of the training did not, since a GPU adds in any order; such a robot goes on without activation.
@@ -28,7 +28,7 @@ def _record_best(runs: Runs, loggers: Sequence[RunLogger], done: Sequence[int]) 
     failures = Failures("freeze")
     params, inputs = runs.design()
     about = [{"of": runs.all[k].best["iteration"], "kind": "best"} for k in done]
-    with recorded(runs, [loggers[k] for k in done], about) as on_frames:
+    with recorded(runs, [files[k] for k in done], about) as on_frames:
         run_episode(
             runs.task,
             runs.model,
@@ -93,7 +93,7 @@ def _end(run: Run) -> float | None:
 
 @torch.no_grad()
 def finish(
-    runs: Runs, loggers: Sequence[RunLogger], finer: Task | None, ends: dict[int, float]
+    runs: Runs, files: Sequence[RunFiles], finer: Task | None, ends: dict[int, float]
 ) -> dict[int, dict[str, float]]:
     """Record the best policy and design of each finished run once more, as the episode after the last, and examine them.
 
@@ -104,13 +104,13 @@ def finish(
         return {}
     found = {}
     with _at_their_best(runs) as done:
-        if any(loggers[k].records for k in done):
-            _record_best(runs, loggers, done)
+        if any(files[k].records for k in done):
+            _record_best(runs, files, done)
         if ends:
             answers = examine(runs, finer)
             found = {k: answers[k] | {"end": ends[k]} for k in done}
             for k in done:
                 run = runs.all[k]
-                loggers[k].add_figures(run.iteration, found[k] | {"best": run.best["loss"]})
-                loggers[k].flush()
+                files[k].add_figures(run.iteration, found[k] | {"best": run.best["loss"]})
+                files[k].flush()
     return found

@@ -14,7 +14,7 @@ from softmpm_learn.recovery.fallback import limits
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.training.evaluation import Evaluation, due, evaluate, evaluate_best
-from softmpm_learn.training.run_logger import RunLogger, recorded
+from softmpm_learn.training.run_files import RunFiles, recorded
 from softmpm_learn.training.timing import clock
 
 SATURATED = 0.98
@@ -43,7 +43,7 @@ class NotFiniteError(RuntimeError):
 
 
 def optimise(
-    runs: Runs, loggers: Sequence[RunLogger], seconds: dict[str, float]
+    runs: Runs, files: Sequence[RunFiles], seconds: dict[str, float]
 ) -> tuple[dict[int, dict[str, float]], Tensor | None]:
     """One optimisation step of every run that goes on: simulate, differentiate, update policy and design.
 
@@ -52,7 +52,7 @@ def optimise(
     goes back for the first time it is saved as it was: from there it is resumed if it fails.
 
     Args:
-        loggers: One for each run, or none.
+        files: One for each run, or none.
 
     Returns:
         A row of metrics.csv for each run that goes on, by its number, and the observations of all worlds.
@@ -66,7 +66,7 @@ def optimise(
     while runs.active:
         runs.move(runs.active)
         try:
-            episode, rows = attempt(runs, goals, loggers, seconds)
+            episode, rows = attempt(runs, goals, files, seconds)
             failed = {k: error for k, error in rows.items() if isinstance(error, NotFiniteError)}
         except softmpm.UnstableError as error:
             failed = runs.failed([error, *runs.loop.errors])
@@ -84,7 +84,7 @@ def optimise(
             return found, episode.observations
         ends = any(k not in runs.active for k in failed)
         with clock(seconds, "save"), runs.group.fail_together():
-            save_before(runs, loggers, {k: s for k, s in streams.items() if ends or k in failed})
+            save_before(runs, files, {k: s for k, s in streams.items() if ends or k in failed})
         for k, error in failed.items():
             go_back(runs, k, error, retries.get(k, 0))
             retries[k] += 1
@@ -105,18 +105,18 @@ def warn_of_saturation(run: Run, activation: float) -> None:
     )
 
 
-def save_before(runs: Runs, loggers: Sequence[RunLogger], streams: dict[int, Tensor]) -> None:
+def save_before(runs: Runs, files: Sequence[RunFiles], streams: dict[int, Tensor]) -> None:
     """Write checkpoints of some runs as they were before this iteration drew their goals, unless there are such.
 
     Args:
         streams: State of the random stream of the goals at that time, by the number of the run.
     """
-    for k, before in streams.items() if loggers else ():
-        if not loggers[k].is_saved:
+    for k, before in streams.items() if files else ():
+        if not files[k].is_saved:
             goals = runs.all[k].goals.stream
             now = goals.get_state()
             goals.set_state(before)
-            loggers[k].save()
+            files[k].save()
             goals.set_state(now)
 
 
@@ -201,13 +201,13 @@ def settle(run: Run, begins: bool) -> bool:
 
 
 def attempt(
-    runs: Runs, goals: Tensor | None, loggers: Sequence[RunLogger], seconds: dict[str, float]
+    runs: Runs, goals: Tensor | None, files: Sequence[RunFiles], seconds: dict[str, float]
 ) -> tuple[Episode, dict[int, dict[str, float] | NotFiniteError]]:
     """Simulate and differentiate policies and designs as they are, in every process, or fail in every one.
 
     Gives the figures of each run that goes on, or an error in their place.
     """
-    recording = [loggers[k] for k in runs.active if loggers and loggers[k].due(runs.all[k].iteration)]
+    recording = [files[k] for k in runs.active if files and files[k].due(runs.all[k].iteration)]
     with clock(seconds, "episode"):
         with runs.failing_together(), recorded(runs, recording, seconds=seconds) as on_frames:
             episode, gradients = runs.loop(goals, on_frames)

@@ -94,7 +94,7 @@ def test_tensorboard_has_what_the_tables_have(task, model, settings, tmp_path):
 def test_tensorboard_of_a_killed_run_that_goes_on(task, model, settings, tmp_path, monkeypatch, where):
     """Killed after a row was shown and before the checkpoint, or after it: no step is lost, none is there twice."""
     settings, calls = logged(settings, "tensorboard"), iter(range(99))
-    owner, name = {"row": (train.RunLogger, "save"), "checkpoint": (train, "optimise")}[where]
+    owner, name = {"row": (train.RunFiles, "save"), "checkpoint": (train, "optimise")}[where]
     real = getattr(owner, name)
 
     def dies(*args):
@@ -193,7 +193,7 @@ def test_wandb_has_each_row_once(task, model, settings, tmp_path, monkeypatch, w
     """Killed after a row and before its checkpoint, or after it, when wandb had sent everything, had not sent the last rows, or was
     offline, where every session begins anew."""
     settings, calls = logged(settings, "wandb"), iter(range(99))
-    owner, name = {"row": (train.RunLogger, "save"), "checkpoint": (train, "optimise")}[where]
+    owner, name = {"row": (train.RunFiles, "save"), "checkpoint": (train, "optimise")}[where]
     real = getattr(owner, name)
 
     def dies(*args):

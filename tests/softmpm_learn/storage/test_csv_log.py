@@ -10,7 +10,7 @@ from softmpm_learn.register import TASKS
 from softmpm_learn.runs.run import Run
 from softmpm_learn.storage.csv_log import Table
 from softmpm_learn.tasks import make_task
-from softmpm_learn.training.run_logger import metrics
+from softmpm_learn.training.run_files import metrics
 
 
 def test_numbers_read_back_to_the_last_bit(tmp_path):

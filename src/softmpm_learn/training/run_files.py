@@ -45,7 +45,7 @@ def metrics(run: Run) -> list[str]:
     return ["loss", *terms, *others]
 
 
-class RunLogger:
+class RunFiles:
     """Goes on where the run is, and begins with a checkpoint of a new one. Of several processes the first keeps it; it shows
     the first of its worlds. Use as a context manager.
 
@@ -219,7 +219,7 @@ class RunLogger:
             "activation": torch.stack(active).cpu().numpy(),
         }
 
-    def __enter__(self) -> "RunLogger":
+    def __enter__(self) -> "RunFiles":
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -230,7 +230,7 @@ class RunLogger:
 @contextlib.contextmanager
 def recorded(
     runs: Runs,
-    loggers: Sequence[RunLogger],
+    files: Sequence[RunFiles],
     about: Sequence[dict] = (),
     seconds: dict[str, float] | None = None,
 ) -> Iterator[OnFrames | None]:
@@ -241,7 +241,7 @@ def recorded(
         seconds: The time that it takes is added to ``record`` [s].
     """
     seconds = {} if seconds is None else seconds
-    notes = zip(loggers, about or [{}] * len(loggers), strict=True)
+    notes = zip(files, about or [{}] * len(files), strict=True)
     recording = [(one, note) for one, note in notes if one.records]
     with contextlib.ExitStack() as open_episodes:
         keep = [
