@@ -109,7 +109,7 @@ def _of_recording(
         raise ValueError(f"{recording.path} has no frames of iteration {iteration} to show.")
     time = recording.read("time", rows)[1]
     chosen = resampled(time, fps, rate)
-    found = dict(zip(np.unique(chosen), recorded(recording, iteration, rows[np.unique(chosen)]), strict=True))
+    found = dict(zip(np.unique(chosen), recorded(recording, rows[np.unique(chosen)]), strict=True))
     return of_recording(recording), _filled([found[k] for k in chosen])
 
 

@@ -32,7 +32,7 @@ class Instant:
     traction: np.ndarray | None = None
     """Of the separating walls at these points [Pa], shape (wall, point, dim)."""
     time: float | None = None
-    """Since the beginning [s]."""
+    """[s], as recorded."""
 
 
 def at_rest(scene: Scene) -> Instant:
@@ -65,9 +65,8 @@ def of_state(model: Model, state: State, activation: Tensor | None, world: int) 
     )
 
 
-def recorded(recording: Recording, iteration: int, rows: np.ndarray) -> Iterator[Instant]:
+def recorded(recording: Recording, rows: np.ndarray) -> Iterator[Instant]:
     """Frames of one recorded simulation."""
-    begin = recording.read("time", recording.rows(iteration)[:1])[1]
     for row in rows[:, None]:
         found = {name: recording.read(name, row)[1] for name in ("time", "x", "v", "strain", "activation")}
         parts = {name: recording.read(name, row)[1] for name in ("places", "traction")}
@@ -77,7 +76,7 @@ def recorded(recording: Recording, iteration: int, rows: np.ndarray) -> Iterator
             speed=np.linalg.norm(found["v"][0], axis=-1),
             strain=found["strain"][0],
             activation=activation if activation.size and np.isfinite(activation).all() else None,
-            time=float(found["time"][0] - begin[0]),
+            time=float(found["time"][0]),
             **{name: values[0].astype(float) for name, values in parts.items() if len(values)},
         )
 

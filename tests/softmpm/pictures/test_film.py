@@ -144,6 +144,20 @@ def test_a_recording_becomes_a_film(recording, tmp_path):
         assert len(pictures(softmpm.to_video(opened, tmp_path / "b.gif", fps=10))) == 2
 
 
+def test_a_film_shows_the_recorded_times(model, states, tmp_path):
+    """Those of Rerun and of the file, where the first frame is that after the first control step."""
+    films = []
+    for begin in (0.0, 0.5, 0.5):
+        path = tmp_path / f"{len(films)}.h5"
+        with softmpm.Recorder(path, model) as recorder, recorder.episode(0) as episode:
+            for k, state in enumerate(states[:2]):
+                episode.frame(begin + 0.1 * k, state)
+        films.append(pictures(softmpm.to_video(path, tmp_path / "a.gif", fps=10)))
+    assert (films[1] == films[2]).all() and [len(film) for film in films] == [2, 2, 2]
+    apart = (films[0] != films[1]).any(-1)
+    assert apart[:, :40].any((1, 2)).all() and not apart[:, 40:].any()  # the words above the axes
+
+
 def test_an_mp4_opens(model, states, tmp_path):
     """With as many pictures and the size and rate that were asked for."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
