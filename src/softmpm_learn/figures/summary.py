@@ -22,7 +22,7 @@ NOTE = (
     "answer, where some have none. Passed: a walker goes forward (`end`, the loss of its best motion, is below 0), then keeps at "
     f"least {SHARE:g} of its speed and tilts by less than {LEVEL:g}°; what reaches for a goal stays within {1000 * NEAR:g} mm of it "
     f"from 0.3 s before the end of the episode to 0.5 s after it, and below {RESTING:g} m/s where it should come to rest. Other "
-    "objectives have no such rule."
+    "objectives have no such rule, and without an examination there is no verdict: –."
 )
 DIFFERENCES = (
     "The first setting minus this one, paired by seed: the mean, of the examination the median, with its bootstrap interval of 95 %; "
@@ -61,7 +61,7 @@ def summary(
     heads = [*settings, *(_head(name, first[0]) for name in quantities)]
     rows = [
         [*_named(members, settings), *(_median(members, name, name not in examined) for name in quantities)]
-        + [_count(members, lambda row: row["status"] != "finished"), _passed(members)]
+        + [_count(members, lambda row: row["status"] != "finished"), _passed(members) if examined else "–"]
         for members in groups.values()
     ]
     text = f"{_table([*heads, 'failed', 'passed'], rows)}\n{NOTE}\n"

@@ -293,6 +293,15 @@ def test_the_summary_has_a_row_for_each_setting(tmp_path):
     assert differences[0] == medians[0][:-2] and row[:2] == ["kmeans", "**-1.75 [-3, -0.5]** (2)"]
 
 
+def test_without_an_examination_there_is_no_verdict(tmp_path):
+    """With ``train.examine=false`` nothing passes, and nothing fails to."""
+    folder = make_sweep(
+        tmp_path, {"observer=latent": LATENT, "observer=kmeans": KMEANS}, later="", largest_tilt=""
+    )
+    program.make([folder], tmp_path / "out")
+    assert [row[-2:] for row in summaries(tmp_path / "out")[0][1:]] == [["0 of 3", "–"]] * 2
+
+
 @pytest.mark.parametrize(
     "changes, passed",
     [
