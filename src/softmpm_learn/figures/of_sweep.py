@@ -283,5 +283,5 @@ def _panels(path: Path, names: Sequence[str], panels: Mapping[str, str], draw, n
         axes.set_axis_off()
     grid[0, 0].set_yticks(range(len(names)), names)
     grid[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    figure.supxlabel(note, fontsize=7)
+    figure.supxlabel(note, fontsize=7, wrap=True)
     canvas.save(figure, path, dpi=130)

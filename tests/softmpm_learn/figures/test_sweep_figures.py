@@ -302,6 +302,17 @@ def test_without_an_examination_there_is_no_verdict(tmp_path):
     assert [row[-2:] for row in summaries(tmp_path / "out")[0][1:]] == [["0 of 3", "–"]] * 2
 
 
+def test_notes_of_the_panels_are_whole(tmp_path, drawn):
+    """Also below a single narrow panel, as without an examination; that of pairs.png was cut off on both sides."""
+    short = {"design.enabled=true": LATENT, "design.enabled=false": KMEANS}
+    program.make([make_sweep(tmp_path, short, later="", largest_tilt="")], tmp_path / "out")
+    notes = [figure for figure in drawn.values() if figure.get_supxlabel()]
+    assert [len(figure.axes) for figure in notes] == [1, 1]
+    for figure in notes:
+        box = figure._supxlabel.get_window_extent()
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+
+
 @pytest.mark.parametrize(
     "changes, passed",
     [
