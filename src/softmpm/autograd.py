@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
-from softmpm.batches import FirstOrder, FirstOrderAdjoint, refuse_batches
+from softmpm.batches import FirstOrder, FirstOrderAdjoint, kinds, refuse_batches, refuse_other_kinds
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
 from softmpm.check_state import check_finite, check_state
 from softmpm.checks import check_activation, check_horizon
@@ -238,14 +238,17 @@ class _Simulate(FirstOrder):
         ctx.mark_non_differentiable(*(t for t in output[ctx.call.count :] if t is not None))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors)  # all of them: PyTorch then tells if one was changed in place
+        ctx.kinds = kinds(tensors)
 
     @staticmethod
     def backward(ctx, *adj_end):
         refuse_batches(adj_end)
+        saved = ctx.saved_tensors  # each access unpacks them
+        refuse_other_kinds(saved, ctx.kinds)
         needed = dict(zip(ctx.call.names, ctx.needs_input_grad[1:], strict=False))
         found = [one.group for one in differentiable(ctx.call.model.spec) if needed.get(one.name)]
         count = ctx.call.count
-        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *ctx.saved_tensors, *adj_end[:count]
+        given = ctx.call, RequestedGrads(tuple(dict.fromkeys(found))), *saved, *adj_end[:count]
         # It may be differentiated once more:
         again = torch.is_grad_enabled() or _has_transform_or_tangent(given[2:])
         backward = _SimulateBackward.apply if again else _SimulateBackward.forward

@@ -1,6 +1,6 @@
 """Errors for what PyTorch offers besides the gradient and the kernels do not: batches, forward mode and second derivatives.
 
-Base classes of functions with an explicit adjoint, and the check for tensors that are batches.
+Base classes of functions with an explicit adjoint, and the checks for tensors that are batches or were saved as another kind.
 """
 
 from collections.abc import Iterable
@@ -21,6 +21,10 @@ FORWARD = (
 SECOND = (
     "softmpm: second derivatives are not available (the adjoint is explicit and first order); "
     "call backward without create_graph=True."
+)
+HOOK = (
+    "softmpm: a hook of torch.autograd.graph.saved_tensors_hooks gave back {got} for {want}; its unpack function must restore "
+    "shape, dtype and device."
 )
 
 
@@ -60,3 +64,15 @@ def _batched(tensor: Tensor) -> bool:
     while inner.is_gradtrackingtensor(tensor):
         tensor = inner.get_unwrapped(tensor)
     return inner.is_batchedtensor(tensor) or inner.is_legacy_batchedtensor(tensor)
+
+
+def kinds(tensors: Iterable[Tensor | None]) -> list[tuple | None]:
+    """Shape, dtype and device of each tensor."""
+    return [None if one is None else (tuple(one.shape), one.dtype, one.device) for one in tensors]
+
+
+def refuse_other_kinds(saved: Iterable[Tensor | None], given: list[tuple | None]) -> None:
+    """Raise RuntimeError unless saved tensors are of the kinds that were given: kernels would read beyond their memory."""
+    for got, want in zip(kinds(saved), given, strict=True):
+        if got != want:
+            raise RuntimeError(HOOK.format(got=got, want=want))

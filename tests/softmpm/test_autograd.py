@@ -257,6 +257,25 @@ def test_no_other_derivative_is_lost(name, scheme):
     assert_relative(got, end(inputs[name]).sum().expand_as(got), 1e-6)
 
 
+def test_hooks_for_saved_tensors(scheme):
+    """One that stores tensors in another precision gives a gradient of that precision; one that does not convert them back raises."""
+    model = softmpm.build(busy_scene(2, per_law=6), device="cpu", scheme=scheme)
+    inputs = busy_inputs(model)
+    want = gradients(softmpm.simulate, model, inputs, 5, cotangent(model.rest()))["v"]
+
+    def stored(unpack):
+        with torch.autograd.graph.saved_tensors_hooks(
+            lambda tensor: (tensor.bfloat16(), tensor.dtype), unpack
+        ):
+            end = run(softmpm.simulate, model, inputs, 5)
+        loss = dot(end[:4], cotangent(model.rest()))
+        return torch.autograd.grad(loss, inputs["v"])[0]
+
+    assert_relative(stored(lambda saved: saved[0].to(saved[1])), want, 0.1)
+    with pytest.raises(RuntimeError, match=r"saved_tensors_hooks gave back .*bfloat16.* must restore"):
+        stored(lambda saved: saved[0])
+
+
 def test_no_grad_keeps_nothing(model):
     """Under no_grad the end has no history."""
     with torch.no_grad():
