@@ -5,6 +5,7 @@ Only what the command line names is imported, and entry points of the group ``so
 
 import hashlib
 import importlib.util
+import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -102,6 +103,15 @@ def command(names: Sequence[str] | None = None) -> str:
     if names is None and not loaded and (own := files()):
         return f"python {_short(own[0])}"
     return " ".join(["python -m softmpm_learn", *map(_short, loaded if names is None else names)])
+
+
+def resume(folder: str | Path) -> str:
+    """Argument that continues the run in a folder, as a shell takes it. Hydra reads spaces, brackets and letters with accents only
+    within quotes of its own."""
+    if re.fullmatch(r"[\w./\\:+-]+", str(folder), re.ASCII):
+        return f"resume={folder}"
+    quoted = str(folder).replace("'", r"\'")
+    return f"\"resume='{quoted}'\""
 
 
 def _program_registers() -> bool:

@@ -122,7 +122,7 @@ def job(
         if found:
             group.once(sweep.update, out, found)
         if found and found.status == "failed":
-            end(1, f"{found.error} The other seeds are finished; resume={out} tries again.")
+            end(1, f"{found.error} The other seeds are finished; {plugins.resume(out)} tries again.")
         return seeds.median_loss(results)
     except JobError as failure:
         end(1, str(failure))
@@ -177,7 +177,7 @@ def _configured(config: DictConfig, out: Path, group: Group) -> RunConf:
             conf.job = int(hydra_config.job.num) if sweeps else 0
             if begun and not sweeps:
                 raise RefusedError(
-                    f"{out} holds a run already; go on with resume={out}, or choose another folder."
+                    f"{out} holds a run already; go on with {plugins.resume(out)}, or choose another folder."
                 )
             if begun and _fixed(saved_configuration(out)) != _fixed(conf):
                 raise RefusedError(

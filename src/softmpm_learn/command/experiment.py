@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 import softmpm
+from softmpm_learn import plugins
 from softmpm_learn.command import seeds
 from softmpm_learn.command.farewell import Ending, farewell, farewell_of_seeds
 from softmpm_learn.command.pictures import DRAWN, Sketches, draw, no_sketch
@@ -145,7 +146,7 @@ def advice(jobs: Sequence[tuple[RunConf, Path]]) -> str:
     """Action where a signal ends the program."""
     if len(jobs) > 1:
         return "Finished iterations are saved; the same command goes on."
-    return f"Finished iterations are saved; to go on, or to draw the pictures: resume={jobs[0][1]}"
+    return f"Finished iterations are saved; to go on, or to draw the pictures: {plugins.resume(jobs[0][1])}"
 
 
 def report(progress: ProgressBar, rows: dict[int, tuple[int, dict[str, float]]]) -> None:

@@ -38,7 +38,7 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     else:
         lines.append(f"Everything is in {shown}; train.record_every=0, so nothing was recorded.")
     if not result.finished:
-        lines.append(f"To go on: {plugins.command()} resume={shown}")
+        lines.append(f"To go on: {plugins.command()} {plugins.resume(shown)}")
     return "\n".join(lines)
 
 
@@ -77,7 +77,7 @@ def farewell_of_seeds(ends: Sequence[Ending], out: Path) -> str:
     has = "; those that have ended have" if stopped else ", and"
     lines.append(f"Each seed has a folder in {place}{has} a row in {place}/{sweep.TABLE}.")
     if failed or stopped:
-        lines.append(f"To go on: {plugins.command()} resume={place}")
+        lines.append(f"To go on: {plugins.command()} {plugins.resume(place)}")
     return "\n".join(lines)
 
 

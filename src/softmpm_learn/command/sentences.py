@@ -44,7 +44,10 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, InterpolationResolutionError) and isinstance(cause, ValueError):
         return sentence(cause)  # from a resolver of ours
     if isinstance(error, OverrideParseException):
-        return f"cannot read {error.override!r}: write key=value, in quotes if it has spaces or brackets."
+        return (
+            f"cannot read {error.override!r}: write key=value; with spaces, brackets or letters with accents in quotes of its own, "
+            "within those of the shell: \"key='value'\"."
+        )
     if isinstance(error, (ConfigAttributeError, ConfigKeyError)):
         kind = error.object_type
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):

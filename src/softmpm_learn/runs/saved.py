@@ -85,7 +85,7 @@ def _need_files(saved: DictConfig, folder: Path) -> None:
         if name not in table:
             raise MissingFileError(
                 f"the {table.what} {name!r} of the run in {folder} was registered by a file: "
-                f"{plugins.command(names)} resume={folder}"
+                f"{plugins.command(names)} {plugins.resume(folder)}"
             )
 
 

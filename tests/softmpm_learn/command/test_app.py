@@ -17,6 +17,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 import softmpm
+from softmpm_learn import plugins
 from softmpm_learn.__main__ import help_text
 from softmpm_learn.command import app, experiment, farewell
 from softmpm_learn.command.sentences import sentence
@@ -393,6 +394,14 @@ def test_the_latest_run_in_a_folder_is_named(monkeypatch, capsys, tmp_path):
     assert said.endswith(
         f"there is no config.yaml in it; the latest run in it is {tmp_path}/2026-01-02_09-00-00."
     )
+
+
+@pytest.mark.parametrize("name", ["plain-1.0", "my runs", "läufe", "Bob's (2), [3]"])
+def test_the_command_that_resumes_can_be_pasted(name, monkeypatch, capsys, tmp_path):
+    """Into a shell, whatever the name of the folder."""
+    (tmp_path / name).mkdir()
+    (argument,) = shlex.split(plugins.resume(tmp_path / name))
+    assert f"{tmp_path / name} holds no run" in refusal(monkeypatch, capsys, argument)
 
 
 def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finished):
