@@ -257,4 +257,5 @@ def _key(figure: Any, axes: list[Any], colouring: Colouring, room: float) -> Any
     )
     bar.set_label(colouring.label + f"; {STROKE}" * colouring.with_fibres, fontsize=9)
     bar.ax.tick_params(labelsize=8)
+    bar.ax.ticklabel_format(useOffset=False)  # values that are nearly equal stand there in full
     return None

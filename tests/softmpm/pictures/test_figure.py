@@ -49,6 +49,14 @@ def model() -> softmpm.Model:
     return softmpm.build(scene_of(), device="cpu", worlds=2)
 
 
+def test_nearly_equal_values_stand_at_the_bar_in_full(model):
+    """An array of 50349 has ticks of that size, not of 0 and 1 beside an offset."""
+    figure = softmpm.show(model, model.rest(), colour=np.full(model.particle_count, 50349.0))
+    figure.draw_without_rendering()
+    bar = next(axes for axes in figure.axes if axes.get_aspect() != 1.0)
+    assert all(float(label.get_text()) > 50000 for label in bar.get_yticklabels())
+
+
 def pixels(figure: Figure, dpi: int = 100) -> np.ndarray:
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=dpi)
