@@ -68,7 +68,7 @@ def _batched(tensor: Tensor) -> bool:
 
 def kinds(tensors: Iterable[Tensor | None]) -> list[tuple | None]:
     """Shape, dtype and device of each tensor."""
-    return [None if one is None else (tuple(one.shape), one.dtype, one.device) for one in tensors]
+    return [one if one is None else (one.shape, one.dtype, one.device) for one in tensors]
 
 
 def refuse_other_kinds(saved: Iterable[Tensor | None], given: list[tuple | None]) -> None:

@@ -71,7 +71,8 @@ def _contact(model) -> str:
         text = f"{model.surface.count} surface points with separating walls, nodes with others"
         way = (model.surface.waves.min() * model.scene.dt / model.scene.grid.spacing).item()
         if model.dim == 3 and way < RIGID:
-            text += f"; a pressure wave passes {way:.2g} cells in a substep: points of curved bodies share loads unevenly"
+            text += f"; a pressure wave passes {way:.2g} cells in a substep"
+            text += ": points of curved bodies share loads unevenly, see docs/accuracy.md"
     held = "" if model.mirror is None else f"; {model.mirror.count} groups of nodes held or reflected"
     return text + held
 

@@ -5,6 +5,7 @@ import math
 import os
 
 import torch
+import warp as wp
 
 logger = logging.getLogger("softmpm")
 
@@ -28,6 +29,22 @@ def device_of(device: str | torch.device | None) -> torch.device:
     return (
         torch.device("cpu") if device.type == "cpu" else device
     )  # tensors on "cpu:0" say that they are on "cpu"
+
+
+def warp_device_of(device: torch.device) -> wp.Device:
+    """The same device for Warp.
+
+    Raises:
+        OSError: The folder in which Warp keeps compiled kernels cannot be made; names it and the remedy.
+    """
+    try:
+        wp.init()
+    except OSError as error:
+        raise OSError(
+            f"Warp keeps compiled kernels in {error.filename}, which cannot be made: {error.strerror}; set the environment variable "
+            "WARP_CACHE_PATH to a folder that can be written to."
+        ) from error
+    return wp.device_from_torch(device)
 
 
 def memory_of(device: torch.device) -> int | None:

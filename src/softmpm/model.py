@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
 from softmpm.alarms import Alarms
 from softmpm.describe import describe
+from softmpm.devices import warp_device_of
 from softmpm.driven_grid import DrivenGrid
 from softmpm.inputs import QUANTITIES, direction_of, stored
 from softmpm.mirror_grid import MirrorGrid
@@ -138,8 +138,7 @@ class Model:
             "offset": [wall.offset for wall in scene.walls],
             "friction": [wall.friction for wall in scene.walls],
         }
-        wp.init()
-        self.wp_device = wp.device_from_torch(device)
+        self.wp_device = warp_device_of(device)
         self.constants = constants_of(scene, self.spec, alarms)
         check_room(self)
         self.neighbours = self._neighbours()
