@@ -345,7 +345,7 @@ def test_inputs_are_designed_like_the_material(task, model, settings, tmp_path):
 
 
 def test_a_design_of_stiff_parts_is_drawn_over_that_of_the_scene(task, make_block, settings, tmp_path):
-    """Else the picture has the two moduli of the parts, ten to one, and a change of some percent cannot be seen."""
+    """Beside the moduli of the parts, ten to one, among which a change of some percent cannot be seen."""
     scene = make_block()
     (body,) = scene.bodies
     stiff = dataclasses.replace(body.material, young=10 * body.material.young)
@@ -357,6 +357,8 @@ def test_a_design_of_stiff_parts_is_drawn_over_that_of_the_scene(task, make_bloc
     conf = changed(settings, observer=dict(name="centroids"))
     model = softmpm.build(scene, device="cpu")
     drawn = design(Run(dataclasses.replace(task, scene=scene), model, conf, tmp_path))
+    values, unit = drawn["Young's modulus of the scene"]
+    assert unit == "Pa" and values == pytest.approx(np.repeat([1.0, 10.0], 16) * body.material.young)
     values, unit = drawn["Young's modulus, over that of the scene"]
     assert unit == "" and values == pytest.approx(np.ones(32), rel=1e-5)
     assert drawn["density"][1] == "kg/m³" and drawn["density"][0] == pytest.approx(np.ones(32), rel=1e-5)

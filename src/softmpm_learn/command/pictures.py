@@ -107,7 +107,7 @@ def decoded(run: Run) -> np.ndarray:
 @torch.no_grad()
 def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
     """Material of the best robot and the inputs that were designed: value on each particle and unit; of a material that differs between
-    parts of the scene the quotient with that of the scene."""
+    parts of the scene that of the scene, and the quotient of both."""
     now = run.policy_snapshot()
     if run.best["iteration"] >= 0:
         run.load_policy(run.best)
@@ -119,8 +119,9 @@ def design(run: Run) -> dict[str, tuple[np.ndarray, str]]:
         title, unit = DESIGN.get(name, (name, ""))
         values = _on_particles(run.model, name, value.cpu().numpy())
         if name in first and len(first[name].unique()) > 1:  # stiff parts would hide what was designed
-            title, unit = f"{title}, over that of the scene", ""
-            values = values / first[name].cpu().numpy().reshape(-1)
+            scene = first[name].cpu().numpy().reshape(-1)
+            shown[f"{title} of the scene"] = (scene, unit)
+            title, unit, values = f"{title}, over that of the scene", "", values / scene
         shown[title] = (values, unit)
     return shown
 
