@@ -40,6 +40,8 @@ def warp_device_of(device: torch.device) -> wp.Device:
     try:
         wp.init()
     except OSError as error:
+        if error.filename is None:
+            raise
         raise OSError(
             f"Warp keeps compiled kernels in {error.filename}, which cannot be made: {error.strerror}; set the environment variable "
             "WARP_CACHE_PATH to a folder that can be written to."

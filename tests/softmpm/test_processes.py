@@ -13,6 +13,7 @@ import torch
 from helpers import thrown_out
 
 import softmpm
+from softmpm.devices import warp_device_of
 
 FIELDS = ("kind", "world", "particle", "substep", "value", "limit")
 
@@ -98,3 +99,14 @@ def test_without_a_place_for_kernels_the_remedy_is_named(tmp_path):
         printed(tmp_path / "file" / "cache").count("WARP_CACHE_PATH to a folder that can be written to") == 2
     )
     assert "WARP_CACHE_PATH" not in printed(tmp_path / "cache")
+
+
+def test_other_errors_of_warp_are_its_own(monkeypatch):
+    """Such as a library that is missing, which is no matter of a folder."""
+
+    def fails():
+        raise OSError("libx.so: cannot open shared object file")
+
+    monkeypatch.setattr("warp.init", fails)
+    with pytest.raises(OSError, match="^libx.so"):
+        warp_device_of(torch.device("cpu"))
