@@ -9,6 +9,10 @@ import torch
 P = ParamSpec("P")
 T = TypeVar("T")
 
+_modes = torch._C._TorchDispatchModeKey
+RECORDING = _modes.PROXY, _modes.FAKE, _modes.FUNCTIONAL
+"""Modes in which PyTorch records operations: of make_fx, of fake and of functional tensors; torch.export has all three."""
+
 _outside: dict[Callable, Callable] = {}
 
 
@@ -22,11 +26,11 @@ def opaque(work: Callable[P, T]) -> Callable[P, T]:
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
         if torch.compiler.is_compiling():
             if work not in _outside:
-                _outside[work] = torch.compiler.disable(recorded_nowhere)
+                _outside[work] = torch.compiler.disable(checked)
             return _outside[work](*args, **kwargs)
-        return recorded_nowhere(*args, **kwargs)
+        return checked(*args, **kwargs)
 
-    def recorded_nowhere(*args: P.args, **kwargs: P.kwargs) -> T:
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
         _refuse_recording()
         return work(*args, **kwargs)
 
@@ -36,14 +40,8 @@ def opaque(work: Callable[P, T]) -> Callable[P, T]:
 def _refuse_recording() -> None:
     """Raise RuntimeError where PyTorch's operations are recorded, in which the kernels have no part."""
     core = torch._C
-    if core._is_tracing() or any(core._get_dispatch_mode(kind) is not None for kind in _recording()):
+    if core._is_tracing() or any(core._get_dispatch_mode(kind) is not None for kind in RECORDING):
         raise RuntimeError(
             "softmpm cannot be traced by torch.jit.trace, torch.export or make_fx, which would record memory that nothing writes to; "
             "trace the policy alone, or use torch.compile, which calls softmpm as it is."
         )
-
-
-@functools.cache
-def _recording() -> tuple:
-    kinds = torch._C._TorchDispatchModeKey
-    return kinds.PROXY, kinds.FAKE, kinds.FUNCTIONAL
