@@ -146,7 +146,7 @@ def figures(
 def main():
     args = arguments(__doc__, threads=True)
     device = torch.device(args.device)
-    table, alone = Table("Two formulations [us/substep], float32", device, args.json), (1.0,) * len(FIGURES)
+    table, alone = Table("Two formulations [us/substep], float32", device, args.json), ()
     runs = [("moving", args.threads[0]), *(("reference", count) for count in args.threads)]
     for name, dim, worlds, particles, scene in cases(device.type == "cpu"):
         if particles * worlds > (args.largest or particles * worlds):
