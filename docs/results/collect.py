@@ -16,6 +16,7 @@ JOBS = {
     "observer": "observer",
     "every": "learning.every",
     "target_rate": "learning.target_rate",
+    "restart_after": "optimizer.restart_after",
 }
 """Settings that tell apart the jobs of a sweep."""
 COLUMNS = {"best": "loss", "iteration": "iteration", "end": "end"}

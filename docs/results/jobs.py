@@ -1,10 +1,11 @@
-"""Print the figures of tables NAME.ROBOT.h200.csv beside this script: `python docs/results/jobs.py NAME`.
+"""Print the figures of tables NAME.ROBOT.h200.csv beside this script: `python docs/results/jobs.py NAME [SEEDS]`.
 
-Of each set of seeds its jobs, and the differences between every two of them, paired by seed.
+Of each set of twenty seeds, or of as many as are given, its jobs, and the differences between every two of them, paired by seed.
 """
 
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 from comparison import Row, of_arms, of_walkers, shown
@@ -15,12 +16,12 @@ from softmpm_learn.figures.intervals import interval, pairs
 Sets = dict[int, dict[str, list[Row]]]
 
 
-def sets_of(rows: list[Row]) -> Sets:
-    """Rows by the first of their twenty seeds and by their job, the settings in the columns before the seed."""
+def sets_of(rows: list[Row], seeds: int) -> Sets:
+    """Rows by the first seed of their set and by their job, the settings in the columns before the seed."""
     sets: Sets = {}
     for row in rows:
         job = ", ".join(f"{name} {row[name]}" for name in list(row)[: list(row).index("seed")])
-        first = int(row["seed"]) // 20 * 20
+        first = int(row["seed"]) // seeds * seeds
         sets.setdefault(first, {}).setdefault(job, []).append(row)
     return sets
 
@@ -42,9 +43,12 @@ def print_differences(jobs: dict[str, list[Row]], arm: bool) -> None:
         print(f"  {pair['first']} {'/' if arm else '-'} {pair['second']}: {shown(pair, is_log=arm)}")
 
 
-def main(name: str):
-    for robot in ("elephant", "biped", "arm"):
-        for first, jobs in sets_of(table(f"{name}.{robot}.h200.csv")).items():
+def main(name: str, seeds: str = "20"):
+    there = [
+        r for r in ("elephant", "biped", "arm") if Path(__file__).with_name(f"{name}.{r}.h200.csv").exists()
+    ]
+    for robot in there:
+        for first, jobs in sets_of(table(f"{name}.{robot}.h200.csv"), int(seeds)).items():
             print(f"{robot}, seeds from {first}")
             print_jobs(jobs, robot == "arm")
             print_differences(jobs, robot == "arm")

@@ -1,9 +1,9 @@
 """Robots drawn at random, of docs/results.md:
 
-    python docs/results/random_robots.py draw FOLDER             writes FOLDER/r00.npy to r11.npy
+    python docs/results/random_robots.py draw FOLDER [SEED]      writes FOLDER/r00.npy to r11.npy, of the seed 2026 or another
     python docs/results/random_robots.py collect NAME FOLDER...  writes NAME, a row for each run in FOLDER/r00 to r11
     python docs/results/random_robots.py [NAME]                  prints the figures of NAME, random_robots.h200.csv
-    python docs/results/random_robots.py picture [NAME]          draws docs/images/random_robots.png
+    python docs/results/random_robots.py picture [NAME [SEED]]   draws docs/images/random_robots.png, or of another table its own
 
 Voxels are drawn with the weights of Evolution Gym's sample_robot (0.6 for an empty one, 1 for each other kind) until the robot is
 connected and has an actuator.
@@ -34,11 +34,11 @@ TRIALS = "random_robots_trials.h200.csv"
 """Lowest loss of an episode in shorter runs with other settings, a column for each seed."""
 
 
-def drawn() -> Iterator[tuple[str, np.ndarray]]:
+def drawn(seed: int = 2026) -> Iterator[tuple[str, np.ndarray]]:
     """Names and voxels of the robots."""
     from scipy.ndimage import label
 
-    rng, weights = np.random.default_rng(2026), np.array([0.6, 1.0, 1.0, 1.0, 1.0])
+    rng, weights = np.random.default_rng(seed), np.array([0.6, 1.0, 1.0, 1.0, 1.0])
     for k in range(12):
         voxels = np.zeros((5, 5), dtype=int)
         while not ((voxels >= 3).any() and label(voxels > 0)[1] == 1):
@@ -46,10 +46,10 @@ def drawn() -> Iterator[tuple[str, np.ndarray]]:
         yield f"r{k:02d}", voxels
 
 
-def draw(folder: str) -> None:
+def draw(folder: str, seed: str = "2026") -> None:
     """Write the robots into a folder."""
     Path(folder).mkdir(parents=True, exist_ok=True)
-    for robot, voxels in drawn():
+    for robot, voxels in drawn(int(seed)):
         np.save(Path(folder) / f"{robot}.npy", voxels)
 
 
@@ -133,7 +133,7 @@ def show(name: str = NAME) -> None:
         print(f"trial of {trial['robot']}, {trial['settings']}: {moved} of 8 move")
 
 
-def picture(name: str = NAME) -> None:
+def picture(name: str = NAME, seed: str = "2026") -> None:
     """Draw the robots with the best evaluations of their runs, of the largest strength."""
     import matplotlib
 
@@ -145,7 +145,7 @@ def picture(name: str = NAME) -> None:
     runs = by_robot(name)[max(by_robot(name), key=float)]
     figure, axes = plt.subplots(2, 6, figsize=(11, 5.2), layout="constrained")
     figure.get_layout_engine().set(hspace=0.1)  # pyright: ignore
-    for axis, (robot, voxels) in zip(axes.flat, drawn(), strict=True):
+    for axis, (robot, voxels) in zip(axes.flat, drawn(int(seed)), strict=True):
         colours = ListedColormap(["white", *KINDS.values()])
         axis.imshow(voxels, cmap=colours, vmin=0, vmax=len(KINDS))
         rows, best = runs[robot], np.median([float(row["best"]) for row in runs[robot]])
@@ -153,7 +153,7 @@ def picture(name: str = NAME) -> None:
         axis.axis("off")
     handles = [Patch(color=colour, label=kind) for kind, colour in KINDS.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    figure.savefig(Path(__file__).parents[1] / "images" / "random_robots.png", dpi=110)
+    figure.savefig(Path(__file__).parents[1] / "images" / f"{name.split('.')[0]}.png", dpi=110)
 
 
 if __name__ == "__main__":
