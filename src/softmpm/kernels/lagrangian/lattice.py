@@ -18,6 +18,11 @@ WARPS, WARPS_ADJ = 20, 16
 """Warps of a multiprocessor, forward and adjoint, at which the threads of small layers hardly spill registers."""
 
 
+def lattice_options(bricks: Bricks) -> dict:
+    """Compile options. On a CPU the particles of a layer are in a loop: one after the other, their code fills the instruction cache."""
+    return brick_options() | ({"max_unroll": bricks.dim} if bricks.serial else {})
+
+
 def resident(spec: Spec, bricks: Bricks, warps: int) -> int:
     """``warps`` where a thread has few numbers, else 0, no demand."""
     small = bricks.parts <= 2 and not spec.viscosity and spec.dtype == "float32"
@@ -28,19 +33,19 @@ def resident(spec: Spec, bricks: Bricks, warps: int) -> int:
 def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
     """As :func:`cells`, for particles on a lattice without external forces of their own."""
     t, Rest, one = types(spec.dim, spec.dtype), rest(spec.dim, spec.dtype).Rest, particle_forces(spec)
-    Constants, dim = t.Constants, spec.dim
+    Constants, dim, mat = t.Constants, spec.dim, t.mat
     ParticleInputs, forced, given_to = input_types(spec).ParticleInputs, one.forced, one.given_to
-    check_now, is_valid, memory, mat = one.check_now, one.is_valid, chunk(dim, spec.dtype), t.mat
+    check_now, is_valid, memory = one.check_now, one.is_valid, chunk(dim, spec.dtype)
     Chunk, state_of, u_of = memory.Chunk, memory.state_of, memory.u_of
     of_u, of_v = (field(dim, spec.dtype, bricks, number, True) for number in range(2))
     stage_u, stage_v, clear = of_u.stage_at, of_v.stage_at, sums(dim, spec.dtype, bricks, False).clear
     one_layer, viscous = layers(dim, spec.dtype, bricks), spec.viscosity
     Lattice, block, places_of = one_layer.Lattice, one_layer.block, one_layer.places_of
     Seat, seat_of = lattice_seats(spec, bricks).Seat, lattice_seats(spec, bricks).seat_of
-    taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
+    taken, add, points = one_layer.taken, one_layer.add, bricks.layer
     gradients_u, gradients_v = one_layer.gradients[0], one_layer.gradients[1]
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
-    options = brick_options()
+    options = lattice_options(bricks)
 
     @wp.func
     def forces_at(
@@ -81,8 +86,17 @@ def lattice_cells(spec: Spec, bricks: Bricks) -> SimpleNamespace:
                     p = wp.max(place[n], 0)
                     own = given_to(inputs, world, p)
                     there = place[n] >= 0  # a branch on it would keep the particles from waiting together
-                    Hn = taken(H, n)
-                    A = put(A, n, wp.where(there, forced(own, Hn, taken(rate, n)), mat()))  # (Q2)
+                    Hn = mat()
+                    rate_n = mat()
+                    for i in range(dim):  # in place: functions would copy those of all particles
+                        for j in range(dim):
+                            Hn[i, j] = H[dim * n + i, j]
+                            if wp.static(viscous):
+                                rate_n[i, j] = rate[dim * n + i, j]
+                    An = wp.where(there, forced(own, Hn, rate_n), mat())  # (Q2)
+                    for i in range(dim):
+                        for j in range(dim):
+                            A[dim * n + i, j] = An[i, j]
                     if wp.static(serial):
                         if there:
                             check_now(constants, inputs, inside, at.words, world, p, s, Hn)
@@ -123,7 +137,7 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     t = types(spec.dim, spec.dtype)
     Rest = rest(spec.dim, spec.dtype).Rest
     one = particle_forces_adj(spec, wanted)
-    Constants, dim = t.Constants, spec.dim
+    Constants, dim, mat = t.Constants, spec.dim, t.mat
     ParticleInputs = input_types(spec).ParticleInputs
     ParticleInputsAdj = input_adj_types(spec, wanted).ParticleInputsAdj
     forced_adj, check_adj, one_layer = one.forced_adj, one.check_adj, layers(dim, spec.dtype, bricks)
@@ -133,12 +147,12 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
     stage_u, stage_f, stage_v = of_u.stage_at, of_f.stage_at, of_v.stage_at
     clear, viscous = sums(dim, spec.dtype, bricks, False).clear, spec.viscosity
     Lattice, block, places_of = one_layer.Lattice, one_layer.block, one_layer.places_of
-    taken, put, add, points = one_layer.taken, one_layer.put, one_layer.add, bricks.layer
+    add, points = one_layer.add, bricks.layer
     gradients_u, gradients_f, gradients_v = one_layer.gradients
     count, turns, serial = bricks.cell_count, bricks.slots // bricks.layer_threads, bricks.serial
     memory = chunk(dim, spec.dtype)
     Chunk, Adjoint = memory.Chunk, memory.Adjoint
-    options = brick_options()
+    options = lattice_options(bricks)
 
     @wp.func
     def forces_adj_at(
@@ -183,15 +197,23 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
                 for n in range(points):
                     p = place[n]
                     if p >= 0:
-                        Hn = taken(H, n)
-                        Gn = taken(G, n)
+                        Hn = mat()
+                        Gn = mat()
+                        rate_n = mat()
+                        for i in range(dim):
+                            for j in range(dim):
+                                Hn[i, j] = H[dim * n + i, j]
+                                Gn[i, j] = G[dim * n + i, j]
+                                if wp.static(viscous):
+                                    rate_n[i, j] = rate[dim * n + i, j]
                         own = given_to(inputs, world, p)
-                        rate_n = taken(rate, n)
                         adj = forced_adj(own, Hn, rate_n, Gn, world, p, adj_inputs)
                         check_adj(at.words, world, inside.order[p], at.length - 1 - s, adj)
-                        A = put(A, n, adj.F)  # (Q1.adj)
-                        if wp.static(viscous):
-                            B = put(B, n, adj.rate)
+                        for i in range(dim):
+                            for j in range(dim):
+                                A[dim * n + i, j] = adj.F[i, j]
+                                if wp.static(viscous):
+                                    B[dim * n + i, j] = adj.rate[i, j]
             add(A, bar.partial_u, world, brick, corner, layer, lane, lattice)
             if wp.static(viscous):
                 add(B, bar.partial_v, world, brick, corner, layer, lane, lattice)
