@@ -7,8 +7,9 @@ each substep. ``ratio`` is the moving formulation's figure over that of the refe
 
 All bodies breathe. ``cube``: particles on a lattice, without walls, in one world or several, with faces on knots of the splines.
 ``block`` has an outline; ``on a floor`` it also meets a wall with friction, at nodes in the moving and at surface points in the
-reference formulation, and ``viscous`` it is of a viscous material; of both a row gives the times over those of the block alone, in the
-reference formulation. On a floor the last rows are of the moving formulation with contact at surface points, and over that at nodes.
+reference formulation, and ``viscous`` it is of a viscous material. On a floor the moving formulation is timed with contact at surface
+points as well. The last rows of the blocks are quotients of calls in turn, medians over the rounds: of both blocks over the block alone
+in the reference formulation, and of contact at surface points over that at nodes in the moving one.
 
 On a CPU the reference formulation runs with each number of threads; ``gain`` is its time with the first over that with this number,
 and ``cores`` the processor time of a call without gradient over its duration: below ``threads`` if other processes had a part of the
@@ -17,7 +18,7 @@ cores.
 
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from common import Table, arguments, cube, sync
@@ -105,27 +106,58 @@ Times = tuple[float, float]
 """What these two return."""
 
 
-def in_pairs(
-    work: Callable[..., Times], model: softmpm.Model, substeps: int, repeats: int
-) -> list[tuple[Times, Times]]:
-    """Times of pairs of a long and a short call, after a pair that compiles."""
-    about, lengths = (model, breathing(model), model.params()), (substeps, substeps // SHORTER)
-    pairs = [(work(*about, lengths[0]), work(*about, lengths[1])) for _ in range(PAIRS * repeats + 1)]
-    return pairs[1:]
+def rounds(
+    work: Callable[..., Times], models: list[softmpm.Model], substeps: int, repeats: int
+) -> list[list[tuple[Times, Times]]]:
+    """In each round, of each model in turn, the times of a long and a short call, after a round that compiles."""
+    lengths = (substeps, substeps // SHORTER)
+
+    def pair(model: softmpm.Model) -> tuple[Times, Times]:
+        about = model, breathing(model), model.params()
+        return work(*about, lengths[0]), work(*about, lengths[1])
+
+    return [[pair(model) for model in models] for _ in range(PAIRS * repeats + 1)][1:]
 
 
-def one_more(pairs: list[tuple[Times, Times]], which: int, substeps: int) -> float:
-    """Median microseconds of one more substep."""
-    return statistics.median(long[which] - short[which] for long, short in pairs) / (
-        substeps - substeps // SHORTER
-    )
+def microseconds(
+    alone: tuple[Times, Times], both: tuple[Times, Times], substeps: int, kept: int
+) -> tuple[float, ...]:
+    """Figures of a round, in the order of :data:`FIGURES`."""
+    longer = substeps - substeps // SHORTER
+    further, adjoint = (pair[0][which] - pair[1][which] for which, pair in ((0, alone), (1, both)))
+    whole = [time / substeps for time in (alone[0][0], *both[0])]
+    return whole[0], further / longer, *whole[1:], adjoint / longer, kept
+
+
+def in_turn(
+    models: list[softmpm.Model], substeps: int, repeats: int
+) -> tuple[list[list[tuple[float, ...]]], list[float]]:
+    """Of each model its figures in every round, and the cores that it used."""
+    alone = rounds(call, models, substeps, repeats)
+    both = rounds(call_with_gradient, models, substeps, repeats)
+    found, cores = [], []
+    for k, model in enumerate(models):
+        kept = model.sizes().inside + model.sizes().nodes
+        found.append([microseconds(a[k], b[k], substeps, kept) for a, b in zip(alone, both, strict=True)])
+        cores.append(statistics.median(a[k][0][1] for a in alone))
+    return found, cores
+
+
+def medians(rows: Iterable[tuple[float, ...]]) -> tuple[float, ...]:
+    return tuple(map(statistics.median, zip(*rows, strict=True)))
 
 
 def figures(
     scene: softmpm.Scene, formulation: str, worlds: int, substeps: int, args, contact: str = "auto"
 ) -> tuple[tuple[float, ...], float]:
     """In the order of :data:`FIGURES`, and the cores that were used."""
-    model = softmpm.build(
+    model = built(scene, formulation, worlds, args, contact)
+    found, cores = in_turn([model], substeps, args.repeats)
+    return medians(found[0]), cores[0]
+
+
+def built(scene: softmpm.Scene, formulation: str, worlds: int, args, contact: str = "auto") -> softmpm.Model:
+    return softmpm.build(
         scene,
         device=args.device,
         worlds=worlds,
@@ -133,20 +165,18 @@ def figures(
         contact=contact,
         memory_budget=2**62,
     )
-    alone = in_pairs(call, model, substeps, args.repeats)
-    both = in_pairs(call_with_gradient, model, substeps, args.repeats)
-    forward, cores = (statistics.median(long[which] for long, _ in alone) for which in range(2))
-    stored, backward = (statistics.median(long[which] for long, _ in both) for which in range(2))
-    sizes, whole = model.sizes(), [time / substeps for time in (forward, stored, backward)]
-    kept = sizes.inside + sizes.nodes
-    values = whole[0], one_more(alone, 0, substeps), *whole[1:], one_more(both, 1, substeps), kept
-    return values, cores
+
+
+def compared(one: softmpm.Model, other: softmpm.Model, substeps: int, repeats: int) -> tuple[float, ...]:
+    """Median quotients of the figures of two models in turn, the first over the second."""
+    found, _ = in_turn([one, other], substeps, repeats)
+    return medians(quotients(a, b) for a, b in zip(*found, strict=True))
 
 
 def main():
     args = arguments(__doc__, threads=True)
     device = torch.device(args.device)
-    table, alone = Table("Two formulations [us/substep], float32", device, args.json), ()
+    table = Table("Two formulations [us/substep], float32", device, args.json)
     runs = [("moving", args.threads[0]), *(("reference", count) for count in args.threads)]
     for name, dim, worlds, particles, scene in cases(device.type == "cpu"):
         if particles * worlds > (args.largest or particles * worlds):
@@ -170,14 +200,16 @@ def main():
         for (_, threads), values in zip(runs[2:], found[2:], strict=True):
             add("gain", threads, quotients(found[1], values))
         if name == "block":
-            alone = found[1]
+            alone = scene()
         elif name in BLOCKS:
-            add("with over without", runs[1][1], quotients(found[1], alone))
-        if name == "block on a floor":
             torch.set_num_threads(args.threads[0])
+            one, other = (built(each, "reference", worlds, args) for each in (scene(), alone))
+            add("with over without", args.threads[0], compared(one, other, substeps, args.repeats))
+        if name == "block on a floor":
             values, cores = figures(scene(), "moving", worlds, substeps, args, "surface")
             add("moving, surface", args.threads[0], values, cores)
-            add("surface over nodes", args.threads[0], quotients(values, found[0]))
+            one, other = (built(scene(), "moving", worlds, args, kind) for kind in ("surface", "nodes"))
+            add("surface over nodes", args.threads[0], compared(one, other, substeps, args.repeats))
 
 
 def quotients(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
