@@ -73,6 +73,14 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
                 out[i, j] = rows[dim * n + i, j]
         return out
 
+    @wp.func
+    def put(rows: block, n: int, A: mat) -> block:
+        new = rows
+        for i in range(dim):
+            for j in range(dim):
+                new[dim * n + i, j] = A[i, j]
+        return new
+
     return SimpleNamespace(
         Lattice=Lattice,
         block=block,
@@ -81,6 +89,7 @@ def layers(dim: int, dtype: str, bricks: Bricks) -> SimpleNamespace:
         Places=Places,
         places_of=places_of,
         taken=taken,
+        put=put,
     )
 
 
