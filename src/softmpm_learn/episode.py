@@ -111,8 +111,7 @@ def run_episode(
     period, times = task.control_period, times_of(task, model)
     made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
     for step in range(task.control_steps):
-        at = f"In control step {step} of {task.control_steps}, which began at {step * period:.4g} s."
-        with softmpm.noted(at):
+        with softmpm.noted(note_of(step, task)):
             observation = observer.observe(model, state)
             if keep_every and step % keep_every == 0:
                 observations.append(observation.detach())
@@ -168,6 +167,13 @@ def kicked(state: State, kicks: Tensor) -> State:
     v = state.v.clone()
     v[..., 0] += kicks[:, None]
     return state._replace(v=v)
+
+
+def note_of(step: int, task: Task) -> str:
+    """Note of the errors of a control step, for :func:`softmpm.noted`."""
+    return (
+        f"In control step {step} of {task.control_steps}, which began at {step * task.control_period:.4g} s."
+    )
 
 
 def times_of(task: Task, model: Model) -> Tensor:

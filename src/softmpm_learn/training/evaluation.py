@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 
 import softmpm
+from softmpm_learn.distributed import in_full
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 
@@ -112,7 +113,7 @@ def simulate(runs: Runs, of: Collection[int], starts: Sequence[float]) -> dict[i
         if k not in of:
             continue
         start = f", from a start with {kick:g} m/s" if times > 1 else ""
-        logger.warning("%s: the evaluation failed%s: %s", runs.all[k].now, start, error)
+        logger.warning("%s: the evaluation failed%s: %s", runs.all[k].now, start, in_full(error))
         found[0][0, k] = math.inf
     means = runs.group.average(found)  # infinite in every process if it is in one
     # of each start the mean over the goals, shape (group of starts, 2, run, start)

@@ -26,7 +26,8 @@ import torch
 
 import softmpm
 from softmpm import Failures, State
-from softmpm_learn.episode import Frame, kicked, run_episode
+from softmpm_learn.distributed import in_full
+from softmpm_learn.episode import Frame, kicked, note_of, run_episode
 from softmpm_learn.objective import Reach, Still, Tilt
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
@@ -132,8 +133,9 @@ def replayed(runs: Runs, task: Task, own: list[Path | None]) -> list[Path | None
     rows = torch.cat([torch.zeros_like(known) if path is None else path.activation for path in own], dim=1)
     states, failures = [model.rest()], Failures("reset")
     settings: dict[str, Any] = dict(substeps=task.substeps, inputs=inputs, failures=failures)
-    for row in rows:
-        states.append(softmpm.simulate(model, states[-1], row[None], params, **settings))
+    for step, row in enumerate(rows):
+        with softmpm.noted(note_of(step, task)):
+            states.append(softmpm.simulate(model, states[-1], row[None], params, **settings))
     times = [task.control_period * k for k in range(len(states))]
     return _each(runs, "finer", failures, Path(times, states, rows, runs.middle_goals()))
 
@@ -143,7 +145,7 @@ def _each(runs: Runs, name: str, failures: Failures, path: Path) -> list[Path | 
     failed = runs.failed(failures.errors)
     for k, error in failed.items():
         of = f" of {runs.all[k].name}" if runs.all[k].name else ""
-        logger.warning("Examination%s, %s: %s", of, name, error)
+        logger.warning("Examination%s, %s: %s", of, name, in_full(error))
     return [None if k in failed else _in_worlds(path, runs.worlds(k)) for k in range(len(runs.all))]
 
 

@@ -98,13 +98,14 @@ def test_a_failed_evaluation_is_no_best(reaching, model, drawn, tmp_path, monkey
     def fails(*args, failures, **kwargs):
         kind = dict(kind="inverted", world=0, particle=3, substep=1, value=-1.0, limit="det F > 0")
         if failures is not None:  # of the evaluation
-            failures.errors.append(softmpm.UnstableError("particle 3 is inverted.", **kind))
+            with softmpm.noted("In control step 1 of 2."):
+                failures.errors.append(softmpm.UnstableError("particle 3 is inverted.", **kind))
         return real(*args, **kwargs)
 
     monkeypatch.setattr(loops, "run_episode", fails)
     row = optimisation.optimise(Runs([run]), [], {})[0][0]
     assert math.isnan(row["evaluation"]) and run.best["iteration"] == -1
-    assert "the evaluation failed: particle 3 is inverted" in caplog.text
+    assert "the evaluation failed: particle 3 is inverted. In control step 1 of 2." in caplog.text
 
 
 def test_a_fixed_goal_needs_no_evaluation(reaching, model, drawn, tmp_path):
