@@ -78,8 +78,8 @@ def surface(spec: Spec) -> SimpleNamespace:
         u = row(at.u, u_of(at, s), world)
         anchor = at.anchor[now]
         middle = u[moving.middle]  # all of it loaded while the status is awaited
-        x = present(point, at_point(point, u))
-        v = at_point(point, row(at.free, world))
+        x = present(point, at_point(body, p, point, u))
+        v = at_point(body, p, point, row(at.free, world))
         dv = row(at.D, world)[p]
         per_force = at.rate[0] * point.newtons
         after = vecs()
@@ -185,7 +185,7 @@ def surface(spec: Spec) -> SimpleNamespace:
         """Check a state that no contact is computed of: the final one of a chunk, or the initial one of a call."""
         world, p = wp.tid()
         point = point_of(body, p)
-        x = present(point, at_point(point, row(u, world))) + shift[world]
+        x = present(point, at_point(body, p, point, row(u, world))) + shift[world]
         for q in range(count):
             if depth(inputs, world, number[q], later, x) > point.deepest:
                 report(words, world, substep, in_wall, q * body.points.shape[0] + p)

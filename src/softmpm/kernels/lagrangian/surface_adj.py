@@ -94,8 +94,9 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
     ):
         """(K7.adj), and (K4.adj), (K3.adj), (K6.adj) from the last wall to the first."""
         anchor = at.anchor[s]
-        x = present(point, at_point(point, row(at.u, s, world)))  # all of it loaded before anything is stored
-        v = at_point(point, row(at.free, world))
+        # All of it is loaded before anything is stored:
+        x = present(point, at_point(body, p, point, row(at.u, s, world)))
+        v = at_point(body, p, point, row(at.free, world))
         dv = row(at.D, world)[p]
         per_force = at.rate[0] * point.newtons
         i = world * bar.held + p
@@ -111,7 +112,7 @@ def surface_adj(spec: Spec, wanted: RequestedGrads) -> SimpleNamespace:
                 rubbed[q] = row(adj_inputs.friction, number[q])[i]
         wall = faces_of(constants, inputs, world, x + at.shift[s, world], anchored)
         adj_D = row(bar.D, world)[p]
-        adj_J = point.area * at_point(point, row(bar.shared, world))
+        adj_J = point.area * at_point(body, p, point, row(bar.shared, world))
         reached = vecs()
         for q in range(count):
             reached[q] = v

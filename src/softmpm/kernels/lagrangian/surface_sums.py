@@ -3,7 +3,7 @@
     x_s = X_s + shift + Σ w_si u_i,  v_s = Σ w_si v*_i                                               (K2)
 
 and sums of a field of the points at a node, in a fixed order; on a GPU the threads of a node share this work. What is the same in every
-substep is read into a struct, which a thread may keep.
+substep is read into a struct, which a thread of a GPU may keep; the CPU reads it where it is, entry by entry (rows.h).
 """
 
 from types import SimpleNamespace
@@ -29,6 +29,21 @@ TOGETHER = """
     return total;
 """
 
+ON_CPU = """
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
+    return true;
+#endif
+"""
+SUM_ON_CPU = """
+#if defined(__CUDA_ARCH__)
+    return {};
+#else
+    return softmpm::sum_of_entries(members, shares, first, last, values);
+#endif
+"""
+
 
 @kernel_factory
 def surface_type(dim: int, dtype: str):
@@ -45,7 +60,7 @@ def surface_type(dim: int, dtype: str):
         deepest: wp.array(dtype=t.real)
         stiffness: wp.array(dtype=t.real)  # in units of the heaviest particle's mass
         loads: wp.array(dtype=t.real)
-        # (node, point), so that neighbouring threads read neighbouring numbers:
+        # (node, point), so that neighbouring threads of a GPU read neighbouring numbers; on a CPU those of a point are neighbours:
         stencil: wp.array2d(dtype=wp.int32)
         weights: wp.array2d(dtype=t.real)
         nodes: wp.array(dtype=wp.int32)
@@ -89,9 +104,32 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
         out.deepest = body.deepest[p]
         return out
 
+    @wp.func_native(ON_CPU)
+    def on_cpu() -> bool: ...
+
+    @wp.func_native(SUM_ON_CPU)
+    def sum_on_cpu(
+        members: wp.array(dtype=wp.int32),
+        shares: wp.array(dtype=real),
+        first: int,
+        last: int,
+        values: wp.array(dtype=vec),
+    ) -> vec: ...
+
+    @wp.func_native(SUM_ON_CPU)
+    def sum_on_cpu(
+        members: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=real),
+        first: int,
+        last: int,
+        values: wp.array(dtype=vec),
+    ) -> vec: ...
+
     @wp.func
-    def at_point(point: Point, nodal: wp.array(dtype=vec)) -> vec:
+    def at_point(body: Surface, p: int, point: Point, nodal: wp.array(dtype=vec)) -> vec:
         """Σ w a of a nodal field of a world."""
+        if on_cpu():
+            return sum_on_cpu(body.stencil, body.weights, count * p, count * (p + 1), nodal)
         total = vec()
         for n in range(count):
             total += point.weights[n] * nodal[point.stencil[n]]
@@ -148,6 +186,8 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func
     def from_points(body: Surface, node: Touched, values: wp.array(dtype=vec)) -> vec:
         """Σ w a of a field of the surface points of a world, at a node that they act on, in a fixed order."""
+        if on_cpu():
+            return sum_on_cpu(body.members, body.shares, node.first, node.last, values)
         total = partly(node.entries, values)
         for m in range(node.first + BATCH * body.lanes, node.last, BATCH * body.lanes):
             total += partly(entries_of(body, m, node.last), values)
@@ -156,6 +196,8 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
     @wp.func
     def both_from_points(body: Surface, node: Touched, a: wp.array(dtype=vec), b: wp.array(dtype=vec)):
         """``from_points`` of two fields; entries are read once."""
+        if on_cpu():
+            return from_points(body, node, a), from_points(body, node, b)
         total_a = partly(node.entries, a)
         total_b = partly(node.entries, b)
         for m in range(node.first + BATCH * body.lanes, node.last, BATCH * body.lanes):

@@ -42,8 +42,10 @@ def _surface_struct(model: Model):
     struct.areas = view(areas.to(model.dtype), t.real)
     for name in ("loads", "shares"):
         setattr(struct, name, view(getattr(points, name).to(model.dtype), t.real))
-    struct.stencil = view(points.stencil.T.contiguous(), wp.int32)
-    struct.weights = view(points.weights.T.to(model.dtype).contiguous(), t.real)
+    stencil, weights = points.stencil.contiguous().T, points.weights.to(model.dtype).contiguous().T
+    if model.device.type == "cuda":
+        stencil, weights = stencil.contiguous(), weights.contiguous()
+    struct.stencil, struct.weights = view(stencil, wp.int32), view(weights, t.real)
     struct.width = model.contact_width * model.scene.grid.spacing
     struct.lanes = LANES if model.device.type == "cuda" else 1
     struct.stiffness = view(points.stiffness.to(model.dtype) / model.mass_unit, t.real)  # as the masses
