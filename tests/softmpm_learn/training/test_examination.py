@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -160,6 +161,17 @@ def test_a_robot_that_fails_does_so_once(run, task, monkeypatch):
     monkeypatch.setattr(examination, "Failures", Kept)
     assert motion(Runs([run]), task, "kicked", kick=1e6) == [None]
     assert [len(failures) for failures in collected] == [1] and task.control_steps > 1
+
+
+def test_a_replay_that_fails_names_its_control_step(run, task, caplog):
+    """Far too strong an activation, from the second step on."""
+    (path,) = motion(Runs([run]), task, "the episode itself")
+    strong = path.activation.clone()
+    strong[1:] = 1e6
+    with caplog.at_level("WARNING", logger="softmpm_learn"):
+        assert examination.replayed(Runs([run]), task, [SimpleNamespace(activation=strong)]) == [None]
+    [message] = caplog.messages
+    assert message.startswith("Examination, finer:") and "In control step 1 of " in message
 
 
 def test_a_run_ends_with_its_examination(task, model, settings, tmp_path):
