@@ -203,10 +203,11 @@ def lattice_cells_adj(spec: Spec, wanted: RequestedGrads, bricks: Bricks) -> Sim
                         rate_n = taken(rate, n)
                         adj = forced_adj(own, Hn, rate_n, Gn, world, p, adj_inputs)
                         check_adj(at.words, world, inside.order[p], at.length - 1 - s, adj)
-                        if wp.static(serial):  # in place; on a GPU with viscosity it took 15 registers more
+                        # (Q1.adj), on a CPU in place, which on a GPU with viscosity took 15 registers more:
+                        if wp.static(serial):
                             for i in range(dim):
                                 for j in range(dim):
-                                    A[dim * n + i, j] = adj.F[i, j]  # (Q1.adj)
+                                    A[dim * n + i, j] = adj.F[i, j]
                                     B[dim * n + i, j] = adj.rate[i, j]
                         else:
                             A = put(A, n, adj.F)

@@ -12,6 +12,7 @@ import warp as wp
 
 from softmpm.kernels.compile import kernel_factory
 from softmpm.kernels.lagrangian.frame import frame
+from softmpm.kernels.lagrangian.portions import ON_A_GPU
 from softmpm.kernels.lagrangian.rest import rest
 from softmpm.kernels.structs import types
 
@@ -29,20 +30,7 @@ TOGETHER = """
     return total;
 """
 
-ON_CPU = """
-#if defined(__CUDA_ARCH__)
-    return false;
-#else
-    return true;
-#endif
-"""
-SUM_ON_CPU = """
-#if defined(__CUDA_ARCH__)
-    return {};
-#else
-    return softmpm::sum_of_entries(members, shares, first, last, values);
-#endif
-"""
+SUM_ON_CPU = ON_A_GPU.format(gpu="{}", cpu="softmpm::sum_of_entries(members, shares, first, last, values)")
 
 
 @kernel_factory
@@ -104,7 +92,7 @@ def surface_sums(dim: int, dtype: str) -> SimpleNamespace:
         out.deepest = body.deepest[p]
         return out
 
-    @wp.func_native(ON_CPU)
+    @wp.func_native(ON_A_GPU.format(gpu="false", cpu="true"))
     def on_cpu() -> bool: ...
 
     @wp.func_native(SUM_ON_CPU)
