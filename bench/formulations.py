@@ -167,12 +167,6 @@ def built(scene: softmpm.Scene, formulation: str, worlds: int, args, contact: st
     )
 
 
-def compared(one: softmpm.Model, other: softmpm.Model, substeps: int, repeats: int) -> tuple[float, ...]:
-    """Median quotients of the figures of two models in turn, the first over the second."""
-    found, _ = in_turn([one, other], substeps, repeats)
-    return medians(quotients(a, b) for a, b in zip(*found, strict=True))
-
-
 def main():
     args = arguments(__doc__, threads=True)
     device = torch.device(args.device)
@@ -203,13 +197,14 @@ def main():
             alone = scene()
         elif name in BLOCKS:
             torch.set_num_threads(args.threads[0])
-            one, other = (built(each, "reference", worlds, args) for each in (scene(), alone))
-            add("with over without", args.threads[0], compared(one, other, substeps, args.repeats))
+            models = [built(each, "reference", worlds, args) for each in (scene(), alone)]
+            found, _ = in_turn(models, substeps, args.repeats)
+            add("with over without", args.threads[0], medians(map(quotients, *found)))
         if name == "block on a floor":
-            values, cores = figures(scene(), "moving", worlds, substeps, args, "surface")
-            add("moving, surface", args.threads[0], values, cores)
-            one, other = (built(scene(), "moving", worlds, args, kind) for kind in ("surface", "nodes"))
-            add("surface over nodes", args.threads[0], compared(one, other, substeps, args.repeats))
+            models = [built(scene(), "moving", worlds, args, kind) for kind in ("surface", "nodes")]
+            found, cores = in_turn(models, substeps, args.repeats)
+            add("moving, surface", args.threads[0], medians(found[0]), cores[0])
+            add("surface over nodes", args.threads[0], medians(map(quotients, *found)))
 
 
 def quotients(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
