@@ -44,10 +44,12 @@ def print_differences(jobs: dict[str, list[Row]], arm: bool) -> None:
 
 
 def main(name: str, seeds: str = "20"):
-    there = [
+    robots = [
         r for r in ("elephant", "biped", "arm") if Path(__file__).with_name(f"{name}.{r}.h200.csv").exists()
     ]
-    for robot in there:
+    if not robots:
+        raise SystemExit(f"there is no table {name}.ROBOT.h200.csv beside this script.")
+    for robot in robots:
         for first, jobs in sets_of(table(f"{name}.{robot}.h200.csv"), int(seeds)).items():
             print(f"{robot}, seeds from {first}")
             print_jobs(jobs, robot == "arm")

@@ -3,7 +3,7 @@
     python docs/results/random_robots.py draw FOLDER [SEED]      writes FOLDER/r00.npy to r11.npy, of the seed 2026 or another
     python docs/results/random_robots.py collect NAME FOLDER...  writes NAME, a row for each run in FOLDER/r00 to r11
     python docs/results/random_robots.py [NAME]                  prints the figures of NAME, random_robots.h200.csv
-    python docs/results/random_robots.py picture [NAME [SEED]]   draws docs/images/random_robots.png, or of another table its own
+    python docs/results/random_robots.py picture [NAME]          draws docs/images/random_robots.png, or of another table its own
 
 Voxels are drawn with the weights of Evolution Gym's sample_robot (0.6 for an empty one, 1 for each other kind) until the robot is
 connected and has an actuator.
@@ -21,6 +21,8 @@ from comparison import Row, lasts
 from settling import table
 
 NAME = "random_robots.h200.csv"
+SEEDS = {NAME: 2026, "random_robots_others.h200.csv": 2027}
+"""Seed with which the robots of a table were drawn."""
 WALKS = -0.03
 """Best evaluation of a robot that walks, a tenth of its length [m]."""
 KINDS = {
@@ -34,7 +36,7 @@ TRIALS = "random_robots_trials.h200.csv"
 """Lowest loss of an episode in shorter runs with other settings, a column for each seed."""
 
 
-def drawn(seed: int = 2026) -> Iterator[tuple[str, np.ndarray]]:
+def drawn(seed: int) -> Iterator[tuple[str, np.ndarray]]:
     """Names and voxels of the robots."""
     from scipy.ndimage import label
 
@@ -46,7 +48,7 @@ def drawn(seed: int = 2026) -> Iterator[tuple[str, np.ndarray]]:
         yield f"r{k:02d}", voxels
 
 
-def draw(folder: str, seed: str = "2026") -> None:
+def draw(folder: str, seed: str = str(SEEDS[NAME])) -> None:
     """Write the robots into a folder."""
     Path(folder).mkdir(parents=True, exist_ok=True)
     for robot, voxels in drawn(int(seed)):
@@ -133,7 +135,7 @@ def show(name: str = NAME) -> None:
         print(f"trial of {trial['robot']}, {trial['settings']}: {moved} of 8 move")
 
 
-def picture(name: str = NAME, seed: str = "2026") -> None:
+def picture(name: str = NAME) -> None:
     """Draw the robots with the best evaluations of their runs, of the largest strength."""
     import matplotlib
 
@@ -145,7 +147,7 @@ def picture(name: str = NAME, seed: str = "2026") -> None:
     runs = by_robot(name)[max(by_robot(name), key=float)]
     figure, axes = plt.subplots(2, 6, figsize=(11, 5.2), layout="constrained")
     figure.get_layout_engine().set(hspace=0.1)  # pyright: ignore
-    for axis, (robot, voxels) in zip(axes.flat, drawn(int(seed)), strict=True):
+    for axis, (robot, voxels) in zip(axes.flat, drawn(SEEDS[name]), strict=True):
         colours = ListedColormap(["white", *KINDS.values()])
         axis.imshow(voxels, cmap=colours, vmin=0, vmax=len(KINDS))
         rows, best = runs[robot], np.median([float(row["best"]) for row in runs[robot]])
