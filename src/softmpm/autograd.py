@@ -41,14 +41,14 @@ def simulate(
 ) -> State:
     """Advance a soft robot, differentiably.
 
-    Each row of ``activation`` drives ``substeps`` substeps of MLS-MPM (Hu et al. 2018, Eq. 29), in the reference formulation of total
-    Lagrangian MPM. Second derivatives raise.
+    Each row of ``activation`` drives ``substeps`` substeps: of MLS-MPM (Hu et al. 2018, Eq. 29) on the moving grid, of total Lagrangian
+    MPM in the reference formulation. Second derivatives raise.
 
     Args:
         model: The model of the scene, from :func:`softmpm.build`.
         start: State at the first substep. Differentiable, never modified.
-        activation: Muscle activation [-], shape (control_step, world, muscle); None is one control step without
-            activation. Differentiable.
+        activation: Activation of each muscle and pressure [-], shape (control_step, world, muscle); None is one control step without
+            activation. Any size, but ``build`` has judged dt by at most 1. Differentiable.
         params: Material of each particle: ``young`` [Pa], ``poisson`` [-], ``density`` [kg/m³], shapes that broadcast
             to (world, particle). Differentiable. Quantities derived from parameters that need no gradient are cached by tensor
             identity and version. In-place writes through ``.data``, NumPy or Warp are not detected; pass a new tensor instead.
@@ -64,8 +64,8 @@ def simulate(
         TypeError: ``model`` is not a :class:`softmpm.Model`, or ``failures`` no :class:`softmpm.Failures`.
         ValueError: An argument has a wrong shape, precision or device; names the rule and the value received.
         UnstableError: A particle became non-finite, collapsed or left the grid, numerical fracture occurred, dt is above the running
-            stable step, a surface point is deep in a wall, or bodies overlap although ``body_contact=False`` (:class:`softmpm.Alarms`);
-            names world, particle, substep and limit.
+            stable step, a surface point is deep in a wall, or bodies pass through each other in the reference formulation
+            (:class:`softmpm.Alarms`); names world, particle, substep and limit.
         torch.OutOfMemoryError: With a note of the estimated requirement. The backward pass may raise it and UnstableError as well.
     """
     return _simulate(model, start, activation, params, substeps, inputs, failures)
@@ -103,7 +103,7 @@ def _simulate(
     horizon = check_horizon(control_steps(activation, given), substeps)
     if not is_capturing(model):  # else nothing can be read back; NaN is reported by the kernels
         check_finite(start, activation)
-        check_inputs_bounds(given)
+        check_inputs_bounds(model, given)
     values = derive(model, start, activation, params, given, horizon)
     if model.formulation == "moving":
         if model.surface is not None:

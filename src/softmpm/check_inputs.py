@@ -4,12 +4,14 @@ Each message names the rule, the value received and a remedy.
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from softmpm.checks import ModelLike, check_tensor, demand, fields
 from softmpm.inputs import QUANTITIES, Inputs
+from softmpm.scene.check_scene import SAME
 from softmpm.validate import need
 
 
@@ -83,8 +85,8 @@ def _one_each(axes: tuple[str, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(n if axis in ("world", "dim") else 1 for axis, n in zip(axes, shape, strict=True))
 
 
-def check_inputs_bounds(given: dict[str, Tensor]) -> None:
-    """All inputs are finite and within their bounds. Reads back once: a GPU has to wait."""
+def check_inputs_bounds(model: ModelLike, given: dict[str, Tensor]) -> None:
+    """All inputs are finite and within their bounds. Reads back, so that a GPU has to wait."""
     if not given:
         return
     given = {name: value.detach() for name, value in given.items()}
@@ -100,3 +102,33 @@ def check_inputs_bounds(given: dict[str, Tensor]) -> None:
     for name in {"wall_normal", "direction"} & given.keys():
         length = given[name].norm(dim=-1)
         demand(f"the length of inputs.{name}", length, length > 0, "> 0")
+    for k in model.spec.mirrors:
+        _check_stays(model, given, k)
+
+
+def _check_stays(model: ModelLike, given: dict[str, Tensor], k: int) -> None:
+    """Clamps and planes of symmetry stay where the scene has them: wall ``k`` is one."""
+    wall = model.scene.walls[k]
+
+    def of_wall(name: str, axes: int, otherwise: Any) -> Tensor:
+        """Its part of an input with so many axes from that of the walls on."""
+        value = given.get(name)
+        if value is None:
+            return torch.tensor(otherwise, dtype=torch.float64)
+        return value.double().cpu().select(-axes, k if value.shape[-axes] > 1 else 0)
+
+    normal, velocity = of_wall("wall_normal", 2, wall.normal), of_wall("wall_velocity", 2, 0.0)
+    length = normal.norm(dim=-1)
+    offset = of_wall("wall_offset", 1, wall.offset) / length
+    turned = (normal / length[..., None] - torch.tensor(wall.normal, dtype=torch.float64)).abs().max()
+    moved = (offset - wall.offset).abs().max()
+    for name, apart, limit in (
+        ("wall_normal", turned, SAME),
+        ("wall_offset", moved, SAME * model.scene.grid.spacing),
+        ("wall_velocity", velocity.abs().max(), 0.0),
+    ):
+        need(
+            name not in given or bool(apart <= limit),
+            f"inputs.{name} must leave wall {k} where the scene has it, because it is a {wall.contact}, which stays where its body "
+            f"began; it differs by {apart:.3g}. Give that wall the scene's values, and move the end of a body by Scene.driven.",
+        )

@@ -27,10 +27,12 @@ class Inputs(NamedTuple):
     damping: Tensor | None = None
     """Rate at which grid velocity decays [1/s], shape (world,)."""
     friction: Tensor | None = None
-    """Coulomb coefficient of each wall [-], shape (world, wall)."""
+    """Coulomb coefficient of each wall [-], ≥ 0, shape (world, wall); read by ``separate`` walls only. With contact at nodes, those
+    that friction holds give it no gradient."""
     wall_offset: Tensor | None = None
     """Offset of each wall [m], shape (pose, world, wall), in float64. One pose is a wall at rest; else there is one at the beginning
-    and one at the end of every control step, and the wall moves between them at a constant speed."""
+    and one at the end of every control step, and the wall moves between them at a constant speed. Clamps and planes of symmetry stay
+    where the scene has them. With contact at nodes only the speed has a gradient: that of a wall at rest is zero."""
     wall_normal: Tensor | None = None
     """Normal of each wall, shape (pose, world, wall, dim), in float64; normalised together with the offset."""
     wall_velocity: Tensor | None = None
@@ -42,7 +44,8 @@ class Inputs(NamedTuple):
     viscosity: Tensor | None = None
     """Viscosity η of the material [Pa s], shape (world, particle)."""
     velocity: Tensor | None = None
-    """Velocity of the driven particles [m/s], shape (control_step, world, driven, dim)."""
+    """Velocity of the driven particles [m/s], shape (control_step, world, driven, dim); smoothed in the reference formulation, see
+    :attr:`Scene.driven`."""
     position: Tensor | None = None
     """Position of the driven particles at the end of each control step [m], shape (control_step, world, driven, dim); they move there
     at a constant velocity. In place of ``velocity``."""

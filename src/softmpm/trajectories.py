@@ -83,7 +83,7 @@ def trajectory(
     refuse_batches((*start.differentiable(), activation, *given.values()))
     if not is_capturing(model):  # before the first frame, by the rows of the whole trajectory
         check_finite(start, activation)
-        check_inputs_bounds(given)
+        check_inputs_bounds(model, given)
     given = _with_velocity(model, start, given, horizon)
     if activation is None and all(steps_of(name, value) is None for name, value in given.items()):
         activation = model.positions.new_zeros(steps, model.worlds, model.muscle_count)

@@ -240,7 +240,7 @@ def warp_solid(
         )
     if not is_capturing(model):
         check_finite(None, activation)
-        check_inputs_bounds(given)
+        check_inputs_bounds(model, given)
     return _warp_solid(model, derive(model, model.rest(), row, params, given, Horizon(1, 1)), requires_grad)
 
 

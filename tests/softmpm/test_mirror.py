@@ -284,6 +284,38 @@ def test_clamps_that_cannot_be_are_refused(wall, said):
         make()
 
 
+@pytest.mark.parametrize(
+    ("name", "changes"), [("wall_offset", 0.01), ("wall_normal", (0.0, 0.1)), ("wall_velocity", (0.0, 0.1))]
+)
+def test_walls_that_reflect_do_not_move(name, changes):
+    """In no pose: nothing would follow. The other walls may, and the scene's own pose may have any length of the normal."""
+    made = corner(2)
+    model = build(made, inputs=("wall_offset",))
+    offset = torch.tensor([wall.offset for wall in made.walls], dtype=torch.float64)
+    normal = torch.tensor([wall.normal for wall in made.walls], dtype=torch.float64)
+    values = {
+        "wall_offset": 2 * offset,
+        "wall_normal": 2 * normal,
+        "wall_velocity": torch.zeros(4, 2).to(model.dtype),
+    }
+    for wall, refused in ((0, True), (1, False)):
+        given = {key: value[None, None].repeat(2, *(1,) * (value.ndim + 1)) for key, value in values.items()}
+        given["wall_velocity"] = given["wall_velocity"][:1]
+        given[name][-1, 0, wall] += torch.tensor(changes, dtype=given[name].dtype)
+
+        def call(given=given):
+            inputs = softmpm.Inputs(**given)
+            softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, inputs=inputs)
+
+        if refused:
+            with pytest.raises(
+                ValueError, match=rf"inputs\.{name} must leave wall 0 .* a clamp, .* Scene\.driven"
+            ):
+                call()
+        else:
+            call()
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("away", [0.4, -0.4])
 def test_a_face_off_the_plane_is_refused(side, away):
