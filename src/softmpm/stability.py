@@ -68,7 +68,8 @@ def stable_dt(
         activation: Largest size of the activation [-], of either sign.
 
     Raises:
-        ValueError: The scene breaks a rule, the stretch is not positive, or a material is outside its bounds.
+        ValueError: The scene breaks a rule, a stretch is not positive or a deformation not finite or inverted beyond the law, or a
+            material is outside its bounds.
     """
     check_scene(scene)
     need(math.isfinite(activation), f"activation must be finite, got {activation}.")
@@ -177,15 +178,20 @@ def _deformations(scene: Scene, group: _Group, stretch: float | Tensor | np.ndar
         axes = axes or [(1.0,) + (0.0,) * (dim - 1)]
         columns = (torch.tensor(axis, dtype=torch.float64)[:, None] for axis in axes)
         return [torch.eye(dim, dtype=torch.float64) + (given - 1) * column @ column.T for column in columns]
-    if given.ndim == 2:
-        given = given.expand(len(group.particles), dim, dim)
-        return [given[:1]]
-    total = scene.particle_count
+    total, material = scene.particle_count, scene.bodies[group.body].material
     need(
-        given.shape == (total, dim, dim),
+        given.shape in ((dim, dim), (total, dim, dim)),
         f"stretch must be one number or have shape ({dim}, {dim}) or ({total}, {dim}, {dim}), got {tuple(given.shape)}.",
     )
-    return [given[torch.from_numpy(group.particles)]]
+    odd = given[~given.isfinite()]
+    need(not len(odd), f"stretch must be finite, got {odd[:1].tolist()}.")
+    F = given[None] if given.ndim == 2 else given[torch.from_numpy(group.particles)]
+    least = torch.linalg.det(F).min()
+    need(
+        material.survives_inversion or bool(least > 0),
+        f"stretch must have a positive determinant for {type(material).__name__}, which has no stress beyond, got {least:.4g}.",
+    )
+    return [F]
 
 
 def _limit(

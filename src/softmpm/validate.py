@@ -16,13 +16,23 @@ def need(condition: bool, message: str) -> None:
 
 def plain(value: Any) -> float:
     """One real number. NumPy would drop what is imaginary or masked, and Python would read texts."""
-    odd = isinstance(value, (str, bytes, bool, np.bool_, np.ma.MaskedArray)) or np.iscomplexobj(value)
-    if odd or np.ndim(value) != 0:
+    odd = isinstance(value, (str, bytes, bool, np.bool_, np.ma.MaskedArray)) or _has_gradient(value)
+    if odd or np.iscomplexobj(value) or np.ndim(value) != 0:
         raise TypeError
     try:
         return float(value)
     except OverflowError:
         return math.inf
+
+
+def _has_gradient(value: Any) -> bool:
+    return bool(getattr(value, "requires_grad", False))
+
+
+def _remedy(*values: Any) -> str:
+    """End of an error for tensors whose gradient a plain number would lose."""
+    lost = any(map(_has_gradient, values))
+    return "; its gradient would be lost: give it to the call, in its params or inputs" if lost else ""
 
 
 def numbers(name: str, values: Iterable[float]) -> tuple[float, ...]:
@@ -32,7 +42,8 @@ def numbers(name: str, values: Iterable[float]) -> tuple[float, ...]:
         numbers = tuple(plain(value) for value in values)
     except (TypeError, ValueError) as error:
         kind = "made of plain numbers" if isinstance(values, Iterable) else "a sequence of numbers"
-        raise TypeError(f"{name} must be {kind}, got {values!r}.") from error
+        given = values if isinstance(values, Sequence) else (values,)
+        raise TypeError(f"{name} must be {kind}, got {values!r}{_remedy(*given)}.") from error
     need(all(map(math.isfinite, numbers)), f"{name} must be finite, at most 1.8e308, got {numbers}.")
     return numbers
 
@@ -44,7 +55,7 @@ def store_numbers(owner: object, what: str, *names: str) -> None:
         try:
             number = plain(value)
         except (TypeError, ValueError) as error:
-            raise TypeError(f"{what} {name} must be one number, got {value!r}.") from error
+            raise TypeError(f"{what} {name} must be one number, got {value!r}{_remedy(value)}.") from error
         need(math.isfinite(number), f"{what} {name} must be finite, at most 1.8e308, got {number}.")
         object.__setattr__(owner, name, number)
 

@@ -131,6 +131,24 @@ def test_closed_form_of_a_viscous_particle(dim):
         assert limits[2] == pytest.approx(deformed, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("stretch", "said"),
+    [
+        (torch.eye(3), r"shape \(2, 2\) or \(4, 2, 2\), got \(3, 3\)"),
+        (torch.ones(3, 2, 2), r"shape \(2, 2\) or \(4, 2, 2\), got \(3, 2, 2\)"),
+        (torch.tensor([[1.0, math.nan], [0.0, 1.0]]), r"stretch must be finite, got \[nan\]"),
+        (torch.diag(torch.tensor([-1.0, 1.0])), "positive determinant for NeoHookean, .* got -1"),
+        (torch.zeros(4, 2, 2), "positive determinant for NeoHookean, .* got 0"),
+    ],
+)
+def test_deformations_without_a_limit_are_refused(stretch, said):
+    """A law that survives inversion has a limit there."""
+    with pytest.raises(ValueError, match=said):
+        stable_dt(scene(NeoHookean(density=RHO, young=100.0)), stretch=stretch)
+    if "determinant" in said and stretch.any():
+        assert stable_dt(scene(StableNeoHookean(density=RHO, young=100.0)), stretch=stretch) > 0
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_limit_under_pressure(dim):
     """Suction adds d p J to the stiffness, pressure of either sign counts as suction in stable_dt and has its sign in running_limit."""

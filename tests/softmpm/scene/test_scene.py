@@ -5,6 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
+import torch
 
 from softmpm.scene.actuators import Actuator, Muscle, Pressure
 from softmpm.scene.materials import FixedCorotated, Material, NeoHookean
@@ -247,3 +248,18 @@ def test_particles_of_a_scene_are_those_of_its_bodies_in_their_order():
     assert whole.positions[:, 1].tolist() == [
         part.positions[0, 0] for part in parts for _ in range(len(part))
     ]
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda value: NeoHookean(density=1.0, young=value), "material young"),
+        (lambda value: pressure(strength=value), "pressure strength"),
+        (lambda value: Muscle(particles=[0], direction=(1.0, value), strength=1.0), "muscle direction"),
+    ],
+)
+def test_a_tensor_that_would_lose_its_gradient_is_refused(make, name):
+    """A scene holds plain numbers; the error says where the gradient is."""
+    make(torch.tensor(2.0))
+    with pytest.raises(TypeError, match=f"{name} must be .*requires_grad.*in its params or inputs"):
+        make(torch.tensor(2.0, requires_grad=True))
