@@ -30,7 +30,7 @@ class MeshConf(OwnConf):
     up: str = "z"
     """Axis of the file that points up: z or y."""
     cells: int | None = 40  # pyright: ignore[reportIncompatibleVariableOverride, reportAssignmentType]
-    """Cells of the grid per metre; work grows with its fourth power."""
+    """Cells of the grid per metre, at least 20, or null for those of task.resolution; work grows with its fourth power."""
     seconds: float = 1.0
     """Length of an episode [s]."""
     slabs: int = 4

@@ -15,7 +15,7 @@ import numpy as np
 
 import softmpm
 from softmpm_learn.setting_checks import positive
-from softmpm_learn.tasks.task import Source, Task, material
+from softmpm_learn.tasks.task import Resolution, Source, Task, material
 from softmpm_learn.tasks.walker import WalkerConf, track, walker_task
 
 START = 0.2
@@ -46,10 +46,14 @@ class OwnConf(WalkerConf):
         super().__post_init__()
         if self.file:
             self.file = str(Path(self.file).absolute())
-        self.cells = self.cells_per_metre
         positive("task", self, "size", "cells")
-        if self.cells < 20:
+        if self.cells_per_metre < 20:
             raise ValueError(f"task.cells must be at least 20 per metre, got {self.cells}.")
+        if self.resolution is not Resolution.draft and self.cells_per_metre != self.resolution.value:
+            raise ValueError(
+                f"task.resolution={self.resolution.name} and task.cells={self.cells} both say how fine the grid is; leave out "
+                "task.resolution, or take task.cells=null."
+            )
 
     @property
     def cells_per_metre(self) -> int:
@@ -57,7 +61,7 @@ class OwnConf(WalkerConf):
 
     def refined(self) -> Self:
         """The same robot on a grid with half as many cells more."""
-        return dataclasses.replace(self, cells=math.ceil(1.5 / self.spacing))
+        return dataclasses.replace(self, cells=math.ceil(1.5 / self.spacing), resolution=Resolution.draft)
 
     def path(self, what: str) -> Path:
         """The file.

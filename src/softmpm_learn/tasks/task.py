@@ -58,7 +58,7 @@ class TaskConf:
     resolution: Resolution = Resolution.draft
     """Cells per metre: draft 80, standard 128, fine 192."""
     seconds: float = 1.0
-    """Length of an episode [s]."""
+    """Length of an episode [s], rounded to whole control periods."""
     control_period: float = 0.0125
     """Time between two decisions of the policy [s]."""
     law: str = "neo_hookean"

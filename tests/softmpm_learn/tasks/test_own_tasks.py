@@ -1,6 +1,7 @@
 """Robots from pictures, arrays of voxels and meshes: the right parts in the right places, one command to train, and errors by name."""
 
 import csv
+import dataclasses
 import json
 import logging
 import sys
@@ -156,6 +157,17 @@ def test_a_picture_is_a_robot(folder):
     assert len(np.concatenate(list(task.regions.values()))) == len(x)
     lowest = min(body.particles.outline.points[:, 1].min() for body in task.scene.bodies)
     assert lowest == pytest.approx(task.scene.walls[0].offset, abs=1e-9)
+
+
+def test_two_settings_of_the_grid_are_refused(folder):
+    """A mesh has cells of its own, and task.resolution would change nothing. A picture takes it, and has finer grids."""
+    with pytest.raises(
+        ValueError, match=r"task\.resolution=fine and task\.cells=40 both .* task\.cells=null"
+    ):
+        MeshConf(file="robot.stl", resolution=Resolution.fine)
+    assert MeshConf(file="robot.stl", resolution=Resolution.fine, cells=None).cells_per_metre == 192
+    conf = dataclasses.replace(ImageConf(file="robot.png"), resolution=Resolution.standard)
+    assert conf.cells_per_metre == 128 and conf.refined().cells_per_metre == 192
 
 
 @pytest.mark.parametrize("contact", ["surface", "nodes"])
