@@ -23,20 +23,21 @@ class Alarms:
     """Least det F [-] of a particle, checked in every substep. Bodies that recover stay above 0.1 (docs/limits.md); below 0.05
     fixed corotated bodies collapse for good. None leaves det F > 0 to the laws that are undefined beyond."""
     gap: float | None = 1.4
-    """Largest distance of two particles that are neighbours at rest [cells], checked after each chunk. Bodies that were stretched to
-    4/3 cells spring back, those at 3/2 do not: they break for numerical reasons alone (numerical fracture)."""
+    """Largest distance of two particles that are neighbours at rest [cells], checked after each chunk of the moving formulation. Bodies
+    that were stretched to 4/3 cells spring back, those at 3/2 do not: they break for numerical reasons alone (numerical fracture). In
+    the reference formulation nothing breaks."""
     step: float | None = 1.0
     """Largest ratio of dt and the stable step of a particle alone on the grid with its present deformation, material and activation
     [-], checked at the start of a call and after each chunk, in the reference formulation at every eighth substep of a chunk as well.
-    Particles that share nodes bear 1.1 to 1.6 of it."""
+    Particles that share nodes bear 1.1 to 1.6 of it. ``build`` refuses a dt above this ratio at rest."""
     depth: float | None = 1.0
     """Largest depth of a surface point under a separating wall, over the way of a pressure wave of the scene's material in a substep
     [-], checked in every substep. Contact pushes a point out within one substep, beyond 1 faster than sound. Impacts at half of the
     wave speed reach 0.3 (docs/math/contact.md)."""
     overlap: float | None = 1.0
-    """Size of the volume around each particle in which no other may be that is more than three cells away from it at rest, over its own
-    volume along each axis [-]; checked after each chunk in the reference formulation, in which bodies pass through themselves and each
-    other. With 1 two flat faces may overlap by half the distance of the particles (docs/limits.md)."""
+    """Particles more than three cells apart at rest must stay out of each other's volume: width of that volume, in units of the
+    particle's own [-]. Checked after each chunk in the reference formulation, in which bodies pass through themselves and each other.
+    With 1 two flat faces may overlap by half the distance of the particles (docs/limits.md)."""
 
     def __post_init__(self):
         for field in fields(self):

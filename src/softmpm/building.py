@@ -62,14 +62,17 @@ def build(
             docs/performance.md.
         formulation: "moving": material point method, whose grid is reset in each substep. "reference": total Lagrangian, with weights
             taken once at rest; see docs/formulations.md. "auto": the reference formulation if the scene states ``body_contact=False``
-            and leaves ``scheme`` out; ``describe`` gives the reason.
+            and ``scheme`` is left at "auto"; ``describe`` gives the reason.
         contact: Part of the bodies that meets the separating walls: "nodes", "surface" (the points of the outlines,
-            :class:`softmpm.Outline`), or "auto": the surface if every body has an outline.
-        contact_width: Distance over which surface contact sets in [cells]: 0 to evaluate, 0.01 to learn, so that gradients are smooth.
+            :class:`softmpm.Outline`), or "auto": the surface if every body has an outline and a wall separates.
+        contact_width: Distance over which surface contact sets in [cells], in [0, 1): 0 to evaluate, 0.01 to learn, so that gradients
+            are smooth. Only with contact at the surface.
         inputs: Names of fields of :class:`softmpm.Inputs` that calls will give, such as ("friction", "gravity"): the kernels then read
             them from memory, for each world. Others are compiled as the scene has them, or left out.
         deterministic: The same bits from run to run, results and gradients, on one kind of GPU; slower, and in the plain scheme
-            and ``step`` much slower: float32 and the fast scheme are best. The CPU adds in one order anyway. See docs/conventions.md.
+            and ``step`` much slower: float32 and the fast scheme are best. The CPU adds in one order anyway. With contact at the
+            surface the moving formulation takes the plain scheme on a CPU and raises on a GPU; the reference formulation does not. See
+            docs/conventions.md.
         calls: Number of calls of ``simulate`` in one backward pass, the control steps of a closed loop, which share the budget. More
             calls than stated exceed it. With eight or more, the first iterations of small scenes on a GPU are faster.
         threads: CPU threads that share a simulation; None takes those of PyTorch (``torch.get_num_threads()``) at each call. Results

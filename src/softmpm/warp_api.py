@@ -38,6 +38,9 @@ def step(
 ) -> None:
     """Advance by one substep of ``model.scene.dt``, a control step of its own, on PyTorch's current stream.
 
+    A failure raises nothing here: its world stays as it is from then on. ``solid.raise_failure(model, state_out)`` raises it; it waits
+    for the device, so call it once in a while, and checks what a step does not: broken bodies and the stable step.
+
     Args:
         state_in, state_out: From :func:`warp_state`; two different ones. With a tape both need ``requires_grad=True``,
             and neither may be written again before ``tape.backward()``.

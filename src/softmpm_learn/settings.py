@@ -36,7 +36,8 @@ class ObserverConf:
     """latent: most nodes of the picture along its longest axis, coarser than the grid by averaging; null: 32 in 2D, 16 in 3D, twice as
     many with follow=False."""
     follow: bool = True
-    """latent: the velocity image is a window around the robot, the same on any track; False shows the whole grid unchanged."""
+    """latent: the velocity image is a window around the robot, the same on any track; False shows the whole grid, averaged over
+    blocks of nodes (``nodes``)."""
     posture: bool = False
     """latent: the picture shows the displacement from rest beside the velocity, so that the policy knows the robot's posture."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -72,7 +73,8 @@ class PolicyConf:
     knots: int = 16
     """knots: values of each muscle along the episode, joined by straight lines."""
     gain: float | None = None
-    """Size of the first random weights, in units of 1/√(inputs); 0 starts at rest. null is the task's: walkers 3, the arm 0.3."""
+    """Size of the initial random weights of the last layer, in units of 1/√(its inputs), and of the values of knots; 0 starts at rest.
+    null is the task's: walkers 3, the arm 0.3."""
     feature_gain: float | None = None
     """Size of the first random weights of linear and mlp that take the features, in units of those that take the clock; without a clock
     it is 1. null is the task's for features of an encoder (latent, untrained), walkers 0.3 and the arm 1, and 1 for others."""
@@ -169,8 +171,8 @@ class LearningConf:
     validation: float = 0.2
     """Share of the iterations that are held out for validation, at most a quarter; their neighbours are used for neither."""
     replay: bool = True
-    """Refinement 2: learn from many past simulations; False learns from those since the last learning phase. Of fewer iterations than a
-    cycle of the split, of 1/``validation``, none may be for training, and such a phase is left out."""
+    """Refinement 2: learn from many past simulations. With False a phase sees ``every`` iterations; where these are fewer than
+    1/``validation``, all of them may be held out or beside one that is, and the phase is left out."""
     simulations: int = 50
     """Most simulations in the replay buffer; the oldest go first. Of many worlds it takes a share of this in each iteration."""
     megabytes: float = 256.0
@@ -213,7 +215,7 @@ class TrainConf:
     """Sweeps: most jobs that learn side by side in one simulation. They have the task in common and may differ in observer, policy,
     design, learning, optimiser and seed."""
     worlds: int = 1
-    """Simulations side by side in each step, of all processes together; useful with random goals. Of each seed as many."""
+    """Simulations side by side in each step, of all processes together; useful with random goals. Each of several seeds has so many."""
     goal_spread: list[float] = field(default_factory=list)
     """Half widths [m] of the box around the task's goal from which each simulation draws its own; empty: fixed goal."""
     evaluate_every: int = 5
@@ -232,7 +234,8 @@ class TrainConf:
     frame_every: int = 1
     """Control steps between two recorded frames."""
     examine: bool = True
-    """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid."""
+    """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid. False also
+    leaves out the last evaluations of the best, from other starts, after which a settled run may end with its next best instead."""
     pictures: bool = True
     """Draw loss.png, latent.png and robot.png at the end, the first and the last while the run goes on too. At the end they take about
     a second for each seed."""

@@ -69,7 +69,8 @@ def show(
             muscles, or the bodies if there are none.
         activation: Activation [-], shape (muscle,) or (world, muscle).
         world: The world to draw, or several, side by side.
-        limits: Ends of the colour scale; None takes those of the values.
+        limits: Ends of the colour scale. None: -1 and 1 for the activation, 0 and the largest value for speed and strain, the lowest
+            and the highest of an array.
         label: Of the colour bar, for an array of one's own.
         axes: matplotlib axes to draw into, or one for each world, in place of a figure of its own.
 

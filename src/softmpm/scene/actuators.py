@@ -24,7 +24,7 @@ class Actuator:
     indices that are read-only: ``params.young[..., torch.tensor(muscle.particles)]``."""
     strength: float
     """Stress at full activation, s [Pa]. Good values: activation times strength below a quarter of Young's modulus; stronger ones
-    stretch a body until it fractures (docs/results.md, Lessons). Differentiable."""
+    stretch a body until it fractures (docs/results.md, Lessons). Differentiable as ``Inputs.strength``."""
     name: str = ""
     """Label in pictures, recordings and messages, such as "left hind leg, front": at most 64 characters. It changes no number. Several
     actuators may have the same; one without is "muscle 3" or "pressure 3", by its place in the scene, counted from 0."""
@@ -57,7 +57,7 @@ class Muscle(Actuator):
     """
 
     direction: Sequence[float]
-    """Fibre direction d in the rest shape; normalised here. Differentiable."""
+    """Fibre direction d in the rest shape; normalised here. Differentiable as ``Inputs.direction``."""
 
     def __post_init__(self):
         Actuator.__post_init__(self)  # super() does not know a class with slots

@@ -17,15 +17,15 @@ class Material:
     """True if the stress is defined where det F ≤ 0."""
 
     density: float
-    """Rest density ρ₀ [kg/m³]. Differentiable."""
+    """Rest density ρ₀ [kg/m³]. Differentiable as ``params.density`` of a call."""
     young: float
-    """Young's modulus E [Pa]. Differentiable."""
+    """Young's modulus E [Pa]. Differentiable as ``params.young``."""
     poisson: float = 0.3
-    """Poisson's ratio ν [-], in (-1, 0.5). Differentiable."""
+    """Poisson's ratio ν [-], in (-1, 0.5). Differentiable as ``params.poisson``."""
     viscosity: float = 0.0
     """Viscosity η [Pa s]: the second Piola-Kirchhoff stress 2η times the rate of the Green strain is added. Good values:
     η = ζ L √(ρ₀ E) / π damps the slowest stretching oscillation of a free body of length L with a damping ratio of about ζ.
-    Large values need a small step, see :func:`softmpm.stable_dt`. Differentiable."""
+    Large values need a small step, see :func:`softmpm.stable_dt`. Differentiable as ``Inputs.viscosity``."""
 
     def __post_init__(self):
         need(

@@ -60,7 +60,7 @@ class Particles:
     volume: np.ndarray | float
     """Rest volume of each particle V⁰ [m³], in 2D [m²] of unit depth; one number or shape (particle,); copied, read-only."""
     outline: Outline | None = None
-    """The true surface of the shape; None if it is not known."""
+    """The true surface of the shape; None if it is not known, and then walls meet all bodies of the scene at the nodes."""
 
     def __post_init__(self):
         positions = np.array(array("positions", self.positions), dtype=np.float64, ndmin=2)
@@ -134,14 +134,17 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Wall:
-    """Half space n·x ≤ offset that a body cannot enter; acts on the nodes inside it.
+    """Half space n·x ≤ offset that a body cannot enter.
 
-    ``stick`` holds the nodes, ``slip`` removes the normal velocity, ``separate`` only stops motion into the
-    wall and applies Coulomb friction to the rest.
+    ``separate`` stops motion into the wall, with Coulomb friction. It acts on the points of the outlines if every body has one, as the
+    shapes do, else on the grid's nodes inside it (``contact`` of :func:`softmpm.build`). Nodes keep a body up to half a cell away, and
+    do not push out one that begins inside the wall.
+
+    ``stick`` holds the nodes inside it, and ``slip`` removes their normal velocity.
 
     ``clamp`` holds the face with which a body begins at the wall's plane, and ``symmetry`` leaves it free to slide in that plane: both
     reflect the body's motion there, and converge with spacing² where ``stick`` and ``slip`` converge with the spacing. They need
-    ``formulation="reference"``, and a plane along the grid's axes that lies on nodes or midway between them.
+    ``formulation="reference"``, and a plane along the grid's axes that lies on nodes or midway between them. They never move.
     """
 
     normal: Sequence[float]
@@ -182,13 +185,14 @@ class Scene:
     walls: Sequence[Wall] = ()
     """Applied in this order; at most 64."""
     driven: Sequence[int] | np.ndarray = ()
-    """Particles whose velocity a call gives, in the order of ``Inputs.velocity``; without Inputs.velocity they stand still (a clamp).
-    Indices into the model's particles, in any order; copied, read-only."""
+    """Particles that move as ``Inputs.velocity`` says, in its order, and stand still without it (a clamp). On the moving grid each has
+    its velocity; in the reference formulation they hold the nodes around them, which smooths velocities that are not those of a rigid
+    motion (docs/inputs.md). Indices into the model's particles, in any order; copied, read-only."""
     gravity: Sequence[float] | None = None
     """Gravity g [m/s²], one number per axis, such as (0.0, -9.8) in 2D, where axis 1 points up; None is weightless."""
     body_contact: bool = True
     """Bodies may touch themselves or each other. False states that they meet walls only, which allows ``formulation="auto"`` of
-    ``build`` to take the reference formulation, where they would pass through each other; nothing checks the statement."""
+    ``build`` to take the reference formulation. There they pass through each other, until the alarm ``overlap`` stops the run."""
     damping: float = 0.0
     """Rate at which grid velocity decays [1/s]; the same for every dt. 0 for free motion; an arm that should come to rest takes 6."""
     dt: float

@@ -21,9 +21,10 @@ class SoftRobotEnv(gymnasium.Env):
     """A task in one world.
 
     An action is the activation of each muscle, clipped to [-1, 1]: 1 contracts with the full strength, as where a policy of
-    :mod:`softmpm_learn.policy` ends. An observation has the observer's features, in no fixed range. The reward is defined in
-    :mod:`softmpm_learn.gym.worlds`. An episode is truncated after ``task.control_steps`` steps and terminated if the simulation
-    fails; the last ``info`` has the ``loss`` of the episode and after a failure its kind as ``failure`` and its ``message``.
+    :mod:`softmpm_learn.policy` ends. An observation has the observer's features, in no fixed range, and where goals are drawn at random
+    the goal, from -1 to 1 across its box; not the time. :attr:`EnvConf.reward` says what the reward is. An episode is truncated after
+    ``task.control_steps`` steps and terminated if the simulation fails; the last ``info`` has the ``loss`` of the episode and after a
+    failure its kind as ``failure`` and its ``message``.
 
     Args:
         task: What to simulate, from :func:`softmpm_learn.tasks.make_task`.

@@ -1,7 +1,8 @@
 """Episodes of a task in the worlds of one model, each with a clock of its own: reset, step, observation and reward.
 
-The reward of a control step is minus what it adds to the loss (rewards.py). A world that fails ends its episode and is charged as if it
-stood still in its last posture until the horizon, without velocity and activation: a bad posture is paid for, later effort is not.
+The reward of a control step is minus what it adds to the objective, with or without its windows of time (rewards.py). A world that
+fails ends its episode and is charged as if it stood still in its last posture until the horizon, without velocity and activation: a bad
+posture is paid for, later effort is not.
 """
 
 import math
@@ -31,7 +32,8 @@ class EnvConf:
     observer: Callable[[Task, Model], Observer] | None = None
     """Builds the observer; None takes the centroids of the task's regions."""
     reward: Literal["dense", "objective"] = "dense"
-    """Kind of reward, see rewards.py."""
+    """dense: the objective without its windows of time, so that every step counts. objective: as the learner counts it, the sum over an
+    episode being minus the loss, but for what the first state adds. ``info["loss"]`` is the learner's loss in both."""
     kick: float = 0.0
     """Standard deviation of each component of the robot's velocity when an episode begins [m/s]; 0 starts at rest."""
     goal_spread: Sequence[float] = ()
