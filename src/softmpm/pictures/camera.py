@@ -41,17 +41,27 @@ class Camera:
         return points + distance * way / np.linalg.norm(way, axis=-1, keepdims=True)
 
     def shading(self, place: Surroundings, positions: np.ndarray) -> np.ndarray:
-        """Brightness of each particle (particle,): Lambert's law, with the normal from the centre of its neighbours to it."""
-        outward = positions - positions[place.neighbours].mean(1)
-        length = np.linalg.norm(outward, axis=-1)
-        cosine = outward @ self._light / np.maximum(length, 1e-12)
+        """Brightness of each particle (particle,): Lambert's law."""
+        cosine = _outward(place, positions) @ self._light
         return AMBIENT + (1.0 - AMBIENT) * np.clip(cosine, 0.0, 1.0)
+
+    @np.errstate(invalid="ignore")
+    def sees(self, place: Surroundings, positions: np.ndarray) -> np.ndarray:
+        """True for particles at faces that are turned to the camera, shape (particle,)."""
+        return (_outward(place, positions) * (self.position - positions)).sum(-1) > 0.0
 
     def frame(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the picture that contains a box."""
         corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
         places, _ = self.project(corners)
         return places.min(0), places.max(0)
+
+
+@np.errstate(invalid="ignore")  # the difference of two infinite positions is no number
+def _outward(place: Surroundings, positions: np.ndarray) -> np.ndarray:
+    """Unit vector from the centre of the neighbours of each particle to it, the normal of the surface there, shape (particle, dim)."""
+    outward = positions - positions[place.neighbours].mean(1)
+    return outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-12)
 
 
 def tiles(outline: np.ndarray, gap: float) -> np.ndarray:

@@ -16,6 +16,9 @@ POINT_RADIUS = 0.07
 """Of a surface point [cells]."""
 RAISED = 8.0
 """Height of the reference arrow above a panel [point]."""
+BEFORE = 4.0
+"""Distance of strokes from their particles towards the camera, in radii of these: at a face seen at a low angle, neighbours are nearer
+to the camera than a particle by 2 to 3."""
 
 
 class Panel:
@@ -87,8 +90,9 @@ class Panel:
     ) -> tuple[np.ndarray, ...]:
         """Particles, and after them the dots of the fibres' strokes: positions, radii, colours and dark edges."""
         dots = strokes.dots(x)
-        if self._camera is not None:  # in front of the particles that they belong to
-            dots = self._camera.nearer(dots, 1.5 * radii[strokes.particle, None, None])
+        if self._camera is not None:  # in front of the particles around them, on the faces that it sees
+            dots = self._camera.nearer(dots, BEFORE * radii[strokes.particle, None, None])
+            dots[~self._camera.sees(self._place, x)[strokes.particle]] = np.nan
         over = np.repeat(stroke_colours(rgb[strokes.particle]), dots.shape[1], axis=0)
         return (
             np.concatenate([x, dots.reshape(-1, self._place.dim)]),

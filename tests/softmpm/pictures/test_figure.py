@@ -7,16 +7,18 @@ import sys
 import numpy as np
 import pytest
 import torch
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.quiver import Quiver
 from PIL import Image
 
 import softmpm
+from softmpm.pictures.camera import Camera
 from softmpm.pictures.colouring import CATEGORIES, NAMED, PASSIVE, categories, of_names
 from softmpm.pictures.panel import _pascal
 from softmpm.recording import style
-from softmpm.recording.surroundings import of_recording
+from softmpm.recording.surroundings import of_recording, of_scene
 
 RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
 FLOOR, SIDE = 0.1, 0.15
@@ -328,6 +330,28 @@ def test_a_solid_scene_is_drawn_in_perspective():
     upper = rows < np.median(rows)
     assert bright[upper].mean() > 1.1 * bright[~upper].mean()
     assert "0.1 m" in figure.axes[0].get_xlabel()
+
+
+@pytest.mark.parametrize("height", [0.05, 0.1])
+def test_strokes_are_whole_and_on_the_faces_in_view(height):
+    """No particle covers the middle of a dot, on a plate of two or four layers, and none belongs to a face that is turned away."""
+    body = softmpm.box((0.2, 0.2, 0.2), (0.6, 0.2 + height, 0.5), spacing=0.025)
+    muscle = softmpm.Muscle(particles=np.arange(len(body)), direction=(1.0, 0.0, 0.0), strength=1.0)
+    scene = scene_of(3, bodies=[softmpm.Body(body, RUBBER)], walls=[], muscles=[muscle])
+    axes = softmpm.show(scene).axes[0]
+    (drawn,) = (one for one in axes.collections if isinstance(one, EllipseCollection))
+    places, radii = np.asarray(drawn.get_offsets()), np.asarray(drawn.get_widths()) / 2
+    strokes = np.flatnonzero(radii < 0.5 * radii.max())
+    assert len(strokes) > 300
+    for k in strokes:
+        later = np.setdiff1d(np.arange(k + 1, len(places)), strokes)
+        assert (np.linalg.norm(places[later] - places[k], axis=1) > radii[later]).all()
+    place = of_scene(scene)
+    camera = Camera(*place.window(place.rest), place.up)
+    bottom = place.rest[:, 1] < 0.2 + 0.02
+    inner = (np.abs(place.rest[:, [0, 2]] - (0.4, 0.35)) < (0.15, 0.1)).all(1)
+    assert not camera.sees(place, place.rest)[bottom & inner].any()
+    assert camera.sees(place, place.rest)[(place.rest[:, 1] > 0.18 + height) & inner].all()
 
 
 def test_particles_that_are_not_finite_are_left_out(model):
