@@ -59,7 +59,7 @@ def collect(name: str, *folders: str) -> None:
     """Write a table with a row for each seed of the runs in some folders."""
     rows = []
     for folder in map(Path, folders):
-        for run in sorted(folder.glob("r*/sweep.csv")):
+        for run in sorted(folder.glob("[rp][0-9][0-9]/sweep.csv")):
             task = yaml.safe_load((run.parent / "config.yaml").read_text())["task"]
             with open(run, newline="") as file:
                 for row in csv.DictReader(file):

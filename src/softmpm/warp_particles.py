@@ -40,7 +40,8 @@ class WarpState:
     fx_low: wp.array | None = None
     """Part of ``fx`` that rounding removed (float32 only)."""
     anchor: wp.array | None = None
-    """Places on the walls where surface points adhere [m], vectors of shape (world, wall, point); with contact at them only."""
+    """Places on the walls where surface points adhere [m], vectors of shape (world, wall, point); with contact at them only. Their
+    gradient is theirs alone, where :func:`softmpm.simulate` adds it to that of x for a state whose anchors follow from x."""
     force: wp.array | None = None
     """Mean force of each wall on each surface point in the latest step [N], vectors of shape (world, wall, point). Not read by a
     step."""

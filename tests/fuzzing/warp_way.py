@@ -157,8 +157,11 @@ def _compared(plan: Plan, call: Call, given: Stepping) -> Verdict:
         softmpm.step(model, states[k], states[k + 1], given.solid, substep=k, tape=tape)
     activation = None if call.activation is None else call.activation[None]
     leaves = [t.detach().clone().requires_grad_() for t in call.state[:4]]
+    # The anchors of surface points are of their own there; a state without them has those that follow from x.
+    surface = softmpm.torch_state(model, states[0]).surface
+    start = softmpm.State(*leaves, surface=None if surface is None else surface.detach())
     try:
-        end = softmpm.simulate(model, softmpm.State(*leaves), activation, call.params, substeps=count)
+        end = softmpm.simulate(model, start, activation, call.params, substeps=count)
     except softmpm.UnstableError as error:
         if error.kind in ("torn", "step"):
             raise  # found between chunks, which steps have not
