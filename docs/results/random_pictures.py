@@ -15,6 +15,8 @@ from PIL import Image, ImageDraw
 from random_robots import by_robot, walking
 
 NAME, SEED = "random_pictures.h200.csv", 2028
+DEFAULT = "6000"
+"""Strength of the muscles of a picture, of the two in the table [Pa]."""
 WIDTH = 300
 """Pixels along the trunk, one for each millimetre."""
 COLOURS = ("#ff0000", "#00c000", "#0000ff", "#ffff00", "#00ffff", "#ff00ff", "#ff8000", "#8000ff")
@@ -55,7 +57,7 @@ def picture(name: str = NAME) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    runs = by_robot(name)[max(by_robot(name), key=float)]
+    runs = by_robot(name)[DEFAULT]
     figure, axes = plt.subplots(3, 4, figsize=(11, 7), layout="constrained")
     for axis, (robot, drawing) in zip(axes.flat, drawn(SEED), strict=True):
         axis.imshow(np.asarray(drawing))

@@ -101,8 +101,8 @@ def by_robot(name: str) -> dict[str, dict[str, list[Row]]]:
 
 
 def walking(rows: list[Row]) -> list[Row]:
-    """Those of some runs that walk."""
-    return [row for row in rows if float(row["best"]) < WALKS]
+    """Those of some runs that walk; one that failed has no best."""
+    return [row for row in rows if row["best"] and float(row["best"]) < WALKS]
 
 
 def show(name: str = NAME) -> None:
@@ -126,7 +126,7 @@ def show(name: str = NAME) -> None:
             torn = len(walk) - len(values)
             print(f"  {column}: median {median:.2f}, tenths {low:.2f} and {high:.2f}, {torn} torn")
         for robot, rows in robots.items():
-            best = [float(row["best"]) for row in rows]
+            best = [float(row["best"]) for row in rows if row["best"]]
             found = f"{len(walking(rows))} of {len(rows)} walk, {sum(map(lasts, walking(rows)))} last"
             print(f"  {robot}: {found}, best {np.median(best):.2f} ({min(best):.2f} to {max(best):.2f})")
 
