@@ -6,6 +6,7 @@
 A trunk 0.3 m long and a quarter to two fifths as high, on two to four legs below it, each of one muscle or of two side by side.
 """
 
+import itertools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +38,7 @@ def drawn(seed: int) -> Iterator[tuple[str, Image.Image]]:
         for left in 10 + lefts.astype(int):
             parts = int(rng.integers(1, 3))
             edges = np.linspace(left, left + width, parts + 1).astype(int)
-            for begin, end in zip(edges[:-1], edges[1:], strict=True):
+            for begin, end in itertools.pairwise(edges):
                 pen.rectangle((begin, below - 10, end - 1, below + leg - 1), fill=next(colours))
         pen.rounded_rectangle((10, 10, 9 + WIDTH, below - 1), radius=20, fill=TRUNK)
         yield f"p{k:02d}", picture
