@@ -119,7 +119,7 @@ def _check_stays(model: ModelLike, given: dict[str, Tensor], k: int) -> None:
 
     normal, velocity = of_wall("wall_normal", 2, wall.normal), of_wall("wall_velocity", 2, 0.0)
     length = normal.norm(dim=-1)
-    offset = of_wall("wall_offset", 1, wall.offset) / length
+    offset = of_wall("wall_offset", 1, wall.offset) / (length if "wall_offset" in given else 1.0)
     turned = (normal / length[..., None] - torch.tensor(wall.normal, dtype=torch.float64)).abs().max()
     moved = (offset - wall.offset).abs().max()
     for name, apart, limit in (

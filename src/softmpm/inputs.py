@@ -34,7 +34,7 @@ class Inputs(NamedTuple):
     and one at the end of every control step, and the wall moves between them at a constant speed. Clamps and planes of symmetry stay
     where the scene has them. With contact at nodes only the speed has a gradient: that of a wall at rest is zero."""
     wall_normal: Tensor | None = None
-    """Normal of each wall, shape (pose, world, wall, dim), in float64; normalised together with the offset."""
+    """Normal of each wall, shape (pose, world, wall, dim), in float64; normalised together with the offset, if that is given too."""
     wall_velocity: Tensor | None = None
     """Velocity of the surface of each wall [m/s], shape (control_step, world, wall, dim), beyond that of its pose: a conveyor belt."""
     direction: Tensor | None = None

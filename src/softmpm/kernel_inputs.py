@@ -47,7 +47,10 @@ def derive(
     if model.driven_grid is not None:
         found["driven_velocity"] = of_nodes(model, found["velocity"])
     if model.spec.moving:
-        found |= _poses(model, full["wall_offset"], full["wall_normal"], horizon)
+        length = full["wall_normal"].norm(dim=-1)
+        normal, offset = full["wall_normal"] / length[..., None], full["wall_offset"]
+        offset = offset / length if "wall_offset" in given else offset  # the scene's is of a unit normal
+        found |= _poses(model, offset, normal, horizon)
     return {name: found[name] for name in model.derived}
 
 
@@ -80,9 +83,7 @@ def _active_stress(
 
 
 def _poses(model: Model, offset: Tensor, normal: Tensor, horizon: Horizon) -> Values:
-    """Pose of the walls at the beginning of each control step, and its rate of change (C4)."""
-    length = normal.norm(dim=-1)
-    offset, normal = offset / length, normal / length[..., None]
+    """Pose of the walls at the beginning of each control step, and its rate of change (C4), from unit normals."""
     seconds, steps = horizon.substeps * model.scene.dt, horizon.control_steps
     found = {}
     for name, pose in (("offset", offset), ("normal", normal)):

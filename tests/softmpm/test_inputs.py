@@ -224,6 +224,19 @@ def test_inputs_of_any_layout(formulation, scheme):
         torch.testing.assert_close(got, want, rtol=0, atol=0, msg=name)
 
 
+@pytest.mark.parametrize("with_offset", [True, False])
+def test_the_length_of_a_normal_moves_no_wall(with_offset):
+    """Normals of another length are the same walls: alone at the offsets of the scene, with offsets of that length."""
+    model = build(full_scene(2, driven=()), inputs=("wall_normal",))
+    normal, offset = (model.defaults[f"wall_{name}"] for name in ("normal", "offset"))
+    ends = []
+    for length in (1.0, 4.0):  # powers of two round nothing
+        inputs = Inputs(wall_normal=length * normal, wall_offset=length * offset if with_offset else None)
+        ends.append(softmpm.simulate(model, model.rest(), None, model.params(), substeps=20, inputs=inputs))
+    for name, one, other in zip("xvCF", ends[0][:4], ends[1][:4], strict=True):
+        assert torch.equal(one, other), name
+
+
 def test_inputs_that_a_model_cannot_take():
     """Each message says the rule, what was given and a remedy."""
     model = build(full_scene(2, driven=()), worlds=2, inputs=("friction", "wall_offset"))

@@ -62,9 +62,10 @@ def _poses(scene: Scene, k: int, inputs: Inputs, worlds: int) -> tuple[Tensor, T
     else:
         offset = offset if offset.ndim == 3 else offset[None]
         offset = offset.expand(len(offset), worlds, walls)[:, :, k]
-    if inputs.wall_normal is not None:  # the scene's are unit vectors
+    if inputs.wall_normal is not None:  # the scene's are unit vectors, and its offsets are theirs
         length = _length(normal)
-        normal, offset = normal / length, offset / length[..., 0]
+        normal = normal / length
+        offset = offset if inputs.wall_offset is None else offset / length[..., 0]
     count = max(len(normal), len(offset))
     return normal.expand(count, -1, -1), offset.expand(count, -1)
 
