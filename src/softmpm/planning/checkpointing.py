@@ -4,17 +4,17 @@ Griewank & Walther 2000, "Algorithm 799: revolve". The backward pass visits a ch
 first; stage i needs the state before it, and s of these states can be stored at once, the first one included.
 The longest chain of which no stage runs more than r times before its own adjoint is
 
-    β(s, r) = (s + r)! / (s! r!)                                                                     (B1)
+    β(s, r) = (s + r)! / (s! r!)                                                                     (N1)
 
 and if β(s, r-1) < l ≤ β(s, r), then t(l, s) runs are needed, the sweep up to the last stage included:
 
-    t(l, s) = r l - β(s + 1, r - 1)                                                                  (B2)
-            = min over m of  m + t(m, s) + t(l - m, s - 1)     store the state before stage m        (B3)
+    t(l, s) = r l - β(s + 1, r - 1)                                                                  (N2)
+            = min over m of  m + t(m, s) + t(l - m, s - 1)     store the state before stage m        (N3)
 
 Here the forward pass runs every stage, for the result, and ends with the state after the last one. The reversal is thus
 one more stage, whose adjoint costs nothing; the backward pass recomputes
 
-    t(l + 1, s) - l                                                                                  (B4)
+    t(l + 1, s) - l                                                                                  (N4)
 """
 
 from collections.abc import Iterator
@@ -64,7 +64,7 @@ def backward_schedule(stages: int, slots: int) -> Iterator[Action]:
 
 
 def recomputed(stages: int, slots: int) -> int:
-    """Number of ``advance`` actions in :func:`backward_schedule` (B4); 0 if each stage has a slot."""
+    """Number of ``advance`` actions in :func:`backward_schedule` (N4); 0 if each stage has a slot."""
     _check(stages, slots)
     r = _repeats(stages + 1, slots)
     return r * (stages + 1) - _reach(slots + 1, r - 1) - stages
@@ -88,7 +88,7 @@ def _backward_actions(kept: list[int], stages: int, slots: int) -> Iterator[Acti
 
 
 def _split(length: int, slots: int) -> int:
-    """The smallest m that attains (B3), for 2 stages or more; the largest one would store states more often."""
+    """The smallest m that attains (N3), for 2 stages or more; the largest one would store states more often."""
     r = _repeats(length, slots)
     return max(_reach(slots, max(r - 2, 0)), length - _reach(slots - 1, r))
 
@@ -103,7 +103,7 @@ def _repeats(length: int, slots: int) -> int:
 
 
 def _reach(slots: int, repeats: int) -> int:
-    """β of (B1)."""
+    """β of (N1)."""
     return comb(slots + repeats, repeats)
 
 

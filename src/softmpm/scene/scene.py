@@ -137,7 +137,7 @@ class Wall:
     """Half space n·x ≤ offset that a body cannot enter.
 
     ``separate`` stops motion into the wall, with Coulomb friction. It acts on the points of the outlines if every body has one, as the
-    shapes do, else on the grid's nodes inside it (``contact`` of :func:`softmpm.build`). Nodes keep a body up to half a cell away, and
+    shapes do, else on the grid's nodes inside it (``contact`` of :func:`softmpm.build`). Nodes keep a body up to 0.9 cells away, and
     do not push out one that begins inside the wall.
 
     ``stick`` holds the nodes inside it, and ``slip`` removes their normal velocity.
@@ -177,7 +177,7 @@ class Scene:
     """A soft robot and its surroundings: everything that does not change while it moves."""
 
     grid: Grid
-    """Background grid; a particle that leaves it is an error."""
+    """Background grid; a particle that leaves it is an error in the moving formulation, and at rest in both."""
     bodies: Sequence[Body]
     """At least one; their particles are numbered in this order."""
     muscles: Sequence[Actuator] = ()

@@ -50,7 +50,7 @@ def simulate(stages: int, slots: int) -> int:
 
 @cache
 def segment(stages: int, slots: int) -> int:
-    """Fewest advances for a chain that starts with nothing but its first state: (B3), all m tried."""
+    """Fewest advances for a chain that starts with nothing but its first state: (N3), all m tried."""
     if stages == 1:
         return 0
     if slots == 1:
@@ -97,7 +97,7 @@ def test_small_chains_are_pulled_back_at_the_least_cost():
 
 @pytest.mark.parametrize("stages", range(1, 8))
 def test_nothing_beats_the_recursion(stages):
-    """Neither (B3) nor a rule about what is kept when enters the search."""
+    """Neither (N3) nor a rule about what is kept when enters the search."""
     for slots in range(1, 6):
         assert recomputed(stages, slots) == shortest(stages, slots), slots
 
@@ -108,7 +108,7 @@ def test_long_chains(stages, slots):
 
 
 def test_binomial_formula():
-    """(B2) is the optimum of (B3), (B4) follows from it, and the split of each length attains it."""
+    """(N2) is the optimum of (N3), (N4) follows from it, and the split of each length attains it."""
     for stages, slots in SMALL:
         r = next(r for r in range(stages) if comb(slots + r, r) >= stages)  # β(s, r-1) < l ≤ β(s, r)
         least = segment(stages, slots)
