@@ -3,6 +3,7 @@
 Each message names the rule, the value received and a remedy. Rules of one object stand with its class.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,6 +19,8 @@ SAME = 1e-11
 """Distance within which two places in a cell are the same [cells]: the rounding of positions."""
 SAME_PLACE = 1e-6
 """Two particles nearer than this share of a cell are one particle twice."""
+FILLED = 0.9
+"""Share of a box of two cells or more that two bodies must not both fill."""
 OPEN = 0.05
 """Largest |Σ n A| of an outline as a share of its area; a cube without one face has 0.2, exact quadrature 0."""
 MOST_WALLS = 64
@@ -198,22 +201,27 @@ def _check_distinct(scene: Scene) -> None:
 
 
 def _check_apart(scene: Scene) -> None:
-    """Raise ValueError for bodies that fill the same space: a box of two cells along each axis, by nine tenths each."""
-    count, edge = len(scene.bodies), 2 * scene.grid.spacing
-    positions = scene.positions
+    """Raise ValueError for bodies that fill the same space: a box of two cells along each axis or, for shapes, of as many distances of
+    their particles as reach two cells, so that their lattice fills it wherever it lies."""
+    count, positions, dx = len(scene.bodies), scene.positions, scene.grid.spacing
+    if count == 1:
+        return
     volumes = np.concatenate([np.broadcast_to(b.particles.volume, len(b.particles)) for b in scene.bodies])
-    bins = np.floor(positions / edge + 0.381966).astype(np.int64)  # see _check_distinct
-    numbers = np.ravel_multi_index(tuple(bins.T), tuple(bins.max(axis=0) + 1))
-    parts, of_part = np.unique(numbers * count + scene.body_index, return_inverse=True)
-    full = parts[np.bincount(of_part, volumes) >= 0.9 * edge**scene.grid.dim]
-    shared = np.flatnonzero(np.diff(full // count) == 0)
-    if len(shared):
-        one, other = (int(part % count) for part in full[shared[0] : shared[0] + 2])
-        place = positions[np.argmax(numbers == full[shared[0]] // count)]
-        raise ValueError(
-            f"bodies {one} and {other} overlap: both fill the space around {_tuple(place)} m, whose mass would count twice; bodies "
-            "must not overlap. Move one, or keep only the particles of one that lie outside the other."
-        )
+    shapes = [2.0 * dx if b.particles.outline is None else b.particles.spacing for b in scene.bodies]
+    for spacing in {float(f"{length / dx:.6g}") for length in shapes}:  # [cells]
+        edge = math.ceil(2.0 / spacing) * spacing * dx
+        bins = np.floor(positions / edge + 0.381966).astype(np.int64)  # see _check_distinct
+        numbers = np.ravel_multi_index(tuple(bins.T), tuple(bins.max(axis=0) + 1))
+        parts, of_part = np.unique(numbers * count + scene.body_index, return_inverse=True)
+        full = parts[np.bincount(of_part, volumes) >= FILLED * edge**scene.grid.dim]
+        shared = np.flatnonzero(np.diff(full // count) == 0)
+        if len(shared):
+            one, other = (int(part % count) for part in full[shared[0] : shared[0] + 2])
+            place = positions[np.argmax(numbers == full[shared[0]] // count)]
+            raise ValueError(
+                f"bodies {one} and {other} overlap: both fill the space around {_tuple(place)} m, whose mass would count twice; "
+                "bodies must not overlap. Move one, or keep only the particles of one that lie outside the other."
+            )
 
 
 def _suspects(bins: np.ndarray) -> np.ndarray:
