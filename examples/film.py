@@ -1,4 +1,4 @@
-"""A jelly cube falls onto another: a recording, a film of it in MP4 or GIF, and a file for the Rerun viewer."""
+"""A disc of jelly falls onto a block: a recording, a film of it in MP4 or GIF, and a file for the Rerun viewer."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""A robot from a picture: dark pixels are its body, red and blue ones its muscles. It learns to crawl. Leaves image_robot.png."""
+"""A robot from a picture, crawler.png: dark pixels are its body, red and blue ones its muscles. Leaves image_robot.png."""
 
 import dataclasses
 import math
@@ -19,10 +19,10 @@ pen = ImageDraw.Draw(drawing)
 pen.rounded_rectangle((10, 10, 210, 60), radius=20, fill="dimgray")
 pen.rectangle((30, 45, 65, 119), fill="red")
 pen.rectangle((155, 45, 190, 119), fill="blue")
-drawing.save("robot.png")
+drawing.save("crawler.png")
 
 corner, height = (0.1, 0.05), 0.12  # of the picture [m]
-shape = softmpm.image("robot.png", corner, height=height, spacing=cell / 2, threshold=0.9, cut_cells=True)
+shape = softmpm.image("crawler.png", corner, height=height, spacing=cell / 2, threshold=0.9, cut_cells=True)
 pixel = ((shape.positions - corner) / (height / drawing.height)).astype(int)
 red, _, blue = np.asarray(drawing)[drawing.height - 1 - pixel[:, 1], pixel[:, 0]].T.astype(int)
 muscles = [

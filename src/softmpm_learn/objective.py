@@ -3,7 +3,7 @@
 objective = Objective(
     Progress(begin=1.0),                             # minus the distance from 1 s on
     Effort(weight=1e-2),
-    AtMost(Upright(front=front, back=back, rest=rest), most=0.1, weight=10.0),
+    AtMost(term=Tilt(front=front, back=back, rest=rest), most=0.1, weight=10.0),
 )
 
 A term of one's own is a frozen dataclass, so that a resumed run can tell whether it is the same, with a method ``value``:

@@ -254,8 +254,8 @@ def resumed(conf: RunConf, overrides: Sequence[str]) -> RunConf:
     words = {_key(text): text for text in [*saved.command_line, *conf.command_line]}
     saved.command_line = list(words.values())
     for group, _, name in (_key(text).partition(".") for text in overrides):
-        if group == "device":
-            saved.device = conf.device
+        if group == "device":  # device=cuda is its name
+            setattr(saved.device, name or "name", getattr(conf.device, name or "name"))
         elif group == "train":
             setattr(saved.train, name, getattr(conf.train, name))
     return saved

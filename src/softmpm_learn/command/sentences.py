@@ -17,6 +17,7 @@ from omegaconf.errors import (
 from softmpm_learn import plugins
 from softmpm_learn.config import unknown_key
 from softmpm_learn.distributed import in_full, is_lost
+from softmpm_learn.register import CHOICES
 from softmpm_learn.tasks.image import unknown_colour
 
 EXPECTED = (
@@ -61,11 +62,9 @@ def sentence(error: BaseException) -> str:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        file = (
-            ""
-            if plugins.loaded
-            else f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
-        )
+        may_be_own = not plugins.loaded and group in (table.what for table in CHOICES)
+        file = f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
+        file = file if may_be_own else ""
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
     if is_lost(error):
         return "another process of this run has ended; its own message says why, or torchrun reports the signal that killed it."

@@ -7,11 +7,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
 from softmpm_learn.storage import sweep
 from softmpm_learn.storage.sweep import EXAMINED
 
 SEEDS = "train.seed", "train.seeds"
-INDIFFERENT = *SEEDS, "train.log", "train.record_every", "train.frame_every", "train.examine", "resume"
+FREE = (
+    "train.log",
+    "train.record_every",
+    "train.frame_every",
+    "train.examine",
+    "train.save_every",
+    "train.pictures",
+)
+INDIFFERENT = *SEEDS, *FREE, "train.side_by_side", "device.threads", "device.memory", "resume"
 """Settings by which runs do not become others, the seed apart."""
 PIECE = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|\\[\\()[\]{}:=, \t]|.""", re.DOTALL)
 """A quoted text, an escaped character or another one."""
@@ -125,10 +135,16 @@ def _place(sweep: Path, folder: Path) -> Path:
     return next((place for place in inside if place.is_dir()), folder)
 
 
+def _seed(place: Path) -> int:
+    """Seed of a run by its configuration, which an experiment may have set; 0 where there is none."""
+    path = place / "config.yaml"
+    return OmegaConf.select(OmegaConf.load(path), "train.seed", default=0) if path.is_file() else 0
+
+
 def _run(folder: Path, job: int, row: dict[str, str], place: Path, seed: int | None = None) -> SweptRun:
     settings = parse(row["settings"])
     try:
-        own = int(row.get("seed") or settings.get("train.seed", 0)) if seed is None else seed
+        own = int(row.get("seed") or settings.get("train.seed") or _seed(place)) if seed is None else seed
     except ValueError:
         own = 0  # such a job has failed
     run = SweptRun(

@@ -9,6 +9,7 @@ from softmpm_learn import plugins
 from softmpm_learn.gym.env import SoftRobotEnv
 from softmpm_learn.gym.vector import SoftRobotVectorEnv
 from softmpm_learn.gym.worlds import EnvConf
+from softmpm_learn.setting_checks import one_of
 from softmpm_learn.tasks import TASKS, Resolution, Task, make_task
 
 
@@ -32,6 +33,18 @@ def register() -> None:
             )
 
 
+def _own(name: str) -> str:
+    """:func:`identifier` of a task, registered by now."""
+    register()  # tasks that were added since
+    there = identifier(name)
+    other = gymnasium.registry[there].kwargs.get("task")
+    if other != name:
+        raise ValueError(
+            f"tasks {other!r} and {name!r} are both {there} in gymnasium; give one another name."
+        )
+    return there
+
+
 def make(name: str, **settings: Any) -> SoftRobotEnv:
     """Environment of a task, without wrappers.
 
@@ -40,16 +53,12 @@ def make(name: str, **settings: Any) -> SoftRobotEnv:
         settings: ``render_mode``, fields of :class:`EnvConf` and of the task's own settings, such as ``seconds=0.5``; ``resolution``
             may be a string.
     """
-    register()  # tasks that were added since
-    return cast(
-        SoftRobotEnv, gymnasium.make(identifier(name), disable_env_checker=True, **settings).unwrapped
-    )
+    return cast(SoftRobotEnv, gymnasium.make(_own(name), disable_env_checker=True, **settings).unwrapped)
 
 
 def make_vec(name: str, num_envs: int = 1, **settings: Any) -> SoftRobotVectorEnv:
     """Environment of ``num_envs`` worlds of a task; settings as of :func:`make`, and ``autoreset_mode``."""
-    register()
-    return cast(SoftRobotVectorEnv, gymnasium.make_vec(identifier(name), num_envs=num_envs, **settings))
+    return cast(SoftRobotVectorEnv, gymnasium.make_vec(_own(name), num_envs=num_envs, **settings))
 
 
 def make_single(task: str, render_mode: str | None = None, **settings: Any) -> SoftRobotEnv:
@@ -73,7 +82,7 @@ def parts(name: str, settings: dict[str, Any]) -> tuple[Task, EnvConf]:
     """Task and settings of the environment from one set of keywords.
 
     Raises:
-        ValueError: A keyword is a setting of neither.
+        ValueError: A keyword is a setting of neither, or there is no such resolution.
     """
     kind: Any = TASKS[name].kind
     own = [field.name for field in dataclasses.fields(EnvConf)]
@@ -85,6 +94,7 @@ def parts(name: str, settings: dict[str, Any]) -> tuple[Task, EnvConf]:
         )
     chosen = {key: value for key, value in settings.items() if key in theirs}
     if isinstance(chosen.get("resolution"), str):
+        one_of("resolution", chosen["resolution"], tuple(Resolution.__members__))
         chosen["resolution"] = Resolution[chosen["resolution"]]
     conf = EnvConf(**{key: value for key, value in settings.items() if key in own})
     return make_task(kind(**chosen)), conf

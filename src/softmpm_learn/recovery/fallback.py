@@ -17,7 +17,10 @@ def limits(conf: OptimizerConf, settles: bool) -> tuple[float, int]:
 
 @dataclass
 class Fallback:
-    """Counts iterations in a row whose progress, the first loss minus the present one, is below a share of the best progress."""
+    """Counts iterations in a row whose progress, the first loss minus the present one, is below a share of the best progress.
+
+    The best may be above the first loss, because a motion that lasts is better than one that does not. Its progress then is its size.
+    """
 
     first: float = math.nan
     """First loss of the run."""
@@ -34,7 +37,8 @@ class Fallback:
 
     def is_below(self, loss: float, best: float, share: float) -> bool:
         """True if the progress of a loss is below a share of the best progress; False as long as there is no first loss."""
-        return self.first - loss < share * (self.first - best)
+        begin = self.first if self.first > best else best + abs(best)
+        return not math.isnan(self.first) and begin - loss < share * (begin - best)
 
     def is_due(self, loss: float, best: float, conf: OptimizerConf, settles: bool = False) -> bool:
         """True if the run should fall back after an iteration; then a new count begins.

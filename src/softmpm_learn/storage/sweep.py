@@ -7,6 +7,7 @@ import io
 import json
 import math
 import re
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,9 +100,20 @@ def update(folder: Path, found: Outcome) -> None:
         return
     own = dict(job=before.job, seed=before.seed, settings=before.settings, folder=before.folder)
     record(folder, dataclasses.replace(found, **own))
-    for above in (folder.parent, folder.parent.parent):
+    if folder.name.startswith(SEED):
+        _update_job(folder.parent)
+    for above in (folder, folder.parent, folder.parent.parent):
         if (above / TABLE).exists():
             tabulate(above)
+
+
+def _update_job(folder: Path) -> None:
+    """A job that failed has finished with the last of its seeds."""
+    job = outcome(folder)
+    its = [found for one in folder.glob(f"{SEED}*") if (found := outcome(one))]
+    if job and job.status == "failed" and its and all(one.status == "finished" for one in its):
+        loss = statistics.median(one.loss for one in its)
+        record(folder, dataclasses.replace(job, status="finished", loss=loss, error=""))
 
 
 def tabulate(sweep: Path) -> None:

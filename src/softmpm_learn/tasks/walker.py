@@ -61,9 +61,11 @@ class WalkerConf(TaskConf):
     def __post_init__(self):
         super().__post_init__()
         not_negative("task", self, "friction", "upright", "stretch")
-        if self.lead is not None and not 0 <= self.lead < self.seconds:
+        last = (max(1, round(self.seconds / self.control_period)) - 1) * self.control_period
+        if self.lead is not None and not 0 <= self.lead <= last * (1 + 1e-9):
             raise ValueError(
-                f"task.lead must be ≥ 0 and below task.seconds = {self.seconds}, or no distance counts; got {self.lead}."
+                f"task.lead must be ≥ 0 and at most {last:g} s, when the last control step of task.seconds begins, or no distance "
+                f"counts; got {self.lead}."
             )
         if not (math.isfinite(self.track_length) and self.track_length >= ROOM):
             raise ValueError(f"task.track must be at least {ROOM:g} m, got {self.track}.")

@@ -21,7 +21,7 @@ from softmpm_learn import plugins
 from softmpm_learn.__main__ import help_text
 from softmpm_learn.command import app, experiment, farewell
 from softmpm_learn.command.sentences import sentence
-from softmpm_learn.config import RunConf, check_keys, conf_dir, to_run
+from softmpm_learn.config import DeviceConf, RunConf, check_keys, conf_dir, to_run
 from softmpm_learn.distributed import Group
 from softmpm_learn.register import CHOICES
 from softmpm_learn.runs.saved import load, save
@@ -520,6 +520,22 @@ def test_resume_changes_nothing_but_what_may_change(tmp_path):
     assert conf.resume is None and conf.train.seed == old.train.seed
     with pytest.raises(ValueError, match="may change, not train.seed"):
         app.check_words([f"resume={tmp_path}", "train.seed=3"])
+
+
+@pytest.mark.parametrize("word, name, threads", [("device.threads=1", "cpu", 1), ("device=auto", "auto", 3)])
+def test_resume_keeps_what_is_not_said_of_the_device(tmp_path, word, name, threads):
+    """One setting of it, or its choice, changes no other."""
+    device = DeviceConf(name="cpu", threads=3, dtype="float64", deterministic=True)
+    save(RunConf(task=ArmConf(), device=device), tmp_path)
+    new = to_run(composed(word))
+    new.resume = str(tmp_path)
+    device = app.resumed(new, [f"resume={tmp_path}", word]).device
+    assert (device.name, device.threads, device.dtype, device.deterministic) == (
+        name,
+        threads,
+        "float64",
+        True,
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -240,6 +240,23 @@ def test_another_column_at_another_iteration(swept, tmp_path):
     assert {row["final"] for row in read(tmp_path / "jobs.csv")} == {"0.25"}
 
 
+def test_settings_that_change_no_number_make_no_other_runs(tmp_path):
+    """Runs of two sweeps are compared although one wrote fewer checkpoints; the seed of a run may stand in its configuration only."""
+    one, other = (make_sweep(tmp_path / name, {"observer=latent": LATENT}) for name in ("one", "other"))
+    rows = read(other / "sweep.csv")
+    for row in rows:
+        seed = 900 + int(row["job"])
+        row["settings"] = (
+            "task=elephant observer=latent train.save_every=10 train.pictures=false device.threads=1"
+        )
+        (other / row["job"] / "config.yaml").write_text(f"train:\n  seed: {seed}\n")
+    table(other / "sweep.csv", COLUMNS, rows)
+    program.main([str(one), str(other), "--out", str(tmp_path / "out")])
+    found = read(tmp_path / "out" / "jobs.csv")
+    assert sorted(int(row["seed"]) for row in found) == [0, 1, 2, 900, 901, 902]
+    assert "train.save_every" not in found[0] and "device.threads" not in found[0]
+
+
 def test_each_robot_has_a_folder(tmp_path):
     """Losses of different tasks are not compared; a task of which nothing has finished does no harm to the others."""
     groups = {

@@ -20,6 +20,7 @@ from softmpm_learn.gym import EnvConf, SoftRobotEnv, SoftRobotVectorEnv, make, m
 from softmpm_learn.gym.picture import picture
 from softmpm_learn.objective import Path as Motion
 from softmpm_learn.observe import Centroids
+from softmpm_learn.register import TASKS
 
 ROOT = Path(__file__).parents[3]
 SHORT = dict(seconds=0.05, device="cpu")
@@ -312,6 +313,14 @@ def test_a_wrong_action_says_what_must_hold(worlds):
         env.step("pull")
     env.step(np.zeros(shape))
     env.step_torch(torch.zeros(shape))
+
+
+def test_two_tasks_have_two_names(monkeypatch):
+    """In gymnasium's registry a task may have the name of another one, whose robot is not given instead."""
+    entry = TASKS["arm"]
+    monkeypatch.setitem(TASKS._entries, "ARM", entry)
+    with pytest.raises(ValueError, match="tasks 'arm' and 'ARM' are both softmpm/Arm-v0 in gymnasium"):
+        make("ARM")
 
 
 def test_a_wrong_autoreset_mode_is_answered_with_the_modes():

@@ -36,6 +36,14 @@ def test_progress_counts_from_the_first_loss():
     assert due(LOSSES, fallback_after=1, fallback_share=0.0) == []
 
 
+def test_a_best_above_the_first_loss_is_not_below_itself():
+    """A best that lasts may have a higher loss than a first motion that did not last: a loss like it goes on, half of it does not."""
+    fallback = Fallback(first=-0.5)
+    assert not fallback.is_below(-0.3, -0.3, 0.9) and not fallback.is_below(-0.4, -0.3, 0.9)
+    assert fallback.is_below(-0.1, -0.3, 0.5) and fallback.is_below(math.inf, -0.3, 0.5)
+    assert not Fallback().is_below(math.inf, -0.3, 0.5)
+
+
 def test_the_first_iterations_do_not_count():
     """Where they would be the ones below the share."""
     assert due(LOSSES, fallback_after=3, fallback_from=3) == [5]

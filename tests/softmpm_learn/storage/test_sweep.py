@@ -216,6 +216,27 @@ def test_a_spoilt_outcome_is_named(run, capsys):
         assert "outcome.json is no outcome of a job" in capsys.readouterr().err and path.read_text() == spoilt
 
 
+def test_the_last_seed_that_failed_finishes_its_job(tmp_path):
+    """Resumed alone, it leaves a table with a row for each seed in the folder of the job and of the sweep, and a job that finished."""
+    job, about = tmp_path / "0", dict(job=0, settings="", folder="0")
+    ends = [("finished", 0.1), ("finished", 0.3), ("failed", math.inf)]
+    for seed, (status, loss) in enumerate(ends):
+        (job / f"seed_{seed}").mkdir(parents=True)
+        sweep.record(job / f"seed_{seed}", sweep.Outcome(seed=seed, status=status, loss=loss, **about))
+    sweep.record(job, sweep.Outcome(status="failed", error="seed 2 failed", **about))
+    for folder in (job, tmp_path):
+        sweep.tabulate(folder)
+    sweep.update(job / "seed_2", sweep.Outcome(seed=2, status="finished", loss=0.2, **about))
+    for folder in (job, tmp_path):
+        with open(folder / sweep.TABLE, newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert [(row["seed"], row["status"], row["loss"]) for row in rows] == [
+            *(("0", "finished", "0.1"), ("1", "finished", "0.3"), ("2", "finished", "0.2"))
+        ]
+    whole = sweep.outcome(job)
+    assert whole is not None and (whole.status, whole.loss, whole.error) == ("finished", 0.2, "")
+
+
 def test_folders_are_named_by_the_command():
     """The same words, the same folder; others, another; never a name that a file system or a person stumbles over."""
     name = sweep.folder_name

@@ -281,6 +281,8 @@ def test_settings_reach_the_scene():
         (ElephantConf, {"gravity": -1.0}, "task.gravity must be ≥ 0"),
         (ElephantConf, {"friction": -0.1}, "task.friction must be ≥ 0"),
         (BipedConf, {"upright": -1.0}, "task.upright must be ≥ 0"),
+        (BipedConf, {"lead": 1.99}, "task.lead must be ≥ 0 and at most 1.9875 s"),
+        (BipedConf, {"lead": -0.1}, "task.lead must be ≥ 0"),
         (ElephantConf, {"control_period": 3.0}, "task.control_period must be at most task.seconds"),
         (ArmConf, {"goal": [0.5]}, "task.goal must be two numbers"),
         (ArmConf, {"goal": [0.9, 0.9]}, "at most the arm's 0.36 m"),
