@@ -21,9 +21,8 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     lines = []
     if math.isfinite(result.best_loss):
         what = "evaluation" if result.run.evaluated else "loss"
-        lines.append(
-            f"Best {what} {result.best_loss:.5g}, in iteration {result.best_iteration}{_outcome(task, out)}."
-        )
+        best = result.best_iteration
+        lines.append(f"Best {what} {result.best_loss:.5g}, in iteration {best}{_outcome(task, out, best)}.")
     if count := result.run.fallback.count:
         lines.append(f"It failed or fell far below its best and went back to it: {_times(count)}.")
     if count := result.run.restart.count:
@@ -87,10 +86,10 @@ def _examined(examination: dict[str, float]) -> str:
     return ", ".join(f"{name} {answer}" for name, answer in answers.items())
 
 
-def _outcome(task: Task, out: Path) -> str:
-    """Achievement of the robot in the last recorded simulation, in words."""
+def _outcome(task: Task, out: Path, iteration: int) -> str:
+    """Achievement of the robot in an iteration, in words, if the last recorded simulation is that of it."""
     episode = last_episode(out / "run.h5")
-    if episode is None:
+    if episode is None or episode[0] != iteration:
         return ""
     words = task.objective.outcome(episode[1]["x"], task.body_length)
     return f"; {words}" if words else ""

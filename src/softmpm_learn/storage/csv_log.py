@@ -20,6 +20,29 @@ class Seal(TypedDict):
     """Hash of these bytes."""
 
 
+def kept(path: Path, columns: list[str], seal: Seal | None) -> bytes:
+    """Content that a :class:`Table` goes on after: the file as it was sealed, or a header.
+
+    Raises:
+        ValueError: The file is not the one that was sealed, or has other columns.
+    """
+    header = (",".join(["iteration", *columns]) + "\n").encode()
+    if seal is None or not path.exists():
+        return header
+    content = files.read(path, seal["bytes"])
+    if len(content) != seal["bytes"] or hashlib.sha256(content).hexdigest() != seal["sha256"]:
+        raise ValueError(
+            f"{path} is damaged or of another run: its first {seal['bytes']} bytes are not those that the checkpoint knows; put the "
+            "right file there, or move it away to go on without its rows."
+        )
+    if not content.startswith(header):
+        raise ValueError(
+            f"{path} should have the columns {header.decode().strip()}; a run of an earlier version has others. Move the file away to "
+            "go on without its rows."
+        )
+    return content
+
+
 class Table:
     """Rows of numbers under fixed column names; the first column is ``iteration``, counted without gaps.
 
@@ -37,21 +60,8 @@ class Table:
 
     def __init__(self, path: Path, columns: list[str], seal: Seal | None = None):
         self.path, self.columns = path, columns
-        header = (",".join(["iteration", *columns]) + "\n").encode()
-        content = header
-        if seal is not None and path.exists():
-            content = files.read(path, seal["bytes"])
-            if len(content) != seal["bytes"] or hashlib.sha256(content).hexdigest() != seal["sha256"]:
-                raise ValueError(
-                    f"{path} is damaged or of another run: its first {seal['bytes']} bytes are not those that the checkpoint "
-                    f"knows; put the right file there, or move it away to go on without its rows."
-                )
-            if not content.startswith(header):
-                raise ValueError(
-                    f"{path} should have the columns {header.decode().strip()}; a run of an earlier version has others. Move the file "
-                    "away to go on without its rows."
-                )
-        elif seal is not None:
+        content = kept(path, columns, seal)
+        if seal is not None and not path.exists():
             logger.warning("%s is missing; its rows up to here are lost, and a new one begins.", path)
         self._hash, self._bytes = hashlib.sha256(content), len(content)
         self._lines: list[str] = []

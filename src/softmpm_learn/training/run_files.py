@@ -19,7 +19,7 @@ from softmpm_learn.runs.loops import OnFrames
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.storage import checkpoint
-from softmpm_learn.storage.csv_log import Table
+from softmpm_learn.storage.csv_log import Table, kept
 from softmpm_learn.storage.sweep import EXAMINED
 from softmpm_learn.training.timing import TIMING, clock
 
@@ -73,16 +73,23 @@ class RunFiles:
     ):
         self.run, self.out, self._loggers = run, out, loggers or Loggers([], out)
         self._named = run.learner.replay.ids if run.learner else []
-        self._metrics = Table(out / "metrics.csv", metrics(run), seals.get("metrics.csv"))
-        self._timing = Table(out / "timing.csv", TIMING, seals.get("timing.csv"))
+        tables = {"metrics.csv": metrics(run), "timing.csv": TIMING}
+        for (
+            name,
+            columns,
+        ) in tables.items():  # what is refused comes before anything is cut back to the checkpoint
+            kept(out / name, columns, seals.get(name))
+        settings = {"task": run.task.name} | dataclasses.asdict(run.settings)
+        self._loggers.open(run.iteration, seals.get("loggers", {}), settings)
         self._recorded = seals.get("run.h5")
         self._recorder = self._open_recorder() if run.settings.train.record_every else None
         self._seal_recording(run.iteration)
         self._saved = self._stage if seals else None
         self.frames: list[tuple[float, Tensor, Tensor | None]] = []
         try:
-            settings = {"task": run.task.name} | dataclasses.asdict(run.settings)
-            self._loggers.open(run.iteration, seals.get("loggers", {}), settings)
+            self._metrics, self._timing = (
+                Table(out / name, columns, seals.get(name)) for name, columns in tables.items()
+            )
         except BaseException:
             self.__exit__(None, None, None)
             raise

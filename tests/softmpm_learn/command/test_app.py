@@ -416,7 +416,7 @@ def test_resume_goes_on_with_the_run_s_own_settings(monkeypatch, tmp_path, finis
 
 
 def test_a_refused_resume_changes_nothing(monkeypatch, capsys, tmp_path, finished):
-    """Refused for another precision, or because another run is writing, the run continues unaffected."""
+    """Refused for another precision, a package that is missing, or because another run is writing, the run continues unaffected."""
     shutil.copytree(finished[0], tmp_path / "run")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
     asked = (f"resume={tmp_path}/run", "train.iterations=9", "device.dtype=float64")
@@ -424,7 +424,19 @@ def test_a_refused_resume_changes_nothing(monkeypatch, capsys, tmp_path, finishe
     (tmp_path / "run" / "error.txt").unlink()
     with checkpoint.locked(tmp_path / "run"):
         assert "another run is writing" in refusal(monkeypatch, capsys, *asked)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    said = refusal(monkeypatch, capsys, *asked[:2], "train.log=[wandb]")
+    assert 'pip install "softmpm[wandb]"' in said
+    (tmp_path / "run" / "error.txt").unlink()
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
+
+
+def test_the_words_about_the_best_are_about_the_best(finished):
+    """Of a run that was stopped the last recorded episode is another one, of which the last lines say nothing."""
+    run = load(finished[0])
+    best = run.best["iteration"]
+    assert farewell._outcome(run.task, finished[0], best).startswith("; ")
+    assert farewell._outcome(run.task, finished[0], best + 1) == ""
 
 
 def test_the_objective_is_part_of_a_run(monkeypatch, capsys, tmp_path, finished):
