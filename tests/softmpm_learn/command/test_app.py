@@ -17,6 +17,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 import softmpm
+import softmpm_learn
 from softmpm_learn import plugins
 from softmpm_learn.__main__ import help_text
 from softmpm_learn.command import app, experiment, farewell
@@ -433,10 +434,9 @@ def test_a_refused_resume_changes_nothing(monkeypatch, capsys, tmp_path, finishe
 
 def test_the_words_about_the_best_are_about_the_best(finished):
     """Of a run that was stopped the last recorded episode is another one, of which the last lines say nothing."""
-    run = load(finished[0])
-    best = run.best["iteration"]
-    assert farewell._outcome(run.task, finished[0], best).startswith("; ")
-    assert farewell._outcome(run.task, finished[0], best + 1) == ""
+    task, best = make_task(load(finished[0]).task), softmpm_learn.load(finished[0]).best["iteration"]
+    assert farewell._outcome(task, finished[0], best).startswith("; ")
+    assert farewell._outcome(task, finished[0], best + 1) == ""
 
 
 def test_the_objective_is_part_of_a_run(monkeypatch, capsys, tmp_path, finished):
